@@ -153,12 +153,13 @@ FLOATERS: dict[str, dict[str, Any]] = {
 }
 GRID = {"exposure": True, "corrections": {"exposure_kind": "grid"}}
 JITTER = {"jitter 0.1": {"jitter": 0.1}}
+POINTS = {f"points_weight {weight}": {"loss": {"points_weight": weight}} for weight in (0.1, 0.3)}
 CASES: dict[str, tuple[Callable[[], a2tg.Scene], dict[str, dict[str, Any]]]] = {
-    "whole": (whole, {"plain": {}, "robust": ROBUST, "grid": GRID, **FLOATERS, **JITTER}),
+    "whole": (whole, {"plain": {}, "robust": ROBUST, "grid": GRID, **FLOATERS, **JITTER, **POINTS}),
     "distractors": (distractors, {"plain": {}, "robust": ROBUST}),
     "distractors, exact masks": (masked, {"plain": {}}),
     "floaters": (with_floaters, {"plain": {}, **FLOATERS}),
-    "few views": (few_views, {"plain": {}, **FLOATERS, **JITTER}),
+    "few views": (few_views, {"plain": {}, **FLOATERS, **JITTER, **POINTS}),
     "few views, depths": (lambda: with_depths(few_views()), {f"depth_weight {weight}": depth_weight(weight)
                                                              for weight in (0.1, 0.3, 1)}),
     "whole, depths": (lambda: with_depths(whole()), {"depth_weight 0.3": depth_weight(0.3)}),

@@ -48,7 +48,9 @@ ROWS = 96
 
 @functools.cache
 def scene():
-    return a2tg.synthetic_scene(num_views=9, width=72, height=54, num_points=ROWS)
+    """A scene whose views saw its points, but the first."""
+    found = a2tg.synthetic_scene(num_views=9, width=72, height=54, num_points=ROWS)
+    return dataclasses.replace(found, train=(dataclasses.replace(found.train[0], points=None), *found.train[1:]))
 
 
 def plain():
@@ -283,7 +285,7 @@ def fit(own, count, **options):
 
 def batches(folder):
     """Views that are drawn at once, each by its share of the devices, have the gradients of one device."""
-    own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True, jitter=0.1)
+    own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True, jitter=0.1, loss={"points_weight": 0.1})
     for index, size, is_streamed in ((1, 4, False), (0, 6, False), (0, 6, True)):
         own = dataclasses.replace(own, batch_size=size)
         if not is_streamed:

@@ -20,7 +20,7 @@ from a2tg_jax.densify.floaters import are_near, nearest_depths
 from a2tg_jax.densify.pruning import blending_weights, shown_in
 from a2tg_jax.events import Due
 from a2tg_jax.training import SYSTEMS
-from a2tg_jax.training.batches import stack_views
+from a2tg_jax.training.batches import Extras, stack_views
 from a2tg_jax.training.bilateral import BilateralGrid, sliced, total_variation
 from a2tg_jax.training.corrections import exposed, learned
 from a2tg_jax.training.depth_prior import DepthPrior, depth_loss, scale_and_shift
@@ -217,7 +217,7 @@ class TestDepthPrior:
         values = RNG.uniform(size=(30, 40))
         values[3, 4] = np.inf
         first = dataclasses.replace(scene.train[0], depth=4 * values)
-        stack = stack_views([first, scene.train[1]], has_depths=True)
+        stack = stack_views([first, scene.train[1]], extras=Extras(depths=True))
         expected = np.where(np.isinf(values), np.nan, values / values[values < 2].max())
         np.testing.assert_allclose(stack.depths[0], expected, rtol=1e-6)
         assert np.isnan(stack.depths[1]).all() and stack_views([first]).depths is None

@@ -13,6 +13,7 @@ from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_ca
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
+from a2tg_jax.data.observations import SeenPoints
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.data.world import normalizing_similarity, scene_scale
@@ -41,6 +42,8 @@ class Shot:
     """Depth map; None without one."""
     panorama: int | None = None
     """Number of the panorama that it was cut from; None of a photograph."""
+    points: SeenPoints | None = None
+    """Points that the reconstruction saw in it, their depths in units of the original world."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -88,7 +91,9 @@ def assemble_scene(
         points, colors = transform.apply(cloud.points), cloud.colors
 
     def views(group: Sequence[Shot]) -> tuple[View, ...]:
-        return tuple(_view(shot, viewmats[shot.name]) for shot in sorted(group, key=lambda shot: shot.name))
+        return tuple(
+            _view(shot, viewmats[shot.name], transform.scale) for shot in sorted(group, key=lambda shot: shot.name)
+        )
 
     return Scene(
         name=name,
@@ -168,8 +173,8 @@ def _are_somewhere(points: np.ndarray) -> np.ndarray:
     return are_within
 
 
-def _view(shot: Shot, viewmat: np.ndarray) -> View:
-    """Return the shot with its camera in the normalised world."""
+def _view(shot: Shot, viewmat: np.ndarray, scale: float) -> View:
+    """Return the shot with its camera in the normalised world, which is `scale` times as large as the original."""
     height, width = shot.pixels.shape[:2]
     check_calibration(viewmat, shot.K, width, height, shot.name)
     rays: Any = shot.rays  # Views of one lens share the array.
@@ -179,4 +184,5 @@ def _view(shot: Shot, viewmat: np.ndarray) -> View:
         has_ray = np.isfinite(shot.rays).all(axis=2)
         mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
     mask = None if mask is None or mask.is_full else mask
-    return View(shot.name, camera, Picture.of(shot.pixels), mask, shot.depth, shot.panorama)
+    points = shot.points and shot.points._replace(depths=shot.points.depths * np.float32(scale))
+    return View(shot.name, camera, Picture.of(shot.pixels), mask, shot.depth, shot.panorama, points)

@@ -21,6 +21,7 @@ from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import KeptLens, Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
+from a2tg_jax.data.observations import SeenPoints, seen_points
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
@@ -86,18 +87,24 @@ def load_colmap(
 
     photos = map_in_threads(photo, registered, num_readers(path))
     found = read_photos(photos, Shelf(room), division, path)
-    shots = [_shot(image, own, panorama_of(image, reach)) for image, own in zip(registered, found, strict=True)]
+    numbers, cloud = np.array(sorted(reconstruction.points3D), np.uint64), read_points(reconstruction)
+
+    def shot(image: Any, read: Reading) -> Shot:
+        points = _seen_points(image, numbers, cloud.points, lenses[image.camera_id], read)
+        return _shot(image, read, panorama_of(image, reach), points)
+
+    shots = [shot(image, read) for image, read in zip(registered, found, strict=True)]
     check_masks(shots, str(path), images_folder.with_name(FOLDER))
     train, test = every_kth(shots, test_every)
-    cloud = _read_cloud(model, reconstruction)
-    return assemble_scene(scene_name(images_folder.parent), train, test, cloud, source=str(path))
+    name = scene_name(images_folder.parent)
+    return assemble_scene(name, train, test, _start_cloud(model, cloud), source=str(path))
 
 
-def _read_cloud(model: Path, reconstruction: Any) -> PointCloud:
-    """Return the points of a model. Networks that estimate depth write a PLY file in place of COLMAP's."""
+def _start_cloud(model: Path, cloud: PointCloud) -> PointCloud:
+    """Return the points to start from: a model's own, or the PLY file that networks of depth write in their place."""
     ply = model / POINTS_PLY
     has_own = any(is_regular(model / f"points3D{suffix}") for suffix in EMPTY_POINTS)
-    return read_ply_points(ply) if not has_own and is_regular(ply) else read_points(reconstruction)
+    return read_ply_points(ply) if not has_own and is_regular(ply) else cloud
 
 
 def read_cameras_and_points(path: Path) -> tuple[np.ndarray, PointCloud]:
@@ -111,7 +118,7 @@ def read_cameras_and_points(path: Path) -> tuple[np.ndarray, PointCloud]:
     images = sorted(
         (reconstruction.images[key] for key in reconstruction.reg_image_ids()), key=lambda image: image.name
     )
-    return np.stack([viewmat_of(image) for image in images]), _read_cloud(model, reconstruction)
+    return np.stack([viewmat_of(image) for image in images]), _start_cloud(model, read_points(reconstruction))
 
 
 def read_points(reconstruction: Any) -> PointCloud:
@@ -148,10 +155,32 @@ def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> Photo
     )  # fmt: skip
 
 
-def _shot(image: Any, read: Reading, panorama: int | None) -> Shot:
+def _shot(image: Any, read: Reading, panorama: int | None, points: SeenPoints | None) -> Shot:
     """Return one registered image whose photograph is read."""
     mask = read.facts.mask
-    return Shot(image.name, viewmat_of(image), read.K, read.picture, mask, read.rays, read.depth, panorama)
+    return Shot(image.name, viewmat_of(image), read.K, read.picture, mask, read.rays, read.depth, panorama, points)
+
+
+def _seen_points(
+    image: Any, numbers: np.ndarray, positions: np.ndarray, lens: Lens, read: Reading
+) -> SeenPoints | None:
+    """Return the points that a registered image saw, their depths in units of the original world; None of none.
+
+    Args:
+      image: whose features have the numbers of their points.
+      numbers: [P] uint64 numbers of all points, in order.
+      positions: [P, 3].
+      lens: of its photograph.
+      read: the photograph.
+    """
+    own = np.array([feature.point3D_id for feature in image.points2D if feature.has_point3D()], np.uint64)
+    own = own[np.isin(own, numbers)]
+    if not len(own):
+        return None
+    viewmat, size = viewmat_of(image), read.picture.size
+    points = positions[np.searchsorted(numbers, own)] @ viewmat[:3, :3].T + viewmat[:3, 3]
+    points = points[points[:, 2] > 0]
+    return seen_points(lens.places(points, read.K, size[::-1]), points[:, 2], size)
 
 
 def spacing(images: Sequence[Any]) -> float:

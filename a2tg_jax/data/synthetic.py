@@ -3,7 +3,8 @@
 Its patterns have details of about 4 to 10 pixels, finer than one or two thousand Gaussians can show without textures.
 """
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
@@ -12,6 +13,7 @@ from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import patterns
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene
 from a2tg_jax.data.lighting import light
+from a2tg_jax.data.observations import seen_points
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.data.splits import check_test_every, every_kth
@@ -24,6 +26,8 @@ DISTANCE = 2.4
 """Distance of the cameras from the target."""
 FIELD_OF_VIEW = np.deg2rad(58.0)
 """Field of view across the longer side of the image."""
+SAME_SURFACE = 1e-3
+"""Largest relative difference of depth between a point and the surface that it lies on."""
 SAMPLE_OFFSETS = np.array([[-0.375, -0.125, 0.125, 0.375], [0.125, -0.375, 0.375, -0.125]])
 """Places [2, S] of a pixel's rays around its centre: a turned square, all different along x and along y."""
 
@@ -70,6 +74,7 @@ def synthetic_scene(
         for index, viewmat in enumerate(viewmats)
     ]
     cloud = sample_points(surfaces, shots, num_points, rng)
+    shots = [seeing(shot, cloud.points, [surface.shape for surface in surfaces]) for shot in shots]
     return assemble_scene("synthetic", *every_kth(shots, test_every), cloud, source="the synthetic scene")
 
 
@@ -140,6 +145,17 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
         colors.append(pixels[row, column])
     is_hit = np.isfinite(np.concatenate(points)).all(axis=1)
     return PointCloud(np.concatenate(points)[is_hit], np.concatenate(colors)[is_hit])
+
+
+def seeing(shot: Shot, points: np.ndarray, shapes: Sequence[Shape]) -> Shot:
+    """Return a shot with those of the points [P, 3] that no shape hides from it."""
+    own = points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
+    own = own[own[:, 2] > 0]
+    places, depths = (own @ shot.K.T)[:, :2] / own[:, 2:], own[:, 2]
+    hits, _ = nearest_hits(shapes, _center(shot.viewmat), _directions(shot.viewmat, shot.K, *places.T))
+    is_seen = depths <= (1 + SAME_SURFACE) * hits
+    height, width = Picture.of(shot.pixels).size
+    return dataclasses.replace(shot, points=seen_points(places[is_seen], depths[is_seen], (height, width)))
 
 
 def exact_points(scene: Scene) -> np.ndarray:

@@ -67,9 +67,9 @@ def batch_gradients(
     }  # fmt: skip
 
     def loss(shown: Model, seen: View, output: RenderOutput) -> tuple[Array, tuple[Array, Array]]:
-        image, alpha, mask, depth = seen.target
+        image, alpha, mask, depth, points = seen.target
         photograph = _black_outside(mask, _over(image, alpha, seen.background))
-        target = Target(seen.camera, photograph, seen.background, mask, depth, clock.progress(iteration - 1))
+        target = Target(seen.camera, photograph, seen.background, mask, depth, clock.progress(iteration - 1), points)
         color = corrected_color(seen.corrections, seen.rows, output.color)
         output = output._replace(color=_black_outside(mask, color))
         terms = [term(shown, target, output) for term in stage.losses]
@@ -87,7 +87,7 @@ def batch_gradients(
         grads = found.gaussians, found.params, found.rows
         return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe)
 
-    pictures = batch.images, batch.alphas, batch.masks, batch.depths
+    pictures = batch.images, batch.alphas, batch.masks, batch.depths, batch.points
     arrays = batch.viewmats, batch.Ks, backgrounds, own, pictures
     num, exchange = backgrounds.shape[0], settings.exchange
     num_at_once = 1 if exchange is None else exchange.num_at_once(num)

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import DTypeLike
 
+from a2tg_jax.data.observations import SeenPoints, check_seen_points, stacked_points
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.cores import num_threads
 from a2tg_jax.rasterize.exchange import Exchange
@@ -27,6 +28,18 @@ MOST_AHEAD = 10
 BYTES_PER_DEPTH = 4
 ALIGNMENT = 64
 """Alignment in bytes of memory that XLA adopts."""
+
+
+class Extras(NamedTuple):
+    """Whether data of a view come along with its photograph."""
+
+    depths: bool = False
+    """Depth maps."""
+    points: bool = False
+    """Points that the reconstruction saw."""
+
+
+NO_EXTRAS = Extras()
 
 
 class Photographs(NamedTuple):
@@ -46,6 +59,8 @@ class Photographs(NamedTuple):
     """[V, H, W] float32 depth maps, NaN where unknown; None unless asked for."""
     rays: Array | None = None
     """[H, W, 2] rays of the lens (`Camera.rays`); None of a pinhole."""
+    points: SeenPoints | None = None
+    """Points [V, S] that the reconstruction saw; None unless asked for."""
 
     def of(self, views: Array | None) -> "Photographs":
         """Return the views of some indices; None: all."""
@@ -105,10 +120,10 @@ class BatchPlan(NamedTuple):
 
 
 def plan_batches(
-    views: tuple[View, ...], batch_size: int, room: float | None = None, has_depths: bool = False
+    views: tuple[View, ...], batch_size: int, room: float | None = None, extras: Extras = NO_EXTRAS
 ) -> BatchPlan:
     """Return whether photographs stay on the device, or how many batches are prepared. Arguments as `PhotoStore`."""
-    sizes, of_rays = [view_bytes(view, has_depths) for view in views], ray_bytes(views)
+    sizes, of_rays = [view_bytes(view, extras) for view in views], ray_bytes(views)
     room = device_room() if room is None else room
     batch_bytes = batch_size * max(sizes)
     num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(batch_bytes, 1))))
@@ -116,9 +131,11 @@ def plan_batches(
     return BatchPlan(is_resident, of_rays <= room, batch_bytes, num_ahead)
 
 
-def view_bytes(view: View, has_depths: bool = False) -> int:
-    """Return the bytes of a photograph, and of its depth map if that comes along."""
-    return view.picture.nbytes + has_depths * BYTES_PER_DEPTH * math.prod(view.picture.size)
+def view_bytes(view: View, extras: Extras = NO_EXTRAS) -> int:
+    """Return the bytes of a photograph, and of what comes along."""
+    of_points = 0 if view.points is None else view.points.nbytes
+    of_depths = BYTES_PER_DEPTH * math.prod(view.picture.size)
+    return view.picture.nbytes + extras.depths * of_depths + extras.points * of_points
 
 
 class PhotoStore:
@@ -131,7 +148,7 @@ class PhotoStore:
         order: BatchOrder,
         last: int,
         exchange: Exchange | None = None,
-        has_depths: bool = False,
+        extras: Extras = NO_EXTRAS,
         room: float | None = None,
     ):
         """Args:
@@ -140,12 +157,12 @@ class PhotoStore:
         last: the stage's last iteration.
         exchange: devices that draw the views of an iteration, and over which photographs that stay there are spread
           by rows of pixels; None: one.
-        has_depths: whether their depth maps come along.
+        extras: what comes along with them.
         room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
         self._views, self._order, self._last, self._exchange = views, order, last, exchange
-        self._has_depths = has_depths
-        plan = plan_batches(views, len(order.indices(1)), room, has_depths)
+        self._extras = extras
+        plan = plan_batches(views, len(order.indices(1)), room, extras)
         self.is_resident, self.num_ahead = not asked_by_any(exchange, not plan.is_resident), plan.num_ahead
         self._keeps_rays = plan.keeps_rays
         self._rays: dict[tuple[int, int, int], Array] = {}
@@ -201,7 +218,7 @@ class PhotoStore:
 
     def _stacked(self, indices: Sequence[int], are_read: Sequence[bool] | None = None) -> Photographs:
         views = [self._views[index] for index in indices]
-        return stack_views(views, self._views, has_depths=self._has_depths, are_read=are_read)
+        return stack_views(views, self._views, extras=self._extras, are_read=are_read)
 
     def close(self) -> None:
         """Ends the threads."""
@@ -211,8 +228,8 @@ class PhotoStore:
 def on_devices(
     photographs: Photographs, exchange: Exchange | None, spread: Callable[[Exchange, Array], Array]
 ) -> Photographs:
-    """Return photographs with their pictures spread over the devices by a function; without an exchange they stay. The
-    rays of their lens stay in any case."""
+    """Return photographs with their pictures spread over the devices by a function, and their points on every device;
+    without an exchange they stay. The rays of their lens stay in any case."""
     if exchange is None:
         return photographs
     on_all, in_parts = (functools.partial(place, exchange) for place in (everywhere, spread))
@@ -224,6 +241,7 @@ def on_devices(
         masks=None if photographs.masks is None else in_parts(photographs.masks),
         depths=None if photographs.depths is None else in_parts(photographs.depths),
         rays=photographs.rays,
+        points=None if photographs.points is None else SeenPoints(*map(on_all, photographs.points)),
     )
 
 
@@ -255,12 +273,17 @@ class Ahead:
         self._pool.shutdown(cancel_futures=True)
 
 
-def check_depths(views: tuple[View, ...]) -> None:
-    """Raise ValueError unless a view has a depth map."""
-    if all(view.depth is None for view in views):
+def check_extras(views: tuple[View, ...], extras: Extras) -> None:
+    """Raise ValueError unless a view has what is to come along."""
+    if extras.depths and all(view.depth is None for view in views):
         raise ValueError(
             "--loss.depth-weight wants depth maps, but no training view has one: put them as NAME.npy or NAME.png "
             "into the folder depths beside images, or set it to 0"
+        )
+    if extras.points and all(view.points is None for view in views):
+        raise ValueError(
+            "--loss.points-weight wants points that photographs saw, which only COLMAP's models tell, but no training "
+            "view has one: use the COLMAP model of the scene, or set it to 0"
         )
 
 
@@ -288,6 +311,8 @@ def check_views(views: tuple[View, ...]) -> None:
                 f"depth of view {view.name} must be {[height, width]}, as large as its camera says; "
                 f"got {list(view.depth.shape)}"
             )
+        if view.points is not None:
+            check_seen_points(view.points, (height, width), f"points of view {view.name}")
 
 
 def device_room() -> float:
@@ -297,7 +322,7 @@ def device_room() -> float:
 
 
 def stack_views(
-    views: list[View], among: tuple[View, ...] | None = None, *, has_depths: bool = False,
+    views: list[View], among: tuple[View, ...] | None = None, *, extras: Extras = NO_EXTRAS,
     are_read: Sequence[bool] | None = None,
 ) -> Photographs:  # fmt: skip
     """Return views of one image size and lens, stacked on the host.
@@ -305,8 +330,8 @@ def stack_views(
     Args:
       views: those to stack.
       among: views that decide the structure: if one of that size has opacities or a mask, every stack of that size has
-        them. None: `views`.
-      has_depths: whether depth maps come along; NaN where a view has none.
+        them, and each has room for as many points as the view with the most. None: `views`.
+      extras: what comes along. Depths are NaN where a view has no map.
       are_read: whether the pictures of each view are read; those of the others are zeros. None: all.
     """
     size = views[0].picture.size
@@ -314,7 +339,7 @@ def stack_views(
     read = {place: view for place, view in enumerate(views) if are_read is None or are_read[place]}
     pixels = {place: view.picture.read() for place, view in read.items()}
     stacked = functools.partial(_stacked, len(views), size)
-    alphas = masks = depths = None
+    alphas = masks = depths = points = None
     if any(view.has_alpha for view in alike):
         opaque = np.full(size, 255, np.uint8)
         alphas = stacked({place: own[..., 3] if own.shape[2] == 4 else opaque for place, own in pixels.items()})
@@ -322,7 +347,10 @@ def stack_views(
         whole = np.ones(size, bool)
         of_views = {place: whole if view.mask is None else view.mask.read() for place, view in read.items()}
         masks = stacked(of_views, bool)
-    if has_depths:
+    if extras.points:  # Those of all views, for every device has them.
+        length = max(0 if view.points is None else len(view.points.pixels) for view in alike)
+        points = stacked_points([view.points for view in views], size, length)
+    if extras.depths:
         depths = stacked({place: _depth(view) for place, view in read.items()}, np.float32)
     return Photographs(
         viewmats=np.stack([np.asarray(view.camera.viewmat) for view in views]),  # type: ignore[arg-type]
@@ -332,6 +360,7 @@ def stack_views(
         masks=masks,  # type: ignore[arg-type]
         rays=views[0].camera.rays,
         depths=depths,  # type: ignore[arg-type]
+        points=points,
     )
 
 

@@ -1,4 +1,7 @@
-"""Depth priors: the rendered inverse depth against a depth map that is known up to scale and shift."""
+"""Depth priors: the rendered inverse depth against a depth map that is known up to scale and shift, or against points.
+
+Points are those of the reconstruction, which has the scale of the cameras.
+"""
 
 from typing import Literal
 
@@ -7,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.numerics import safe_divide
+from a2tg_jax.data.observations import SeenPoints
 from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
@@ -38,6 +42,20 @@ class DepthPrior:
         return self.weight * depth_loss(output.depth, output.alpha, prior, counts, has_shift=self.kind == "inverse")
 
 
+@event
+class PointDepths:
+    """Mean absolute difference of inverse depths at the points that the photograph saw (`points_loss`)."""
+
+    weight: float
+
+    has_geometry = True
+    has_points = True
+
+    def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
+        assert target.points is not None
+        return self.weight * points_loss(output.depth, output.alpha, target.points, target.mask)
+
+
 def depth_loss(depth: Array, alpha: Array, prior: Array, counts: Array, *, has_shift: bool = True) -> Array:
     """Mean |s·prior + t − alpha/depth| over the pixels that count and are covered.
 
@@ -57,7 +75,41 @@ def depth_loss(depth: Array, alpha: Array, prior: Array, counts: Array, *, has_s
     inverse = jnp.where(counts, safe_divide(alpha, depth), 0.0)
     prior = jnp.where(counts, prior, 0.0)
     scale, shift = jax.lax.stop_gradient(scale_and_shift(prior, inverse, counts, has_shift=has_shift))
-    error = jnp.where(counts, jnp.abs(scale * prior + shift - inverse), 0.0)
+    return _mean_error(scale * prior + shift, inverse, counts)
+
+
+def points_loss(depth: Array, alpha: Array, points: SeenPoints, mask: Array | None = None) -> Array:
+    """Mean |1/z − alpha/depth| over the pixels of points of depth z that count and are covered.
+
+    Args:
+      depth: [H, W] rendered depth Σ z·α·T, not divided by alpha.
+      alpha: [H, W] rendered alpha.
+      points: [S], as `SeenPoints` has them.
+      mask: [H, W] bool, True at pixels that count; None: all.
+
+    Returns:
+      A scalar; 0 if no point counts.
+    """
+    depth, alpha = (_at(points.pixels, image) for image in (depth, alpha))
+    counts = (points.depths > 0) & (alpha > LEAST_ALPHA) & (depth > 0)
+    if mask is not None:
+        counts = counts & _at(points.pixels, mask)
+    known = safe_divide(jnp.ones_like(points.depths), points.depths)
+    inverse, known = (jnp.where(counts, x, 0.0) for x in (safe_divide(alpha, depth), known))
+    return _mean_error(known, inverse, counts)
+
+
+def _at(pixels: Array, image: Array) -> Array:
+    """Return the values [S] of an image [H, W] at pixels in order, 0 at those beyond its end."""
+    values: Array = (
+        image.reshape(-1).at[pixels].get(mode="fill", fill_value=0, unique_indices=True, indices_are_sorted=True)
+    )
+    return values
+
+
+def _mean_error(one: Array, other: Array, counts: Array) -> Array:
+    """Return the mean absolute difference over those that count; 0 if none does."""
+    error = jnp.where(counts, jnp.abs(one - other), 0.0)
     return jnp.sum(error) / jnp.maximum(jnp.sum(counts), 1).astype(error.dtype)
 
 

@@ -12,7 +12,7 @@ from a2tg_jax.data.scene import Scene, origin_of_scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.training.batches import check_depths, check_views
+from a2tg_jax.training.batches import check_extras, check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, StageRun, Watch, never, unwatched
@@ -189,8 +189,7 @@ def fit_stage(
         raise ValueError(f"index must be that of one of the {len(system.stages())} stages, from 0; got {index}")
     if checkpoint_every is not None and checkpoint_every < 1:
         raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
-    if system.stages()[index].has_depths:
-        check_depths(scene.train)
+    check_extras(scene.train, system.stages()[index].extras)
     if start is None and resume is None:
         start = initial_model(scene, system)
     with system.naming_options():

@@ -10,7 +10,7 @@ from a2tg_jax.events import Event, FieldError, StepEvent, from_options
 from a2tg_jax.host.text import shortened
 from a2tg_jax.training.bilateral import BilateralGrid
 from a2tg_jax.training.corrections import Exposure, PoseRefinement
-from a2tg_jax.training.depth_prior import DepthKind, DepthPrior
+from a2tg_jax.training.depth_prior import DepthKind, DepthPrior, PointDepths
 from a2tg_jax.training.robust import RobustPhotometric
 from a2tg_jax.training.stage import LossTerm
 from a2tg_jax.training.terms import Photometric, Term, distortion, l1, normals, opacity, scale
@@ -40,6 +40,8 @@ class LossConfig:
     """Rendered inverse depth against the scene's depth maps, after scale and shift of least squares per view."""
     depth_kind: DepthKind = "inverse"
     """Meaning of depth maps: inverse depth up to scale and shift (monocular networks), or depth up to scale."""
+    points_weight: float = 0.0
+    """Rendered inverse depth against that of the reconstruction's points, in the pixels in which they were seen."""
 
     def terms(self, is_first: bool = True) -> tuple[LossTerm, ...]:
         """Return the loss terms whose weight is not 0.
@@ -47,12 +49,13 @@ class LossConfig:
         Args:
           is_first: whether they are of the first stage, in whose beginning robust_share leaves out nothing.
         """
-        optional: tuple[Term | DepthPrior, ...] = (
+        optional: tuple[Term | DepthPrior | PointDepths, ...] = (
             Term(normals, self.normal_weight, has_geometry=True),
             Term(distortion, self.distortion_weight, has_geometry=True),
             Term(opacity, self.opacity_weight),
             Term(scale, self.scale_weight),
             DepthPrior(self.depth_weight, self.depth_kind),
+            PointDepths(self.points_weight),
         )
         return (self._photometric(is_first), *(term for term in optional if term.weight))
 

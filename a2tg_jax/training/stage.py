@@ -22,6 +22,7 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput
+from a2tg_jax.training.batches import Extras
 from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.terms import Target
@@ -33,7 +34,7 @@ class LossTerm(Protocol):
     """A part of the loss, a pytree of its numbers.
 
     One that reads the render's depth, normal or distortion has `has_geometry = True`; one that reads the depth maps of
-    the photographs has `has_depths = True`.
+    the photographs has `has_depths = True`, and one that reads the reconstruction's points has `has_points = True`.
     """
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
@@ -80,9 +81,9 @@ class Stage:
         return any(getattr(term, "has_geometry", False) for term in self.losses)
 
     @property
-    def has_depths(self) -> bool:
-        """Whether a loss term reads the depth maps of the photographs (`Target.depth`)."""
-        return any(getattr(term, "has_depths", False) for term in self.losses)
+    def extras(self) -> Extras:
+        """Data that loss terms read beside the photographs: depth maps (`Target.depth`), points (`Target.points`)."""
+        return Extras(*(any(getattr(term, f"has_{name}", False) for term in self.losses) for name in Extras._fields))
 
     def floats_shown(self, sh_degree: int) -> float:
         """Return the floats that a Gaussian of a degree shows beside its own when the stage begins (host)."""

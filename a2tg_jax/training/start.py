@@ -17,7 +17,7 @@ from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import FieldError
 from a2tg_jax.model import Model
-from a2tg_jax.training.batches import check_depths
+from a2tg_jax.training.batches import check_extras
 from a2tg_jax.training.options import System
 from a2tg_jax.training.sky import check_sky, sky_of
 from a2tg_jax.training.stage import Stage
@@ -100,8 +100,8 @@ def check_start(scene: Scene, system: System, num_given: int | None = None) -> N
         with system.naming_options():
             _rows_needed(system.stages()[0], num, system)
     (system.check_number if num_given is None else system.check_given_number)(num)
-    if any(stage.has_depths for stage in system.stages()):
-        check_depths(scene.train)
+    for stage in system.stages():
+        check_extras(scene.train, stage.extras)
     if system.sky_gaussians:
         check_sky(scene, system.sky_gaussians)
 

@@ -165,6 +165,8 @@ def attempt(
     batch = photographs.of(views)
     batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
     batch = batch if batch.depths is None else batch._replace(depths=batch.depths.astype(dtype))
+    if batch.points is not None:
+        batch = batch._replace(points=batch.points._replace(depths=batch.points.depths.astype(dtype)))
     backgrounds = drawn_backgrounds(keys[0], settings.background, batch.viewmats.shape[0], dtype)
     own = rows_of(state.corrections, rows)
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
