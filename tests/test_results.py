@@ -10,6 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tomli_w
 
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.cameras import Camera
@@ -51,6 +52,7 @@ from a2tg_jax.results.summary import (
 )
 from a2tg_jax.systems.a2tg import A2tg, TextureConfig
 from a2tg_jax.systems.bbsplat import BBSplat
+from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.systems.gaussians_2d import Gaussians2d
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
@@ -310,6 +312,7 @@ def test_command_repeats_the_run(tmp_path, name, system, compare, preset):
     a2tg, command, *arguments = shlex.split(repeating_command(run))
     again = cli._parse(command, arguments)
     assert (a2tg, again.record, again.out) == ("a2tg", record, tmp_path / "run c-again")
+    assert again.record.systems == record.systems
 
 
 def test_record_names_the_options_that_a_budget_replaces(tmp_path):
@@ -381,6 +384,61 @@ def test_compared_systems_take_the_options(tmp_path, monkeypatch):
     assert of_preset.densify.cap == RECORD.system.densify.cap
     with pytest.raises(ValueError, match="would be called 'a2tg'"):
         dataclasses.replace(RECORD, compare=("a2tg",)).check()
+
+
+class TestComparedOptions:
+    """Options of compared systems that the main one lacks are kept, too."""
+
+    record = dataclasses.replace(RECORD, compare=("bytewise", "gaussians-2d-mcmc"), preset="quick")
+
+    def kept(self, folder, change=lambda table: table):
+        run = create_run(folder)
+        write_record(run, self.record)
+        table = change(tomllib.loads(run.record.read_text()))
+        run.record.write_text(tomli_w.dumps(table))
+        return read_record(run).systems["bytewise"]
+
+    def test_they_stay_when_defaults_change(self, tmp_path, monkeypatch):
+        before = self.record.systems["bytewise"]
+        assert before.kernel.rate != 0.123
+        run = create_run(tmp_path)
+        write_record(run, self.record)
+        kernel = dataclasses.replace(before.kernel, rate=0.123)
+        presets = {"quick": dataclasses.replace(before, kernel=kernel)}
+        monkeypatch.setattr(type(before), "presets", classmethod(lambda _: presets))
+        assert self.record.systems["bytewise"].kernel.rate == 0.123
+        assert read_record(run).systems["bytewise"] == before
+        again = cli._parse("train", ["--config", str(run.record), "--out", "again", "--seed", "3"]).record
+        assert again.systems["bytewise"] == dataclasses.replace(before, seed=3)
+
+    def test_those_of_the_main_system_are_not_repeated(self, tmp_path):
+        run = create_run(tmp_path)
+        write_record(run, self.record)
+        table = tomllib.loads(run.record.read_text())["compare_options"]
+        assert set(table) == set(self.record.compare)
+        assert "rate" in table["bytewise"]["kernel"] and "cap" not in table["bytewise"].get("texture", {})
+
+    def test_runs_of_before_have_the_options_of_then(self, tmp_path):
+        def without(table):
+            return {name: value for name, value in table.items() if name != "compare_options"}
+
+        kernel = self.kept(tmp_path, without).kernel
+        assert (kernel.rate, kernel.least_exponent) == (0.0, 0.0)
+
+    def test_a_file_may_set_them(self, tmp_path):
+        file = tmp_path / "mine.toml"
+        text = 'scene = "synthetic"\ncompare = ["bytewise"]\n[compare_options.bytewise.kernel]\nrate = 0.5\n'
+        file.write_text(text)
+        said = cli._parse("train", ["--config", str(file), "--out", "run", "--seed", "3"]).record
+        other = cli._parse("train", ["--config", str(file), "--out", "run", "--preset", "smoke"]).record
+        assert said.systems["bytewise"].kernel.rate == 0.5 and said.systems["bytewise"].seed == 3
+        assert other.systems["bytewise"].kernel.rate == Bytewise.preset("smoke").kernel.rate
+        file.write_text(text.replace("rate", "rat"))
+        with pytest.raises(ValueError, match=r"compare_options\.bytewise\.kernel"):
+            cli._parse("train", ["--config", str(file), "--out", "run"]).record.check()
+        file.write_text(text.replace('["bytewise"]', '["bbsplat"]'))
+        with pytest.raises(ValueError, match=r"mine\.toml: compare_options\.bytewise is not among the systems of"):
+            cli._parse("train", ["--config", str(file), "--out", "run"]).record.check()
 
 
 # Summaries

@@ -3,9 +3,9 @@
 import contextlib
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import tyro
@@ -233,7 +233,15 @@ class Train:
         source = SceneSource(path, self.downscale, self.test_every, self.alpha, self.lens, self.validation)
         init = None if self.init is None else str(self.init.resolve())
         compare = tuple(dict.fromkeys(compare))
-        return RunRecord(source, self.system, self.options, compare, self.preset, self.on_nan, init)
+        return RunRecord(source, self.system, self.options, compare, self.preset, self.on_nan, init, self._compared)
+
+    @property
+    def _compared(self) -> dict[str, Mapping[str, Any]]:
+        """Options of compared systems in the configuration file; none if its numbers are those of another preset or
+        system."""
+        file = RunFile() if self.config is None else read_run_file(self.config)
+        is_of_file = (file.system, file.preset) == (self.system, self.preset)
+        return file.compared(str(self.config)) if is_of_file else {}
 
     def _resumed(self, run: RunFolder, *, is_written: bool = True) -> RunRecord:
         """Return the record of an existing run, with further comparisons, or raise if a flag contradicts it.

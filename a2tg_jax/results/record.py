@@ -10,11 +10,14 @@ A configuration file says the same or less; what it leaves out has the value tha
 
     [options.texture]                    # options of the system, as nested tables
     cap = 8
+
+    [compare_options.gaussians-2d-mcmc]  # options of a compared system that the main one lacks
 """
 
 import dataclasses
 import os
 import shlex
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -122,6 +125,9 @@ class RunRecord:
     """Action if a loss or gradient is not finite, or a loss explodes."""
     init: str | None = None
     """File of splats in place of the main system's first stage."""
+    compare_options: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict, compare=False)
+    """Options of the compared systems that the main one lacks, nested, by name; the others have the preset's values. A
+    record that is written and read again has all of them."""
 
     @property
     def systems(self) -> dict[str, System]:
@@ -134,7 +140,8 @@ class RunRecord:
         for name in self.compare:
             if label_of(name) in found:
                 raise ValueError(f"compare: two systems of the run would be called {shortened(label_of(name))!r}")
-            found[label_of(name)] = compared_system(name, self.system, self.preset)
+            beside = compared_system(name, self.system, self.preset)
+            found[label_of(name)] = with_changes(beside, self.compare_options.get(name, {}), f"compare_options.{name}")
         return found
 
     @property
@@ -186,6 +193,7 @@ class RunFile:
     version: str | None = None
     """Version of a2tg-jax that wrote the file."""
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    compare_options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def chosen(self, where: str) -> System:
         """Return the system with the file's preset and options.
@@ -195,6 +203,24 @@ class RunFile:
         """
         system = chosen_system(self.system, self.preset)
         return with_changes(system, with_earlier_options(type(system), self.options), f"{where}: options")
+
+    def compared(self, where: str) -> dict[str, Mapping[str, Any]]:
+        """Return the options of compared systems by name, as `RunRecord.compare_options` has them. A run folder of an
+        older version does not tell them; those that were added since have their values of then.
+
+        Raises:
+          ValueError: if there are options of a system that is not compared, or there is no such system.
+        """
+        for name, options in self.compare_options.items():
+            if name not in self.compare or not isinstance(options, Mapping):
+                told = "is no table of options" if name in self.compare else "is not among the systems of compare"
+                raise ValueError(f"{where}: compare_options.{shortened(name)} {told}")
+        found = dict(self.compare_options)
+        if self.version is not None:
+            main = self.chosen(where)
+            for name in self.compare:
+                found.setdefault(name, _beside(type(find_system(name)).earlier_options, main))
+        return found
 
 
 def label_of(name: str) -> str:
@@ -228,6 +254,22 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
     kind = type(found)
     start = kind() if preset is None else kind.presets().get(preset, kind())
     return with_changes(like(start, other), differences(found), name)
+
+
+def _beside(options: Mapping[str, Any], main: System) -> dict[str, Any]:
+    """Return those of a compared system's options, nested, that the main one lacks."""
+    return _without(options, config_to_dict(main))
+
+
+def _without(options: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in options.items():
+        if isinstance(value, Mapping) and isinstance(others.get(name), Mapping):
+            inner = _without(value, others[name])
+            found |= {name: inner} if inner else {}
+        elif name not in others:
+            found[name] = value
+    return found
 
 
 def read_run_file(path: Path) -> RunFile:
@@ -283,10 +325,20 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         **({} if record.init is None else {"init": record.init}),
         "version": version("a2tg-jax"),
         "options": _without_none(config_to_dict(record.system), start),
+        **({"compare_options": _options_beside(record)} if record.compare else {}),
     }
     text = f"# Repeats the run: {repeating_command(run)}\n{_budget_note(record.system)}{tomli_w.dumps(table)}"
     with replacing(run.own(run.record)) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def _options_beside(record: RunRecord) -> dict[str, Any]:
+    """Return every option of the compared systems that the main one lacks, by name of the system."""
+    found, systems = {}, record.systems
+    for name in record.compare:
+        start = config_to_dict(compared_system(name, record.system, record.preset))
+        found[name] = _without_none(_beside(config_to_dict(systems[label_of(name)]), record.system), start)
+    return found
 
 
 def _budget_note(system: System) -> str:
@@ -317,7 +369,8 @@ def _checked_record(run: RunFolder) -> RunRecord:
         raise ValueError(f"{run.record}: scene is missing")
     source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha, file.lens, file.validation)
     system = file.chosen(str(run.record))
-    record = RunRecord(source, file.system, system, file.compare, file.preset, file.on_nan, file.init)
+    compared = file.compared(str(run.record))
+    record = RunRecord(source, file.system, system, file.compare, file.preset, file.on_nan, file.init, compared)
     record.check()
     return record
 
