@@ -1,22 +1,24 @@
 """Train on few views and score views left out of the training views: does `bytewise` overfit?
 
-    python experiments/few_views.py --scenes SCENES --out OUT
+    python experiments/few_views.py --scenes SCENES --out OUT [--seed 1] [--only herz_jesus_p25]
 
 Of scenes with many training views 24 are kept, evenly spaced, and 12 to 23 of the others are scored. Scenes with fewer
 than 30 are cut into five folds: every fifth view is scored. Test views are not used. The preset is `quick`, the budget
 0.6 MB, the photographs are downscaled by 2; --small has photographs downscaled by 4 and 0.15 MB.
 
-Each training is kept in OUT/few_views.json as soon as it is measured, so that a second call goes on. The table is
-OUT/few_views.md. With --small both are called few_views_small.
+Each training is kept in OUT/few_views.json as soon as it is measured, so that a second call goes on. The table, means
+of the seeds that were measured for a cell and its reference, is OUT/few_views.md. With --small both are called
+few_views_small.
 """
 
 import dataclasses
 import functools
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lab import tables
 from lab.interrupts import interruptible
 from lab.kept import KeptFigures, parser_of
@@ -32,21 +34,38 @@ DOWNSCALE, BUDGET = 2, 0.6
 """Size of the photographs, as a divisor, and the memory budget in MB."""
 SMALL_DOWNSCALE, SMALL_BUDGET = 4, 0.15
 NUM_KEPT, NUM_SCORED, NUM_FOLDS = 24, 12, 5
+FIGURES = "psnr", "train_psnr"
+MOST_SEEDS = 10
 GAUSSIAN_KERNELS = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.23}}
 WITHOUT_DETAILS = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.0}, "texture": {"share": 0.0}}
 REFERENCE = "MCMC, degree 0"
-METHODS: dict[str, tuple[str, dict[str, Any]]] = {
-    REFERENCE: ("gaussians-2d-mcmc", {"sh_degree": 0, "stage2_iterations": 1_000}),
+_PLAIN = {"sh_degree": 0, "stage2_iterations": 1_000}
+PLAIN: dict[str, tuple[str, dict[str, Any]]] = {
+    REFERENCE: ("gaussians-2d-mcmc", _PLAIN),
+    "MCMC, degree 0, pruned": ("gaussians-2d-mcmc", {**_PLAIN, "prune": {"share": 0.1}}),
+    "clone and split, degree 0": ("gaussians-2d", _PLAIN),
+    "clone and split, degree 0, pruned": (
+        "gaussians-2d", {**_PLAIN, "prune": {"share": 0.1, "at": [0.2, 0.25, 0.3, 0.35, 0.4, 0.45]}},
+    ),
+}  # fmt: skip
+"""Plain Gaussians of one colour, as grids/methods.toml has them."""
+OF_POINTS = "depths of points"
+"""Method for captures whose reconstruction tells which points a photograph saw."""
+BYTEWISE: dict[str, tuple[str, dict[str, Any]]] = {
     "bytewise": ("bytewise", {}),
+    OF_POINTS: ("bytewise", {"loss": {"points_weight": 0.1}}),
+}
+PARTS: dict[str, tuple[str, dict[str, Any]]] = {
     "bytewise, Gaussian kernels": ("bytewise", GAUSSIAN_KERNELS),
     "bytewise without details": ("bytewise", WITHOUT_DETAILS),
     "the same without pruning": ("bytewise", {**WITHOUT_DETAILS, "prune": {"share": 0.0}}),
 }
+METHODS = {**PLAIN, **BYTEWISE, **PARTS}
 SMALL_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
-    **{label: METHODS[label] for label in (REFERENCE, "bytewise")},
+    **PLAIN, **BYTEWISE,
     "floaters pruned": ("bytewise", {"floaters": {"near_share": 0.7}}),
     "jitter": ("bytewise", {"jitter": 0.1}),
-}
+}  # fmt: skip
 
 
 def captures(folder: Path, downscale: int = DOWNSCALE) -> Iterator[tuple[str, a2tg.Scene]]:
@@ -71,11 +90,11 @@ def _split(scene: a2tg.Scene, scored: list[int], kept: list[int] | None) -> a2tg
 
 
 def measured(
-    scene: a2tg.Scene, name: str, method: tuple[str, dict[str, Any]], budget: float = BUDGET
+    scene: a2tg.Scene, name: str, method: tuple[str, dict[str, Any]], budget: float = BUDGET, seed: int = 0
 ) -> dict[str, float]:
     """Return the figures of one training by a system with some options."""
     known, options = method
-    own = {"memory_budget": budget, **({"background": "white"} if name in WHITE_BEHIND else {})}
+    own = {"memory_budget": budget, "seed": seed, **({"background": "white"} if name in WHITE_BEHIND else {})}
     system = with_changes(find_system(known).preset("quick"), {**options, **own}, name)
     start = time.perf_counter()
     model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
@@ -87,40 +106,84 @@ def measured(
 
 
 def table(methods: Iterable[str], found: Mapping[str, Mapping[str, float]]) -> str:
-    """Return a row for each capture: PSNR of the reference, and what the others gain, on left-out / training views."""
-    rows, others = [], [label for label in methods if label != REFERENCE]
-    for name in dict.fromkeys(key.partition(" | ")[0] for key in found):
-        base = found.get(key_of(name, REFERENCE))
-        if base is None:
-            continue
-        gains = [_told(found.get(key_of(name, label)), base) for label in others]
-        rows.append([name, f"{base['views']:g}", f"{base['psnr']:.2f} / {base['train_psnr']:.2f}", *gains])
-    return tables.markdown(["capture", "training views", REFERENCE, *others], rows)
+    """Return a row for each capture, then one for the folds of a scene: figures of the reference, then gains over it.
+
+    Figures are on left-out / training views, means over the seeds of a capture, then over the folds.
+    """
+    names = list(dict.fromkeys(key.partition(" | ")[0] for key in found))
+    scenes = dict.fromkeys(name.partition(", fold")[0] for name in names if ", fold" in name)
+    rows = {name: [name] for name in names}
+    rows |= {f"{scene}, mean of folds": [name for name in names if name.startswith(scene)] for scene in scenes}
+    others = [label for label in methods if label != REFERENCE]
+    cells = {name: [_gain(found, own, label) for label in others] for name, own in rows.items()}
+    is_shown = [any(own[place] is not None for own in cells.values()) for place in range(len(others))]
+    told = [
+        [name, _told(_figures(found, own, REFERENCE), "{:.2f}"),
+         *(_told(gain, "{:+.2f}") for gain, shown in zip(cells[name], is_shown, strict=True) if shown)]
+        for name, own in rows.items()
+    ]  # fmt: skip
+    shown = [label for label, shown in zip(others, is_shown, strict=True) if shown]
+    return tables.markdown(["capture", REFERENCE, *shown], told)
 
 
-def _told(cell: Mapping[str, float] | None, base: Mapping[str, float]) -> str:
-    if cell is None:
-        return tables.MISSING
-    return " / ".join(tables.signed(cell[figure] - base[figure], 2) for figure in ("psnr", "train_psnr"))
+def _figures(found: Mapping[str, Mapping[str, float]], names: Iterable[str], label: str) -> np.ndarray | None:
+    """Return the means of `FIGURES` over the seeds of each capture, then over captures; None if one is missing."""
+    means = [_mean([found[key] for key in _keys(name, label) if key in found]) for name in names]
+    return None if any(mean is None for mean in means) else np.mean(means, axis=0)
 
 
-def key_of(name: str, label: str) -> str:
-    return f"{name} | {label}"
+def _gain(found: Mapping[str, Mapping[str, float]], names: Iterable[str], label: str) -> np.ndarray | None:
+    """Return what a method gains over the reference, over seeds that both have; None if a capture has none."""
+    gains = []
+    for name in names:
+        pairs = zip(_keys(name, label), _keys(name, REFERENCE), strict=True)
+        both = [pair for pair in pairs if found.keys() >= set(pair)]
+        own, base = (_mean([found[pair[place]] for pair in both]) for place in (0, 1))
+        if own is None or base is None:
+            return None
+        gains.append(own - base)
+    return np.mean(gains, axis=0)
+
+
+def _mean(cells: Sequence[Mapping[str, float]]) -> np.ndarray | None:
+    return np.mean([[cell[figure] for figure in FIGURES] for cell in cells], axis=0) if cells else None
+
+
+def _told(figures: np.ndarray | None, form: str) -> str:
+    return tables.MISSING if figures is None else " / ".join(map(form.format, figures))
+
+
+def key_of(name: str, label: str, seed: int = 0) -> str:
+    return f"{name} | {label}" + (f" | seed {seed}" if seed else "")
+
+
+def _keys(name: str, label: str) -> list[str]:
+    return [key_of(name, label, seed) for seed in range(MOST_SEEDS)]
 
 
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--scenes", type=Path, required=True, help=f"folder of {', '.join(SCENES)}")
     parser.add_argument("--small", action="store_true", help="small photographs and few bytes")
+    parser.add_argument("--seed", type=int, default=0, choices=range(MOST_SEEDS), help="seed of the trainings")
+    parser.add_argument("--only", default="", help="captures whose names begin so")
+    parser.add_argument("--method", action="append", metavar="LABEL", help="method to train, of all; may be repeated")
     arguments = parser.parse_args()
     a2tg.configure_cpu()
     methods = SMALL_METHODS if arguments.small else METHODS
+    if unknown := set(arguments.method or ()) - methods.keys():
+        parser.error(f"there is no method {', '.join(sorted(unknown))}; there are {', '.join(methods)}")
     downscale, budget = (SMALL_DOWNSCALE, SMALL_BUDGET) if arguments.small else (DOWNSCALE, BUDGET)
     file = "few_views_small" if arguments.small else "few_views"
-    kept = KeptFigures(arguments.out, file, functools.partial(table, methods))
+    kept, seed = KeptFigures(arguments.out, file, functools.partial(table, methods)), arguments.seed
     for name, scene in captures(arguments.scenes, downscale):
-        for label, method in methods.items():
-            kept.measure(key_of(name, label), functools.partial(measured, scene, name, method, budget))
+        if not name.startswith(arguments.only):
+            continue
+        for label in arguments.method or methods:
+            method = methods[label]
+            if label == OF_POINTS and all(view.points is None for view in scene.train):
+                continue
+            kept.measure(key_of(name, label, seed), functools.partial(measured, scene, name, method, budget, seed))
     print(kept.table())
 
 
