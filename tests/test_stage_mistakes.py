@@ -1,6 +1,7 @@
 """Mistakes in stages, events and loss terms of one's own: each is an error that names the stage and the part."""
 
 import dataclasses
+import functools
 import re
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 
 import a2tg_jax as a2tg
 from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.training.corrections import Exposure
 from a2tg_jax.training.terms import Photometric
 
 
@@ -93,6 +95,27 @@ class Observing(a2tg.StepEvent):
         return a2tg.Change(model, moments, state)
 
 
+WRONG = {
+    "camera": lambda self, row, camera: row,
+    "color": lambda self, row, color: color.mean((0, 1)),
+    "penalty": lambda self, row: row,
+    "learning_rate": lambda self, progress: None,
+    "project": lambda self, rows: rows[:1],
+}
+
+
+@a2tg.event
+class Correcting(Exposure):
+    """A correction of which one method returns something wrong."""
+
+    wrong: str = a2tg.static(default="camera")
+
+    def __getattribute__(self, name):
+        if name in WRONG and name == object.__getattribute__(self, "wrong"):
+            return functools.partial(WRONG[name], self)
+        return super().__getattribute__(name)
+
+
 GIVEN = {
     "stage 'own': appearance must be an Appearance; got the class Plain: say Plain(…)": {"appearance": a2tg.Plain},
     "stage 'own': rates must be LearningRates; got float": {"rates": 0.1},
@@ -133,6 +156,11 @@ RETURNED = {
     "the loss function '<lambda>' must return a scalar, such as jnp.mean(…); got None": {
         "losses": (a2tg.Term(lambda *_: None),)
     },
+    "Correcting.camera must keep its structure": {"corrections": (Correcting(wrong="camera"),)},
+    "Correcting.color must be [16, 16, 3]; got [3]": {"corrections": (Correcting(wrong="color"),)},
+    "Correcting.penalty must return a scalar": {"corrections": (Correcting(wrong="penalty"),)},
+    "Correcting.learning_rate must return a scalar": {"corrections": (Correcting(wrong="learning_rate"),)},
+    "Correcting.project must be [": {"corrections": (Correcting(wrong="project"),)},
     "depth was not rendered: say has_geometry=True, as in Term(function, has_geometry=True)": {
         "losses": (Photometric(), a2tg.Term(roughness))
     },

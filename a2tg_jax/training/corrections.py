@@ -19,6 +19,7 @@ from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.events import event
+from a2tg_jax.training.returned import check_kept, check_scalar
 
 MOST_READABLE = 100
 """Largest number of numbers of a row that `learned` lists."""
@@ -173,23 +174,46 @@ def rows_of(states: Sequence[CorrectionState], views: Array | None) -> tuple[Arr
 
 
 def corrected_camera(corrections: Sequence[Correction], rows: Sequence[Array], camera: Camera) -> Camera:
-    """Return the camera of a view, given its row of each correction."""
+    """Return the camera of a view, given its row of each correction.
+
+    Raises:
+      ValueError: naming the correction, if it returns something else than a camera of the same size.
+    """
     for correction, row in zip(corrections, rows, strict=True):
-        camera = correction.camera(row, camera)
+        camera = _kept(correction, "camera", correction.camera(row, camera), camera)
     return camera
 
 
 def corrected_color(corrections: Sequence[Correction], rows: Sequence[Array], color: Array) -> Array:
-    """Return the colours of a view, given its row of each correction."""
+    """Return the colours of a view, given its row of each correction.
+
+    Raises:
+      ValueError: naming the correction, if it returns something else than colours of the same shape.
+    """
     for correction, row in zip(corrections, rows, strict=True):
-        color = correction.color(row, color)
+        color = _kept(correction, "color", correction.color(row, color), color)
     return color
 
 
 def penalties(corrections: Sequence[Correction], rows: Sequence[Array]) -> list[Array]:
-    """Return what the corrections add to the loss of a view, given its row of each."""
-    found = [correction.penalty(row) for correction, row in zip(corrections, rows, strict=True)]
-    return [penalty for penalty in found if penalty is not None]
+    """Return what the corrections add to the loss of a view, given its row of each.
+
+    Raises:
+      ValueError: naming the correction, if it returns something else than a number.
+    """
+    found = []
+    for correction, row in zip(corrections, rows, strict=True):
+        penalty = correction.penalty(row)
+        if penalty is not None:
+            check_scalar(f"{type(correction).__name__}.penalty", penalty)
+            found.append(penalty)
+    return found
+
+
+def _kept(correction: Correction, method: str, found: Any, before: Any) -> Any:
+    """Return what a method of a correction returned, which must be like what it was given."""
+    check_kept(f"{type(correction).__name__}.{method}", found, before)
+    return found
 
 
 def updated(
@@ -207,13 +231,14 @@ def updated(
     sums = jnp.zeros_like(state.rows).at[views].add(grads)
     is_seen = jnp.zeros(len(state.rows), bool).at[views].set(True)
     rate = correction.learning_rate(progress)
+    check_scalar(f"{type(correction).__name__}.learning_rate", rate)
     step = jax.vmap(lambda row, grad, moments: adam_update(row, grad, moments, rate))(state.rows, sums, state.moments)
 
     def chosen(new: Array, old: Array) -> Array:
         return jnp.where(is_seen.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     rows, moments = jax.tree.map(chosen, (step.params, step.state), (state.rows, state.moments))
-    return CorrectionState(correction.project(rows), moments)
+    return CorrectionState(_kept(correction, "project", correction.project(rows), rows), moments)
 
 
 def corrected_origin(origin: Origin, corrections: Sequence[Correction], states: Sequence[CorrectionState]) -> Origin:
