@@ -34,13 +34,13 @@ if TYPE_CHECKING:
     from a2tg_jax.core.similarity import Similarity as Similarity
     from a2tg_jax.core.transform import transform_gaussians as transform_gaussians
     from a2tg_jax.data import Mask as Mask
+    from a2tg_jax.data import ObservedPoints as ObservedPoints
     from a2tg_jax.data import Picture as Picture
     from a2tg_jax.data import Scene as Scene
-    from a2tg_jax.data import SeenPoints as SeenPoints
     from a2tg_jax.data import View as View
     from a2tg_jax.data import load_scene as load_scene
+    from a2tg_jax.data import observed_points as observed_points
     from a2tg_jax.data import run_sfm as run_sfm
-    from a2tg_jax.data import seen_points as seen_points
     from a2tg_jax.data import synthetic_scene as synthetic_scene
     from a2tg_jax.data import view_image as view_image
     from a2tg_jax.data import with_validation_views as with_validation_views
@@ -183,11 +183,11 @@ _NAMES = {
         "Mask",
         "Picture",
         "Scene",
-        "SeenPoints",
+        "ObservedPoints",
         "View",
         "load_scene",
         "run_sfm",
-        "seen_points",
+        "observed_points",
         "synthetic_scene",
         "view_image",
         "with_validation_views",

@@ -49,11 +49,11 @@ PLAIN: dict[str, tuple[str, dict[str, Any]]] = {
     ),
 }  # fmt: skip
 """Plain Gaussians of one colour, as grids/methods.toml has them."""
-OF_POINTS = "depths of points"
+POINT_DEPTHS = "depths of points"
 """Method for captures whose reconstruction tells which points a photograph saw."""
 BYTEWISE: dict[str, tuple[str, dict[str, Any]]] = {
     "bytewise": ("bytewise", {}),
-    OF_POINTS: ("bytewise", {"loss": {"points_weight": 0.1}}),
+    POINT_DEPTHS: ("bytewise", {"loss": {"points_weight": 0.1}}),
 }
 PARTS: dict[str, tuple[str, dict[str, Any]]] = {
     "bytewise, Gaussian kernels": ("bytewise", GAUSSIAN_KERNELS),
@@ -68,9 +68,12 @@ SMALL_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 }  # fmt: skip
 
 
-def captures(folder: Path, downscale: int = DOWNSCALE) -> Iterator[tuple[str, a2tg.Scene]]:
-    """Yield each capture of few views by name, with the scored views in place of test views."""
-    for name in SCENES:
+Capture = tuple[str, a2tg.Scene]
+
+
+def captures(folder: Path, downscale: int = DOWNSCALE, names: Iterable[str] = SCENES) -> Iterator[Capture]:
+    """Yield each capture of few views of some scenes by name, with the scored views in place of test views."""
+    for name in names:
         scene = a2tg.load_scene(folder / name, downscale=downscale)
         num = len(scene.train)
         if num < 30:
@@ -106,24 +109,27 @@ def measured(
 
 
 def table(methods: Iterable[str], found: Mapping[str, Mapping[str, float]]) -> str:
-    """Return a row for each capture, then one for the folds of a scene: figures of the reference, then gains over it.
+    """Return a row for each capture, and one for all folds of a scene: figures of the reference, then gains over it.
 
-    Figures are on left-out / training views, means over the seeds of a capture, then over the folds.
+    Figures are on left-out / training views, means over the seeds of a capture, then over the folds. Gains are means
+    over the seeds that both methods have.
     """
     names = list(dict.fromkeys(key.partition(" | ")[0] for key in found))
-    scenes = dict.fromkeys(name.partition(", fold")[0] for name in names if ", fold" in name)
     rows = {name: [name] for name in names}
-    rows |= {f"{scene}, mean of folds": [name for name in names if name.startswith(scene)] for scene in scenes}
+    for scene in SCENES:
+        folds = [name for name in names if name.startswith(f"{scene}, fold ")]
+        if len(folds) == NUM_FOLDS:
+            rows[f"{scene}, mean of folds"] = folds
     others = [label for label in methods if label != REFERENCE]
-    cells = {name: [_gain(found, own, label) for label in others] for name, own in rows.items()}
-    is_shown = [any(own[place] is not None for own in cells.values()) for place in range(len(others))]
-    told = [
-        [name, _told(_figures(found, own, REFERENCE), "{:.2f}"),
-         *(_told(gain, "{:+.2f}") for gain, shown in zip(cells[name], is_shown, strict=True) if shown)]
-        for name, own in rows.items()
-    ]  # fmt: skip
-    shown = [label for label, shown in zip(others, is_shown, strict=True) if shown]
-    return tables.markdown(["capture", REFERENCE, *shown], told)
+    gains = {name: {label: _gain(found, own, label) for label in others} for name, own in rows.items()}
+    shown = [label for label in others if any(own[label] is not None for own in gains.values())]
+    told = []
+    for name, own in rows.items():
+        views = _mean([found[key] for key in _keys(own[0], REFERENCE) if key in found], ("views",))
+        num = tables.MISSING if views is None or len(own) > 1 else f"{views[0]:g}"
+        reference = _told(_figures(found, own, REFERENCE), "{:.2f}")
+        told.append([name, num, reference, *(_told(gains[name][label], "{:+.2f}") for label in shown)])
+    return tables.markdown(["capture", "training views", REFERENCE, *shown], told)
 
 
 def _figures(found: Mapping[str, Mapping[str, float]], names: Iterable[str], label: str) -> np.ndarray | None:
@@ -145,8 +151,9 @@ def _gain(found: Mapping[str, Mapping[str, float]], names: Iterable[str], label:
     return np.mean(gains, axis=0)
 
 
-def _mean(cells: Sequence[Mapping[str, float]]) -> np.ndarray | None:
-    return np.mean([[cell[figure] for figure in FIGURES] for cell in cells], axis=0) if cells else None
+def _mean(cells: Sequence[Mapping[str, float]], figures: Sequence[str] = FIGURES) -> np.ndarray | None:
+    """Return the means of some figures; None of no cells."""
+    return np.mean([[cell[figure] for figure in figures] for cell in cells], axis=0) if cells else None
 
 
 def _told(figures: np.ndarray | None, form: str) -> str:
@@ -166,7 +173,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, required=True, help=f"folder of {', '.join(SCENES)}")
     parser.add_argument("--small", action="store_true", help="small photographs and few bytes")
     parser.add_argument("--seed", type=int, default=0, choices=range(MOST_SEEDS), help="seed of the trainings")
-    parser.add_argument("--only", default="", help="captures whose names begin so")
+    parser.add_argument("--only", action="append", choices=SCENES, help="scene to train on; may be repeated")
     parser.add_argument("--method", action="append", metavar="LABEL", help="method to train, of all; may be repeated")
     arguments = parser.parse_args()
     a2tg.configure_cpu()
@@ -176,12 +183,10 @@ def main() -> None:
     downscale, budget = (SMALL_DOWNSCALE, SMALL_BUDGET) if arguments.small else (DOWNSCALE, BUDGET)
     file = "few_views_small" if arguments.small else "few_views"
     kept, seed = KeptFigures(arguments.out, file, functools.partial(table, methods)), arguments.seed
-    for name, scene in captures(arguments.scenes, downscale):
-        if not name.startswith(arguments.only):
-            continue
+    for name, scene in captures(arguments.scenes, downscale, arguments.only or SCENES):
         for label in arguments.method or methods:
             method = methods[label]
-            if label == OF_POINTS and all(view.points is None for view in scene.train):
+            if label == POINT_DEPTHS and all(view.points is None for view in scene.train):
                 continue
             kept.measure(key_of(name, label, seed), functools.partial(measured, scene, name, method, budget, seed))
     print(kept.table())

@@ -201,7 +201,7 @@ def test_digests_differ_where_training_would():
     fisheye = dataclasses.replace(view.camera, rays=np.zeros((*size, 2), np.float32))
     views = [changed(camera=camera), changed(camera=fisheye), changed(mask=np.ones(size, bool)), changed(name="other"),
              changed(depth=np.ones(size, np.float32)), changed(picture=np.zeros((*size, 4), np.uint8)),
-             changed(points=a2tg.SeenPoints(np.zeros(1, np.int32), np.ones(1, np.float32)))]  # fmt: skip
+             changed(points=a2tg.ObservedPoints(np.zeros(1, np.int32), np.ones(1, np.float32)))]  # fmt: skip
     scenes = [digests(view=each) for each in views]
     scenes += [digests(points=scene.points + np.float32(1e-6)), digests(colors=scene.colors * 0.5), digests(scale=9.0)]
     assert all(found[:2] == digests()[:2] and found[2] != digests()[2] for found in scenes)

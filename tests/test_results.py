@@ -57,7 +57,7 @@ from a2tg_jax.systems.gaussians_2d import Gaussians2d
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.systems.textured_gaussians import TexturedGaussians
-from a2tg_jax.training import History, LearningRates, like
+from a2tg_jax.training import History, LearningRates, find_system, like
 
 RECORD = RunRecord(SceneSource("/scenes/a b", downscale=2), "a2tg", A2tg.preset("quick"), ("gaussians-2d-mcmc",))
 NAMES = ["a2tg-gaussians", "a2tg-textures", "gaussians-2d-mcmc-continued"]
@@ -422,23 +422,80 @@ class TestComparedOptions:
         def without(table):
             return {name: value for name, value in table.items() if name != "compare_options"}
 
-        kernel = self.kept(tmp_path, without).kernel
+        kernel = self.kept(tmp_path / "none", without).kernel
         assert (kernel.rate, kernel.least_exponent) == (0.0, 0.0)
+
+        def without_one(table):
+            del table["compare_options"]["bytewise"]["kernel"]["least_exponent"]
+            return table
+
+        kernel = self.kept(tmp_path / "one", without_one).kernel
+        assert kernel == dataclasses.replace(self.record.systems["bytewise"].kernel, least_exponent=0.0)
 
     def test_a_file_may_set_them(self, tmp_path):
         file = tmp_path / "mine.toml"
         text = 'scene = "synthetic"\ncompare = ["bytewise"]\n[compare_options.bytewise.kernel]\nrate = 0.5\n'
         file.write_text(text)
         said = cli._parse("train", ["--config", str(file), "--out", "run", "--seed", "3"]).record
-        other = cli._parse("train", ["--config", str(file), "--out", "run", "--preset", "smoke"]).record
         assert said.systems["bytewise"].kernel.rate == 0.5 and said.systems["bytewise"].seed == 3
-        assert other.systems["bytewise"].kernel.rate == Bytewise.preset("smoke").kernel.rate
-        file.write_text(text.replace("rate", "rat"))
-        with pytest.raises(ValueError, match=r"compare_options\.bytewise\.kernel"):
+        for preset in ("smoke", "paper"):
+            other = cli._parse("train", ["--config", str(file), "--out", "run", "--preset", preset]).record
+            assert other.systems["bytewise"].kernel.rate == Bytewise.preset(preset).kernel.rate
+        file.write_text(text.replace('compare = ["bytewise"]', ""))
+        added = cli._parse("train", ["--config", str(file), "--out", "run", "--compare", "bytewise"]).record
+        added.check()
+        assert added.systems["bytewise"].kernel.rate == 0.5
+        with pytest.raises(ValueError, match=r"bytewise: the run does not compare this system: add it"):
             cli._parse("train", ["--config", str(file), "--out", "run"]).record.check()
-        file.write_text(text.replace('["bytewise"]', '["bbsplat"]'))
-        with pytest.raises(ValueError, match=r"mine\.toml: compare_options\.bytewise is not among the systems of"):
-            cli._parse("train", ["--config", str(file), "--out", "run"]).record.check()
+
+    @pytest.mark.parametrize(
+        ("table", "told"),
+        [
+            ("kernel.rat = 1.0", r"compare_options\.bytewise\.kernel\.rat is an unknown key"),
+            ("kernel.rate = []", r"compare_options\.bytewise\.kernel\.rate must be float; got \[\]"),
+            (
+                "rates.means = 1.0",
+                r"compare_options\.bytewise\.rates\.means: compared systems take it",
+            ),
+            ("seed = 3", r"compare_options\.bytewise\.seed: compared systems .*; set options\.seed"),
+        ],
+    )
+    def test_others_are_refused(self, tmp_path, table, told):
+        file = tmp_path / "mine.toml"
+        file.write_text(f'scene = "synthetic"\ncompare = ["bytewise"]\n[compare_options.bytewise]\n{table}\n')
+        with pytest.raises(ValueError, match=rf"mine\.toml: {told}"):
+            cli._parse("train", ["--config", str(file), "--out", "run"])
+        file.write_text('scene = "synthetic"\ncompare_options.bytewise = 3\n')
+        with pytest.raises(ValueError, match=r"compare_options\.bytewise must be a table of options; got 3"):
+            cli._parse("train", ["--config", str(file), "--out", "run"])
+
+    def test_a_resumed_run_refuses_others(self, tmp_path, capsys):
+        run = create_run(tmp_path / "run")
+        write_record(run, dataclasses.replace(self.record, scene=SceneSource("synthetic")))
+        file, table = tmp_path / "mine.toml", tomllib.loads(run.record.read_text())
+        table["compare_options"]["bytewise"]["kernel"]["rate"] = 0.5
+        file.write_text(tomli_w.dumps(table))
+        assert cli.main(["train", "--config", str(file), "--out", str(run.path), "--resume"]) == 2
+        told = capsys.readouterr().err
+        assert f"leave out --config {file}, which differs in compare_options.bytewise" in told
+
+    def test_systems_of_ones_own_with_options_of_another_type(self, tmp_path, monkeypatch):
+        """`kernel` of the main system is a number, that of bytewise a group."""
+        (tmp_path / "with_kernel.py").write_text(
+            "import dataclasses\nfrom a2tg_jax import Gaussians2dMcmc\n"
+            "@dataclasses.dataclass(frozen=True, kw_only=True)\nclass Main(Gaussians2dMcmc):\n    kernel: float = 1.0\n"
+        )
+        monkeypatch.syspath_prepend(tmp_path)
+        kind = type(find_system("with_kernel:Main"))
+        record = RunRecord(
+            SceneSource("synthetic"), "with_kernel:Main", kind(stage2_iterations=9), ("bytewise",), "quick"
+        )
+        run = create_run(tmp_path / "run")
+        write_record(run, record)
+        assert set(tomllib.loads(run.record.read_text())["compare_options"]["bytewise"]["kernel"]) == {
+            "rate", "least_exponent"
+        }  # fmt: skip
+        assert read_record(run).systems == record.systems
 
 
 # Summaries

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import jax
 import tyro
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
 from a2tg_jax.cli.arguments import check_path, defaulting_to, flag_of, flag_with_value
 from a2tg_jax.cli.place import HEARTBEAT_TIMEOUT, place_of
@@ -33,6 +33,7 @@ from a2tg_jax.results.record import (
     RunFile,
     RunRecord,
     SceneSource,
+    changed_compared,
     changed_numbers,
     read_record,
     read_run_file,
@@ -159,6 +160,8 @@ class Train:
     """Number of this process, from 0, with --coordinator HOST:PORT. The first one, 0, writes the run folder."""
     heartbeat_timeout_seconds: Annotated[float | None, defaulting_to(f"{HEARTBEAT_TIMEOUT:g}", "SECONDS")] = None
     """Time after which a process that is silent counts as lost and the others stop, with --coordinator."""
+    compare_options: Annotated[Mapping[str, Any], Fixed, Suppress] = dataclasses.field(default_factory=dict)
+    """Options of the compared systems in the configuration file (`RunRecord.compare_options`)."""
     options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
 
     def run(self) -> None:
@@ -233,15 +236,8 @@ class Train:
         source = SceneSource(path, self.downscale, self.test_every, self.alpha, self.lens, self.validation)
         init = None if self.init is None else str(self.init.resolve())
         compare = tuple(dict.fromkeys(compare))
-        return RunRecord(source, self.system, self.options, compare, self.preset, self.on_nan, init, self._compared)
-
-    @property
-    def _compared(self) -> dict[str, Mapping[str, Any]]:
-        """Options of compared systems in the configuration file; none if its numbers are those of another preset or
-        system."""
-        file = RunFile() if self.config is None else read_run_file(self.config)
-        is_of_file = (file.system, file.preset) == (self.system, self.preset)
-        return file.compared(str(self.config)) if is_of_file else {}
+        main = source, self.system, self.options
+        return RunRecord(*main, compare, self.preset, self.on_nan, init, self.compare_options)
 
     def _resumed(self, run: RunFolder, *, is_written: bool = True) -> RunRecord:
         """Return the record of an existing run, with further comparisons, or raise if a flag contradicts it.
@@ -256,6 +252,10 @@ class Train:
         changed = changed_numbers(asked, kept)
         if changed:
             raise ValueError(f"--resume takes every option from {run.record}; {self._told_changes(run, changed)}")
+        beside = ", ".join(changed_compared(asked, kept))
+        if beside:
+            told = f"leave out --config {self.config}, which differs in {beside}"
+            raise ValueError(f"--resume takes every option from {run.record}; {told}")
         compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
         record = dataclasses.replace(kept, compare=compare, on_nan=self.on_nan)
         record.check()
@@ -290,7 +290,8 @@ def train_defaults(arguments: list[str]) -> Train:
     file = read_run_file(Path(path)) if path else RunFile()
     if preset or (system and system != file.system):
         # The numbers of the file are those of another preset or system.
-        file = dataclasses.replace(file, system=system or file.system, preset=preset or None, options={})
+        file = dataclasses.replace(file, system=system or file.system, preset=preset or None, version=None)
+        file = dataclasses.replace(file, options={}, compare_options={})
     return Train(
         scene=tyro.MISSING if file.scene is None else file.scene,
         out=tyro.MISSING,
@@ -304,6 +305,7 @@ def train_defaults(arguments: list[str]) -> Train:
         compare=file.compare,
         on_nan=file.on_nan,
         init=None if file.init is None else Path(file.init),
+        compare_options=file.compared(path),
         options=file.chosen(path),
     )
 

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from a2tg_jax.core.similarity import Similarity as Similarity
     from a2tg_jax.data.load import load_scene as load_scene
     from a2tg_jax.data.masks import Mask as Mask
-    from a2tg_jax.data.observations import SeenPoints as SeenPoints
-    from a2tg_jax.data.observations import seen_points as seen_points
+    from a2tg_jax.data.observations import ObservedPoints as ObservedPoints
+    from a2tg_jax.data.observations import observed_points as observed_points
     from a2tg_jax.data.photo_store import Picture as Picture
     from a2tg_jax.data.scene import Scene as Scene
     from a2tg_jax.data.scene import View as View
@@ -29,7 +29,7 @@ _NAMES = {
     "a2tg_jax.data.masks": ("Mask",),
     "a2tg_jax.data.photo_store": ("Picture",),
     "a2tg_jax.data.scene": ("Scene", "View", "counted_pixels", "view_image", "views_by_kind"),
-    "a2tg_jax.data.observations": ("SeenPoints", "seen_points"),
+    "a2tg_jax.data.observations": ("ObservedPoints", "observed_points"),
     "a2tg_jax.data.sfm": ("SfmSummary", "run_sfm"),
     "a2tg_jax.data.splits": ("with_validation_views",),
     "a2tg_jax.data.synthetic": ("synthetic_scene",),

@@ -13,7 +13,7 @@ from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_ca
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
-from a2tg_jax.data.observations import SeenPoints
+from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.data.world import normalizing_similarity, scene_scale
@@ -42,8 +42,8 @@ class Shot:
     """Depth map; None without one."""
     panorama: int | None = None
     """Number of the panorama that it was cut from; None of a photograph."""
-    points: SeenPoints | None = None
-    """Points that the reconstruction saw in it, their depths in units of the original world."""
+    points: ObservedPoints | None = None
+    """Points that it observed, their depths in units of the original world; None of an unknown reconstruction."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -184,5 +184,5 @@ def _view(shot: Shot, viewmat: np.ndarray, scale: float) -> View:
         has_ray = np.isfinite(shot.rays).all(axis=2)
         mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
     mask = None if mask is None or mask.is_full else mask
-    points = shot.points and shot.points._replace(depths=shot.points.depths * np.float32(scale))
+    points = None if shot.points is None else shot.points.scaled(scale)
     return View(shot.name, camera, Picture.of(shot.pixels), mask, shot.depth, shot.panorama, points)

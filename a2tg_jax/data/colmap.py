@@ -21,7 +21,7 @@ from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import KeptLens, Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
-from a2tg_jax.data.observations import SeenPoints, seen_points
+from a2tg_jax.data.observations import ObservedPoints, observed_points
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
@@ -87,10 +87,10 @@ def load_colmap(
 
     photos = map_in_threads(photo, registered, num_readers(path))
     found = read_photos(photos, Shelf(room), division, path)
-    numbers, cloud = np.array(sorted(reconstruction.points3D), np.uint64), read_points(reconstruction)
+    ids, cloud = np.array(sorted(reconstruction.points3D), np.uint64), read_points(reconstruction)
 
     def shot(image: Any, read: Reading) -> Shot:
-        points = _seen_points(image, numbers, cloud.points, lenses[image.camera_id], read)
+        points = _observed_points(image, ids, cloud.points, lenses[image.camera_id], read)
         return _shot(image, read, panorama_of(image, reach), points)
 
     shots = [shot(image, read) for image, read in zip(registered, found, strict=True)]
@@ -155,32 +155,32 @@ def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> Photo
     )  # fmt: skip
 
 
-def _shot(image: Any, read: Reading, panorama: int | None, points: SeenPoints | None) -> Shot:
+def _shot(image: Any, read: Reading, panorama: int | None, points: ObservedPoints | None) -> Shot:
     """Return one registered image whose photograph is read."""
     mask = read.facts.mask
     return Shot(image.name, viewmat_of(image), read.K, read.picture, mask, read.rays, read.depth, panorama, points)
 
 
-def _seen_points(
-    image: Any, numbers: np.ndarray, positions: np.ndarray, lens: Lens, read: Reading
-) -> SeenPoints | None:
-    """Return the points that a registered image saw, their depths in units of the original world; None of none.
+def _observed_points(
+    image: Any, ids: np.ndarray, positions: np.ndarray, lens: Lens, read: Reading
+) -> ObservedPoints | None:
+    """Return the points that a registered image observed, in units of the original world; None if it observed none.
 
     Args:
-      image: whose features have the numbers of their points.
-      numbers: [P] uint64 numbers of all points, in order.
+      image: of the reconstruction.
+      ids: [P] uint64 ids of all points, in ascending order.
       positions: [P, 3].
       lens: of its photograph.
       read: the photograph.
     """
-    own = np.array([feature.point3D_id for feature in image.points2D if feature.has_point3D()], np.uint64)
-    own = own[np.isin(own, numbers)]
+    own = np.array([feature.point3D_id for feature in image.get_observation_points2D()], np.uint64)
+    own = own[np.isin(own, ids)]
     if not len(own):
         return None
     viewmat, size = viewmat_of(image), read.picture.size
-    points = positions[np.searchsorted(numbers, own)] @ viewmat[:3, :3].T + viewmat[:3, 3]
+    points = positions[np.searchsorted(ids, own)] @ viewmat[:3, :3].T + viewmat[:3, 3]
     points = points[points[:, 2] > 0]
-    return seen_points(lens.places(points, read.K, size[::-1]), points[:, 2], size)
+    return observed_points(lens.projected(points, read.K, size[::-1]), points[:, 2], size)
 
 
 def spacing(images: Sequence[Any]) -> float:

@@ -123,11 +123,11 @@ class Lens:
         """Return the rays of pictures of a size, as `Camera.rays` has them; None of a pinhole."""
         return None
 
-    def places(self, points: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    def projected(self, points: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """Return x and y [P, 2] in pixels of points [P, 3] before the camera, in a view of a K and (width, height)."""
         seen = points @ K.T
-        places: np.ndarray = seen[:, :2] / seen[:, 2:]
-        return places
+        xy: np.ndarray = seen[:, :2] / seen[:, 2:]
+        return xy
 
     def view_plane(self, plane: np.ndarray) -> np.ndarray:
         """Return numbers [h, w] float32 of each pixel of a photograph as its view, a pinhole's, sees them, at their
@@ -177,10 +177,10 @@ class KeptLens(Lens):
         new_size = downscaled_size(*stored, downscale)
         return new_size, scaled_intrinsics(self._matrix(), self.size, new_size)
 
-    def places(self, points: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Return x and y [P, 2] in pixels of points [P, 3] before the camera, in a picture of a size."""
-        places: np.ndarray = np.asarray(self.camera.img_from_cam(points)) * np.divide(size, self.size)
-        return places
+    def projected(self, points: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Return x and y [P, 2] in pixels of points [P, 3] before the camera, in a picture of a (width, height)."""
+        xy: np.ndarray = np.asarray(self.camera.img_from_cam(points)) * np.divide(size, self.size)
+        return xy
 
     def view_plane(self, plane: np.ndarray) -> np.ndarray:
         """Return numbers [h, w] of each pixel of a photograph as they are."""

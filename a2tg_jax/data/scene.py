@@ -17,7 +17,7 @@ from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
-from a2tg_jax.data.observations import SeenPoints
+from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.host.remote_files import is_remote
 
@@ -50,8 +50,8 @@ class View:
     """Depth map for `loss.depth_weight`; None without one. An array [H, W] of floats may be given, too."""
     panorama: int | None = None
     """Number of the panorama that it was cut from; None of a photograph. Its views are held out together."""
-    points: SeenPoints | None = None
-    """Points that the reconstruction saw in it, for `loss.points_weight`; None if it does not tell."""
+    points: ObservedPoints | None = None
+    """Points of the reconstruction that it observed, for `loss.points_weight`; None if they are not known."""
 
     def __post_init__(self) -> None:
         """Convert arrays to pictures, masks and depth maps."""

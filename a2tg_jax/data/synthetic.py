@@ -13,7 +13,7 @@ from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import patterns
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene
 from a2tg_jax.data.lighting import light
-from a2tg_jax.data.observations import seen_points
+from a2tg_jax.data.observations import observed_points
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.data.splits import check_test_every, every_kth
@@ -74,7 +74,7 @@ def synthetic_scene(
         for index, viewmat in enumerate(viewmats)
     ]
     cloud = sample_points(surfaces, shots, num_points, rng)
-    shots = [seeing(shot, cloud.points, [surface.shape for surface in surfaces]) for shot in shots]
+    shots = [observing(shot, cloud.points, [surface.shape for surface in surfaces]) for shot in shots]
     return assemble_scene("synthetic", *every_kth(shots, test_every), cloud, source="the synthetic scene")
 
 
@@ -147,15 +147,15 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
     return PointCloud(np.concatenate(points)[is_hit], np.concatenate(colors)[is_hit])
 
 
-def seeing(shot: Shot, points: np.ndarray, shapes: Sequence[Shape]) -> Shot:
-    """Return a shot with those of the points [P, 3] that no shape hides from it."""
+def observing(shot: Shot, points: np.ndarray, shapes: Sequence[Shape]) -> Shot:
+    """Return a shot that observed those of the points [P, 3] that no shape hides from it."""
     own = points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
     own = own[own[:, 2] > 0]
     places, depths = (own @ shot.K.T)[:, :2] / own[:, 2:], own[:, 2]
     hits, _ = nearest_hits(shapes, _center(shot.viewmat), _directions(shot.viewmat, shot.K, *places.T))
     is_seen = depths <= (1 + SAME_SURFACE) * hits
     height, width = Picture.of(shot.pixels).size
-    return dataclasses.replace(shot, points=seen_points(places[is_seen], depths[is_seen], (height, width)))
+    return dataclasses.replace(shot, points=observed_points(places[is_seen], depths[is_seen], (height, width)))
 
 
 def exact_points(scene: Scene) -> np.ndarray:

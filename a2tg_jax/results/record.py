@@ -35,12 +35,12 @@ from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.host.urls import checked_url, is_url, path_here
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.results.finish_options import read_finish
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.plan import RunPlan, plan_run
 from a2tg_jax.training import System, find_system, like
-from a2tg_jax.training.options import BUDGET_OPTIONS
+from a2tg_jax.training.options import BUDGET_OPTIONS, own_options
 from a2tg_jax.training.registry import differences, with_changes, with_earlier_options
 
 SYNTHETIC = "synthetic"
@@ -126,8 +126,8 @@ class RunRecord:
     init: str | None = None
     """File of splats in place of the main system's first stage."""
     compare_options: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict, compare=False)
-    """Options of the compared systems that the main one lacks, nested, by name; the others have the preset's values. A
-    record that is written and read again has all of them."""
+    """Options of the compared systems that they do not take from the main one, nested, by name; those that are left out
+    have the preset's values. A record that is written and read again has all of them."""
 
     @property
     def systems(self) -> dict[str, System]:
@@ -140,8 +140,8 @@ class RunRecord:
         for name in self.compare:
             if label_of(name) in found:
                 raise ValueError(f"compare: two systems of the run would be called {shortened(label_of(name))!r}")
-            beside = compared_system(name, self.system, self.preset)
-            found[label_of(name)] = with_changes(beside, self.compare_options.get(name, {}), f"compare_options.{name}")
+            beside, given = compared_system(name, self.system, self.preset), self.compare_options.get(name, {})
+            found[label_of(name)] = changed_beside(beside, given, self.system, f"compare_options.{name}")
         return found
 
     @property
@@ -155,6 +155,10 @@ class RunRecord:
         Raises:
           ValueError: naming the option, what was wanted and what came.
         """
+        for name in self.compare_options:
+            if name not in self.compare:
+                told = f"compare_options.{shortened(name)}: the run does not compare this system"
+                raise ValueError(f"{told}: add it to compare, or remove the table")
         for label, system in self.systems.items():
             try:
                 system.check()
@@ -205,22 +209,55 @@ class RunFile:
         return with_changes(system, with_earlier_options(type(system), self.options), f"{where}: options")
 
     def compared(self, where: str) -> dict[str, Mapping[str, Any]]:
-        """Return the options of compared systems by name, as `RunRecord.compare_options` has them. A run folder of an
-        older version does not tell them; those that were added since have their values of then.
+        """Return the options of compared systems, as `RunRecord.compare_options` has them.
+
+        Run folders of older versions lack options that were added since; these have their values of then.
 
         Raises:
-          ValueError: if there are options of a system that is not compared, or there is no such system.
+          ValueError: naming the option, if it is unknown, of another type, or one of the main system.
         """
-        for name, options in self.compare_options.items():
-            if name not in self.compare or not isinstance(options, Mapping):
-                told = "is no table of options" if name in self.compare else "is not among the systems of compare"
-                raise ValueError(f"{where}: compare_options.{shortened(name)} {told}")
-        found = dict(self.compare_options)
-        if self.version is not None:
-            main = self.chosen(where)
-            for name in self.compare:
-                found.setdefault(name, _beside(type(find_system(name)).earlier_options, main))
+        main, found = self.chosen(where), dict[str, Mapping[str, Any]]()
+        for name in dict.fromkeys((*self.compare, *self.compare_options)):
+            beside, given = compared_system(name, main, self.preset), self.compare_options.get(name, {})
+            label = f"{where}: compare_options.{name}"
+            if not isinstance(given, Mapping):
+                raise ValueError(f"{label} must be a table of options; got {shortened(given)}")
+            changed_beside(beside, given, main, label)
+            earlier = {} if self.version is None else _common(beside.earlier_options, own_options(beside, main))
+            found[name] = merged(earlier, given)
         return found
+
+
+def changed_beside(beside: System, changes: Mapping[str, Any], main: System, where: str) -> System:
+    """Return a compared system with some options changed.
+
+    Raises:
+      ValueError: naming the option, if it is unknown or of another type, or if the main system has it, too.
+    """
+    changed = with_changes(beside, changes, where)
+    shared = _leaves(changes) - _leaves(own_options(beside, main))
+    if shared:
+        option = ".".join(min(shared))
+        raise ValueError(f"{where}.{option}: compared systems take it from the main one; set options.{option}")
+    return changed
+
+
+def _leaves(options: Mapping[str, Any], path: tuple[str, ...] = ()) -> set[tuple[str, ...]]:
+    """Return the paths of nested options."""
+    found: set[tuple[str, ...]] = set()
+    for name, value in options.items():
+        own = (*path, name)
+        found |= _leaves(value, own) if isinstance(value, Mapping) else {own}
+    return found
+
+
+def _common(options: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of nested options that others have, too."""
+    found: dict[str, Any] = {}
+    for name in options.keys() & others.keys():
+        is_group = isinstance(options[name], Mapping) and isinstance(others[name], Mapping)
+        found[name] = _common(options[name], others[name]) if is_group else options[name]
+    return found
 
 
 def label_of(name: str) -> str:
@@ -254,22 +291,6 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
     kind = type(found)
     start = kind() if preset is None else kind.presets().get(preset, kind())
     return with_changes(like(start, other), differences(found), name)
-
-
-def _beside(options: Mapping[str, Any], main: System) -> dict[str, Any]:
-    """Return those of a compared system's options, nested, that the main one lacks."""
-    return _without(options, config_to_dict(main))
-
-
-def _without(options: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in options.items():
-        if isinstance(value, Mapping) and isinstance(others.get(name), Mapping):
-            inner = _without(value, others[name])
-            found |= {name: inner} if inner else {}
-        elif name not in others:
-            found[name] = value
-    return found
 
 
 def read_run_file(path: Path) -> RunFile:
@@ -337,7 +358,7 @@ def _options_beside(record: RunRecord) -> dict[str, Any]:
     found, systems = {}, record.systems
     for name in record.compare:
         start = config_to_dict(compared_system(name, record.system, record.preset))
-        found[name] = _without_none(_beside(config_to_dict(systems[label_of(name)]), record.system), start)
+        found[name] = _without_none(own_options(systems[label_of(name)], record.system), start)
     return found
 
 
@@ -405,6 +426,13 @@ def changed_numbers(asked: RunRecord, kept: RunRecord) -> list[str]:
     """Return the names of the options in which two records of the same scene differ."""
     before = kept.leaves()
     return [name for name, value in asked.leaves().items() if name not in before or value != before[name]]
+
+
+def changed_compared(asked: RunRecord, kept: RunRecord) -> list[str]:
+    """Return the tables `compare_options` of a record that differ from the systems compared by another record."""
+    names = [name for name in asked.compare_options if name in kept.compare]
+    before, now = kept.systems, asked.systems
+    return [f"compare_options.{name}" for name in names if before[label_of(name)] != now[label_of(name)]]
 
 
 def _without_none(table: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def digests_of(record: RunRecord, scene: Scene, session: Session | None) -> list
 
 
 def _told_of_view(view: View) -> tuple[Any, ...]:
-    """Return what is compared of a view: its name, its size, what it has, its camera, and the points that it saw."""
+    """Return what is compared of a view: its name, its size, what it has, its camera, and its points."""
     has = view.has_alpha, view.mask is not None, view.depth is not None
     points = None if view.points is None else [*map(_checksum, view.points)]
     return view.name, view.picture.size, has, _checksum(view.camera.viewmat), _checksum(view.camera.K), points

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import DTypeLike
 
-from a2tg_jax.data.observations import SeenPoints, check_seen_points, stacked_points
+from a2tg_jax.data.observations import ObservedPoints, check_observed_points, stacked_points
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.cores import num_threads
 from a2tg_jax.rasterize.exchange import Exchange
@@ -31,12 +31,12 @@ ALIGNMENT = 64
 
 
 class Extras(NamedTuple):
-    """Whether data of a view come along with its photograph."""
+    """Data of views that are loaded with their photographs."""
 
     depths: bool = False
-    """Depth maps."""
+    """Whether depth maps are."""
     points: bool = False
-    """Points that the reconstruction saw."""
+    """Whether the observed points are."""
 
 
 NO_EXTRAS = Extras()
@@ -59,8 +59,8 @@ class Photographs(NamedTuple):
     """[V, H, W] float32 depth maps, NaN where unknown; None unless asked for."""
     rays: Array | None = None
     """[H, W, 2] rays of the lens (`Camera.rays`); None of a pinhole."""
-    points: SeenPoints | None = None
-    """Points [V, S] that the reconstruction saw; None unless asked for."""
+    points: ObservedPoints | None = None
+    """Observed points [V, S]; None unless asked for."""
 
     def of(self, views: Array | None) -> "Photographs":
         """Return the views of some indices; None: all."""
@@ -132,7 +132,7 @@ def plan_batches(
 
 
 def view_bytes(view: View, extras: Extras = NO_EXTRAS) -> int:
-    """Return the bytes of a photograph, and of what comes along."""
+    """Return the bytes of a photograph and of the extras."""
     of_points = 0 if view.points is None else view.points.nbytes
     of_depths = BYTES_PER_DEPTH * math.prod(view.picture.size)
     return view.picture.nbytes + extras.depths * of_depths + extras.points * of_points
@@ -157,7 +157,7 @@ class PhotoStore:
         last: the stage's last iteration.
         exchange: devices that draw the views of an iteration, and over which photographs that stay there are spread
           by rows of pixels; None: one.
-        extras: what comes along with them.
+        extras: what is loaded with them.
         room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
         self._views, self._order, self._last, self._exchange = views, order, last, exchange
@@ -241,7 +241,7 @@ def on_devices(
         masks=None if photographs.masks is None else in_parts(photographs.masks),
         depths=None if photographs.depths is None else in_parts(photographs.depths),
         rays=photographs.rays,
-        points=None if photographs.points is None else SeenPoints(*map(on_all, photographs.points)),
+        points=None if photographs.points is None else ObservedPoints(*map(on_all, photographs.points)),
     )
 
 
@@ -274,7 +274,7 @@ class Ahead:
 
 
 def check_extras(views: tuple[View, ...], extras: Extras) -> None:
-    """Raise ValueError unless a view has what is to come along."""
+    """Raise ValueError unless one view at least has each of the extras."""
     if extras.depths and all(view.depth is None for view in views):
         raise ValueError(
             "--loss.depth-weight wants depth maps, but no training view has one: put them as NAME.npy or NAME.png "
@@ -282,8 +282,8 @@ def check_extras(views: tuple[View, ...], extras: Extras) -> None:
         )
     if extras.points and all(view.points is None for view in views):
         raise ValueError(
-            "--loss.points-weight wants points that photographs saw, which only COLMAP's models tell, but no training "
-            "view has one: use the COLMAP model of the scene, or set it to 0"
+            "--loss.points-weight needs a COLMAP model whose images list the points that they observed, but no "
+            "training view has any: set it to 0, or load a folder with such a model"
         )
 
 
@@ -312,7 +312,7 @@ def check_views(views: tuple[View, ...]) -> None:
                 f"got {list(view.depth.shape)}"
             )
         if view.points is not None:
-            check_seen_points(view.points, (height, width), f"points of view {view.name}")
+            check_observed_points(view.points, (height, width), f"points of view {view.name}")
 
 
 def device_room() -> float:
@@ -331,7 +331,7 @@ def stack_views(
       views: those to stack.
       among: views that decide the structure: if one of that size has opacities or a mask, every stack of that size has
         them, and each has room for as many points as the view with the most. None: `views`.
-      extras: what comes along. Depths are NaN where a view has no map.
+      extras: what is loaded with them. Depths are NaN where a view has no map.
       are_read: whether the pictures of each view are read; those of the others are zeros. None: all.
     """
     size = views[0].picture.size

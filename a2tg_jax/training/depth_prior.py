@@ -1,6 +1,6 @@
-"""Depth priors: the rendered inverse depth against a depth map that is known up to scale and shift, or against points.
+"""Depth priors: the rendered inverse depth against a depth map, or against the points that a photograph observed.
 
-Points are those of the reconstruction, which has the scale of the cameras.
+Depth maps are known up to scale and shift; the points of a reconstruction have the scale of its cameras.
 """
 
 from typing import Literal
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.numerics import safe_divide
-from a2tg_jax.data.observations import SeenPoints
+from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
@@ -44,7 +44,7 @@ class DepthPrior:
 
 @event
 class PointDepths:
-    """Mean absolute difference of inverse depths at the points that the photograph saw (`points_loss`)."""
+    """Mean absolute difference of inverse depths at the points that the photograph observed (`points_loss`)."""
 
     weight: float
 
@@ -78,13 +78,13 @@ def depth_loss(depth: Array, alpha: Array, prior: Array, counts: Array, *, has_s
     return _mean_error(scale * prior + shift, inverse, counts)
 
 
-def points_loss(depth: Array, alpha: Array, points: SeenPoints, mask: Array | None = None) -> Array:
+def points_loss(depth: Array, alpha: Array, points: ObservedPoints, mask: Array | None = None) -> Array:
     """Mean |1/z − alpha/depth| over the pixels of points of depth z that count and are covered.
 
     Args:
       depth: [H, W] rendered depth Σ z·α·T, not divided by alpha.
       alpha: [H, W] rendered alpha.
-      points: [S], as `SeenPoints` has them.
+      points: [S], as `ObservedPoints` has them.
       mask: [H, W] bool, True at pixels that count; None: all.
 
     Returns:

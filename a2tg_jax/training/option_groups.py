@@ -41,7 +41,7 @@ class LossConfig:
     depth_kind: DepthKind = "inverse"
     """Meaning of depth maps: inverse depth up to scale and shift (monocular networks), or depth up to scale."""
     points_weight: float = 0.0
-    """Rendered inverse depth against that of the reconstruction's points, in the pixels in which they were seen."""
+    """Rendered inverse depth against that of the points that COLMAP observed in each photograph."""
 
     def terms(self, is_first: bool = True) -> tuple[LossTerm, ...]:
         """Return the loss terms whose weight is not 0.

@@ -12,7 +12,7 @@ from a2tg_jax.densify.clone_split import CloneSplitPrune
 from a2tg_jax.densify.floaters import PruneFloaters
 from a2tg_jax.events import Event, FieldError, with_names
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.config_json import changed_config, check_config, flatten_config
+from a2tg_jax.io.config_json import changed_config, check_config, config_to_dict, flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.training.bilateral import BilateralGrid
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
@@ -371,6 +371,24 @@ def like(kind: type[System] | System, other: System) -> System:
     """
     changed: System = _like(kind() if isinstance(kind, type) else kind, other)
     return changed
+
+
+def own_options(system: System, other: System) -> dict[str, Any]:
+    """Return the options of a system that `like` does not take from another, nested as in a configuration file."""
+    return _own(system, other)
+
+
+def _own(value: Any, other: Any) -> dict[str, Any]:
+    hints, other_hints = (typing.get_type_hints(type(config)) for config in (value, other))
+    found: dict[str, Any] = {}
+    for name, option in config_to_dict(value).items():
+        own, others = getattr(value, name), getattr(other, name, None)
+        if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
+            inner = _own(own, others)
+            found |= {name: inner} if inner else {}
+        elif hints[name] != other_hints.get(name):
+            found[name] = option
+    return found
 
 
 def _like(value: Any, other: Any) -> Any:

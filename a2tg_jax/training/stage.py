@@ -82,7 +82,7 @@ class Stage:
 
     @property
     def extras(self) -> Extras:
-        """Data that loss terms read beside the photographs: depth maps (`Target.depth`), points (`Target.points`)."""
+        """Data that loss terms read beside the photographs, as `Target.depth` and `Target.points`."""
         return Extras(*(any(getattr(term, f"has_{name}", False) for term in self.losses) for name in Extras._fields))
 
     def floats_shown(self, sh_degree: int) -> float:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.data.observations import SeenPoints
+from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
@@ -32,8 +32,8 @@ class Target(NamedTuple):
     """[H, W] depth map as given, NaN where unknown; None unless a term of the stage has `has_depths`."""
     progress: Array | float = 1.0
     """Share of the stage that is done."""
-    points: SeenPoints | None = None
-    """Points [S] that the reconstruction saw in the photograph; None unless a term of the stage has `has_points`."""
+    points: ObservedPoints | None = None
+    """Points [S] that the photograph observed; None unless a term of the stage has `has_points`."""
 
 
 LossFunction = Callable[[Model, Target, RenderOutput], Array]

@@ -1,12 +1,14 @@
-"""Points that photographs saw: read from COLMAP's models, and compared with rendered depth."""
+"""Points that photographs observed: read from COLMAP's models, and compared with rendered depth."""
 
 import dataclasses
+import re
+import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_data_colmap import CAMERAS, HEIGHT, WIDTH, dot_place, project, write_scene
+from test_data_colmap import CAMERAS, dot_place, project, write_scene
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.colmap_library import pycolmap
@@ -88,17 +90,17 @@ def test_real_scenes(shared):
 
 def test_the_nearest_of_a_pixel_counts_and_what_lies_outside_does_not():
     places = np.array([[1.5, 0.5], [1.2, 0.9], [-0.1, 0.5], [3.0, 1.0], [np.nan, 1.0], [0.0, 1.99], [2.5, 1.5]])
-    found = a2tg.seen_points(places, np.array([3.0, 2.0, 1.0, 1.0, 1.0, 5.0, -1.0]), (2, 3))
+    found = a2tg.observed_points(places, np.array([3.0, 2.0, 1.0, 1.0, 1.0, 5.0, -1.0]), (2, 3))
     np.testing.assert_array_equal(found.pixels, [1, 3])
     np.testing.assert_array_equal(found.depths, np.float32([2, 5]))
     assert found.pixels.dtype == np.int32 and found.depths.dtype == np.float32
-    nothing = a2tg.seen_points(np.zeros((0, 2)), np.zeros(0), (2, 3))
+    nothing = a2tg.observed_points(np.zeros((0, 2)), np.zeros(0), (2, 3))
     assert nothing.pixels.shape == nothing.depths.shape == (0,)
 
 
 class TestLoss:
     depth, alpha = (jnp.asarray(RNG.uniform(*limits, (5, 6))) for limits in ((1, 2), (0.6, 1)))
-    points = a2tg.SeenPoints(np.array([1, 8, 29, 30, 31], np.int32), np.array([2.0, 1.0, 3.0, 0.0, 0.0]))
+    points = a2tg.ObservedPoints(np.array([1, 8, 29, 30, 31], np.int32), np.array([2.0, 1.0, 3.0, 0.0, 0.0]))
 
     def test_it_is_the_mean_difference_of_inverse_depths(self):
         alpha = self.alpha.at[1, 2].set(0.4)
@@ -121,12 +123,12 @@ class TestLoss:
     def test_right_depth_costs_nothing_and_no_points_neither(self):
         depth = jnp.asarray(self.depth, jnp.float32)
         at = np.arange(30, dtype=np.int32)
-        target = a2tg.Target(None, None, None, points=a2tg.SeenPoints(at, depth.reshape(-1)))
+        target = a2tg.Target(None, None, None, points=a2tg.ObservedPoints(at, depth.reshape(-1)))
         output = a2tg.render.RenderOutput(None, jnp.ones_like(depth), depth, None, None, None)
         assert float(PointDepths(1.0)(None, target, output)) < 1e-7
         for length in (0, 4):
             empty = stacked_points([None], (5, 6), length)
-            nothing = a2tg.Target(None, None, None, points=a2tg.SeenPoints(*(x[0] for x in empty)))
+            nothing = a2tg.Target(None, None, None, points=a2tg.ObservedPoints(*(x[0] for x in empty)))
             assert PointDepths(1.0)(None, nothing, output) == 0
         assert PointDepths(1.0)(None, target, output._replace(depth=2 * depth)) > 0.1
 
@@ -156,7 +158,7 @@ def test_batches_hold_the_points_of_their_views(scene):
                 row = place if places is None else places[place]
                 pixels, depths = (np.asarray(x[row]) for x in batch.points)
                 assert pixels.shape == (most,)
-                own = views[index].points or a2tg.SeenPoints(np.zeros(0, np.int32), np.zeros(0, np.float32))
+                own = views[index].points or a2tg.ObservedPoints(np.zeros(0, np.int32), np.zeros(0, np.float32))
                 np.testing.assert_array_equal(pixels[depths > 0], own.pixels)
                 np.testing.assert_array_equal(depths[depths > 0], own.depths)
                 assert (np.diff(pixels) > 0).all()
@@ -183,25 +185,49 @@ def test_training_moves_depths_to_the_points(scene):
 
 def test_scenes_without_points_are_refused(scene):
     views = tuple(dataclasses.replace(view, points=None) for view in scene.train)
-    with pytest.raises(ValueError, match=r"--loss.points-weight wants points .* COLMAP"):
+    with pytest.raises(ValueError, match=r"--loss.points-weight needs a COLMAP model .*: set it to 0"):
         a2tg.fit(dataclasses.replace(scene, train=views), small(loss={"points_weight": 0.1}), progress=False)
 
 
-@pytest.mark.parametrize("pixels, depths, told", [
-    (np.zeros((1, 2), np.int32), np.ones((1, 2), np.float32), r"must be pixels \[S\] int32 and depths \[S\] float32"),
-    (np.zeros(2, np.int32), np.ones(2, np.float32), "must have increasing pixels from 0 to 1199"),
-    (np.array([1200], np.int32), np.ones(1, np.float32), "must have increasing pixels from 0 to 1199"),
-    (np.array([3], np.int32), np.array([np.nan], np.float32), "must have finite depths above 0"),
+@pytest.mark.parametrize("points, told", [
+    (a2tg.ObservedPoints(np.zeros((1, 2), np.int32), np.ones((1, 2), np.float32)), "must be pixels [S] int32 and"),
+    (a2tg.ObservedPoints(np.zeros(2, np.int32), np.ones(2, np.float32)), "must have increasing pixels from 0 to 1199"),
+    (a2tg.ObservedPoints(np.array([1200], np.int32), np.ones(1, np.float32)), "must have increasing pixels from 0 to"),
+    (a2tg.ObservedPoints(np.array([3], np.int32), np.array([np.nan], np.float32)), "must have depths from 1e-12 to"),
+    ((np.zeros(1, np.int32), np.ones(1, np.float32)), "must be ObservedPoints; got tuple"),
+    (3, "must be ObservedPoints; got int"),
 ])  # fmt: skip
-def test_other_points_are_refused(scene, pixels, depths, told):
-    first = dataclasses.replace(scene.train[0], points=a2tg.SeenPoints(pixels, depths))
-    with pytest.raises(ValueError, match=rf"points of view {first.name} {told}: make them with seen_points|{told}"):
+def test_other_points_are_refused(scene, points, told):
+    first = dataclasses.replace(scene.train[0], points=points)
+    with pytest.raises(ValueError, match=re.escape(f"points of view {first.name} {told}")) as caught:
         a2tg.fit(dataclasses.replace(scene, train=(first,)), small(), progress=False)
+    assert str(caught.value).endswith(": make them with observed_points")
+    with pytest.raises(ValueError, match=r"xy must be \[S, 2\] and depths \[S\]; got \[3, 2\] and \[2\]"):
+        a2tg.observed_points([[1, 2]] * 3, [1, 2], (4, 4))
 
 
-def test_scenes_of_other_sizes_agree(tmp_path):
-    """Half the size: half the places, and the same depths."""
+@pytest.mark.parametrize("far", [1e13, 1e39, 1e-14, np.inf])
+def test_points_too_far_or_too_near_are_left_out(tmp_path, far):
+    reconstruction = with_observations(tmp_path, "PINHOLE", [range(1, 30)] * 5)
+    image = reconstruction.find_image_with_name("img_00.png")
+    reconstruction.points3D[7].xyz = image.cam_from_world().inverse() * np.array([0, 0, far])
+    before = a2tg.load_scene(tmp_path, test_every=0).train[0].points
+    reconstruction.write_binary(str(tmp_path / "sparse/0"))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*they are left out")
+        scene = a2tg.load_scene(tmp_path, test_every=0)
+    depths = scene.train[0].points.depths
+    assert np.isfinite(depths).all() and depths.max() < 100 and len(before.pixels) > 5
+    a2tg.fit(scene, small(stage1_iterations=1, loss={"points_weight": 0.1}), progress=False)
+
+
+def test_half_the_size_has_half_the_places_and_the_same_depths(tmp_path):
     with_observations(tmp_path, "RADIAL", [range(1, 40)] * 5)
-    whole, half = (a2tg.load_scene(tmp_path, test_every=0, downscale=k).train[0].points for k in (1, 2))
-    assert WIDTH == 128 and HEIGHT == 96
-    assert set(half.depths) <= set(whole.depths) and len(half.depths) > 0.8 * len(whole.depths)
+    views = [a2tg.load_scene(tmp_path, test_every=0, downscale=k).train[0] for k in (1, 2)]
+    whole, half = (
+        {z: divmod(pixel, view.camera.width) for pixel, z in zip(*map(np.ndarray.tolist, view.points), strict=True)}
+        for view in views
+    )
+    assert half.keys() <= whole.keys() and len(whole) >= len(half) > 10
+    for z, place in half.items():
+        assert np.abs(np.add(place, 0.5) * 2 - np.add(whole[z], 0.5)).max() <= 1.5
