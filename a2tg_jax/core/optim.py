@@ -14,6 +14,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_number, check_numeric, check_shape
+from a2tg_jax.host.text import shortened
 
 with warnings.catch_warnings():
     # jaxopt says at import that it is no longer maintained, which a user of this package can do nothing about.
@@ -82,15 +83,13 @@ def adam_update(
     mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
     nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
 
-    def step(rate: Any, param: Array, m: Array, v: Array) -> Array:
+    def step(rate: Array, param: Array, m: Array, v: Array) -> Array:
         rate = jnp.asarray(rate, param.dtype)
-        if rate.ndim and (rate.ndim != param.ndim or jnp.broadcast_shapes(rate.shape, param.shape) != param.shape):
-            raise ValueError(f"rates must broadcast to {[*param.shape]} at equal rank; got {[*rate.shape]}")
         root = jnp.sqrt(v) / jnp.sqrt(_bias_correction(b2, count, param.dtype))
         change: Array = rate / _bias_correction(b1, count, param.dtype) * (m / (root + eps))
         return param - change
 
-    params = jax.tree.map(step, jax.tree.broadcast(rates, params), params, mu, nu)
+    params = jax.tree.map(step, _one_each(rates, params), params, mu, nu)
     return OptStep(params=params, state=AdamState(mu, nu, count))
 
 
@@ -115,6 +114,24 @@ def exponential_decay(start: float, final_factor: float, iteration: Array | int,
     check_number("total", total, least=1)
     progress = jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) / total, 0.0, 1.0)
     return start * jnp.exp(math.log(final_factor) * progress)
+
+
+def _one_each(rates: Any, params: Any) -> Any:
+    """Return a rate for each leaf of the parameters, or raise ValueError, naming the leaf that has none that fits."""
+    try:
+        found = jax.tree.broadcast(rates, params)
+    except ValueError as error:
+        told = shortened(str(jax.tree.structure(rates)))
+        raise ValueError(f"rates must be one for all, or have the fields of params; got {told}") from error
+    for (path, param), rate in zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(found), strict=True):
+        shape = jnp.shape(rate)
+        fits = len(shape) == param.ndim and all(
+            own in (1, whole) for own, whole in zip(shape, param.shape, strict=True)
+        )
+        if shape and not fits:
+            name = f"rates{jax.tree_util.keystr(path)}"
+            raise ValueError(f"{name} must broadcast to {[*param.shape]} at equal rank; got {[*shape]}")
+    return found
 
 
 def _check_floats(params: Any) -> None:

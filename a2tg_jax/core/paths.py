@@ -47,7 +47,8 @@ def look_at(
     center, seen, up = vectors.values()
     forward = seen - center
     if np.linalg.norm(np.cross(forward, up)) <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(up):
-        raise ValueError(f"target must lie in a direction that is not along up; it lies at {forward} from the camera")
+        told = f"target must lie in a direction that is not along up; it lies at {forward} from the camera"
+        raise ValueError(f"{told}, and up is {up}: say another up=")
     if not 0 < fov < 180:
         raise ValueError(f"fov must lie between 0 and 180 degrees; got {fov}")
     viewmat, K = looking(center, forward, -up), intrinsics(width, height, np.radians(fov))

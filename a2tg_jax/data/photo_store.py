@@ -44,8 +44,22 @@ class Picture:
 
     @staticmethod
     def of(pixels: "np.ndarray | Picture") -> "Picture":
-        """Return a picture of pixels held in memory; a picture is returned unchanged."""
-        return pixels if isinstance(pixels, Picture) else Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
+        """Return a picture of pixels held in memory; a picture is returned unchanged.
+
+        Raises:
+          ValueError: unless they are uint8, [H, W, 3] or [H, W, 4].
+        """
+        if isinstance(pixels, Picture):
+            return pixels
+        wanted = "a picture must be an array uint8 [H, W, 3], or [H, W, 4] with alpha"
+        if isinstance(pixels, str | os.PathLike) or not hasattr(pixels, "dtype"):
+            raise ValueError(f"{wanted}; got {type(pixels).__name__}")
+        is_image = len(pixels.shape) == 3 and pixels.shape[2] in (3, 4) and min(pixels.shape) > 0
+        if not is_image or pixels.dtype != np.uint8:
+            is_share = is_image and np.issubdtype(pixels.dtype, np.floating)
+            advice = ": say np.rint(255 * image).astype(np.uint8) of an image in [0, 1]" if is_share else ""
+            raise ValueError(f"{wanted}; got {pixels.dtype} {[*pixels.shape]}{advice}")
+        return Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
 
     def __deepcopy__(self, memo: Any) -> "Picture":
         """Return the picture itself, which nothing changes."""

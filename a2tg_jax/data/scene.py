@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import check_kind, check_shape
+from a2tg_jax.core.cameras import Camera, check_is_camera
+from a2tg_jax.core.checks import check_array, check_kind, check_number, check_shape
 from a2tg_jax.core.display import THUMBNAIL, counted, enlarged, html_image, in_bytes, png
 from a2tg_jax.core.origin import BLACK, Color, Origin
-from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.observations import ObservedPoints
@@ -54,7 +54,12 @@ class View:
     """Points of the reconstruction that it observed, for `loss.points_weight`; None if they are not known."""
 
     def __post_init__(self) -> None:
-        """Convert arrays to pictures, masks and depth maps."""
+        """Convert arrays to pictures, masks and depth maps.
+
+        Raises:
+          ValueError: if they are of another kind or shape.
+        """
+        check_is_camera(self.camera, f"view {self.name}: camera")
         object.__setattr__(self, "picture", Picture.of(self.picture))
         object.__setattr__(self, "mask", None if self.mask is None else Mask.of(self.mask))
         object.__setattr__(self, "depth", None if self.depth is None else DepthMap.of(self.depth))
@@ -117,6 +122,21 @@ class Scene:
         sizes = {view.picture.size for view in (*self.train, *self.test)}
         height, width = max(sizes, key=math.prod, default=(0, 0))
         return f"{width}×{height}" if len(sizes) < 2 else f"{len(sizes)} sizes to {width}×{height}"
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise ValueError, naming the field, unless points, transform and scale are valid, and names of views unique."""
+    names = [view.name for view in scene.train]
+    twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
+    if twice is not None:
+        raise ValueError(f"scene.train has two views called {twice!r}: give each its own name")
+    check_array("scene.points", scene.points)
+    check_shape("scene.points", scene.points, ("P", 3))
+    check_shape("scene.colors", scene.colors, scene.points.shape)
+    if len(scene.points) < 2:
+        raise ValueError(f"scene.points must hold at least two points; got {len(scene.points)}")
+    check_similarity(scene.transform, "scene.transform")
+    check_number("scene.scale", scene.scale, above=0)
 
 
 def check_are_views(views: Sequence[View], call: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.npz import read_npz
-from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.regular_files import is_folder, is_regular
 from a2tg_jax.host.text import shortened
 
 FORMAT = "a2tg-jax checkpoint"
@@ -84,6 +84,9 @@ def read_archive_header(path: str | os.PathLike[str], *, format: str = FORMAT) -
 
 def _read_entries(path: Path, format: str, is_wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
     """Return the wanted arrays of an .npz; whatever is wrong with the file becomes one ValueError."""
+    if is_folder(path):
+        told = ", such as " + str(next(iter(sorted(path.glob("models/*.npz"))), path / "model.npz"))
+        raise ValueError(f"{path}: is a folder; name a file in it{told}")
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such {format}")
     try:
@@ -93,4 +96,4 @@ def _read_entries(path: Path, format: str, is_wanted: Callable[[str], bool]) -> 
 
 
 def _damaged(path: Path, format: str, reason: str) -> ValueError:
-    return ValueError(f"{path}: is not an {format}, or is damaged ({reason})")
+    return ValueError(f"{path}: is not an {format}, or is damaged ({reason}); copy or write it again")

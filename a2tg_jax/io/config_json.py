@@ -119,6 +119,9 @@ def _within(where: str, name: str) -> str:
 
 
 def _instead(name: str, names: list[str]) -> str:
+    group, _, option = name.partition(".")
+    if option and group in names:
+        return f"; say {group}={{{option!r}: …}}"
     return did_you_mean(name, names) or f"; it has {', '.join(names)}"
 
 

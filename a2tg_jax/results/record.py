@@ -11,7 +11,8 @@ A configuration file says the same or less; what it leaves out has the value tha
     [options.texture]                    # options of the system, as nested tables
     cap = 8
 
-    [compare_options.gaussians-2d-mcmc]  # options of a compared system that the main one lacks
+    [compare_options.gaussians-2d-mcmc]  # options of a compared system, in place of the main one's
+    sh_degree = 0
 """
 
 import dataclasses
@@ -126,8 +127,8 @@ class RunRecord:
     init: str | None = None
     """File of splats in place of the main system's first stage."""
     compare_options: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict, compare=False)
-    """Options of the compared systems that they do not take from the main one, nested, by name; those that are left out
-    have the preset's values. A record that is written and read again has all of them."""
+    """Options of the compared systems, nested, by name. Those that are left out have the main system's values, or the
+    preset's if it lacks them. A record that is written and read again has all that the main system lacks."""
 
     @property
     def systems(self) -> dict[str, System]:
@@ -141,7 +142,7 @@ class RunRecord:
             if label_of(name) in found:
                 raise ValueError(f"compare: two systems of the run would be called {shortened(label_of(name))!r}")
             beside, given = compared_system(name, self.system, self.preset), self.compare_options.get(name, {})
-            found[label_of(name)] = changed_beside(beside, given, self.system, f"compare_options.{name}")
+            found[label_of(name)] = with_changes(beside, given, f"compare_options.{name}")
         return found
 
     @property
@@ -214,7 +215,7 @@ class RunFile:
         Run folders of older versions lack options that were added since; these have their values of then.
 
         Raises:
-          ValueError: naming the option, if it is unknown, of another type, or one of the main system.
+          ValueError: naming the option, if it is unknown or of another type.
         """
         main, found = self.chosen(where), dict[str, Mapping[str, Any]]()
         for name in dict.fromkeys((*self.compare, *self.compare_options)):
@@ -222,33 +223,10 @@ class RunFile:
             label = f"{where}: compare_options.{name}"
             if not isinstance(given, Mapping):
                 raise ValueError(f"{label} must be a table of options; got {shortened(given)}")
-            changed_beside(beside, given, main, label)
+            with_changes(beside, given, label)
             earlier = {} if self.version is None else _common(beside.earlier_options, own_options(beside, main))
             found[name] = merged(earlier, given)
         return found
-
-
-def changed_beside(beside: System, changes: Mapping[str, Any], main: System, where: str) -> System:
-    """Return a compared system with some options changed.
-
-    Raises:
-      ValueError: naming the option, if it is unknown or of another type, or if the main system has it, too.
-    """
-    changed = with_changes(beside, changes, where)
-    shared = _leaves(changes) - _leaves(own_options(beside, main))
-    if shared:
-        option = ".".join(min(shared))
-        raise ValueError(f"{where}.{option}: compared systems take it from the main one; set options.{option}")
-    return changed
-
-
-def _leaves(options: Mapping[str, Any], path: tuple[str, ...] = ()) -> set[tuple[str, ...]]:
-    """Return the paths of nested options."""
-    found: set[tuple[str, ...]] = set()
-    for name, value in options.items():
-        own = (*path, name)
-        found |= _leaves(value, own) if isinstance(value, Mapping) else {own}
-    return found
 
 
 def _common(options: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
@@ -354,11 +332,12 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
 
 
 def _options_beside(record: RunRecord) -> dict[str, Any]:
-    """Return every option of the compared systems that the main one lacks, by name of the system."""
-    found, systems = {}, record.systems
+    """Return the options of the compared systems by name: all that they do not take from the main one, and others."""
+    found = {}
     for name in record.compare:
-        start = config_to_dict(compared_system(name, record.system, record.preset))
-        found[name] = _without_none(own_options(systems[label_of(name)], record.system), start)
+        beside = compared_system(name, record.system, record.preset)
+        own = own_options(record.systems[label_of(name)], record.system)
+        found[name] = _without_none(merged(own, record.compare_options.get(name, {})), config_to_dict(beside))
     return found
 
 

@@ -11,11 +11,13 @@ import numpy as np
 from jax import Array
 from numpy.typing import DTypeLike
 
+from a2tg_jax.core.cameras import check_camera
 from a2tg_jax.data.observations import ObservedPoints, check_observed_points, stacked_points
-from a2tg_jax.data.scene import View, kinds_of, ray_bytes
+from a2tg_jax.data.scene import View, check_are_views, kinds_of, ray_bytes
 from a2tg_jax.host.cores import num_threads
 from a2tg_jax.rasterize.exchange import Exchange
 from a2tg_jax.rasterize.placement import are_drawn_here, asked_by_any, everywhere, spread_pixels, spread_views
+from a2tg_jax.training.losses import SSIM_WINDOW
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25
@@ -273,8 +275,15 @@ class Ahead:
         self._pool.shutdown(cancel_futures=True)
 
 
-def check_extras(views: tuple[View, ...], extras: Extras) -> None:
-    """Raise ValueError unless one view at least has each of the extras."""
+def check_loss_data(views: tuple[View, ...], extras: Extras, has_ssim: bool) -> None:
+    """Raise ValueError unless one view at least has each of the extras, and all are large enough for SSIM."""
+    for view in views if has_ssim else ():
+        if min(view.picture.size) < SSIM_WINDOW:
+            height, width = view.picture.size
+            raise ValueError(
+                f"view {view.name} has {width} by {height} pixels, but --loss.ssim-weight needs {SSIM_WINDOW} by "
+                f"{SSIM_WINDOW}: lower --downscale, or set it to 0"
+            )
     if extras.depths and all(view.depth is None for view in views):
         raise ValueError(
             "--loss.depth-weight wants depth maps, but no training view has one: put them as NAME.npy or NAME.png "
@@ -283,16 +292,19 @@ def check_extras(views: tuple[View, ...], extras: Extras) -> None:
     if extras.points and all(view.points is None for view in views):
         raise ValueError(
             "--loss.points-weight needs a COLMAP model whose images list the points that they observed, but no "
-            "training view has any: set it to 0, or load a folder with such a model"
+            "training view has any: set it to 0, or load a folder with such a model (in Python, observed_points makes "
+            "View.points)"
         )
 
 
 def check_views(views: tuple[View, ...]) -> None:
     """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes, of which some
     pixels count."""
-    if not views:
+    if isinstance(views, tuple | list) and not views:
         raise ValueError("scene.train must hold at least one view; got none")
+    check_are_views(views, "Scene(train=(view, …))")
     for view in views:
+        check_camera(view.camera, f"view {view.name}: camera")
         height, width, picture = view.camera.height, view.camera.width, view.picture
         if picture.shape not in ((height, width, 3), (height, width, 4)) or picture.dtype != np.uint8:
             raise ValueError(

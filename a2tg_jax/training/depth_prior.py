@@ -34,7 +34,6 @@ class DepthPrior:
     has_depths = True
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
-        assert target.depth is not None
         prior = target.depth if self.kind == "inverse" else safe_divide(jnp.ones_like(target.depth), target.depth)
         counts = jnp.isfinite(prior) if self.kind == "inverse" else target.depth > 0
         if target.mask is not None:
@@ -52,7 +51,6 @@ class PointDepths:
     has_points = True
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
-        assert target.points is not None
         return self.weight * points_loss(output.depth, output.alpha, target.points, target.mask)
 
 

@@ -8,11 +8,11 @@ from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.core.origin import BLACK, WHITE, Color
-from a2tg_jax.data.scene import Scene, origin_of_scene
+from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.training.batches import check_extras, check_views
+from a2tg_jax.training.batches import check_loss_data, check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, StageRun, Watch, never, unwatched
@@ -155,6 +155,7 @@ def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None) ->
         check_kind("resume", resume, Checkpoint, "say load_checkpoint(path)" if isinstance(resume, is_path) else "")
     system.check()
     check_views(scene.train)
+    check_scene(scene)
 
 
 def fit_stage(
@@ -189,7 +190,8 @@ def fit_stage(
         raise ValueError(f"index must be that of one of the {len(system.stages())} stages, from 0; got {index}")
     if checkpoint_every is not None and checkpoint_every < 1:
         raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
-    check_extras(scene.train, system.stages()[index].extras)
+    stage = system.stages()[index]
+    check_loss_data(scene.train, stage.extras, stage.has_ssim)
     if start is None and resume is None:
         start = initial_model(scene, system)
     with system.naming_options():

@@ -81,6 +81,11 @@ class Stage:
         return any(getattr(term, "has_geometry", False) for term in self.losses)
 
     @property
+    def has_ssim(self) -> bool:
+        """Whether a loss term of the library's compares by SSIM, which needs pictures as large as its window (host)."""
+        return any(isinstance(weight := getattr(term, "ssim_weight", 0), float) and weight > 0 for term in self.losses)
+
+    @property
     def extras(self) -> Extras:
         """Data that loss terms read beside the photographs, as `Target.depth` and `Target.points`."""
         return Extras(*(any(getattr(term, f"has_{name}", False) for term in self.losses) for name in Extras._fields))

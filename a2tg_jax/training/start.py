@@ -17,7 +17,7 @@ from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import FieldError
 from a2tg_jax.model import Model
-from a2tg_jax.training.batches import check_extras
+from a2tg_jax.training.batches import check_loss_data
 from a2tg_jax.training.options import System
 from a2tg_jax.training.sky import check_sky, sky_of
 from a2tg_jax.training.stage import Stage
@@ -101,7 +101,7 @@ def check_start(scene: Scene, system: System, num_given: int | None = None) -> N
             _rows_needed(system.stages()[0], num, system)
     (system.check_number if num_given is None else system.check_given_number)(num)
     for stage in system.stages():
-        check_extras(scene.train, stage.extras)
+        check_loss_data(scene.train, stage.extras, stage.has_ssim)
     if system.sky_gaussians:
         check_sky(scene, system.sky_gaussians)
 

@@ -4,7 +4,7 @@ A term is a frozen dataclass registered as a pytree, whose numbers are traced; `
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -17,6 +17,13 @@ from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss
 from a2tg_jax.training.returned import check_scalar
 
+EXTRAS = {"depth": "has_depths", "points": "has_points"}
+"""Fields of `Target` that only some terms read, and how these say so."""
+
+
+class NotLoadedError(ValueError, AttributeError):
+    """Data of photographs that no term asked for were read; for `hasattr` there is no such attribute."""
+
 
 class Target(NamedTuple):
     """Target that a render is compared with."""
@@ -28,12 +35,22 @@ class Target(NamedTuple):
     """[3]."""
     mask: Array | None = None
     """[H, W] bool, True at pixels that count; None: all. Excluded pixels of photograph and render are black."""
-    depth: Array | None = None
-    """[H, W] depth map as given, NaN where unknown; None unless a term of the stage has `has_depths`."""
+    depth: Array = None  # type: ignore[assignment]
+    """[H, W] depth map as given, NaN where unknown. Unless a term of the stage has `has_depths`, reading it raises
+    ValueError."""
     progress: Array | float = 1.0
     """Share of the stage that is done."""
-    points: ObservedPoints | None = None
-    """Points [S] that the photograph observed; None unless a term of the stage has `has_points`."""
+    points: ObservedPoints = None  # type: ignore[assignment]
+    """Points [S] that the photograph observed. Unless a term of the stage has `has_points`, reading them raises
+    ValueError."""
+
+    def __getattribute__(self, name: str) -> Any:
+        value = tuple.__getattribute__(self, name)
+        if value is None and name in EXTRAS:
+            flag = EXTRAS[name]
+            told = f"say {flag}=True, as in Term(function, {flag}=True) for a loss term of your own"
+            raise NotLoadedError(f"target.{name} was not loaded: {told}")
+        return value
 
 
 LossFunction = Callable[[Model, Target, RenderOutput], Array]
@@ -55,6 +72,10 @@ class Term:
     has_geometry: bool = static(default=False)
     """Whether the function reads `output.depth`, `normal` or `distortion`, which are rendered only on demand: unless a
     term of the stage asks for them, reading them raises ValueError."""
+    has_depths: bool = static(default=False, is_addition=True)
+    """Whether the function reads `target.depth`, the depth map of the photograph."""
+    has_points: bool = static(default=False, is_addition=True)
+    """Whether the function reads `target.points`, the points that the photograph observed."""
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
         value = self.function(model, target, output)
