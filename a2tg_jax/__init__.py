@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from a2tg_jax.data import load_scene as load_scene
     from a2tg_jax.data import observed_points as observed_points
     from a2tg_jax.data import run_sfm as run_sfm
+    from a2tg_jax.data import scene_from_arrays as scene_from_arrays
     from a2tg_jax.data import synthetic_scene as synthetic_scene
     from a2tg_jax.data import view_image as view_image
     from a2tg_jax.data import with_validation_views as with_validation_views
@@ -188,6 +189,7 @@ _NAMES = {
         "load_scene",
         "run_sfm",
         "observed_points",
+        "scene_from_arrays",
         "synthetic_scene",
         "view_image",
         "with_validation_views",

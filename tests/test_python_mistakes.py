@@ -3,6 +3,7 @@
 import dataclasses
 import re
 import signal
+import tempfile
 import warnings
 
 import jax
@@ -129,6 +130,15 @@ def scene() -> a2tg.Scene:
     return a2tg.Scene("toy", (view, view), (view,), points, 0 * points, some_world(), 1.0)
 
 
+def fitted(**changes) -> a2tg.FitResult:
+    whole = scene()
+    return a2tg.fit(dataclasses.replace(whole, **{"train": whole.test, **changes}), a2tg.A2tg())
+
+
+def stepped(rates):
+    return a2tg.adam_update(GAUSSIANS, GAUSSIANS, a2tg.adam_init(GAUSSIANS), rates)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OneStage(a2tg.A2tg):
     def stages(self):
@@ -179,6 +189,33 @@ KINDS = {
     "texture must be a TextureConfig; got dict: say TextureConfig(cap=8)": lambda: a2tg.A2tg(
         texture={"cap": 8}
     ).check(),
+    "must be an array uint8 [H, W, 3], or [H, W, 4] with alpha; got float64 [12, 16, 3]: say np.rint(255": lambda: (
+        a2tg.View("a.png", CAMERA, np.zeros((12, 16, 3)))
+    ),
+    "with alpha; got uint8 [3, 12, 16]": lambda: a2tg.View("a.png", CAMERA, np.zeros((3, 12, 16), np.uint8)),
+    "with alpha; got str": lambda: a2tg.View("a.png", CAMERA, "a.png"),
+    "view a.png: camera must be a Camera; got": lambda: a2tg.View("a.png", None, np.zeros((12, 16, 3), np.uint8)),
+    "view a.png: camera.viewmat must be [4, 4]; got [3, 4]": lambda: fitted(
+        train=(dataclasses.replace(scene().test[0], camera=dataclasses.replace(CAMERA, viewmat=jnp.eye(4)[:3])),)
+    ),
+    "scene.train has two views called 'a.png': give each its own name": lambda: fitted(train=scene().test * 2),
+    "views must be views, such as scene.train; got ndarray": lambda: fitted(train=(np.zeros(3),)),
+    "scene.transform must be a Similarity; got NoneType": lambda: fitted(transform=None),
+    "scene.transform must be a Similarity; got ndarray": lambda: fitted(transform=np.eye(4)),
+    "scene.scale must be above 0": lambda: fitted(scale=0.0),
+    "scene.points must hold at least two points; got 0": lambda: fitted(
+        points=np.zeros((0, 3)), colors=np.zeros((0, 3))
+    ),
+    "scene.colors must be [9, 3]; got [2, 3]": lambda: fitted(colors=np.zeros((2, 3))),
+    "A2tg.texture.cap is an unknown key; say texture={'cap': …}": lambda: a2tg.A2tg.preset(
+        "quick", **{"texture.cap": 4}
+    ),
+    "and up is [0. 0. 1.]: say another up=": lambda: a2tg.look_at([0, 0, 1], [0, 0, 0], width=64, height=48),
+    "is a folder; name a file in it, such as ": lambda: a2tg.load_model(tempfile.gettempdir()),
+    "rates.sh must broadcast to [7, 16, 3] at equal rank; got [1, 4, 1]": lambda: stepped(
+        a2tg.LearningRates().of_gaussians(1e-3, 1)
+    ),
+    "rates must be one for all, or have the fields of params": lambda: stepped({"means": 1e-3}),
     "background must be one of black, white, random; got 'grey'": lambda: a2tg.fit(
         scene(), a2tg.A2tg(background="grey")
     ),

@@ -161,6 +161,12 @@ RETURNED = {
     "Correcting.penalty must return a scalar": {"corrections": (Correcting(wrong="penalty"),)},
     "Correcting.learning_rate must return a scalar": {"corrections": (Correcting(wrong="learning_rate"),)},
     "Correcting.project must be [": {"corrections": (Correcting(wrong="project"),)},
+    "target.points was not loaded: say has_points=True, as in Term(function, has_points=True)": {
+        "losses": (a2tg.Term(lambda model, target, output: target.points.depths.sum()),)
+    },
+    "target.depth was not loaded: say has_depths=True": {
+        "losses": (a2tg.Term(lambda model, target, output: target.depth.sum()),)
+    },
     "depth was not rendered: say has_geometry=True, as in Term(function, has_geometry=True)": {
         "losses": (Photometric(), a2tg.Term(roughness))
     },

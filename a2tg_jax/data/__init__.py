@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from a2tg_jax.core.similarity import Similarity as Similarity
+    from a2tg_jax.data.arrays import scene_from_arrays as scene_from_arrays
     from a2tg_jax.data.load import load_scene as load_scene
     from a2tg_jax.data.masks import Mask as Mask
     from a2tg_jax.data.observations import ObservedPoints as ObservedPoints
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "a2tg_jax.core.similarity": ("Similarity",),
+    "a2tg_jax.data.arrays": ("scene_from_arrays",),
     "a2tg_jax.data.load": ("load_scene",),
     "a2tg_jax.data.masks": ("Mask",),
     "a2tg_jax.data.photo_store": ("Picture",),

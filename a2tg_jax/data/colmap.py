@@ -21,7 +21,7 @@ from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import KeptLens, Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
-from a2tg_jax.data.observations import ObservedPoints, observed_points
+from a2tg_jax.data.observations import ObservedPoints, before_camera, observed_points
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
@@ -177,9 +177,7 @@ def _observed_points(
     own = own[np.isin(own, ids)]
     if not len(own):
         return None
-    viewmat, size = viewmat_of(image), read.picture.size
-    points = positions[np.searchsorted(ids, own)] @ viewmat[:3, :3].T + viewmat[:3, 3]
-    points = points[points[:, 2] > 0]
+    points, size = before_camera(positions[np.searchsorted(ids, own)], viewmat_of(image)), read.picture.size
     return observed_points(lens.projected(points, read.K, size[::-1]), points[:, 2], size)
 
 

@@ -53,6 +53,19 @@ def observed_points(xy: np.ndarray, depths: np.ndarray, size: tuple[int, int]) -
     return ObservedPoints(found, near[order][first])
 
 
+def before_camera(points: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
+    """Return those of the points [P, 3] of a world that lie before a camera, in its frame."""
+    own: np.ndarray = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    return own[own[:, 2] > 0]
+
+
+def projected(points: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Return x and y [P, 2] in pixels of points [P, 3] before a pinhole camera, in its frame."""
+    seen = points @ K.T
+    xy: np.ndarray = seen[:, :2] / seen[:, 2:]
+    return xy
+
+
 def _are_usable(depths: np.ndarray) -> np.ndarray:
     """Return [S] whether depths are within the bounds of coordinates, and their inverses, too."""
     return (depths >= 1 / LARGEST_COORDINATE) & (depths <= LARGEST_COORDINATE)  # False for NaN.

@@ -13,7 +13,7 @@ from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import patterns
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene
 from a2tg_jax.data.lighting import light
-from a2tg_jax.data.observations import observed_points
+from a2tg_jax.data.observations import before_camera, observed_points, projected
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.data.splits import check_test_every, every_kth
@@ -149,13 +149,12 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
 
 def observing(shot: Shot, points: np.ndarray, shapes: Sequence[Shape]) -> Shot:
     """Return a shot that observed those of the points [P, 3] that no shape hides from it."""
-    own = points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
-    own = own[own[:, 2] > 0]
-    places, depths = (own @ shot.K.T)[:, :2] / own[:, 2:], own[:, 2]
-    hits, _ = nearest_hits(shapes, _center(shot.viewmat), _directions(shot.viewmat, shot.K, *places.T))
+    own = before_camera(points, shot.viewmat)
+    xy, depths = projected(own, shot.K), own[:, 2]
+    hits, _ = nearest_hits(shapes, _center(shot.viewmat), _directions(shot.viewmat, shot.K, *xy.T))
     is_seen = depths <= (1 + SAME_SURFACE) * hits
     height, width = Picture.of(shot.pixels).size
-    return dataclasses.replace(shot, points=observed_points(places[is_seen], depths[is_seen], (height, width)))
+    return dataclasses.replace(shot, points=observed_points(xy[is_seen], depths[is_seen], (height, width)))
 
 
 def exact_points(scene: Scene) -> np.ndarray:
