@@ -1,15 +1,17 @@
 """Each system's way of a call, with the modules and functions of the others taken away."""
 
+import gc
 import math
 import os
 import signal
 import socket
 import sys
+import time
 from types import SimpleNamespace
 
 import pytest
 
-from a2tg_jax.host import cores, operating_system
+from a2tg_jax.host import cores, operating_system, signals
 from a2tg_jax.host.memory import memory_limit
 
 SYSTEMS = ("linux", "darwin", "win32")
@@ -119,3 +121,23 @@ def test_linux_needs_a_display_for_a_browser(monkeypatch, system, variable):
     if variable:
         monkeypatch.setenv(variable, ":0")
     assert operating_system.has_display() == (system != "linux" or variable is not None)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_lost(number):
+    """Python prints and ignores what such a callback raises; JAX has one, which runs often while modules load."""
+    sent = []
+
+    def callback(phase, info):
+        if not sent:
+            sent.append(number)
+            signal.raise_signal(number)
+
+    gc.callbacks.append(callback)
+    try:
+        with pytest.raises(KeyboardInterrupt), signals.raised():
+            gc.collect()
+            assert sent
+            time.sleep(20)
+    finally:
+        gc.callbacks.remove(callback)

@@ -2,19 +2,19 @@
 
 import sys
 
-INTERRUPTED = 128 + 2
-"""Exit code after Ctrl-C."""
+from a2tg_jax.host import signals
 
 
 def main() -> int:
-    """Run the command line; Ctrl-C during its imports, which take a second, ends it in one line, too."""
+    """Run the command line. A signal during the imports, which take a second, ends it in one line, too."""
     try:
-        from a2tg_jax.cli.main import main as run
-
+        with signals.raised():
+            from a2tg_jax.cli.main import main as run
         return run()
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        stopped = stop if isinstance(stop, signals.Stopped) else signals.Stopped(signals.CTRL_C)
         print("a2tg: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return stopped.exit_code
 
 
 if __name__ == "__main__":

@@ -1,15 +1,24 @@
-"""Ctrl-C, SIGTERM and SIGHUP: orderly ends of a program."""
+"""Ctrl-C, SIGTERM and SIGHUP: orderly ends of a program.
+
+Python ignores exceptions in callbacks of the garbage collector, of which JAX has one. A signal that comes while one
+runs is therefore sent once more.
+"""
 
 import contextlib
+import dataclasses
+import gc
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Any
 
 from a2tg_jax.host.operating_system import ending_signals
 
 CTRL_C = signal.SIGINT
 ENDING = ending_signals()
+SOON = 0.02
+"""Seconds after which a signal is sent once more."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -36,8 +45,12 @@ def raised() -> Iterator[None]:
     def stop(number: int, frame: object) -> None:
         raise Stopped(number)
 
-    with _handled_by(stop, ENDING):
+    with _handled_by(stop, ENDING), _handled_by(_interrupt, (CTRL_C,)):
         yield
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
@@ -75,11 +88,38 @@ def ctrl_c_noted() -> Iterator[Callable[[], bool]]:
         if len(numbers) > 1:
             raise KeyboardInterrupt
 
-    is_own = signal.getsignal(CTRL_C) is not signal.default_int_handler
+    before = signal.getsignal(CTRL_C)
+    handler = before.handler if isinstance(before, _Heard) else before
+    is_own = handler not in (signal.default_int_handler, _interrupt)
     with contextlib.nullcontext() if is_own else _handled_by(note, (CTRL_C,)):
         yield lambda: bool(numbers)
     if numbers:
         raise KeyboardInterrupt
+
+
+@dataclasses.dataclass(frozen=True)
+class _Heard:
+    """Handler of a signal whose exceptions are not lost."""
+
+    handler: Callable[..., Any]
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if not _ignores_exceptions(frame):
+            self.handler(number, frame)
+            return
+        again = threading.Timer(SOON, signal.raise_signal, (number,))
+        again.daemon = True
+        again.start()
+
+
+def _ignores_exceptions(frame: FrameType | None) -> bool:
+    """Return whether a frame runs within a callback of the garbage collector."""
+    callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
+    while frame is not None:
+        if frame.f_code in callbacks:
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextlib.contextmanager
@@ -91,7 +131,7 @@ def _handled_by(handler: Callable[..., Any], numbers: tuple[int, ...]) -> Iterat
         before = {number: signal.getsignal(number) for number in numbers}
         before = {number: old for number, old in before.items() if old not in (signal.SIG_IGN, None)}
     for number in before:
-        signal.signal(number, handler)
+        signal.signal(number, _Heard(handler))
     try:
         yield
     finally:
