@@ -289,8 +289,8 @@ def test_numbers_out_of_range_are_named(changes, message):
     ],
 )
 def test_damaged_scenes_are_refused(scene, change, message):
-    changed = {name: function(getattr(scene, name)) for name, function in change.items()}
     with pytest.raises(ValueError, match=message):
+        changed = {name: function(getattr(scene, name)) for name, function in change.items()}
         fit(dataclasses.replace(scene, **changed), CONFIG, progress=False)
 
 
