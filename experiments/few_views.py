@@ -114,7 +114,8 @@ def table(methods: Iterable[str], found: Mapping[str, Mapping[str, float]]) -> s
     Figures are on left-out / training views, means over the seeds of a capture, then over the folds. Gains are means
     over the seeds that both methods have.
     """
-    names = list(dict.fromkeys(key.partition(" | ")[0] for key in found))
+    by_scene = sorted({key.partition(" | ")[0] for key in found})
+    names = sorted(by_scene, key=lambda name: SCENES.index(name.partition(",")[0]))
     rows = {name: [name] for name in names}
     for scene in SCENES:
         folds = [name for name in names if name.startswith(f"{scene}, fold ")]

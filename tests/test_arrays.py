@@ -74,23 +74,31 @@ def test_points_may_be_left_out(given):
 
 
 WRONG = {
-    "a picture must be an array uint8 [H, W, 3], or [H, W, 4] with alpha; got float32 [30, 40, 3]: say np.rint(255": {
+    "images[0]: a picture must be an array uint8 [H, W, 3], or [H, W, 4] with alpha; got float32 [30, 40, 3]: say": {
         "images": [np.zeros((30, 40, 3), np.float32)] * 6
     },
     "a picture must be an array uint8 [H, W, 3], or [H, W, 4] with alpha; got uint8 [3, 30, 40]": {
         "images": [np.zeros((3, 30, 40), np.uint8)] * 6
     },
     "viewmats must be [6, 4, 4]; got [6, 3, 4]": {"viewmats": np.zeros((6, 3, 4))},
-    "viewmats[0]: its pose is not a rigid motion": {"viewmats": 2 * np.stack([np.eye(4)] * 6)},
+    "viewmats[0]: its pose is not a rigid motion": {"viewmats": np.stack([np.diag([2.0, 2, 2, 1])] * 6)},
     "Ks must be [6, 3, 3]; got [2, 3, 3]": {"Ks": np.zeros((2, 3, 3))},
     "points must be [P, 3]; got [5, 2]": {"points": np.zeros((5, 2))},
     "colors must be uint8; got float64: say np.rint(255": {"colors": np.zeros((200, 3))},
     "colors must be [200, 3]; got [2, 3]": {"colors": np.zeros((2, 3), np.uint8)},
     "names must hold one item for each of 6 images; got 1": {"names": ["a"]},
-    "observed[1] must hold integers [S] from 0 to 199": {"observed": [[0], [200], *[[]] * 4]},
-    "observed needs points": {"points": None, "observed": [[0]] * 6},
+    "observed[1] must hold integers [S] from 0 to 199, indices of points; got int64 [1]": {
+        "observed": [[0], [200], *[[]] * 4]
+    },
+    "observed needs points": {"points": None, "colors": None, "observed": [[0]] * 6},
     "lists a twice": {"names": ["a"] * 6},
-    "a mask must be bool": {"masks": [np.ones((30, 40))] * 6},
+    "masks[0]: a mask must be bool": {"masks": [np.ones((30, 40))] * 6},
+    "masks[0] must be as large as its image, [30, 40]; got [3, 4]": {"masks": [np.ones((3, 4), bool)] * 6},
+    "depths[1] must be as large as its image, [30, 40]; got [3, 4]": {"depths": [None, np.ones((3, 4)), *[None] * 4]},
+    "names[0] must be a str; got NoneType": {"names": [None] * 6},
+    "must end with the row 0, 0, 0, 1: transpose": {"viewmats": np.stack([np.eye(4) + np.eye(4, k=-1)] * 6)},
+    "colors needs points": {"points": None},
+    "; got bool [200]: say np.flatnonzero of a mask": {"observed": [np.ones(200, bool)] * 6},
 }  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import subprocess
 
 import efficiency
 import equal_bytes
+import few_views
 import numpy as np
 import polish
 import pytest
@@ -20,6 +21,7 @@ from lab import pages, spreadsheet, tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.grid import Grid, Method, Run
 from lab.jobs import Job
+from lab.kept import read_kept
 from lab.plan import duration
 from lab.scenes import SceneAt
 from run import experiments, main
@@ -193,7 +195,7 @@ def test_the_documented_results_are_those_of_the_committed_records(tmp_path):
     shown = set()
     for page, text in pages.pages().items():
         assert page.read_text(encoding="utf-8") == text, f"{page} is old: python experiments/run.py appendix"
-        shown |= {pathlib.Path(name).name for name in pages.names(text)}
+        shown |= {pathlib.Path(name).name for name in pages.names(text) if name.startswith("results/small/")}
     made_from_models = {
         "decomposition", "efficiency", "equal_bytes_speed", "on_disk", "polish", "shrink", "upscale_gains",
         "comparison_pictures",
@@ -211,6 +213,16 @@ def test_the_documented_results_are_those_of_the_committed_records(tmp_path):
     assert unshown <= {"quick_preset.md"}, "a table is on no page"
     for name in made:
         assert (tmp_path / name).read_text() == (committed / name).read_text(), name
+
+
+@pytest.mark.parametrize(
+    ("name", "methods"), [("few_views", few_views.METHODS), ("few_views_small", few_views.SMALL_METHODS)]
+)
+def test_tables_of_few_views_are_those_of_the_committed_figures(name, methods):
+    folder = EXPERIMENTS / "results"
+    table = few_views.table(methods, read_kept(folder / f"{name}.json"))
+    assert (folder / f"{name}.md").read_text(encoding="utf-8") == table
+    assert "| herz_jesus_p25, mean of folds | – |" in table
 
 
 def test_every_picture_on_a_page_is_committed_and_every_committed_one_is_on_a_page():

@@ -185,7 +185,7 @@ def test_training_moves_depths_to_the_points(scene):
 
 def test_scenes_without_points_are_refused(scene):
     views = tuple(dataclasses.replace(view, points=None) for view in scene.train)
-    with pytest.raises(ValueError, match=r"--loss.points-weight needs a COLMAP model .*: set it to 0"):
+    with pytest.raises(ValueError, match=r"--loss.points-weight, or a term of your own, wants points .* COLMAP"):
         a2tg.fit(dataclasses.replace(scene, train=views), small(loss={"points_weight": 0.1}), progress=False)
 
 

@@ -135,9 +135,11 @@ def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_lost(number)
 
     gc.callbacks.append(callback)
     try:
+        start = time.monotonic()
         with pytest.raises(KeyboardInterrupt), signals.raised():
             gc.collect()
             assert sent
             time.sleep(20)
+        assert time.monotonic() - start < 10, "waiting of the main thread is interrupted"
     finally:
         gc.callbacks.remove(callback)

@@ -199,7 +199,7 @@ KINDS = {
         train=(dataclasses.replace(scene().test[0], camera=dataclasses.replace(CAMERA, viewmat=jnp.eye(4)[:3])),)
     ),
     "scene.train has two views called 'a.png': give each its own name": lambda: fitted(train=scene().test * 2),
-    "views must be views, such as scene.train; got ndarray": lambda: fitted(train=(np.zeros(3),)),
+    "scene.train must be a tuple of views; got (array([": lambda: fitted(train=(np.zeros(3),)),
     "scene.transform must be a Similarity; got NoneType": lambda: fitted(transform=None),
     "scene.transform must be a Similarity; got ndarray": lambda: fitted(transform=np.eye(4)),
     "scene.scale must be above 0": lambda: fitted(scale=0.0),
@@ -211,7 +211,7 @@ KINDS = {
         "quick", **{"texture.cap": 4}
     ),
     "and up is [0. 0. 1.]: say another up=": lambda: a2tg.look_at([0, 0, 1], [0, 0, 0], width=64, height=48),
-    "is a folder; name a file in it, such as ": lambda: a2tg.load_model(tempfile.gettempdir()),
+    "is a folder; name a file": lambda: a2tg.load_model(tempfile.gettempdir()),
     "rates.sh must broadcast to [7, 16, 3] at equal rank; got [1, 4, 1]": lambda: stepped(
         a2tg.LearningRates().of_gaussians(1e-3, 1)
     ),

@@ -486,6 +486,19 @@ class TestComparedOptions:
         told = capsys.readouterr().err
         assert f"leave out --config {file}, which differs in compare_options.bytewise" in told
 
+    def test_a_resumed_run_takes_those_of_systems_it_compares_anew(self, tmp_path):
+        run = create_run(tmp_path / "run")
+        write_record(run, dataclasses.replace(self.record, scene=SceneSource("synthetic"), compare=("bytewise",)))
+        file, table = tmp_path / "mine.toml", tomllib.loads(run.record.read_text())
+        del table["compare"]
+        file.write_text(tomli_w.dumps(table))
+        resumed = ["--config", str(file), "--out", str(run.path), "--resume"]
+        assert cli._parse("train", resumed)._resumed(run).compare == ("bytewise",)
+        table["compare"], table["compare_options"] = ["gaussians-2d-mcmc"], {"gaussians-2d-mcmc": {"sh_degree": 0}}
+        file.write_text(tomli_w.dumps(table))
+        cli._parse("train", resumed)._resumed(run)
+        assert read_record(run).systems["gaussians-2d-mcmc"].sh_degree == 0
+
     def test_systems_of_ones_own_with_options_of_another_type(self, tmp_path, monkeypatch):
         """`kernel` of the main system is a number, that of bytewise a group."""
         (tmp_path / "with_kernel.py").write_text(

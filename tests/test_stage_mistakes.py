@@ -12,7 +12,7 @@ import pytest
 import a2tg_jax as a2tg
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.training.corrections import Exposure
-from a2tg_jax.training.terms import Photometric
+from a2tg_jax.training.terms import Photometric, l1
 
 
 @pytest.fixture(scope="module")
@@ -196,3 +196,26 @@ def test_depth_that_was_not_rendered_is_no_zero(scene):
         assert not hasattr(output, name)
         with pytest.raises(ValueError, match=f"{name} was not rendered"):
             getattr(output, name)
+
+
+def test_photographs_too_small_for_ssim_are_refused_before_anything_compiles(scene):
+    """Unless the loss has none."""
+    tiny = a2tg.synthetic_scene(num_views=3, width=10, height=10, num_points=50)
+    told = "has 10 by 10 pixels, but the loss has SSIM, which needs 11 by 11: lower --downscale, or set"
+    with pytest.raises(ValueError, match=told):
+        a2tg.fit(tiny, own(losses=(Photometric(1),)), progress=False)
+    assert a2tg.fit(tiny, own(losses=(a2tg.Term(l1),)), progress=False).model.num == 50
+
+
+def test_terms_of_ones_own_want_depth_maps_and_points(scene):
+    views = tuple(dataclasses.replace(view, points=None) for view in scene.train)
+    without = dataclasses.replace(scene, train=views)
+    for flag, told in (("has_depths", "wants depth maps"), ("has_points", "wants points that photographs observed")):
+        term = a2tg.Term(lambda model, target, output: 0.0 * output.color.sum(), **{flag: True})
+        with pytest.raises(ValueError, match=f"or a term of your own, {told}"):
+            a2tg.fit(without, own(losses=(Photometric(), term)), progress=False)
+    seen = a2tg.Term(
+        lambda model, target, output: target.points.depths.mean() + 0 * output.color.sum(), has_points=True
+    )
+    assert a2tg.fit(scene, own(losses=(Photometric(), seen)), progress=False).model.num == 50
+    assert not hasattr(a2tg.Target(None, None, None), "depth")

@@ -257,7 +257,8 @@ class Train:
             told = f"leave out --config {self.config}, which differs in {beside}"
             raise ValueError(f"--resume takes every option from {run.record}; {told}")
         compare = tuple(dict.fromkeys((*kept.compare, *asked.compare)))
-        record = dataclasses.replace(kept, compare=compare, on_nan=self.on_nan)
+        options = {**asked.compare_options, **kept.compare_options}
+        record = dataclasses.replace(kept, compare=compare, on_nan=self.on_nan, compare_options=options)
         record.check()
         if record != kept and is_written:
             write_record(run, record)

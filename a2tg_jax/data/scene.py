@@ -60,9 +60,12 @@ class View:
           ValueError: if they are of another kind or shape.
         """
         check_is_camera(self.camera, f"view {self.name}: camera")
-        object.__setattr__(self, "picture", Picture.of(self.picture))
-        object.__setattr__(self, "mask", None if self.mask is None else Mask.of(self.mask))
-        object.__setattr__(self, "depth", None if self.depth is None else DepthMap.of(self.depth))
+        for field, kind in (("picture", Picture), ("mask", Mask), ("depth", DepthMap)):
+            value = getattr(self, field)
+            try:
+                object.__setattr__(self, field, None if value is None and field != "picture" else kind.of(value))
+            except ValueError as error:
+                raise ValueError(f"view {self.name}: {error}") from error
 
     @property
     def image(self) -> np.ndarray:
@@ -125,7 +128,8 @@ class Scene:
 
 
 def check_scene(scene: Scene) -> None:
-    """Raise ValueError, naming the field, unless points, transform and scale are valid, and names of views unique."""
+    """Raise ValueError, naming the field, unless points, transform and scale are valid, and the training views have
+    different names."""
     names = [view.name for view in scene.train]
     twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
     if twice is not None:

@@ -107,9 +107,17 @@ class _Heard:
         if not _ignores_exceptions(frame):
             self.handler(number, frame)
             return
-        again = threading.Timer(SOON, signal.raise_signal, (number,))
+        again = threading.Timer(SOON, _send, (number,))
         again.daemon = True
         again.start()
+
+
+def _send(number: int) -> None:
+    """Send a signal to the main thread, whose waiting it ends; Windows has no such call."""
+    if hasattr(signal, "pthread_kill") and (main := threading.main_thread().ident) is not None:
+        signal.pthread_kill(main, number)
+    else:
+        signal.raise_signal(number)
 
 
 def _ignores_exceptions(frame: FrameType | None) -> bool:

@@ -85,8 +85,8 @@ def read_archive_header(path: str | os.PathLike[str], *, format: str = FORMAT) -
 def _read_entries(path: Path, format: str, is_wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
     """Return the wanted arrays of an .npz; whatever is wrong with the file becomes one ValueError."""
     if is_folder(path):
-        told = ", such as " + str(next(iter(sorted(path.glob("models/*.npz"))), path / "model.npz"))
-        raise ValueError(f"{path}: is a folder; name a file in it{told}")
+        found = sorted(path.glob("models/*.npz"))
+        raise ValueError(f"{path}: is a folder; name a file{f', such as {found[0]}' if found else ''}")
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such {format}")
     try:

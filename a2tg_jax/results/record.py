@@ -219,8 +219,13 @@ class RunFile:
         """
         main, found = self.chosen(where), dict[str, Mapping[str, Any]]()
         for name in dict.fromkeys((*self.compare, *self.compare_options)):
-            beside, given = compared_system(name, main, self.preset), self.compare_options.get(name, {})
-            label = f"{where}: compare_options.{name}"
+            label, given = f"{where}: compare_options.{name}", self.compare_options.get(name, {})
+            try:
+                beside = compared_system(name, main, self.preset)
+            except ValueError as error:
+                if name in self.compare:
+                    raise
+                raise ValueError(f"{label}: {error}") from error
             if not isinstance(given, Mapping):
                 raise ValueError(f"{label} must be a table of options; got {shortened(given)}")
             with_changes(beside, given, label)
@@ -410,7 +415,7 @@ def changed_numbers(asked: RunRecord, kept: RunRecord) -> list[str]:
 def changed_compared(asked: RunRecord, kept: RunRecord) -> list[str]:
     """Return the tables `compare_options` of a record that differ from the systems compared by another record."""
     names = [name for name in asked.compare_options if name in kept.compare]
-    before, now = kept.systems, asked.systems
+    before, now = kept.systems, dataclasses.replace(asked, compare=kept.compare).systems
     return [f"compare_options.{name}" for name in names if before[label_of(name)] != now[label_of(name)]]
 
 

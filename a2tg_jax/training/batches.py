@@ -13,8 +13,9 @@ from numpy.typing import DTypeLike
 
 from a2tg_jax.core.cameras import check_camera
 from a2tg_jax.data.observations import ObservedPoints, check_observed_points, stacked_points
-from a2tg_jax.data.scene import View, check_are_views, kinds_of, ray_bytes
+from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.cores import num_threads
+from a2tg_jax.host.text import shortened
 from a2tg_jax.rasterize.exchange import Exchange
 from a2tg_jax.rasterize.placement import are_drawn_here, asked_by_any, everywhere, spread_pixels, spread_views
 from a2tg_jax.training.losses import SSIM_WINDOW
@@ -281,19 +282,19 @@ def check_loss_data(views: tuple[View, ...], extras: Extras, has_ssim: bool) -> 
         if min(view.picture.size) < SSIM_WINDOW:
             height, width = view.picture.size
             raise ValueError(
-                f"view {view.name} has {width} by {height} pixels, but --loss.ssim-weight needs {SSIM_WINDOW} by "
-                f"{SSIM_WINDOW}: lower --downscale, or set it to 0"
+                f"view {view.name} has {width} by {height} pixels, but the loss has SSIM, which needs {SSIM_WINDOW} by "
+                f"{SSIM_WINDOW}: lower --downscale, or set --loss.ssim-weight to 0"
             )
     if extras.depths and all(view.depth is None for view in views):
         raise ValueError(
-            "--loss.depth-weight wants depth maps, but no training view has one: put them as NAME.npy or NAME.png "
-            "into the folder depths beside images, or set it to 0"
+            "--loss.depth-weight, or a term of your own, wants depth maps, but no training view has one: put them as "
+            "NAME.npy or NAME.png into the folder depths beside images, or leave it out"
         )
     if extras.points and all(view.points is None for view in views):
         raise ValueError(
-            "--loss.points-weight needs a COLMAP model whose images list the points that they observed, but no "
-            "training view has any: set it to 0, or load a folder with such a model (in Python, observed_points makes "
-            "View.points)"
+            "--loss.points-weight, or a term of your own, wants points that photographs observed, but no training view "
+            "has any: load a COLMAP model whose images list them (in Python, say scene_from_arrays(…, observed=…)), or "
+            "leave it out"
         )
 
 
@@ -302,7 +303,8 @@ def check_views(views: tuple[View, ...]) -> None:
     pixels count."""
     if isinstance(views, tuple | list) and not views:
         raise ValueError("scene.train must hold at least one view; got none")
-    check_are_views(views, "Scene(train=(view, …))")
+    if not isinstance(views, tuple | list) or not all(isinstance(view, View) for view in views):
+        raise ValueError(f"scene.train must be a tuple of views; got {shortened(views)}")
     for view in views:
         check_camera(view.camera, f"view {view.name}: camera")
         height, width, picture = view.camera.height, view.camera.width, view.picture

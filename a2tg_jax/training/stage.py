@@ -82,8 +82,8 @@ class Stage:
 
     @property
     def has_ssim(self) -> bool:
-        """Whether a loss term of the library's compares by SSIM, which needs pictures as large as its window (host)."""
-        return any(isinstance(weight := getattr(term, "ssim_weight", 0), float) and weight > 0 for term in self.losses)
+        """Whether a loss term compares by SSIM, which needs pictures as large as its window (host)."""
+        return any(getattr(term, "has_ssim", False) for term in self.losses)
 
     @property
     def extras(self) -> Extras:

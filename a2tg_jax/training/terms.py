@@ -36,8 +36,8 @@ class Target(NamedTuple):
     mask: Array | None = None
     """[H, W] bool, True at pixels that count; None: all. Excluded pixels of photograph and render are black."""
     depth: Array = None  # type: ignore[assignment]
-    """[H, W] depth map as given, NaN where unknown. Unless a term of the stage has `has_depths`, reading it raises
-    ValueError."""
+    """[H, W] depth map, divided by its largest magnitude, NaN where unknown. Unless a term of the stage has
+    `has_depths`, reading it raises ValueError."""
     progress: Array | float = 1.0
     """Share of the stage that is done."""
     points: ObservedPoints = None  # type: ignore[assignment]
@@ -88,6 +88,8 @@ class Photometric:
     """(1 − w)·L1 + w·(1 − SSIM), the loss of 3DGS."""
 
     ssim_weight: float = 0.2
+
+    has_ssim = True
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
         return photometric_loss(output.color, target.image, ssim_weight=self.ssim_weight)

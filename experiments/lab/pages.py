@@ -15,6 +15,7 @@ DOCS = EXPERIMENTS.parent / "docs"
 PAGE, APPENDIX = DOCS / "results.md", DOCS / "results-appendix.md"
 TEXT = EXPERIMENTS / "appendix.md"
 """Text of the appendix, without its tables."""
+TITLE = re.compile(r"^# .*\n+", re.MULTILINE)
 BLOCK = re.compile(r"(<!-- (results/\S+\.md) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -43,6 +44,6 @@ def names(text: str) -> list[str]:
 
 
 def body(path: Path) -> str:
-    """Return a page of results without its title, its headings one level lower."""
-    _, *lines = path.read_text(encoding="utf-8").strip().splitlines()
-    return "\n".join(f"#{line}" if line.startswith("#") else line for line in lines).strip() + "\n"
+    """Return a page of results without its title, if it has one, its headings one level lower."""
+    text = TITLE.sub("", path.read_text(encoding="utf-8"), count=1)
+    return re.sub(r"^#", "##", text, flags=re.MULTILINE).strip() + "\n"
