@@ -92,7 +92,7 @@ WRONG = {
     },
     "observed needs points": {"points": None, "colors": None, "observed": [[0]] * 6},
     "lists a twice": {"names": ["a"] * 6},
-    "masks[0]: a mask must be bool": {"masks": [np.ones((30, 40))] * 6},
+    "masks[0]: a mask must be an array bool": {"masks": [np.ones((30, 40))] * 6},
     "masks[0] must be as large as its image, [30, 40]; got [3, 4]": {"masks": [np.ones((3, 4), bool)] * 6},
     "depths[1] must be as large as its image, [30, 40]; got [3, 4]": {"depths": [None, np.ones((3, 4)), *[None] * 4]},
     "names[0] must be a str; got NoneType": {"names": [None] * 6},

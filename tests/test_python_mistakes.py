@@ -193,6 +193,12 @@ KINDS = {
         a2tg.View("a.png", CAMERA, np.zeros((12, 16, 3)))
     ),
     "with alpha; got uint8 [3, 12, 16]": lambda: a2tg.View("a.png", CAMERA, np.zeros((3, 12, 16), np.uint8)),
+    "view a.png: a mask must be an array bool [H, W], True where pixels count; got list": lambda: dataclasses.replace(
+        scene().test[0], mask=[[True]]
+    ),
+    "view a.png: a depth map must be an array of floats [H, W]; got list": lambda: dataclasses.replace(
+        scene().test[0], depth=[[1.0]]
+    ),
     "with alpha; got str": lambda: a2tg.View("a.png", CAMERA, "a.png"),
     "view a.png: camera must be a Camera; got": lambda: a2tg.View("a.png", None, np.zeros((12, 16, 3), np.uint8)),
     "view a.png: camera.viewmat must be [4, 4]; got [3, 4]": lambda: fitted(

@@ -24,8 +24,10 @@ class DepthMap:
         """
         if isinstance(values, DepthMap):
             return values
+        if not hasattr(values, "dtype"):
+            raise ValueError(f"a depth map must be an array of floats [H, W]; got {type(values).__name__}")
         if values.ndim != 2 or not np.issubdtype(values.dtype, np.floating):
-            raise ValueError(f"a depth map must be floats [H, W]; got {values.dtype} {list(values.shape)}")
+            raise ValueError(f"a depth map must be an array of floats [H, W]; got {values.dtype} {list(values.shape)}")
         height, width = values.shape
         return DepthMap((height, width), lambda: values)
 

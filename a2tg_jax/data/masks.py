@@ -28,8 +28,11 @@ class Mask:
         """
         if isinstance(counts, Mask):
             return counts
+        wanted = "a mask must be an array bool [H, W], True where pixels count"
+        if not hasattr(counts, "dtype"):
+            raise ValueError(f"{wanted}; got {type(counts).__name__}")
         if counts.ndim != 2 or counts.dtype != bool:
-            raise ValueError(f"a mask must be bool [H, W], True where pixels count; got {counts.dtype} {counts.shape}")
+            raise ValueError(f"{wanted}; got {counts.dtype} {[*counts.shape]}")
         height, width = counts.shape
         return Mask((height, width), int(counts.sum()), zlib.compress(np.packbits(counts).tobytes(), 1))
 
