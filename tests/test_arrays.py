@@ -46,7 +46,7 @@ def test_the_scene_is_that_of_the_arrays(whole, given):
 
 
 def test_what_is_given_beside_images_is_in_the_views(whole, given):
-    """In another world, twice as large: depths of observed points are those of the normalised one."""
+    """The depths of observed points are in units of the normalised world, however large the given one is."""
     masks = [None] * 5 + [np.arange(1200).reshape(30, 40) > 7]
     depths = [None, np.full((30, 40), 2.0, np.float32), *[None] * 4]
     larger = {"points": 2 * given["points"], "viewmats": given["viewmats"].copy()}

@@ -209,10 +209,8 @@ class TestDepthPrior:
         assert DepthPrior(1.0)(None, wrong, output) > 0.05
 
     def test_a_training_needs_some_and_may_lack_others(self, scene, trained):
-        with pytest.raises(
-            ValueError,
-            match=r"--loss.depth-weight, or a term of your own, wants depth maps, but no",
-        ):
+        told = r"--loss.depth-weight, or a term of your own, wants depth maps, but no training view has one"
+        with pytest.raises(ValueError, match=told):
             a2tg.fit(scene, small(loss={"depth_weight": 1.0}), progress=False)
         assert np.isfinite(trained.history.loss).all()
 

@@ -12,9 +12,8 @@ def main() -> int:
             from a2tg_jax.cli.main import main as run
         return run()
     except KeyboardInterrupt as stop:
-        stopped = stop if isinstance(stop, signals.Stopped) else signals.Stopped(signals.CTRL_C)
         print("a2tg: interrupted", file=sys.stderr)
-        return stopped.exit_code
+        return signals.Stopped.of(stop).exit_code
 
 
 if __name__ == "__main__":

@@ -199,7 +199,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _parse(name, arguments).run()
             sys.stdout.flush()
     except KeyboardInterrupt as stop:
-        stopped = stop if isinstance(stop, signals.Stopped) else signals.Stopped(signals.CTRL_C)
+        stopped = signals.Stopped.of(stop)
         print(f"a2tg: interrupted{stopped.advice and '; ' + stopped.advice}", file=sys.stderr)
         return stopped.exit_code
     except BrokenPipeError:

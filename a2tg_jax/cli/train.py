@@ -291,8 +291,10 @@ def train_defaults(arguments: list[str]) -> Train:
     file = read_run_file(Path(path)) if path else RunFile()
     if preset or (system and system != file.system):
         # The numbers of the file are those of another preset or system.
-        file = dataclasses.replace(file, system=system or file.system, preset=preset or None, version=None)
-        file = dataclasses.replace(file, options={}, compare_options={})
+        file = dataclasses.replace(
+            file, system=system or file.system, preset=preset or None, version=None, options={}, compare_options={}
+        )
+    options = file.chosen(path)
     return Train(
         scene=tyro.MISSING if file.scene is None else file.scene,
         out=tyro.MISSING,
@@ -306,8 +308,8 @@ def train_defaults(arguments: list[str]) -> Train:
         compare=file.compare,
         on_nan=file.on_nan,
         init=None if file.init is None else Path(file.init),
-        compare_options=file.compared(path),
-        options=file.chosen(path),
+        compare_options=file.compared(options, path),
+        options=options,
     )
 
 

@@ -117,7 +117,7 @@ def exponential_decay(start: float, final_factor: float, iteration: Array | int,
 
 
 def _one_each(rates: Any, params: Any) -> Any:
-    """Return a rate for each leaf of the parameters, or raise ValueError, naming the leaf that has none that fits."""
+    """Return a rate for each leaf of the parameters. Raise ValueError, naming the leaf, if a rate does not fit."""
     try:
         found = jax.tree.broadcast(rates, params)
     except ValueError as error:

@@ -43,7 +43,7 @@ class Shot:
     panorama: int | None = None
     """Number of the panorama that it was cut from; None of a photograph."""
     points: ObservedPoints | None = None
-    """Points that it observed, their depths in units of the original world; None of an unknown reconstruction."""
+    """Points that it observed, their depths in units of the original world; None if they are not known."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

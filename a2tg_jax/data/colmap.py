@@ -90,8 +90,9 @@ def load_colmap(
     ids, cloud = np.array(sorted(reconstruction.points3D), np.uint64), read_points(reconstruction)
 
     def shot(image: Any, read: Reading) -> Shot:
-        points = _observed_points(image, ids, cloud.points, lenses[image.camera_id], read)
-        return _shot(image, read, panorama_of(image, reach), points)
+        viewmat, mask, panorama = viewmat_of(image), read.facts.mask, panorama_of(image, reach)
+        points = _observed_points(image, viewmat, ids, cloud.points, lenses[image.camera_id], read)
+        return Shot(image.name, viewmat, read.K, read.picture, mask, read.rays, read.depth, panorama, points)
 
     shots = [shot(image, read) for image, read in zip(registered, found, strict=True)]
     check_masks(shots, str(path), images_folder.with_name(FOLDER))
@@ -155,19 +156,14 @@ def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> Photo
     )  # fmt: skip
 
 
-def _shot(image: Any, read: Reading, panorama: int | None, points: ObservedPoints | None) -> Shot:
-    """Return one registered image whose photograph is read."""
-    mask = read.facts.mask
-    return Shot(image.name, viewmat_of(image), read.K, read.picture, mask, read.rays, read.depth, panorama, points)
-
-
 def _observed_points(
-    image: Any, ids: np.ndarray, positions: np.ndarray, lens: Lens, read: Reading
+    image: Any, viewmat: np.ndarray, ids: np.ndarray, positions: np.ndarray, lens: Lens, read: Reading
 ) -> ObservedPoints | None:
     """Return the points that a registered image observed, in units of the original world; None if it observed none.
 
     Args:
       image: of the reconstruction.
+      viewmat: its world-to-camera matrix [4, 4].
       ids: [P] uint64 ids of all points, in ascending order.
       positions: [P, 3].
       lens: of its photograph.
@@ -177,7 +173,7 @@ def _observed_points(
     own = own[np.isin(own, ids)]
     if not len(own):
         return None
-    points, size = before_camera(positions[np.searchsorted(ids, own)], viewmat_of(image)), read.picture.size
+    points, size = before_camera(positions[np.searchsorted(ids, own)], viewmat), read.picture.size
     return observed_points(lens.projected(points, read.K, size[::-1]), points[:, 2], size)
 
 

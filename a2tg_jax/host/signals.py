@@ -32,6 +32,11 @@ class Stopped(KeyboardInterrupt):
         super().__init__(signal.Signals(number).name)
         self.number, self.advice = int(number), advice
 
+    @staticmethod
+    def of(interrupt: KeyboardInterrupt) -> "Stopped":
+        """Return the end that an interrupt asked for: Ctrl-C, unless it says another."""
+        return interrupt if isinstance(interrupt, Stopped) else Stopped(CTRL_C)
+
     @property
     def exit_code(self) -> int:
         """Exit code, 128 plus the number of the signal: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""

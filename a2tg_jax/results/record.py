@@ -209,15 +209,19 @@ class RunFile:
         system = chosen_system(self.system, self.preset)
         return with_changes(system, with_earlier_options(type(system), self.options), f"{where}: options")
 
-    def compared(self, where: str) -> dict[str, Mapping[str, Any]]:
+    def compared(self, main: System, where: str) -> dict[str, Mapping[str, Any]]:
         """Return the options of compared systems, as `RunRecord.compare_options` has them.
 
         Run folders of older versions lack options that were added since; these have their values of then.
 
+        Args:
+          main: the system that `chosen` returns.
+          where: path of the file, for errors.
+
         Raises:
           ValueError: naming the option, if it is unknown or of another type.
         """
-        main, found = self.chosen(where), dict[str, Mapping[str, Any]]()
+        found = dict[str, Mapping[str, Any]]()
         for name in dict.fromkeys((*self.compare, *self.compare_options)):
             label, given = f"{where}: compare_options.{name}", self.compare_options.get(name, {})
             try:
@@ -337,11 +341,12 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
 
 
 def _options_beside(record: RunRecord) -> dict[str, Any]:
-    """Return the options of the compared systems by name: all that they do not take from the main one, and others."""
-    found = {}
+    """Return the options of the compared systems by name: all that they do not take from the main one, and those that
+    were given."""
+    found, systems = {}, record.systems
     for name in record.compare:
         beside = compared_system(name, record.system, record.preset)
-        own = own_options(record.systems[label_of(name)], record.system)
+        own = own_options(systems[label_of(name)], record.system)
         found[name] = _without_none(merged(own, record.compare_options.get(name, {})), config_to_dict(beside))
     return found
 
@@ -374,7 +379,7 @@ def _checked_record(run: RunFolder) -> RunRecord:
         raise ValueError(f"{run.record}: scene is missing")
     source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha, file.lens, file.validation)
     system = file.chosen(str(run.record))
-    compared = file.compared(str(run.record))
+    compared = file.compared(system, str(run.record))
     record = RunRecord(source, file.system, system, file.compare, file.preset, file.on_nan, file.init, compared)
     record.check()
     return record

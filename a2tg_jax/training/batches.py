@@ -301,10 +301,10 @@ def check_loss_data(views: tuple[View, ...], extras: Extras, has_ssim: bool) -> 
 def check_views(views: tuple[View, ...]) -> None:
     """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes, of which some
     pixels count."""
-    if isinstance(views, tuple | list) and not views:
-        raise ValueError("scene.train must hold at least one view; got none")
     if not isinstance(views, tuple | list) or not all(isinstance(view, View) for view in views):
         raise ValueError(f"scene.train must be a tuple of views; got {shortened(views)}")
+    if not views:
+        raise ValueError("scene.train must hold at least one view; got none")
     for view in views:
         check_camera(view.camera, f"view {view.name}: camera")
         height, width, picture = view.camera.height, view.camera.width, view.picture

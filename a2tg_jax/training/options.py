@@ -373,18 +373,15 @@ def like(kind: type[System] | System, other: System) -> System:
     return changed
 
 
-def own_options(system: System, other: System) -> dict[str, Any]:
-    """Return the options of a system that `like` does not take from another, nested as in a configuration file."""
-    return _own(system, other)
-
-
-def _own(value: Any, other: Any) -> dict[str, Any]:
-    hints, other_hints = (typing.get_type_hints(type(config)) for config in (value, other))
+def own_options(system: Any, other: Any) -> dict[str, Any]:
+    """Return the options of a system, or of a group of options, that `like` does not take from another, nested as in a
+    configuration file."""
+    hints, other_hints = (typing.get_type_hints(type(config)) for config in (system, other))
     found: dict[str, Any] = {}
-    for name, option in config_to_dict(value).items():
-        own, others = getattr(value, name), getattr(other, name, None)
+    for name, option in config_to_dict(system).items():
+        own, others = getattr(system, name), getattr(other, name, None)
         if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
-            inner = _own(own, others)
+            inner = own_options(own, others)
             found |= {name: inner} if inner else {}
         elif hints[name] != other_hints.get(name):
             found[name] = option
