@@ -79,7 +79,10 @@ class AtlasLayout:
 
 
 def check_textures(textures: Textures, layout: AtlasLayout, num: int | None = None, name: str = "textures") -> None:
-    """Raise ValueError, naming the field, unless both have the shapes of textures of `num` Gaussians; None: of any."""
+    """Raise ValueError, naming the field, unless textures and layout fit each other and `num` Gaussians, if given.
+
+    Buckets and rows are compared with the textures where they have values, which tracers do not.
+    """
     if not isinstance(textures, Textures) or not isinstance(layout, AtlasLayout):
         kinds = f"{type(textures).__name__} and {type(layout).__name__}"
         raise ValueError(f"{name} and layout must be Textures and their AtlasLayout; got {kinds}")
@@ -92,16 +95,34 @@ def check_textures(textures: Textures, layout: AtlasLayout, num: int | None = No
         raise ValueError(f"{name} must have one bucket for each size of the layout; they have {counts}")
     for index, (bucket, size) in enumerate(zip(textures.buckets, layout.resolutions, strict=True)):
         check_floats(f"{name}.buckets[{index}]", bucket, ("capacity", *size, 4))
+    for field in ("bucket", "row"):
+        if not jnp.issubdtype(getattr(layout, field).dtype, jnp.integer):
+            raise ValueError(f"layout.{field} must be integers; got {getattr(layout, field).dtype}")
+    if layout.num and not any(isinstance(leaf, jax.core.Tracer) for leaf in (layout.bucket, layout.row)):
+        _check_ranges(textures, layout)
+
+
+def _check_ranges(textures: Textures, layout: AtlasLayout) -> None:
+    """Raise ValueError unless each bucket exists and each row is within its bucket (host)."""
+    bucket, row = on_host(layout.bucket), on_host(layout.row)
+    last = len(textures.buckets) - 1
+    if bucket.min() < 0 or bucket.max() > last:
+        raise ValueError(f"layout.bucket must be 0 to {last}; got {bucket.min()} to {bucket.max()}")
+    capacities = np.asarray([len(texels) for texels in textures.buckets])[bucket]
+    outside = np.flatnonzero((row < 0) | (row >= capacities))
+    if outside.size:
+        first = outside[0]
+        raise ValueError(
+            f"layout.row must be below the number of textures in the bucket, {capacities[first]} in bucket "
+            f"{bucket[first]}; got {row[first]} for Gaussian {first} (of {outside.size} rows out of range): "
+            "is this the layout of other textures?"
+        )
 
 
 def check_places(textures: Textures, layout: AtlasLayout) -> None:
-    """Raise ValueError unless each texture has a row of its own within its bucket (host)."""
+    """Raise ValueError unless each texture has a row of its own; they must have passed `check_textures` (host)."""
     bucket, row = np.asarray(layout.bucket), np.asarray(layout.row)
-    if bucket.size and not 0 <= bucket.min() <= bucket.max() < len(textures.buckets):
-        raise ValueError(f"layout.bucket must lie below {len(textures.buckets)}; got {bucket.min()}..{bucket.max()}")
     capacities = np.asarray([len(texels) for texels in textures.buckets], np.int64)
-    if bucket.size and ((row < 0) | (row >= capacities[bucket])).any():
-        raise ValueError("layout.row must lie within the buckets; some do not")
     starts = np.cumsum(capacities) - capacities
     if bucket.size and np.bincount(starts[bucket] + row).max() > 1:
         raise ValueError("layout must give each texture its own row; some share one")

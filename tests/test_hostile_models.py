@@ -24,7 +24,7 @@ from a2tg_jax.io.validate import check_model
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model
 from a2tg_jax.systems.bytewise import Bytewise, KernelConfig
-from a2tg_jax.texture import AtlasLayout, Textures, check_places
+from a2tg_jax.texture import AtlasLayout, Textures, check_places, check_textures
 from a2tg_jax.training import load_checkpoint, save_checkpoint
 from a2tg_jax.training.registry import system_from_dict
 
@@ -144,13 +144,14 @@ def test_textures_lie_within_their_buckets_and_apart():
 
     check_places(textures, layout([0, 0, 1], [0, 3, 1]))
     for bucket, row, message in [
-        ([0, 0, 1], [0, 4, 1], "within the buckets; some do not"),
-        ([0, 0, 1], [0, -1, 1], "within the buckets; some do not"),
-        ([0, 0, 2], [0, 1, 1], "layout.bucket must lie below 2"),
-        ([0, -1, 1], [0, 1, 1], "layout.bucket must lie below 2"),
+        ([0, 0, 1], [0, 4, 1], "layout.row must be below the number"),
+        ([0, 0, 1], [0, -1, 1], "layout.row must be below the number"),
+        ([0, 0, 2], [0, 1, 1], "layout.bucket must be 0 to 1"),
+        ([0, -1, 1], [0, 1, 1], "layout.bucket must be 0 to 1"),
         ([0, 0, 1], [2, 2, 0], "its own row"),
     ]:
         with pytest.raises(ValueError, match=message):
+            check_textures(textures, layout(bucket, row))
             check_places(textures, layout(bucket, row))
         with pytest.raises(ValueError, match=message):
             model = some_model()

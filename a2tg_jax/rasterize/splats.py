@@ -124,6 +124,11 @@ def _check_rule(rule: AppearanceRule, opacities: Array, numbers: Array, colors: 
     if colors.shape != (num, rule.num_colors):
         wanted = f"[N, {rule.num_colors}] of N = {num} gaussians, by its num_colors"
         raise ValueError(f"a rule gives own_colors {wanted}; {name} gave {colors.shape}")
+    places = {} if rule.regions is None else rule.regions._asdict()
+    for field, numbers_of_textures in places.items():
+        if numbers_of_textures.shape != (num,):
+            given = numbers_of_textures.shape
+            raise ValueError(f"a rule gives regions.{field} [N] of N = {num} gaussians; {name} gave {given}")
     if not 0 < rule.max_alpha < 1:
         raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {name} is {rule.max_alpha}")
     check_shading(StaticRule.of(rule), shading_arguments(rule.texels, rule.regions, numbers, colors))

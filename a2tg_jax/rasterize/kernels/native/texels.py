@@ -204,7 +204,9 @@ class TexelWriter(Writer):
           reached ones.
         """
         b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
-        most = self.lanes.broadcast(b.sitofp(b.sub(size, LONG(1)), self.real))
+        # An axis without texels has an empty range, not one that begins before the first texel.
+        last = b.select(b.icmp_signed(">", size, LONG(0)), b.sub(size, LONG(1)), LONG(0))
+        most = self.lanes.broadcast(b.sitofp(last, self.real))
         # Clipped, so that no lane reads outside the texture, even if it holds NaN.
         places = b.select(b.fcmp_ordered(">", places, number(0.0)), places, number(0.0))
         places = b.select(b.fcmp_ordered("<", places, most), places, most)
