@@ -13,7 +13,7 @@ from jax import Array
 
 from a2tg_jax.appearance import Appearance, AppearanceRule, Features, PlainRule, appearance_for, check_rule
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_floats, check_kind, check_shape, dtype_of
+from a2tg_jax.core.checks import check_floats, check_kind, check_shape, dtype_of, plain
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.overflow import OverflowWatch
@@ -101,6 +101,7 @@ def with_features(rule: AppearanceRule, features: Any, gaussians: Gaussians) -> 
     """
     if features is None:
         return rule
+    features = plain("features", features, gaussians.means.dtype)
     check_floats("features", features, (gaussians.num, "D"))
     if dtype_of(features) != gaussians.means.dtype or not np.shape(features)[1]:
         found = f"{dtype_of(features)}{[*np.shape(features)]}"

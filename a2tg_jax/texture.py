@@ -17,7 +17,16 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from a2tg_jax.core.checks import check_floats, check_kind, check_number, check_shape, short_repr
+from a2tg_jax.core.checks import (
+    check_array,
+    check_floats,
+    check_kind,
+    check_number,
+    check_shape,
+    make_plain,
+    plain,
+    short_repr,
+)
 from a2tg_jax.core.spread_arrays import on_host, placed_like
 
 MAX_SIDE = 16
@@ -34,6 +43,12 @@ class Textures:
     buckets: tuple[Array, ...]
     """Bucket b is [capacity_b, Tv_b, Tu_b, 4]."""
 
+    def __post_init__(self) -> None:
+        """Convert lists and NumPy's special arrays to plain arrays."""
+        if type(self.buckets) in (list, tuple):  # JAX puts other leaves here, such as PartitionSpec.
+            buckets = (plain(f"textures.buckets[{index}]", bucket) for index, bucket in enumerate(self.buckets))
+            object.__setattr__(self, "buckets", tuple(buckets))
+
     def __repr__(self) -> str:
         return short_repr(self)
 
@@ -49,6 +64,10 @@ class AtlasLayout:
     """[N] int32 row in that bucket."""
     resolutions: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})
     """(Tv, Tu) of each bucket, ascending."""
+
+    def __post_init__(self) -> None:
+        """Convert lists and NumPy's special arrays to plain arrays."""
+        make_plain(self, "layout", "bucket", "row", dtype=np.int32)
 
     @property
     def num(self) -> int:
@@ -86,6 +105,8 @@ def check_textures(textures: Textures, layout: AtlasLayout, num: int | None = No
     if not isinstance(textures, Textures) or not isinstance(layout, AtlasLayout):
         kinds = f"{type(textures).__name__} and {type(layout).__name__}"
         raise ValueError(f"{name} and layout must be Textures and their AtlasLayout; got {kinds}")
+    check_array("layout.bucket", layout.bucket)
+    check_array("layout.row", layout.row)
     check_shape("layout.bucket", layout.bucket, ("N",))
     if num is not None and layout.num != num:
         raise ValueError(f"layout is of {layout.num} textures, but there are {num} gaussians")

@@ -32,7 +32,9 @@ def test_flat_psnr_is_that_of_the_mean_colour():
 
 def frozen(scene, **changes):
     """A system that cannot learn from bad initial colours."""
-    black = dataclasses.replace(scene, colors=np.zeros_like(scene.colors))
+    colors = np.zeros_like(scene.colors)
+    colors[0] = 0.1  # a cloud of one colour would start grey
+    black = dataclasses.replace(scene, colors=colors)
     numbers = {"stage1_iterations": 210, "initial_opacity": 0.9, "densify": a2tg.McmcConfig(is_enabled=False)}
     return black, a2tg.Gaussians2dMcmc(**{**numbers, "rates": NO_RATES, **changes})
 

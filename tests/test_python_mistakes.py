@@ -170,8 +170,8 @@ KINDS = {
     "parameters must be Parameters; got Gaussians: say": lambda: MODEL.with_parameters(GAUSSIANS),
     "model must be a Model; got ArrayImpl": lambda: a2tg.value_and_grad(jnp.sum)(jnp.ones(3)),
     "settings must be RenderSettings; got dict": lambda: MODEL.render(CAMERA, settings={"tile_size": 8}),
-    "camera.viewmat must be an array; got list": lambda: MODEL.render(
-        a2tg.Camera(np.eye(4).tolist(), np.eye(3).tolist(), 8, 8)
+    "camera.viewmat must be an array; got tuple": lambda: MODEL.render(
+        a2tg.Camera(tuple(np.eye(4)), tuple(np.eye(3)), 8, 8)
     ),
     "camera.width must be a positive number of pixels, a Python int": lambda: MODEL.render(
         dataclasses.replace(CAMERA, width=jnp.int32(80))

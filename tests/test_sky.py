@@ -50,7 +50,7 @@ def scene():
     image[:HORIZON] = BLUE
     views = tuple(a2tg.View(f"{index}.png", camera, image) for index, camera in enumerate(cameras))
     points = np.concatenate([ground(camera, rng) for camera in cameras])
-    colors = np.full_like(points, 0.4)
+    colors = np.full_like(points, 0.5)
     return a2tg.Scene("plain", views, views, points, colors, Similarity(1.0, np.eye(3), np.zeros(3)), 1.0)
 
 

@@ -121,8 +121,8 @@ class Billboards(Bucketed):
         return BillboardRule(shown.reshape(-1, 4), first, peaks, self.side, self.initial_rgb, self.max_alpha)
 
     def project(self, params: Textures) -> Textures:
-        """Return pictures with alpha clamped to [0, 1]."""
-        return self._with_alpha(params, lambda alpha: jnp.clip(alpha, 0.0, 1.0))
+        """Return pictures with alpha clamped to [0, `max_alpha`]: above it nothing would ever fade again."""
+        return self._with_alpha(params, lambda alpha: jnp.clip(alpha, 0.0, self.max_alpha))
 
     def rates(self, rate: tuple[float, float], params: Textures) -> Array:
         """Return the rates of RGB and alpha, given as a pair."""

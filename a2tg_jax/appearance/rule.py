@@ -23,6 +23,7 @@ from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.jit import classes_of
+from a2tg_jax.core.numerics import at_least
 from a2tg_jax.core.sh import sh_sum
 
 Residual = tuple[Array, ...] | None
@@ -67,7 +68,7 @@ class AppearanceRule:
 
         By default, D = 3 of spherical harmonics up to `degree`, which may be traced.
         """
-        return jnp.maximum(self.own_color_sums(gaussians, camera, degree) + 0.5, 0.0)
+        return at_least(self.own_color_sums(gaussians, camera, degree) + 0.5, 0.0)
 
     def own_color_sums(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
         """Return the sums of spherical harmonics [N, 3] behind `own_colors`, of either sign; linear in them."""

@@ -18,6 +18,7 @@ from a2tg_jax.appearance.options import TextureOptions
 from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual, gaussian_cutoff
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.numerics import within
 from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, allocate_textures
 
 EXTENT = 3.0
@@ -107,8 +108,8 @@ def shown_textures(textures: Textures, layout: AtlasLayout, options: TextureOpti
 
     def shown(texels: Array) -> Array:
         rgb, alpha = texels[..., :3], texels[..., 3:]
-        rgb = jnp.clip(rgb, 0.0, 1.0) if options.rgb == "unit" else rgb
-        alpha = alpha if divisor is None else jnp.clip(alpha / divisor, 0.0, 1.0)
+        rgb = within(rgb, 0.0, 1.0) if options.rgb == "unit" else rgb
+        alpha = alpha if divisor is None else within(alpha / divisor, 0.0, 1.0)
         return jnp.concatenate([rgb, alpha], axis=-1)
 
     result: Textures = jax.tree.map(shown, textures)
@@ -201,12 +202,15 @@ class Textured(Bucketed):
 def project_texels(textures: Textures, options: TextureOptions) -> Textures:
     """Return textures with alpha factors clamped to [0, 1], and RGB too if it is unsigned.
 
-    If alpha is divided by its maximum, texels stay as they are: `shown_textures` clips them instead.
+    Alpha that is divided by its maximum has no upper bound. What `shown_textures` would clip is clipped here as well,
+    which changes no image: beyond the bounds, where gradients are 0, texels would stay for ever.
     """
-    if options.alpha == "global-maximum":
-        return textures
-    is_unsigned = jnp.asarray([options.rgb == "unit"] * 3 + [True])[None, None, None]
-    projected: Textures = jax.tree.map(
-        lambda texels: jnp.where(is_unsigned, jnp.clip(texels, 0.0, 1.0), texels), textures
-    )
-    return projected
+    most_alpha = jnp.inf if options.alpha == "global-maximum" else 1.0
+    least, most = (0.0, 1.0) if options.rgb == "unit" else (-jnp.inf, jnp.inf)
+
+    def projected(texels: Array) -> Array:
+        bounds = (jnp.asarray([rgb] * 3 + [alpha], texels.dtype) for rgb, alpha in ((least, 0.0), (most, most_alpha)))
+        return jnp.clip(texels, *(bound[None, None, None] for bound in bounds))
+
+    result: Textures = jax.tree.map(projected, textures)
+    return result

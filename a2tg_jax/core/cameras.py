@@ -9,7 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.checks import LARGEST_NUMBER, check_array, check_floats, check_int, check_kind, short_repr
+from a2tg_jax.core.checks import (
+    LARGEST_NUMBER,
+    check_array,
+    check_floats,
+    check_int,
+    check_kind,
+    make_plain,
+    short_repr,
+)
 
 LONGEST_SIDE = 100_000
 """Largest longer side of an image, in pixels."""
@@ -47,7 +55,8 @@ class Camera:
     is not differentiated; None is a pinhole camera."""
 
     def __post_init__(self) -> None:
-        """Convert sides of numpy's integers to Python's."""
+        """Convert sides of numpy's integers to Python's, and lists and NumPy's special arrays to plain arrays."""
+        make_plain(self, "camera", "viewmat", "K", "rays")
         for side in ("width", "height"):
             if isinstance(getattr(self, side), np.integer):
                 object.__setattr__(self, side, int(getattr(self, side)))

@@ -100,6 +100,48 @@ def check_array(name: str, x: Any, hint: str = "") -> None:
         raise ValueError(f"{name} must be an array; got {kind_of(x)}{hint and f': {hint}'}")
 
 
+def plain(name: str, value: Any, dtype: Any = None) -> Any:
+    """Return nested lists of numbers, and NumPy's special arrays, as arrays that JAX takes; other values unchanged.
+
+    Args:
+      name: name of the argument in the error.
+      value: a list, a masked array without masked entries, an array in foreign byte order, or anything else.
+      dtype: dtype of an array that is made of a list; None: JAX's default float.
+
+    Raises:
+      ValueError: if an entry is masked, or the rows of a list differ in length.
+    """
+    if isinstance(value, np.ma.MaskedArray):
+        if np.ma.is_masked(value):
+            raise ValueError(f"{name} has masked entries: replace them, as in array.filled(0), or drop their rows")
+        value = np.ma.getdata(value)
+    if type(value) is list and _holds_numbers(value):
+        try:
+            value = np.asarray(value, jnp.result_type(float) if dtype is None else dtype)
+        except ValueError:
+            raise ValueError(f"{name} must be an array; got a list whose rows differ in length") from None
+    if isinstance(value, np.ndarray) and not value.dtype.isnative:
+        value = value.astype(value.dtype.newbyteorder("="))
+    return value
+
+
+def make_plain(instance: Any, name: str, *fields: str, dtype: Any = None) -> None:
+    """Replace fields of a frozen dataclass by what `plain` makes of them; lists get the dtype of the first array."""
+    values = {field: getattr(instance, field) for field in fields}
+    dtypes = [value.dtype for value in values.values() if hasattr(value, "dtype")]
+    for field, value in values.items():
+        changed = plain(f"{name}.{field}", value, dtype or next(iter(dtypes), None))
+        if changed is not value:
+            object.__setattr__(instance, field, changed)
+
+
+def _holds_numbers(values: Any) -> bool:
+    """Return whether the first entry of nested sequences is a number, as it is in none that JAX puts into a pytree."""
+    while isinstance(values, list | tuple) and values:
+        values = values[0]
+    return isinstance(values, numbers.Number) and not isinstance(values, bool)
+
+
 def _noun(kind: type) -> str:
     """Return the name of a class with its article; a plural, such as Gaussians, has none."""
     article = "" if kind.__name__.endswith("s") else "an " if kind.__name__[0] in "AEIOUaeiou" else "a "

@@ -15,7 +15,17 @@ from jax import Array
 from jax.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from a2tg_jax.core.checks import FLOATS, check_floats, check_int, check_number, dtype_of, short_repr
+from a2tg_jax.core.checks import (
+    FLOATS,
+    check_array,
+    check_floats,
+    check_int,
+    check_number,
+    dtype_of,
+    make_plain,
+    plain,
+    short_repr,
+)
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.sh import NUM_BASES
 
@@ -25,6 +35,8 @@ NO_ROW_LOG_SCALE = -10.0
 COLOR_SLACK = 1e-3
 """Rounding by which colours may leave [0, 1]."""
 SH_C0 = 0.28209479177387814
+LEAST_INITIAL_COLOR = 0.05
+"""Least initial colour. At and below 0 the renderer's max(colour, 0) has no gradient that would raise it."""
 
 
 @jax.tree_util.register_dataclass
@@ -43,7 +55,11 @@ class Gaussians:
     sh: Array
     """[N, K, 3] spherical-harmonic coefficients of the colour, degree 0 first; K is 1, 4, 9 or 16."""
 
-    __iter__ = None  # Python would iterate by __getitem__, forever: indices of JAX end nowhere.
+    __iter__ = None  # JAX indexing never raises IndexError, so iteration by __getitem__ would not terminate.
+
+    def __post_init__(self) -> None:
+        """Convert lists and NumPy's special arrays to plain arrays."""
+        make_plain(self, "gaussians", "means", "quats", "log_scales", "logit_opacities", "sh")
 
     @property
     def num(self) -> int:
@@ -93,6 +109,8 @@ def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
     """Raise ValueError, naming the field, unless all fields have their shapes and one dtype, float32 or float64."""
     if not isinstance(gaussians, Gaussians):
         raise ValueError(f"{name} must be Gaussians; got {type(gaussians).__name__}")
+    for own in dataclasses.fields(gaussians):
+        check_array(f"{name}.{own.name}", getattr(gaussians, own.name))
     check_floats(f"{name}.means", gaussians.means, ("N", 3))
     num, dtype = gaussians.num, dtype_of(gaussians.means)
     if str(dtype) not in FLOATS:
@@ -170,6 +188,7 @@ def init_from_points(
     check_int("num", 2 if num is None else num, 2)
     check_int("sh_degree", sh_degree, 0, len(NUM_BASES) - 1)
     check_number("opacity", opacity, above=0, below=1)
+    points, colors = plain("points", points), plain("colors", colors)
     check_unit_colors("colors", colors)
     points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
@@ -186,8 +205,6 @@ def init_from_points(
     distances = cKDTree(points).query(points, k=neighbours + 1)[0][:, 1:]
     scales = np.sqrt(np.maximum(np.mean(distances**2, axis=1), 1e-7))
     count = len(points)
-    sh = np.zeros((count, NUM_BASES[sh_degree], 3))
-    sh[:, 0] = (colors - 0.5) / SH_C0
     quats = rng.normal(size=(count, 4))
     as_float = functools.partial(jnp.asarray, dtype=jnp.float32)
     return Gaussians(
@@ -195,8 +212,15 @@ def init_from_points(
         quats=as_float(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
         log_scales=as_float(np.repeat(np.log(scales)[:, None], 2, axis=1)),
         logit_opacities=as_float(np.full(count, np.log(opacity / (1 - opacity)))),
-        sh=as_float(sh),
+        sh=as_float(sh_of_colors(colors, sh_degree)),
     )
+
+
+def sh_of_colors(colors: np.ndarray, sh_degree: int) -> np.ndarray:
+    """Return initial coefficients [N, K, 3] of colours [N, 3] in [0, 1], raised to `LEAST_INITIAL_COLOR` at least."""
+    sh = np.zeros((len(colors), NUM_BASES[sh_degree], 3))
+    sh[:, 0] = (np.maximum(colors, LEAST_INITIAL_COLOR) - 0.5) / SH_C0
+    return sh
 
 
 def no_rows(num: int, num_coefficients: int, dtype: Any = jnp.float32) -> Gaussians:

@@ -23,6 +23,25 @@ def safe_sqrt(x: Array) -> Array:
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
+def at_least(x: Array, least: float) -> Array:
+    """Return max(x, least), with derivative 1 where x = least; JAX's maximum has ½ there.
+
+    A parameter that starts on the bound, or is projected onto it, moves on if the gradient leads inside. Sums that miss
+    the bound by rounding, up to 4 ε, count as on it and are returned as they are. NaN stays NaN.
+    """
+    return jnp.where(x < least - _rounding_of(x), jnp.asarray(least, x.dtype), x)
+
+
+def within(x: Array, least: float, most: float) -> Array:
+    """Return x clipped to [least, most], with derivative 1 on both bounds, as `at_least` has it."""
+    return jnp.where(x > most + _rounding_of(x), jnp.asarray(most, x.dtype), at_least(x, least))
+
+
+def _rounding_of(x: Array) -> float:
+    """Return 4 ε of an array's dtype."""
+    return 4 * float(jnp.finfo(x.dtype).eps)  # type: ignore[no-untyped-call]
+
+
 def safe_norm(x: Array, axis: int = -1, keepdims: bool = False) -> Array:
     """Return the Euclidean norm along `axis`, with zero gradient at the origin."""
     return safe_sqrt(jnp.sum(x * x, axis=axis, keepdims=keepdims))

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.checks import check_kind, check_shape
+from a2tg_jax.core.checks import check_kind, check_shape, plain
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.host.npz import read_npz
@@ -131,7 +131,7 @@ def parameter_bytes(gaussians: Gaussians, layout: AtlasLayout | None = None) -> 
 
 def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[Array, Array]:
     """Return both images in [0, 1], and black where pixels do not count."""
-    image, target = _converted(image), _converted(target)
+    image, target = _converted("image", image), _converted("target", target)
     losses.check_same_shape(image, target)
     image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
     if mask is None:
@@ -141,8 +141,9 @@ def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[
     return jnp.where(counts, image, 0.0), jnp.where(counts, target, 0.0)
 
 
-def _converted(image: Any) -> Any:
+def _converted(name: str, image: Any) -> Any:
     """Return arrays of other libraries and nested lists as arrays of JAX, and all else as it is."""
+    image = plain(name, image)
     return jnp.asarray(image) if hasattr(image, "__array__") or type(image) in (list, tuple) else image
 
 

@@ -191,7 +191,8 @@ def show(
     a = a if factor is None else a * factor
     # NaN must stay NaN, here and in `absorb`.
     is_hidden = a < MIN_ALPHA if rule.has_low_pass else (a < MIN_ALPHA) | ~hit.is_ray
-    alpha = jnp.where(is_hidden, 0.0, jnp.where(a >= rule.max_alpha, rule.max_alpha, a))
+    # Not >=: an alpha on its cap has a gradient, so that what starts or is projected there can fade.
+    alpha = jnp.where(is_hidden, 0.0, jnp.where(a > rule.max_alpha, rule.max_alpha, a))
     channels: tuple[Array, ...] = splat.color
     if residual is not None:
         channels = tuple(base + extra for base, extra in zip(splat.color, residual, strict=True))

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera, check_is_camera
-from a2tg_jax.core.checks import check_array, check_floats, check_number, check_shape
+from a2tg_jax.core.checks import check_array, check_floats, check_number, check_shape, plain
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import normalize, safe_divide
 from a2tg_jax.rasterize.kernels import windows
@@ -36,6 +36,7 @@ def photometric_loss(image: Array, target: Array, *, ssim_weight: float | Array 
     Raises:
       ValueError: if one is no image, the shapes differ, the weight is out of range, or as `mean_ssim` does.
     """
+    image, target = plain("image", image), plain("target", target)
     check_same_shape(image, target)
     l1 = jnp.mean(jnp.abs(image - target))
     if not isinstance(ssim_weight, Array):
@@ -61,6 +62,7 @@ def mean_ssim(image: Array, target: Array) -> Array:
     Raises:
       ValueError: if the shapes differ or a side is shorter than the window.
     """
+    image, target = plain("image", image), plain("target", target)
     check_same_shape(image, target)
     if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(

@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.capture import vertical_of
-from a2tg_jax.core.gaussians import SH_C0, Gaussians
-from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.gaussians import Gaussians, sh_of_colors
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.training.directions import even_directions
 
@@ -87,14 +86,12 @@ def sky_of(scene: Scene, num: int, *, opacity: float, sh_degree: int) -> Gaussia
     facing = directions * np.where(directions[:, 2:] < 0, -1, 1)  # Splats have two sides.
     x, y, z = facing.T
     quats = np.stack([1 + z, -y, x, np.zeros(num)], axis=1)
-    sh = np.zeros((num, NUM_BASES[sh_degree], 3), np.float32)
-    sh[:, 0] = (colors - 0.5) / SH_C0
     return Gaussians(
         means=jnp.asarray(means, jnp.float32),
         quats=jnp.asarray(quats / np.linalg.norm(quats, axis=1, keepdims=True), jnp.float32),
         log_scales=jnp.full((num, 2), np.log(radius * spacing), jnp.float32),
         logit_opacities=jnp.full(num, np.log(opacity / (1 - opacity)), jnp.float32),
-        sh=jnp.asarray(sh),
+        sh=jnp.asarray(sh_of_colors(colors, sh_degree), jnp.float32),
     )
 
 

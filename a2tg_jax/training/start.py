@@ -26,6 +26,8 @@ KEY_OF_PARAMETERS = 0x7E8E1
 LEAST_OPACITY = INITIAL_OPACITY
 """Lower bound of the reduced opacities: the initial opacity of 3DGS."""
 SMALLEST_SIDE = 1e-6
+GREY, GREY_SLACK = 0.5, 0.01
+"""Colour of points without one, and the difference up to which a colour counts as that grey."""
 
 
 def initial_model(scene: Scene, system: System) -> Model:
@@ -33,12 +35,29 @@ def initial_model(scene: Scene, system: System) -> Model:
     num, degree, opacity = initial_number(scene, system), system.initial_sh_degree, system.initial_opacity
     num_sky = system.sky_gaussians
     gaussians = init_from_points(
-        scene.points, scene.colors, num - num_sky, system.seed, opacity=opacity, sh_degree=degree
+        scene.points, start_colors(scene), num - num_sky, system.seed, opacity=opacity, sh_degree=degree
     )
     if num_sky:
         gaussians = _followed_by(gaussians, sky_of(scene, num_sky, opacity=opacity, sh_degree=degree))
     adapted = fainter_where_dense if system.stages()[0].appearance.has_low_pass else wider_where_dense
     return Model(adapted(gaussians, [view.camera for view in scene.train]))
+
+
+def start_colors(scene: Scene) -> np.ndarray:
+    """Return the colours [P, 3] of a scene's points; grey, with a warning, if all points have one other colour.
+
+    Point clouds without colours, from a scanner or a depth map, are often stored as black or white.
+    """
+    colors = np.asarray(scene.colors)
+    if len(colors) < 2 or (colors != colors[0]).any() or (np.abs(colors[0] - GREY) < GREY_SLACK).all():
+        return colors
+    given = ", ".join(f"{number:g}" for number in colors[0].round(3).tolist())
+    warnings.warn(
+        f"all {len(colors):,} points of {scene.name} have one colour ({given}): taken as points without colours, "
+        "which start grey",
+        stacklevel=3,
+    )
+    return np.full_like(colors, GREY)
 
 
 def wider_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:

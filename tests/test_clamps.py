@@ -1,0 +1,172 @@
+"""Clamps that parameters start on, or are driven onto, let them leave again: colours, texels, alphas at their cap."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_values import some_gaussians
+
+import a2tg_jax as a2tg
+from a2tg_jax.appearance import Billboards, TextureOptions, textured_rule
+from a2tg_jax.appearance.textured import project_texels
+from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.core.numerics import at_least, within
+from a2tg_jax.core.optim import adam_init, adam_update
+from a2tg_jax.training.start import start_colors
+
+UNIT = TextureOptions(rgb="unit", alpha="global-maximum")
+CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(2.0), jnp.asarray([[30.0, 0, 8], [0, 30, 8], [0, 0, 1]]), 16, 16)
+
+
+def one_splat(color=0.5):
+    """A splat whose texture fills the image of `CAMERA`."""
+    sh = jnp.zeros((1, 1, 3)).at[0, 0].set((color - 0.5) / SH_C0)
+    means, quats = jnp.zeros((1, 3)), jnp.asarray([[1.0, 0, 0, 0]])
+    return a2tg.Gaussians(means, quats, jnp.full((1, 2), np.log(0.25)), jnp.full(1, 3.0), sh)
+
+
+@pytest.mark.parametrize(("x", "slope"), [(-1e-6, 0.0), (-1e-7, 1.0), (0.0, 1.0), (1.0, 1.0), (1.0001, 0.0)])
+def test_edges_have_the_derivative_of_the_inside(x, slope):
+    assert jax.grad(lambda x: within(x, 0.0, 1.0))(x) == slope
+    assert jax.grad(lambda x: at_least(x, 0.0))(x) == float(x >= -1e-7)
+    assert jax.jvp(lambda x: within(x, 0.0, 1.0), (x,), (1.0,))[1] == slope
+
+
+def test_clamped_numbers_are_those_of_numpy():
+    x = jnp.asarray([-np.inf, -1, 0, 0.3, 1, 2, np.inf, np.nan])
+    np.testing.assert_array_equal(within(x, 0.0, 1.0), np.clip(x, 0, 1))
+    np.testing.assert_array_equal(at_least(x, 0.0), np.maximum(x, 0))
+
+
+@pytest.mark.parametrize("compositor", ["native", "xla", "cuda"])
+def test_a_splat_that_starts_black_takes_the_colour_of_the_photographs(compositor):
+    target = jnp.broadcast_to(jnp.asarray([0.8, 0.4, 0.2])[None, None], (16, 16, 3))
+    settings = a2tg.RenderSettings(compositor=compositor, capacity=64)
+
+    def loss(gaussians):
+        return jnp.mean((a2tg.render_image(gaussians, CAMERA, settings=settings).color - target) ** 2)
+
+    def step(state, _):
+        gaussians, moments = state
+        gradient = dataclasses.replace(jax.tree.map(jnp.zeros_like, gaussians), sh=jax.grad(loss)(gaussians).sh)
+        return tuple(adam_update(gaussians, gradient, moments, jax.tree.map(lambda _: 0.02, gaussians))), None
+
+    start = a2tg.init_from_points([[0.0, 0, 0], [0, 0, 9]], np.zeros((2, 3)), sh_degree=0)[:1]
+    assert (jax.grad(loss)(one_splat(0.0)).sh < 0).all()  # on the very edge, too
+    start = dataclasses.replace(one_splat(), sh=start.sh)
+    (end, _), _ = jax.jit(lambda state: jax.lax.scan(step, state, None, 1500))((start, adam_init(start)))
+    weights = np.asarray(a2tg.render_image(end, CAMERA, settings=settings).alpha)
+    nearest = target[0, 0] * (weights.sum() / (weights**2).sum())  # least squares
+    np.testing.assert_allclose(end.sh[0, 0] * SH_C0 + 0.5, nearest, rtol=0.02)
+
+
+def test_initial_colours_lie_inside():
+    colors = np.asarray([[0.0, 0.5, 1.0], [0.02, 0.9, 0.3]])
+    sh = a2tg.init_from_points(np.eye(3)[:2], colors).sh
+    np.testing.assert_allclose(sh[:, 0] * SH_C0 + 0.5, [[0.05, 0.5, 1.0], [0.05, 0.9, 0.3]], atol=1e-6)
+
+
+def with_colors(color):
+    scene = a2tg.synthetic_scene(width=32, height=24, num_views=4, num_points=50)
+    return dataclasses.replace(scene, colors=np.broadcast_to(np.asarray(color, np.float32), scene.colors.shape))
+
+
+@pytest.mark.parametrize("color", [(0, 0, 0), (1, 1, 1), (0.2, 0, 0)])
+def test_a_cloud_of_one_colour_has_none(color):
+    with pytest.warns(UserWarning, match=r"all 50 points of synthetic have one colour \(.*\): taken as points without"):
+        np.testing.assert_array_equal(start_colors(with_colors(color)), 0.5)
+
+
+def test_other_clouds_keep_their_colours():
+    grey, scene = with_colors((0.502, 0.502, 0.502)), with_colors((0, 0, 0))
+    colors = np.array(scene.colors)
+    colors[3] = 0.1
+    for kept in (grey, dataclasses.replace(scene, colors=colors)):
+        np.testing.assert_array_equal(start_colors(kept), kept.colors)
+
+
+def test_black_points_train_as_grey_ones(shared):
+    """6.3 dB before; a channel that is 0 in all points stayed 0 for ever."""
+    scene = a2tg.load_scene(shared / "scenes" / "fox", downscale=8)
+    system = dataclasses.replace(a2tg.Gaussians2dMcmc.preset("quick"), stage1_iterations=600, stage2_iterations=200)
+    no_red = np.array(scene.colors) * np.asarray([0, 1, 1], np.float32)
+
+    def trained(colors):
+        model = a2tg.fit(dataclasses.replace(scene, colors=colors), system).model
+        return a2tg.evaluate(scene.test, model).psnr, model.render(scene.test[0].camera).color
+
+    grey, _ = trained(np.full_like(scene.colors, 0.5))
+    with pytest.warns(UserWarning, match="have one colour"):
+        black, _ = trained(np.zeros_like(scene.colors))
+    assert black == grey
+    without_red, image = trained(no_red)
+    assert without_red > grey - 1.5
+    red = np.mean(a2tg.view_image(scene.test[0])[..., 0])
+    assert abs(np.clip(image[..., 0], 0, 1).mean() - red) < 0.15 * red
+
+
+def gradient_of_texels(texels, options, gaussians):
+    """The gradient that would brighten or thicken the splat at each texel."""
+    textures, layout = a2tg.textures_from_arrays([texels])
+
+    def total(textures):
+        rule = textured_rule(textures, layout, options)
+        settings = a2tg.RenderSettings(capacity=64)
+        return jnp.sum(a2tg.render_appearance(gaussians, CAMERA, rule, settings=settings).color)
+
+    return jax.grad(total)(textures).buckets[0][0]
+
+
+def test_texels_on_their_bounds_can_leave_them():
+    texels = np.full((2, 2, 4), 0.5, np.float32)
+    texels[0, 0], texels[1, 1, :3] = 0, 1
+    for options in (TextureOptions(), TextureOptions(rgb="unit"), UNIT):
+        assert (gradient_of_texels(texels, options, one_splat()) != 0).all(), options
+
+
+@pytest.mark.parametrize("options", [TextureOptions(rgb="unit"), UNIT])
+def test_projection_keeps_the_image_and_returns_texels_to_where_they_learn(options):
+    rng = np.random.default_rng(0)
+    texels = rng.uniform(-0.5, 1.5, (3, 4, 4)).astype(np.float32)
+    textures, layout = a2tg.textures_from_arrays([texels])
+    if options.alpha == "projected":
+        textures = dataclasses.replace(textures, buckets=(textures.buckets[0].at[..., 3].set(0.7),))
+    projected = project_texels(textures, options)
+    images = [
+        a2tg.render_appearance(one_splat(), CAMERA, textured_rule(t, layout, options)).color
+        for t in (textures, projected)
+    ]
+    np.testing.assert_allclose(images[0], images[1], atol=1e-6)
+    assert (gradient_of_texels(np.asarray(projected.buckets[0][0]), options, one_splat())[..., :3] != 0).all()
+
+
+def test_alphas_at_their_cap_can_fade():
+    """Texels of pictures, whose alpha takes the place of opacity and Gaussian, are projected onto the cap."""
+    appearance, gaussians = Billboards(), one_splat()
+    params, layout = appearance.allocate(jax.random.key(0), gaussians)
+    params = appearance.project(jax.tree.map(lambda texels: jnp.full_like(texels, 5.0), params))
+    assert params.buckets[0][..., 3].max() == jnp.float32(0.99)
+
+    def mean_of_picture(params):
+        return jnp.mean(a2tg.render_appearance(gaussians, CAMERA, appearance.rule(params, layout)).alpha)
+
+    assert (jax.grad(mean_of_picture)(params).buckets[0][..., 3] > 0).all()
+
+
+def test_exponents_at_their_limit_have_a_gradient():
+    from a2tg_jax.appearance import Plain, Shaped
+    from a2tg_jax.densify.exponents import LARGEST_LOG_EXPONENT
+
+    gaussians = some_gaussians(5)
+    appearance = Shaped(Plain())
+    params, layout = appearance.allocate(jax.random.key(0), gaussians)
+    limit = jnp.full(5, np.arctanh(np.log(0.6) / LARGEST_LOG_EXPONENT), jnp.float32)
+    camera = a2tg.Camera(jnp.eye(4).at[2, 3].set(4.0), CAMERA.K, 16, 16)
+
+    def total(shapes):
+        rule = appearance.rule(appearance.with_shapes(params, shapes), layout)
+        return jnp.sum(a2tg.render_appearance(gaussians, camera, rule).color)
+
+    assert np.count_nonzero(jax.grad(total)(limit)) >= 3
