@@ -6,11 +6,11 @@ import os
 import jax
 import jax.numpy as jnp
 import numpy as np
-from a2tg_jax.rasterize.kernels.native.tracing import trace
 from llvmlite import ir
 
 from a2tg_jax.rasterize.kernels.native import lanes, llvm_modules
 from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
+from a2tg_jax.rasterize.kernels.tracing import trace
 from benchmarks.timing import timed
 
 

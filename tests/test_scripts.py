@@ -1,0 +1,83 @@
+"""All scripts beside the package can be imported, and those that measure run at their smallest size."""
+
+import importlib
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[1]
+sys.path.append(str(ROOT))  # Last, so that the installed package comes first.
+
+OTHERS = {"gsplat", "torch", "mitsuba"}
+"""Programs that scripts compare with, and that no extra installs."""
+SCRIPTS = [
+    *("benchmarks." + ".".join(path.relative_to(ROOT / "benchmarks").with_suffix("").parts)
+      for path in sorted((ROOT / "benchmarks").rglob("*.py")) if path.stem != "__init__"),
+    *(path.stem for path in sorted((ROOT / "experiments").glob("*.py"))),
+    *("lab." + path.stem for path in sorted((ROOT / "experiments" / "lab").glob("*.py")) if path.stem != "__init__"),
+    *(path.stem for path in sorted((ROOT / "docs" / "scripts").glob("*.py"))),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_it_can_be_imported(name):
+    try:
+        importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name not in OTHERS:
+            raise
+        pytest.skip(f"{name} compares with {error.name}, which is not installed")
+
+
+RANDOM = {"num": 40, "width": 24, "height": 16, "textures": "mixed"}
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"case": "limit", "multiply_adds": 20, "pairs": 1e4},
+        {"case": "render", **RANDOM},
+        {"case": "ratios", **RANDOM, "rounds": 2},
+        {"case": "stages", **RANDOM},
+    ],
+    ids=lambda case: case["case"],
+)
+def test_a_case_is_measured(monkeypatch, capsys, case):
+    from benchmarks import limit, measure, rendering, stages
+
+    monkeypatch.setattr("a2tg_jax.configure_cpu", lambda **_: None)
+    for module in (limit, rendering, stages):  # once, not for a second
+        if hasattr(module, "timed"):
+            monkeypatch.setattr(module, "timed", lambda function, *given, **_: (function(*given), {"ms": 1.0})[1])
+    monkeypatch.setattr(sys, "argv", ["measure", json.dumps(case)])
+    measure.main()
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["peak_mb"] > 0
+
+
+SMALLEST = {
+    "__main__": "--only limit --out {out}",
+    "large_scene": "--photographs 4 --size 60 40 --downscale 2 --out {out}",
+    "meshes": "--num 300 --views 2 --size 32 24 --resolution 12",
+    "plots": "benchmarks/results/cpu.json {folder}",
+    "remote_scene": "--photographs 4 --size 24 16 --iterations 2 --latency 0 --out {out}",
+    "scaling": "--largest 10000 --out {out}",
+    "tables": "benchmarks/results/cpu.json {folder}/page.md",
+}
+"""Arguments of the scripts of `benchmarks`."""
+
+
+@pytest.mark.parametrize("name", SMALLEST)
+def test_it_runs(name, tmp_path):
+    arguments = SMALLEST[name].format(out=tmp_path / "found.json", folder=tmp_path).split()
+    (tmp_path / "page.md").write_text((ROOT / "docs" / "performance.md").read_text(encoding="utf-8"), encoding="utf-8")
+    module = "benchmarks" if name == "__main__" else f"benchmarks.{name}"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-m", module, *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, env=environment)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "failed" not in done.stdout
+    assert done.stdout or len(list(tmp_path.iterdir())) > 1 or name == "tables"
