@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from a2tg_jax.data.video import LEAST_MOTION, choose_frames, extract_frames, motion
+from a2tg_jax.data.video import LEAST_MOTION, _as_shown, _display_matrix, choose_frames, extract_frames, motion
 
 
 def test_the_sharpest_of_each_interval_is_chosen():
@@ -31,33 +31,25 @@ def test_motion_is_measured_in_widths(shift):
 WIDTH, HEIGHT = 96, 64
 
 
-def write_video(path, rotation=0):
-    """A pattern that moves, stands still for ten frames, and moves; every third frame is blurred."""
+def encode(path, frames):
+    """Writes grey frames [HEIGHT, WIDTH] as a video."""
     av = pytest.importorskip("av", reason="the extra [video] is not installed")
-    wide = np.kron(np.random.default_rng(0).integers(0, 255, (16, 60)), np.ones((4, 4)))
-    wide[:8] = 255
-    places = [*range(0, 40, 2), *[40] * 10, *range(40, 80, 2)]
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt, stream.bit_rate = WIDTH, HEIGHT, "yuv420p", 4_000_000
-        for number, place in enumerate(places):
-            grey = gaussian_filter(wide[:, place : place + WIDTH], 2 * (number % 3 == 1)).astype(np.uint8)
-            frame = av.VideoFrame.from_ndarray(np.repeat(grey[..., None], 3, -1), format="rgb24")
+        for grey in frames:
+            frame = av.VideoFrame.from_ndarray(np.repeat(grey.astype(np.uint8)[..., None], 3, -1), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    if rotation:
-        turn(path, rotation)
+
+
+def write_video(path):
+    """A pattern that moves, stands still for ten frames, and moves; every third frame is blurred."""
+    wide = np.kron(np.random.default_rng(0).integers(0, 255, (16, 60)), np.ones((4, 4)))
+    places = [*range(0, 40, 2), *[40] * 10, *range(40, 80, 2)]
+    frames = [gaussian_filter(wide[:, at : at + WIDTH], 2 * (n % 3 == 1)) for n, at in enumerate(places)]
+    encode(path, frames)
     return places
-
-
-def turn(path, degrees):
-    """Writes the matrix of the track header (ISO 14496-12) by which players turn the picture clockwise."""
-    data = bytearray(path.read_bytes())
-    at = data.index(b"tkhd") + 4 + 40
-    a, b = {90: (0, 1), 180: (-1, 0), 270: (0, -1)}[degrees]
-    for place, value in ((0, a), (4, b), (12, -b), (16, a)):
-        data[at + place : at + place + 4] = (value * 65536).to_bytes(4, "big", signed=True)
-    path.write_bytes(bytes(data))
 
 
 def test_sharp_frames_apart_from_each_other_are_written(tmp_path):
@@ -70,15 +62,47 @@ def test_sharp_frames_apart_from_each_other_are_written(tmp_path):
     assert LEAST_MOTION * WIDTH < 2
 
 
-@pytest.mark.parametrize("rotation", [90, 180, 270])
-def test_frames_are_turned_as_players_show_them(tmp_path, rotation):
-    """The white bar on top of the stored picture is to the right after a quarter turn clockwise."""
-    write_video(tmp_path / "clip.mp4", rotation)
+QUADRANTS = {(-1, -1): 20, (1, -1): 90, (-1, 1): 160, (1, 1): 235}
+"""Grey levels by direction (right, down) from the middle of the stored picture."""
+MATRICES = [(1, 0, 0, 1), (0, 1, -1, 0), (-1, 0, 0, -1), (0, -1, 1, 0)]
+MATRICES += [(-a, b, -c, d) for a, b, c, d in MATRICES]
+"""(a, b, c, d): turns by 0 to 270 degrees clockwise, and the same in a mirror."""
+
+
+@pytest.mark.parametrize("matrix", MATRICES)
+def test_frames_are_turned_and_mirrored_as_players_show_them(tmp_path, matrix):
+    """The track header's matrix (ISO 14496-12) shows (x, y) at (a x + c y, b x + d y)."""
+    a, b, c, d = matrix
+    top, bottom = ([QUADRANTS[side, down] for side in (-1, 1)] for down in (-1, 1))
+    encode(tmp_path / "clip.mp4", [np.kron([top, bottom], np.ones((HEIGHT // 2, WIDTH // 2)))] * 3)
+    data = bytearray((tmp_path / "clip.mp4").read_bytes())
+    at = data.index(b"tkhd") + 4 + 40
+    for place, value in ((0, a), (4, b), (12, c), (16, d)):
+        data[at + place : at + place + 4] = (value * 65536).to_bytes(4, "big", signed=True)
+    (tmp_path / "clip.mp4").write_bytes(bytes(data))
     extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 3, progress=False)
     pixels = np.asarray(Image.open(min((tmp_path / "frames").iterdir())))[..., 0]
-    assert pixels.shape == ((HEIGHT, WIDTH) if rotation == 180 else (WIDTH, HEIGHT))
-    bar = {90: pixels[:, -5:], 180: pixels[-5:], 270: pixels[:, :5]}[rotation]
-    assert bar.min() > 200
+    height, width = pixels.shape
+    assert (width, height) == ((WIDTH, HEIGHT) if a else (HEIGHT, WIDTH))
+    for (x, y), grey in QUADRANTS.items():
+        right, down = a * x + c * y, b * x + d * y
+        assert abs(int(pixels[height * (2 + down) // 4, width * (2 + right) // 4]) - grey) < 8
+
+
+class FrameOfNewerKind:
+    """A frame with side data that this PyAV does not know."""
+
+    rotation = 90
+
+    @property
+    def side_data(self):
+        raise ValueError("34 is not a valid Type")
+
+
+def test_frames_with_unknown_side_data_are_turned():
+    """By 90 degrees counterclockwise the right edge comes to the top."""
+    shown = _as_shown(np.array([[[1], [2], [3]], [[4], [5], [6]]]), _display_matrix(FrameOfNewerKind()))
+    np.testing.assert_array_equal(shown[..., 0], [[3, 6], [2, 5], [1, 4]])
 
 
 def test_what_is_no_video_is_named(tmp_path):

@@ -123,9 +123,29 @@ def _grey(frame: Any, width: int) -> np.ndarray:
 
 
 def _write(frame: Any, path: Path) -> None:
-    """Write a frame as players show it. Its rotation is in degrees counterclockwise."""
-    pixels = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
+    """Write a frame as players show it."""
+    pixels = _as_shown(frame.to_ndarray(format="rgb24"), _display_matrix(frame))
     Image.fromarray(np.ascontiguousarray(pixels)).save(path, quality=QUALITY)
+
+
+def _display_matrix(frame: Any) -> np.ndarray:
+    """Return [2, 2] that maps stored (x, y) to shown (x, y), y down, up to a positive factor."""
+    try:
+        stored = frame.side_data.get("DISPLAYMATRIX")
+    except ValueError:  # PyAV does not list side data of a kind that is newer than it.
+        angle = np.deg2rad(frame.rotation)  # counterclockwise, without mirrors
+        return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    if stored is None:
+        return np.eye(2)
+    # FFmpeg has rows (a, b, u), (c, d, v), (x, y, w) with x' = a x + c y and y' = b x + d y.
+    return np.frombuffer(bytes(stored), np.int32).reshape(3, 3)[:2, :2].T.astype(np.float64)
+
+
+def _as_shown(pixels: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Return pixels [H, W, C] turned and mirrored by the display matrix, rounded to quarter turns."""
+    if abs(matrix[0, 1]) + abs(matrix[1, 0]) > abs(matrix[0, 0]) + abs(matrix[1, 1]):
+        pixels, matrix = pixels.swapaxes(0, 1), matrix[:, ::-1]
+    return pixels[:: -1 if matrix[1, 1] < 0 else 1, :: -1 if matrix[0, 0] < 0 else 1]
 
 
 def _av() -> ModuleType:
