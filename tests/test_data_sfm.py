@@ -13,6 +13,7 @@ from test_data_colmap import write_scene as write_colmap
 
 from a2tg_jax.data import load_scene, progress, run_sfm, sfm, synthetic_scene
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.decoding import picture_facts, picture_size, read_pixels
 from a2tg_jax.data.photo_folder import find_photos
 from a2tg_jax.data.sfm_database import join_rig, list_images
 from a2tg_jax.data.staging import _link, _prefixes, stage
@@ -29,7 +30,11 @@ def save_photos(folder, num_photos, width, height):
     return scene
 
 
-STORED = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}
+STORED = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}  # fmt: skip
 """How a picture is stored that EXIF says to turn back, by EXIF's number of the orientation."""
 
 
@@ -40,6 +45,7 @@ def save_turned(image, path, orientation):
     exif[ExifTags.Base.Make] = "Phone"
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 32
     image.transpose(STORED[orientation]).save(path, exif=exif, quality=95)
+    return path
 
 
 def test_photographs_of_two_folders_become_a_scene(tmp_path):
@@ -106,16 +112,80 @@ def test_cameras_are_told_apart_and_exif_gives_their_focal_length(tmp_path):
     assert cameras[3].focal_length == pytest.approx(32 / np.hypot(36, 24) * np.hypot(64, 48), rel=0.02)
 
 
+GREY = np.kron([[0, 255, 60], [90, 160, 200]], np.ones((32, 32))).astype(np.uint8)
+
+
+def seen_by_colmap(file):
+    """Grey levels of a file as COLMAP reads it."""
+    return pycolmap().Bitmap.read(file, False).to_array().squeeze()
+
+
 @pytest.mark.parametrize("orientation", STORED)
 def test_turned_photographs_are_turned_back(tmp_path, orientation):
-    image = Image.fromarray(np.kron([[0, 255], [90, 160]], np.ones((32, 48))).astype(np.uint8))
-    for index in range(3):
-        save_turned(image, tmp_path / f"{index}.jpg", orientation)
-    (group,) = staged([tmp_path], tmp_path / "work").groups
-    assert group.size == image.size
-    upright = Image.open(tmp_path / "work" / "photos" / "0.jpg")
-    assert upright.getexif()[ExifTags.Base.Orientation] == 1
-    np.testing.assert_allclose(np.asarray(upright)[..., 0], np.asarray(image), atol=12)
+    for suffix in ("jpg", "png", "tif", "webp", "avif"):
+        save_turned(Image.fromarray(GREY), tmp_path / f"{suffix}.{suffix}", orientation)
+    told = []
+    found = staged([tmp_path], tmp_path / "work", tell=told.append)
+    assert told == ["5 photographs turned as EXIF says"]
+    names = ["avif.avif.jpg", "jpg.jpg", "png.png", "tif.tif.png", "webp.webp.jpg"]
+    assert found.names == names
+    assert {group.size for group in found.groups} == {(96, 64)}
+    assert {(camera.width, camera.height) for camera in cameras_of(found, tmp_path)[0]} == {(96, 64)}
+    for name in names:
+        upright = tmp_path / "work" / "photos" / name
+        with Image.open(upright) as image:
+            assert image.getexif()[ExifTags.Base.Orientation] == 1
+        assert np.abs(seen_by_colmap(upright).astype(int) - GREY).mean() < 3, name
+
+
+@pytest.mark.parametrize("orientation", STORED)
+def test_turned_tiff_is_read_as_stored(tmp_path, orientation):
+    """As COLMAP reads it, whose cameras it has; Pillow turns TIFF by itself."""
+    file = save_turned(Image.fromarray(GREY), tmp_path / "0.tif", orientation)
+    stored = seen_by_colmap(file)
+    np.testing.assert_array_equal(read_pixels(file)[..., 0], stored)
+    assert picture_size(file) == stored.shape[::-1]
+    assert picture_facts(file)[:2] == ((96, 64), True)
+
+
+COLOUR = np.kron(np.random.default_rng(0).integers(0, 255, (4, 6, 3)), np.ones((16, 16, 1))).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "name, mode, options",
+    [
+        ("0.jpg", "RGB", {"progressive": True}),
+        ("0.jpg", "CMYK", {}),
+        ("0.jpg", "L", {}),
+        ("0.mpo.jpg", "RGB", {"format": "MPO", "save_all": True, "append_images": [Image.new("RGB", (96, 64))]}),
+        ("0.png", "RGBA", {}),
+        ("0.png", "LA", {}),
+        ("0.png", "P", {}),
+        ("0.png", "1", {}),
+        ("0.bmp", "P", {}),
+        ("0.tif", "RGB", {}),
+        ("0.tif", "CMYK", {"compression": "tiff_lzw"}),
+        ("0.tif", "RGB", {"compression": "zstd"}),
+        ("0.webp", "RGB", {}),
+        ("0.webp", "RGBA", {"lossless": True}),
+        ("0.avif", "RGB", {}),
+        ("gif.png", "P", {"format": "GIF"}),
+        ("jpeg.webp", "RGB", {"format": "JPEG"}),
+        ("png.heic", "RGB", {"format": "PNG"}),
+    ],
+)
+def test_colmap_reads_and_writes_every_photograph(tmp_path, name, mode, options):
+    """The formats and their variants, and files of another format than their suffix says."""
+    (tmp_path / "photos").mkdir()
+    Image.fromarray(COLOUR).convert(mode).save(tmp_path / "photos" / name, **options)
+    expected = read_pixels(tmp_path / "photos" / name)
+    for index in range(1, 3):
+        os.link(tmp_path / "photos" / name, tmp_path / "photos" / f"{index}-{name}")
+    (group,) = staged([tmp_path / "photos"], tmp_path / "work").groups
+    assert len(group.names) == 3 and group.size == (96, 64)
+    bitmap = pycolmap().Bitmap.read(tmp_path / "work" / "photos" / group.names[0], True)
+    assert np.abs(bitmap.to_array().astype(int) - expected).mean() < 4
+    assert bitmap.write(tmp_path / group.names[0])
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])

@@ -27,8 +27,16 @@ LONGEST_BOX = 64
 """Bytes of the first box that are looked at."""
 BITS_PER_SAMPLE = 258
 """TIFF tag of the bits per sample."""
+TIFF_SIZE = 256, 257
+"""TIFF tags of the stored width and height."""
 TURNED, SIDEWAYS = range(2, 9), range(5, 9)
 """EXIF orientations other than upright, and those that exchange width and height."""
+AS_STORED = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}  # fmt: skip
+"""Turn from the upright picture to the stored one, by EXIF orientation."""
 LENS_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 LONGEST_REASON = 200
 MOST_BYTES = 1 << 30
@@ -51,14 +59,25 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
     """
     with _opened(path) as image:
         has_alpha = _has_alpha(image)
-        pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
+        # Pillow turns TIFF, and no other format, as it decodes.
+        turn = image.tag_v2.get(ExifTags.Base.Orientation) if image.format == "TIFF" else None  # type: ignore[attr-defined]
+        converted = image.convert("RGBA" if has_alpha else "RGB")
+        pixels = np.asarray(converted.transpose(AS_STORED[turn]) if turn in AS_STORED else converted)
     return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
 
 
 def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """Return (width, height) of an image file as stored, without decoding it. Raises as `read_pixels` does."""
     with _opened(path) as image:
+        return _stored_size(image)
+
+
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    """Return (width, height) without EXIF rotation, which Pillow applies to the size of TIFF."""
+    if image.format != "TIFF":
         return image.size
+    width, height = (int(image.tag_v2[tag]) for tag in TIFF_SIZE)  # type: ignore[attr-defined]
+    return width, height
 
 
 class PictureFacts(NamedTuple):
@@ -79,11 +98,12 @@ class PictureFacts(NamedTuple):
 def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
     """Return facts of an image file after decoding it. Raises as `read_pixels` does."""
     with _opened(path) as image:
+        turn = image.getexif().get(ExifTags.Base.Orientation, 1)  # Decoding TIFF removes it.
+        width, height = _stored_size(image)
+        size = (height, width) if turn in SIDEWAYS else (width, height)
         image.load()
         exif = image.getexif()
-        turn = exif.get(ExifTags.Base.Orientation, 1)
         details = exif.get_ifd(ExifTags.IFD.Exif)
-        size = image.size[::-1] if turn in SIDEWAYS else image.size
         lens = (*(exif.get(tag) for tag in LENS_TAGS), *(details.get(tag) for tag in LENS_TAGS))
         told = tuple(str(value) for value in lens if value)
         is_transparent = _has_alpha(image) and bool((np.asarray(image.convert("RGBA"))[..., 3] < 255).any())
@@ -97,14 +117,19 @@ def _has_alpha(image: Image.Image) -> bool:
 def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> None:
     """Write an image file anew with its pixels turned as EXIF says, as PNG or JPEG by the target's suffix.
 
-    The other EXIF data are kept, because the focal length is among them.
+    EXIF data of the camera are kept, because the focal length is among them. Those of a TIFF's layout would be wrong.
     """
     with _opened(path) as image:
-        exif = image.getexif()
+        stored, exif = image.getexif(), Image.Exif()
+        exif.update({tag: stored[tag] for tag in LENS_TAGS[:2] if tag in stored})
+        details = stored.get_ifd(ExifTags.IFD.Exif)
+        exif.get_ifd(ExifTags.IFD.Exif).update(
+            {tag: value for tag, value in details.items() if tag != ExifTags.Base.MakerNote}
+        )
         upright = ImageOps.exif_transpose(image)
         exif[ExifTags.Base.Orientation] = 1
-        if target.suffix == ".png":
-            upright.save(target, exif=exif)
+        if target.suffix.lower() == ".png":
+            upright.convert("RGB").save(target, exif=exif, compress_level=1)
         else:
             upright.convert("RGB").save(target, quality=quality, subsampling=0, exif=exif)
 

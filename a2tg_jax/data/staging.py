@@ -23,7 +23,10 @@ from a2tg_jax.data.video import extract_frames
 
 Panorama = Literal["auto", "yes", "no"]
 """Whether pictures twice as wide as high are panoramas: those whose edges join (auto), all of them, or none."""
-COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "BMP", "WEBP")
+COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP")
+"""Formats that COLMAP reads as Pillow does. TIFF is not among them: with some compressions COLMAP reads black."""
+COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
+"""Suffixes of the images that COLMAP can write; it reads by content."""
 LOSSLESS_FORMATS = ("PNG", "TIFF", "BMP")
 QUALITY = 95
 """JPEG quality of photographs that are written anew."""
@@ -193,12 +196,11 @@ def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
 
 
 def _wanted_name(photo: _Photo) -> str:
-    """Return a photograph's name in the folder: with another suffix if it will be written in another format."""
-    if photo.facts.format not in COLMAP_FORMATS:
-        return f"{photo.name}.jpg"
-    if photo.facts.is_turned and Path(photo.name).suffix.lower() not in (".jpg", ".jpeg", ".png"):
-        return photo.name + (".png" if photo.facts.format in LOSSLESS_FORMATS else ".jpg")
-    return photo.name
+    """Return a photograph's name in the folder: with another suffix if its own does not suit what is put there."""
+    suits = (".jpg", ".jpeg", ".png") if photo.facts.is_turned else COLMAP_SUFFIXES
+    if photo.facts.format in COLMAP_FORMATS and Path(photo.name).suffix.lower() in suits:
+        return photo.name
+    return photo.name + (".png" if photo.facts.format in LOSSLESS_FORMATS else ".jpg")
 
 
 def _place(photo: _Photo, target: Path) -> None:
