@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -247,28 +248,68 @@ def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd, monkeypatch, is
 
 
 def test_too_little_in_common(tmp_path, capfd):
+    """Noise has features, and those that match by chance show no depth."""
     (tmp_path / "photos").mkdir()
     for index in range(3):
         noise = np.random.default_rng(index).integers(0, 255, (64, 64, 3), np.uint8)
         Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.png")
-    with pytest.raises(ValueError, match="none of the 3 photographs could be placed"):
+    with pytest.raises(
+        ValueError, match=r"none of the 3 photographs could be placed \(3 pairs match\); photographs match"
+    ) as told:
         run_sfm(tmp_path / "photos", tmp_path / "new" / "scene", progress=False)
+    assert "features" not in str(told.value)
     assert capfd.readouterr().err == "" and not (tmp_path / "new").exists()
 
 
-def test_failure_says_what_to_do(tmp_path):
+def test_photographs_without_features_are_named(tmp_path):
+    """More photographs would not help if all are blank."""
+    (tmp_path / "photos").mkdir()
+    for index in range(6):
+        Image.new("RGB", (64, 64), (90, 120, 150)).save(tmp_path / "photos" / f"{index}.png")
+    with pytest.raises(ValueError, match=r"no features.* in 6 of them \(0.png, 1.png, .*4.png, …\)$") as told:
+        run_sfm(tmp_path / "photos", tmp_path / "scene", progress=False)
+    assert "take more" not in str(told.value)
+
+
+NAMES = [f"{number}.jpg" for number in range(300)]
+
+
+class Reconstruction:
+    """A part of the photographs, as pycolmap has it."""
+
+    def __init__(self, names):
+        self.images = {NAMES.index(name) + 1: SimpleNamespace(name=name) for name in names}
+        self.image, self.reg_image_ids = self.images.__getitem__, self.images.keys
+
+    def num_reg_images(self):
+        return len(self.images)
+
+
+def test_failure_says_what_to_do():
     with pytest.raises(ValueError, match=r"take more.*overlap.*texture") as told:
-        sfm._check_model(None, 300, "photos", "exhaustive", 4)
+        sfm._check_models([], NAMES, "photos", "exhaustive", 4, [])
     assert "sequential" not in str(told.value)
     with pytest.raises(ValueError, match="matching exhaustive"):
-        sfm._check_model(None, 300, "photos", "sequential", 4)
+        sfm._check_models([], NAMES, "photos", "sequential", 4, [])
 
 
 def test_photographs_from_one_place_are_told_apart_from_those_that_do_not_match():
     for num_matched, is_told in ((299, False), (300, True)):
         with pytest.raises(ValueError, match=rf"photographs could be placed \({num_matched} pairs match\)") as told:
-            sfm._check_model(None, 300, "photos", "exhaustive", num_matched)
+            sfm._check_models([], NAMES, "photos", "exhaustive", num_matched, [])
         assert ("show no depth: walk between them" in str(told.value)) == is_told
+
+
+def test_photographs_that_are_left_out_are_named():
+    """All are placed; all but one; and the smaller part of two that do not connect, one photograph of it blank."""
+    sfm._check_models([Reconstruction(NAMES)], NAMES, "photos", "exhaustive", 999, [])
+    with pytest.warns(UserWarning, match=r"^photos: 1 of 300 photographs could not be .* left out \(299.jpg\)$"):
+        sfm._check_models([Reconstruction(NAMES[:-1])], NAMES, "photos", "exhaustive", 999, [])
+    parts = [Reconstruction(NAMES[:290]), Reconstruction(NAMES[290:299])]
+    with pytest.warns(
+        UserWarning, match=r": 10 of 300 .*\(290.jpg, 291.jpg, .*, …\).* in 1 of them \(299.jpg\).* 290, 9"
+    ):
+        sfm._check_models(parts, NAMES, "photos", "exhaustive", 999, NAMES[299:])
 
 
 def test_sources_of_one_name_are_told_apart(tmp_path):

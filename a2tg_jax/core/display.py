@@ -3,7 +3,7 @@
 import base64
 import html
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,11 @@ LEAST_WIDTH = 240
 def counted(num: int, noun: str) -> str:
     """Return a number with its noun, as in "1 view" and "8,412 points"."""
     return f"{num:,} {noun}{'' if num == 1 else 's'}"
+
+
+def first_names(names: Sequence[str], most: int = 5) -> str:
+    """Return the first few of some names, and an ellipsis if there are more."""
+    return ", ".join([*names[:most], *["…"] * (len(names) > most)])
 
 
 def in_bytes(num: float) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from a2tg_jax.core.checks import check_literal
-from a2tg_jax.core.display import counted
+from a2tg_jax.core.display import counted, first_names
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
 from a2tg_jax.data.progress import clock
@@ -18,6 +18,7 @@ from a2tg_jax.data.sfm_database import (
     CameraModel,
     Matching,
     extract_features,
+    featureless,
     known_cameras,
     match_features,
     num_matched_pairs,
@@ -32,6 +33,7 @@ MIN_REGISTERED = 3
 ADVICE = "take more, sharp and closer together: they should overlap by two thirds and show texture, unlike blank walls"
 
 NO_DEPTH = "photographs match, but show no depth: walk between them; "
+NO_FEATURES = "COLMAP finds no features, as in blank or very blurred pictures,"
 
 
 class SfmSummary(NamedTuple):
@@ -85,6 +87,8 @@ def run_sfm(
       FileNotFoundError: if there is no such folder of photographs.
       FileExistsError: if `out` is a file, or holds a scene already.
       ValueError: if there are fewer than 3 photographs, or fewer than 3 could be registered, or one cannot be read.
+
+    Warns of photographs that could not be placed, and of files that are not taken for photographs.
     """
     check_literal("matching", matching, Matching)
     check_literal("panorama", panorama, Panorama)
@@ -105,8 +109,9 @@ def run_sfm(
         database = work / "database.db"
         extract_features(staged, names, database, seed, camera_model, progress)
         match_features(database, len(names), seed, matching, progress)
-        model = _map(staged, work, seed, progress, on_note)
-        _check_model(model, len(names), told, matching, num_matched_pairs(database))
+        models = _map(staged, work, seed, progress)
+        _check_models(models, names, told, matching, num_matched_pairs(database), featureless(database))
+        model = models[0]
         with clock("undistorting", progress):
             _write_scene(model, staged.folder, work, out)
     error = model.compute_mean_reprojection_error()
@@ -122,8 +127,8 @@ def _check_new(out: Path) -> None:
         raise FileExistsError(f"{out} is a file; choose a folder for the scene")
 
 
-def _map(staged: Staged, work: Path, seed: int, progress: bool, tell: Callable[[str], None]) -> Any:
-    """Return the largest reconstruction of the matched photographs, or None. A line tells the sizes of several."""
+def _map(staged: Staged, work: Path, seed: int, progress: bool) -> list[Any]:
+    """Return the reconstructions of the matched photographs, the largest first."""
     colmap = pycolmap()
     options = colmap.IncrementalPipelineOptions(
         random_seed=seed, num_threads=1, min_model_size=MIN_REGISTERED, ba_use_gpu=False
@@ -142,28 +147,47 @@ def _map(staged: Staged, work: Path, seed: int, progress: bool, tell: Callable[[
             initial_image_pair_callback=lambda: bar.update(2),
             next_image_callback=lambda: bar.update(1),
         )
-    sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)
-    if len(sizes) > 1:
-        tell(f"photographs fall into parts of {', '.join(map(str, sizes))} that do not connect; the largest is kept")
-    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 
-def _check_model(model: Any, num_photos: int, told: str, matching: Matching, num_matched: int) -> None:
-    """Raise ValueError without a usable model, and warn if many photographs have no pose."""
-    num_registered = 0 if model is None else model.num_reg_images()
-    has_no_depth = num_registered < MIN_REGISTERED and num_matched >= num_photos
+def _check_models(
+    models: Sequence[Any], names: Sequence[str], told: str, matching: Matching, num_matched: int, blank: Sequence[str]
+) -> None:
+    """Raise ValueError without a usable model, and warn of the photographs that the largest leaves out.
+
+    Args:
+      models: the reconstructions, the largest first.
+      names: of all photographs.
+      told: name of the sources in messages.
+      matching: how pairs were chosen.
+      num_matched: number of pairs that match.
+      blank: names of the photographs without features.
+    """
+    placed = {models[0].image(number).name for number in models[0].reg_image_ids()} if models else set()
+    left_out = [name for name in names if name not in placed]
+    if not left_out:
+        return
+    has_no_depth = len(placed) < MIN_REGISTERED and num_matched >= len(names)
     advice = (NO_DEPTH if has_no_depth else "") + ADVICE
     if matching == "sequential":
         advice += "; only neighbours by name were matched: name them in the order of taking, or choose --matching "
         advice += "exhaustive"
-    placed = f"only {num_registered} of" if num_registered else "none of the"
-    message = (
-        f"{told}: {placed} {num_photos} photographs could be placed ({counted(num_matched, 'pair')} match); {advice}"
-    )
-    if num_registered < MIN_REGISTERED:
-        raise ValueError(message)
-    if num_registered < num_photos / 2:
-        warnings.warn(message, stacklevel=3)
+    reasons = []
+    if blank:
+        reasons.append(f"{NO_FEATURES} in {len(blank)} of them ({first_names(blank)})")
+    if len(models) > 1:
+        sizes = ", ".join(str(model.num_reg_images()) for model in models)
+        reasons.append(f"they fall into parts of {sizes} that do not connect, and the largest is kept")
+    if len(placed) < len(names) / 2 and len(blank) < len(names):
+        reasons.append(advice)
+    if len(placed) < MIN_REGISTERED:
+        found = f"only {len(placed)} of" if placed else "none of the"
+        pairs = counted(num_matched, "pair")
+        raise ValueError(
+            "; ".join([f"{told}: {found} {len(names)} photographs could be placed ({pairs} match)", *reasons])
+        )
+    missing = f"{told}: {len(left_out)} of {len(names)} photographs could not be placed and are left out"
+    warnings.warn("; ".join([f"{missing} ({first_names(left_out)})", *reasons]), stacklevel=3)
 
 
 def _longest_side(model: Any) -> int:

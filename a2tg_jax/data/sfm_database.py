@@ -81,6 +81,13 @@ def match_features(database: Path, num_photos: int, seed: int, matching: Matchin
         match(database, verification_options=verification, device=colmap.Device.cpu)
 
 
+def featureless(database: Path) -> list[str]:
+    """Return the names of the photographs in which no feature was found, sorted."""
+    with closing(pycolmap().Database.open(database)) as opened:
+        images = opened.read_all_images()
+        return sorted(image.name for image in images if not opened.num_keypoints_for_image(image.image_id))
+
+
 def num_matched_pairs(database: Path) -> int:
     """Return the number of pairs of photographs with verified matches."""
     with closing(pycolmap().Database.open(database)) as opened:
