@@ -3,6 +3,7 @@
 import contextlib
 import os
 import re
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -361,6 +362,69 @@ def test_what_is_skipped_is_counted(tmp_path, names, words):
         find_photos(tmp_path)
     text = str(told.value if len(names) < 4 else told[0].message)
     assert all(word in text for word in words)
+
+
+def save_blocks(path, width, height, random):
+    """Saves a picture that no other resembles."""
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(random.integers(0, 255, (6, 8, 3), np.uint8)).resize((width, height)).save(path, quality=95)
+
+
+def test_pictures_that_are_no_photographs_are_left_out(tmp_path):
+    """Of a capture that other programs and this one have worked on, `images` and the two clips are left."""
+    random = np.random.default_rng(0)
+    photos = [
+        "clip/3.jpg",
+        "clip/4.jpg",
+        "clip_2/3.jpg",
+        "clip_2/4.jpg",
+        "images/0.jpg",
+        "images/1.jpg",
+        "images/2.jpg",
+    ]
+    for name in photos:
+        save_blocks(tmp_path / name, *((120, 90) if name.startswith("clip_2") else (240, 180)), random)
+    others = {"cameras.png": 0, ".thumbs/0.jpg": 0, "run/test/0.png": 0, "images/0.png": 0, "images/1_mask.png": 1}
+    others |= {"images/mask_2.jpg": 2} | {f"masks/{index}.jpg.png": index for index in range(3)}
+    others |= {f"{k}/{index}.jpg": index for k in ("images_2", "small/images", "Depth-Maps") for index in range(3)}
+    for name, index in others.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        with Image.open(tmp_path / "images" / f"{index}.jpg") as image:
+            image.reduce(2 if name.startswith("images_2") else 3 if name.startswith("small") else 1).save(
+                tmp_path / name
+            )
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "run" / ".a2tg-run").write_text("a2tg-jax run\n.a2tg-run\ntest/0.png\n")
+    with pytest.warns(UserWarning) as told:
+        assert find_photos(tmp_path) == sorted(photos)
+    assert str(told[0].message) == (
+        f"{tmp_path}: Not taken for photographs: written by a2tg: 2 (cameras.png, run/test/0.png); "
+        "in hidden folders: 1 (.thumbs/0.jpg); masks or depth maps: 8 (Depth-Maps/*.jpg, images/1_mask.png, "
+        "images/mask_2.jpg, masks/*.png); copies of others: 7 (images/0.png, images_2/*.jpg, small/images/*.jpg). "
+        "To use some, give a folder of these only"
+    )
+    for folder in ("masks", "images_2", "Depth-Maps", "small"):
+        assert len(find_photos(tmp_path / folder)) == 3, "as the message says"
+    for folder in ("images", "images_2", "clip", "clip_2", "small"):
+        shutil.rmtree(tmp_path / folder)
+    with pytest.raises(
+        ValueError, match=r"holds no photographs; at least 3 .*\. Not taken for photographs: .*\. To use"
+    ):
+        find_photos(tmp_path)
+
+
+def test_turned_and_converted_copies_are_found(tmp_path):
+    """A phone's photograph with EXIF rotation, its upright copy without, and one in another format."""
+    random = np.random.default_rng(0)
+    for index in range(3):
+        save_blocks(tmp_path / "webp" / f"{index}.webp", 192, 144, random)
+        for folder in ("phone", "upright"):
+            (tmp_path / folder).mkdir(exist_ok=True)
+        with Image.open(tmp_path / "webp" / f"{index}.webp") as image:
+            save_turned(image, tmp_path / "phone" / f"{index}.jpg", 6)
+            image.reduce(2).save(tmp_path / "upright" / f"{index}.jpg")
+    with pytest.warns(UserWarning, match=r"copies of others: 6 \(upright/\*.jpg, webp/\*.webp\)"):
+        assert find_photos(tmp_path) == [f"phone/{index}.jpg" for index in range(3)]
 
 
 def test_a_video_is_told_how_to_become_a_scene(tmp_path):

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import defaulting_to
 from a2tg_jax.data import SfmSummary, run_sfm
 from a2tg_jax.data.load import is_scene
+from a2tg_jax.data.other_pictures import CAMERA_PICTURE
 from a2tg_jax.data.photo_folder import holds_photos, is_video
 from a2tg_jax.data.sfm_database import CameraModel, Matching
 from a2tg_jax.data.staging import Panorama
@@ -19,9 +20,6 @@ from a2tg_jax.results.camera_picture import save_camera_picture
 from a2tg_jax.results.forecast import quick_downscale, quick_flags
 from a2tg_jax.results.output import check_output
 from a2tg_jax.results.preflight import check_apart
-
-PICTURE = "cameras.png"
-"""File in the scene folder that shows where the cameras stand."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,11 +69,11 @@ class Sfm:
             panorama=self.panorama,
             on_note=_print,
         )
-        save_camera_picture(out, out / PICTURE)
+        save_camera_picture(out, out / CAMERA_PICTURE)
         print(_told(found))
         run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
         command = shlex.join([*run, *quick_flags(quick_downscale(found.longest_side))])
-        print(f"cameras: {out / PICTURE}\nscene: {out}; continue with: {command}")
+        print(f"cameras: {out / CAMERA_PICTURE}\nscene: {out}; continue with: {command}")
 
     def _places(self) -> tuple[list[Path], Path]:
         """Return the sources and the scene folder."""

@@ -134,6 +134,13 @@ def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> No
             upright.convert("RGB").save(target, quality=quality, subsampling=0, exif=exif)
 
 
+def upright_thumbnail(path: str | os.PathLike[str], side: int) -> tuple[tuple[int, int], np.ndarray]:
+    """Return (width, height) and grey levels [side, side] of an image file turned as EXIF says."""
+    with _opened(path) as image:
+        upright = ImageOps.exif_transpose(image)
+        return upright.size, np.asarray(upright.convert("RGB").convert("L").resize((side, side))).astype(np.float32)
+
+
 def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
     """Return a depth map [H, W] of whole numbers, of 8 or 16 bits. Raises as `read_pixels` does, and for colours."""
     with _opened(path, most_bits=16) as image:

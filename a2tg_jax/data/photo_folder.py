@@ -8,10 +8,14 @@ from pathlib import Path
 
 from a2tg_jax.core.display import counted
 from a2tg_jax.data.images import PHOTO_SUFFIXES
+from a2tg_jax.data.other_pictures import other_pictures
 from a2tg_jax.data.unread_captures import told_of_capture
 from a2tg_jax.host.text import as_argument
 
-FOREIGN_SUFFIXES = (".jxl", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".gif")
+FOREIGN_SUFFIXES = (
+    ".jxl", ".jp2", ".j2k", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".gif",
+    ".ppm", ".tga", ".psd", ".exr", ".hdr",
+)  # fmt: skip
 """Suffixes of pictures that are not read."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 LEAST_PHOTOS = 3
@@ -31,8 +35,9 @@ def holds_photos(folder: Path) -> bool:
 
 
 def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
-    """Return paths of the photographs below a folder, relative to it, sorted. A warning counts pictures and videos
-    among the other files.
+    """Return paths of the photographs below a folder, relative to it, sorted.
+
+    Warnings count pictures that are no photographs (`other_pictures`), and files of other formats.
 
     Raises:
       FileNotFoundError: if there is no such folder.
@@ -43,15 +48,20 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of photographs")
     files = sorted(file.relative_to(folder) for file in _files_below(folder))
-    photos = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
-    others = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
+    pictures = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
+    left_out, told_others = other_pictures(folder, pictures)
+    photos = [name for name in pictures if name not in left_out]
+    unread = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
     if len(photos) < least:
         held = f"holds {counted(len(photos), 'photograph') if photos else 'no photographs'}" if files else "is empty"
         told = f"{folder}: {held}; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
-        raise ValueError(told + (f". {_skipped(folder, others)}" if others else ""))
-    pictures = [file for file in others if file.suffix.lower() in FOREIGN_SUFFIXES + VIDEO_SUFFIXES]
-    if pictures:
-        warnings.warn(f"{folder}: {_skipped(folder, pictures)}", stacklevel=3)
+        skipped = [_skipped(folder, unread)] if unread else []
+        raise ValueError(". ".join([told, *([told_others] if left_out else []), *skipped]))
+    if left_out:
+        warnings.warn(f"{folder}: {told_others}", stacklevel=3)
+    foreign = [file for file in unread if file.suffix.lower() in FOREIGN_SUFFIXES + VIDEO_SUFFIXES]
+    if foreign:
+        warnings.warn(f"{folder}: {_skipped(folder, foreign)}", stacklevel=3)
     return photos
 
 
