@@ -71,7 +71,8 @@ def stacked_integral(opacities: Array, num_shares: Array) -> Array:
         return -jnp.expm1(count * jnp.log1p(-opacities * jnp.exp(-jnp.asarray(x * x, opacities.dtype))))
 
     def add_node(node: Array, total: Array) -> Array:
-        return total + integrand(node.astype(opacities.dtype) * spacing)
+        # Without jit, JAX hands Python's integers to the body of a loop.
+        return total + integrand(jnp.asarray(node, opacities.dtype) * spacing)
 
     # A loop over nodes, not an axis of nodes: the memory stays that of one value per row.
     half = jax.lax.fori_loop(1, QUADRATURE_STEPS + 1, add_node, 0.5 * integrand(0.0))
