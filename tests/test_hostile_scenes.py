@@ -16,8 +16,9 @@ from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write
 from test_data_transforms import write_scene as write_transforms
 
 from a2tg_jax.data import load_scene
-from a2tg_jax.data.colmap_binary import RECORDS, check_binary
-from a2tg_jax.data.colmap_text import check_text
+from a2tg_jax.data.colmap_binary import read_binary
+from a2tg_jax.data.colmap_records import KINDS
+from a2tg_jax.data.colmap_text import read_text
 from a2tg_jax.data.lenses import checked_lens
 from a2tg_jax.data.ply_points import read_ply_points
 
@@ -40,13 +41,13 @@ def model(request, tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("kind", RECORDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_whole_files_pass(model, kind):
     file = next((model / "sparse" / "0").glob(f"{kind}.*"))
-    (check_binary if file.suffix == ".bin" else check_text)(file)  # Warnings are errors here.
+    (read_binary if file.suffix == ".bin" else read_text)(file, kind)  # Warnings are errors here.
 
 
-@pytest.mark.parametrize("kind", RECORDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_cut_of_a_binary_file_is_noticed(tmp_path, kind):
     """Read by pycolmap, most of these hang and eat memory, or load wrong numbers in silence."""
     write_colmap(tmp_path, models=tuple(CAMERAS), num_points=5)
@@ -55,13 +56,13 @@ def test_every_cut_of_a_binary_file_is_noticed(tmp_path, kind):
     for size in range(len(whole)):
         file.write_bytes(whole[:size])
         with pytest.raises(ValueError, match=rf"{kind}\.bin: is cut off or damaged"):
-            check_binary(file)
+            read_binary(file, kind)
     refused(tmp_path, rf"{kind}\.bin: is cut off")
     file.write_bytes(whole + b"\0")
     refused(tmp_path, rf"{kind}\.bin: .* is followed by 1 bytes")
 
 
-@pytest.mark.parametrize("kind", RECORDS)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [2**64 - 1, 2**32, 10])
 def test_counts_that_lie_are_refused(tmp_path, kind, count):
     write_colmap(tmp_path, num_points=5)
@@ -81,7 +82,7 @@ def test_points_and_names_of_images_that_do_not_end_are_refused(tmp_path):
     refused(tmp_path, r"images\.bin: .* has a name that does not end")
 
 
-@pytest.mark.parametrize("kind", RECORDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_lines_that_are_cut_off_are_noticed(tmp_path, kind):
     write_colmap(tmp_path, models=tuple(CAMERAS), num_points=5, text=True)
     file = tmp_path / "sparse" / "0" / f"{kind}.txt"
@@ -90,7 +91,7 @@ def test_lines_that_are_cut_off_are_noticed(tmp_path, kind):
     for count in range(1, len(words)):
         file.write_text("\n".join([" ".join(words[:count]), *lines[1:]]) + "\n")
         with pytest.raises(ValueError, match=rf"{kind}\.txt: line 1 cannot be read"):
-            check_text(file)
+            read_text(file, kind)
     refused(tmp_path, rf"{kind}\.txt: line 1 cannot be read")
 
 
@@ -102,7 +103,11 @@ def test_lines_that_are_cut_off_are_noticed(tmp_path, kind):
         ("cameras", "1 PINHOLE 128 96 110 120 70", "PINHOLE has 4 parameters; got 3"),
         ("cameras", "1 MAGIC 128 96 110", "knows no camera model MAGIC"),
         ("cameras", "1 PINHOLE wide 96 110 120 70 40", "line 1"),
-        ("images", "1 1 0 0 0 0 0 0 1 a.png", "the line of its points is missing"),
+        ("images", "1 1 0 0 0 0 0 0 1", "an image needs 10 words"),
+        ("images", "1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 0 1 b.png\n", "the line of its points is missing"),
+        ("points3D", "1 0 0 0 1 2 3.5.1 0.5", "line 1"),
+        ("points3D", "1.5 0 0 0 1 2 3 0.5", "1.5 is no whole number of at least 0"),
+        ("cameras", "1 PINHOLE nan 96 110 120 70 40", "nan is no whole number"),
         ("images", "1 1 0 0 0 0 0 0 1 a.png\n1 2 3 4", "the line of its points is missing or cut off"),
         ("points3D", "1 0 0 zero 1 2 3 0.5", "line 1"),
     ],
@@ -111,7 +116,7 @@ def test_lines_of_text_that_lie_are_refused(tmp_path, kind, line, message):
     file = tmp_path / f"{kind}.txt"
     file.write_text(line)
     with pytest.raises(ValueError, match=rf"{kind}\.txt: line 1.*" if message == "line 1" else message):
-        check_text(file)
+        read_text(file, kind)
 
 
 def test_a_text_that_ends_too_early_is_told(tmp_path):
@@ -121,7 +126,7 @@ def test_a_text_that_ends_too_early_is_told(tmp_path):
         file = tmp_path / "sparse" / "0" / f"{kind}.txt"
         file.write_text("".join(file.read_text().splitlines(keepends=True)[:-size]))
         with pytest.warns(UserWarning, match=rf"{kind}\.txt: says that it has . {kind}, and has ."):
-            check_text(file)
+            read_text(file, kind)
 
 
 # Numbers
@@ -375,7 +380,7 @@ def test_a_text_of_colmap_of_one_endless_line(tmp_path):
     (tmp_path / "points3D.txt").touch()
     os.truncate(tmp_path / "points3D.txt", 10**9)
     with pytest.raises(ValueError, match=r"points3D\.txt: has a line of more than"):
-        check_text(tmp_path / "points3D.txt")
+        read_text(tmp_path / "points3D.txt", "points3D")
 
 
 def test_links_to_files_are_followed(tmp_path):

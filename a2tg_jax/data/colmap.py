@@ -1,24 +1,23 @@
 """COLMAP scenes: a sparse model (.bin or .txt) beside a folder of images."""
 
-import logging
-import shutil
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+import warnings
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from a2tg_jax.core.display import counted
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
-from a2tg_jax.data.colmap_binary import RECORDS, check_binary
+from a2tg_jax.data.colmap_binary import count_binary, read_binary
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.colmap_text import check_text
+from a2tg_jax.data.colmap_records import KINDS, POINT, FrameRecord, ImageRecord, RigRecord
+from a2tg_jax.data.colmap_text import count_text_images, read_text
 from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
-from a2tg_jax.data.images import locate_image, map_in_threads, num_readers
+from a2tg_jax.data.images import PHOTO_SUFFIXES, inside, locate_image, map_in_threads, num_readers, on_disk
 from a2tg_jax.data.lenses import KeptLens, Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
 from a2tg_jax.data.observations import ObservedPoints, before_camera, observed_points
@@ -27,33 +26,73 @@ from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
 from a2tg_jax.data.splits import every_kth
-from a2tg_jax.host.regular_files import is_folder, is_regular, open_regular
+from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
 from a2tg_jax.host.remote_files import is_remote
+from a2tg_jax.host.text import shortened
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "", "0")
-"""Folders of the model below a scene folder, in order of preference."""
-EMPTY_POINTS = {".bin": bytes(8), ".txt": b""}
-"""A points3D file with no points in it."""
+SUFFIXES = (".bin", ".txt")
+"""Suffixes of a model's files, in order of preference."""
+IMAGES = "images"
+"""Folder of photographs in a scene folder."""
+TRIED_NAMES = 10
+"""Number of photographs that are looked for in a folder before it is taken for another one."""
 POINTS_PLY = "points3D.ply"
 """Points of models without COLMAP's points3D."""
 SAME_PLACE = 1e-3
 """Largest distance between the cameras of a panorama, in units of the distance between neighbouring frames."""
 
-logger = logging.getLogger(__name__)
+
+class Model(NamedTuple):
+    """Sparse model."""
+
+    cameras: dict[int, Any]
+    """pycolmap.Camera, by id."""
+    images: list[ImageRecord]
+    points: np.ndarray
+    """[P] `POINT`, by id."""
+    rigs: list[RigRecord]
+    frames: list[FrameRecord]
+
+    @property
+    def cloud(self) -> PointCloud:
+        """Its points."""
+        return PointCloud(self.points["position"], self.points["color"])
 
 
-def find_model(path: Path) -> Path | None:
-    """Return the folder of the sparse model of a scene folder, or None."""
-    folders = [path / folder if folder else path for folder in MODEL_FOLDERS]
-    return next((folder for folder in folders if _model_suffix(folder) is not None), None)
+def find_models(path: Path) -> list[Path]:
+    """Return the folders of sparse models in a scene folder, first the folder itself, then as COLMAP numbers them."""
+    sparse = path / "sparse"
+    numbered = {folder: sorted(filter(str.isdecimal, names_in(folder)), key=int) for folder in (sparse, path)}
+    below = {folder: [folder / name for name in names] for folder, names in numbered.items()}
+    return [folder for folder in (path, *below[sparse], sparse, *below[path]) if _model_files(folder)]
 
 
 def _model_of(path: Path) -> Path:
-    """Return the folder of the sparse model of a scene folder, or raise FileNotFoundError."""
-    model = find_model(path)
-    if model is None:
+    """Return the folder of the sparse model of a scene folder: itself, or of several the one with the most images.
+
+    A warning names the others.
+
+    Raises:
+      FileNotFoundError: if there is none.
+    """
+    models = find_models(path)
+    if not models:
         raise FileNotFoundError(f"{path}: has no sparse model; expected sparse/0 with cameras, images and points3D")
-    return model
+    if len(models) == 1:
+        return models[0]
+    counts = {model: _num_images(model) for model in models}
+    chosen = path if path in models else max(models, key=lambda model: counts[model])
+    told = {
+        model: f"{'/'.join(model.parts[len(path.parts) :]) or 'its own'} ({counted(counts[model], 'image')})"
+        for model in models
+    }
+    others = [model for model in models if model != chosen]
+    warnings.warn(
+        f"{path}: has {len(models)} COLMAP models; {told[chosen]} is read, and not "
+        f"{', '.join(told[model] for model in others)}; to read another, give its folder, such as {others[0]}",
+        stacklevel=3,
+    )
+    return chosen
 
 
 def load_colmap(
@@ -74,38 +113,36 @@ def load_colmap(
         cannot be undistorted, or the views make no scene (`assemble_scene`).
     """
     model = _model_of(path)
-    reconstruction = _read_model(model)
-    images_folder = _find_images_folder(path, model, downscale)
-    cameras = reconstruction.cameras.items()
+    contents = _read_model(model)
+    scene, folder = _find_photos(path, model, contents.images, downscale)
+    images = [image._replace(name=inside(folder, image.name)) for image in contents.images]
+    cameras = contents.cameras.items()
     lenses = {key: checked_lens(camera, f"{model}: camera {key}", lens) for key, camera in cameras}
-    registered = [reconstruction.images[key] for key in reconstruction.reg_image_ids()]
-    _log_unregistered(images_folder, len(registered))
-    reach = SAME_PLACE * spacing(registered)
-
-    def photo(image: Any) -> PhotoFiles:
-        return _photo(image, lenses[image.camera_id], images_folder, downscale)
-
-    photos = map_in_threads(photo, registered, num_readers(path))
+    files = _located(folder, images, downscale, model)
+    _warn_of_others(folder, images)
+    photos = [
+        _photo(image.name, *file, lenses[image.camera_id], scene, downscale)
+        for image, file in zip(images, files, strict=True)
+    ]
     found = read_photos(photos, Shelf(room), division, path)
-    ids, cloud = np.array(sorted(reconstruction.points3D), np.uint64), read_points(reconstruction)
+    cloud, panoramas = contents.cloud, _panoramas(contents)
 
-    def shot(image: Any, read: Reading) -> Shot:
-        viewmat, mask, panorama = viewmat_of(image), read.facts.mask, panorama_of(image, reach)
-        points = _observed_points(image, viewmat, ids, cloud.points, lenses[image.camera_id], read)
+    def shot(image: ImageRecord, read: Reading) -> Shot:
+        viewmat, mask = viewmat_of(image), read.facts.mask
+        points = _observed_points(image, viewmat, contents.points, lenses[image.camera_id], read)
+        panorama = panoramas.get(image.id)
         return Shot(image.name, viewmat, read.K, read.picture, mask, read.rays, read.depth, panorama, points)
 
-    shots = [shot(image, read) for image, read in zip(registered, found, strict=True)]
-    check_masks(shots, str(path), images_folder.with_name(FOLDER))
+    shots = [shot(image, read) for image, read in zip(images, found, strict=True)]
+    check_masks(shots, str(path), scene / FOLDER)
     train, test = every_kth(shots, test_every)
-    name = scene_name(images_folder.parent)
-    return assemble_scene(name, train, test, _start_cloud(model, cloud), source=str(path))
+    return assemble_scene(scene_name(scene), train, test, _start_cloud(model, cloud), source=str(path))
 
 
 def _start_cloud(model: Path, cloud: PointCloud) -> PointCloud:
-    """Return the points to start from: a model's own, or the PLY file that networks of depth write in their place."""
-    ply = model / POINTS_PLY
-    has_own = any(is_regular(model / f"points3D{suffix}") for suffix in EMPTY_POINTS)
-    return read_ply_points(ply) if not has_own and is_regular(ply) else cloud
+    """Return the points to start from: a model's own, or the PLY file that networks of depth write instead."""
+    ply = None if len(cloud.points) else on_disk(model, POINTS_PLY)
+    return cloud if ply is None else read_ply_points(ply)
 
 
 def read_cameras_and_points(path: Path) -> tuple[np.ndarray, PointCloud]:
@@ -115,34 +152,29 @@ def read_cameras_and_points(path: Path) -> tuple[np.ndarray, PointCloud]:
       FileNotFoundError, ValueError: as `load_colmap`.
     """
     model = _model_of(path)
-    reconstruction = _read_model(model)
-    images = sorted(
-        (reconstruction.images[key] for key in reconstruction.reg_image_ids()), key=lambda image: image.name
-    )
-    return np.stack([viewmat_of(image) for image in images]), _start_cloud(model, read_points(reconstruction))
+    contents = _read_model(model)
+    images = sorted(contents.images, key=lambda image: image.name)
+    return np.stack([viewmat_of(image) for image in images]), _start_cloud(model, contents.cloud)
 
 
-def read_points(reconstruction: Any) -> PointCloud:
-    """Return the points of a pycolmap.Reconstruction, in the order of their ids."""
-    points = [reconstruction.points3D[key] for key in sorted(reconstruction.points3D)]
-    return PointCloud(
-        np.array([point.xyz for point in points]).reshape(-1, 3),
-        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
-    )
-
-
-def viewmat_of(image: Any) -> np.ndarray:
-    """Return the world-to-camera matrix [4, 4] of a registered pycolmap.Image (a method since pycolmap 4, before a
-    property)."""
-    pose = image.cam_from_world
+def viewmat_of(image: ImageRecord) -> np.ndarray:
+    """Return the world-to-camera matrix [4, 4] of an image. Its quaternion may have any length but 0."""
     viewmat = np.eye(4)
-    viewmat[:3] = (pose() if callable(pose) else pose).matrix()
+    quaternion, viewmat[:3, 3] = np.array(image.pose[:4]), image.pose[4:]
+    length = np.linalg.norm(quaternion)
+    if length == 0:
+        raise ValueError(f"{image.name}: its pose has a quaternion of zeros; remove it from the model")
+    w, x, y, z = quaternion / length if np.isfinite(length) else np.full(4, np.nan)
+    viewmat[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
     return rigid_viewmat(viewmat, image.name)
 
 
-def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> PhotoFiles:
-    """Return the files and the lens of one registered image."""
-    file, still_to_downscale = locate_image(images_folder, image.name, downscale)
+def _photo(name: str, file: Path, still_to_downscale: int, lens: Lens, scene: Path, downscale: int) -> PhotoFiles:
+    """Return the files and the lens of one image. Masks and depth maps are beside `images` in the scene."""
 
     def error_message(error: Exception) -> str:
         if isinstance(lens, KeptLens):
@@ -150,122 +182,165 @@ def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> Photo
         return f"{file}: its camera model {error}; undistort the scene with COLMAP first"
 
     return PhotoFiles(
-        image.name, file, still_to_downscale, lambda _: lens, error_message,
-        mask=find_mask(images_folder, image.name, downscale),
-        depths=find_depths(images_folder, image.name),
+        name, file, still_to_downscale, lambda _: lens, error_message,
+        mask=find_mask(scene / IMAGES, name, downscale),
+        depths=find_depths(scene / IMAGES, name),
     )  # fmt: skip
 
 
+def _located(folder: Path, images: Sequence[ImageRecord], downscale: int, model: Path) -> list[tuple[Path, int]]:
+    """Return the file of each image of a model and the remaining factor of downscaling.
+
+    Raises:
+      FileNotFoundError: if some are missing, with their number and what to do.
+    """
+
+    def locate(image: ImageRecord) -> tuple[Path, int] | None:
+        try:
+            if folder.name == IMAGES:
+                return locate_image(folder, image.name, downscale)
+            return locate_image(folder, image.name, 1)[0], downscale  # Only `images` has smaller siblings.
+        except FileNotFoundError:
+            return None
+
+    found = map_in_threads(locate, images, num_readers(folder))
+    missing = [image.name for image, file in zip(images, found, strict=True) if file is None]
+    if missing:
+        more = f", and {len(missing) - 1} more of its {len(images)} are missing" if len(missing) > 1 else ""
+        images_file = _model_files(model)["images"]
+        if images_file.suffix.lower() == ".txt":
+            advice = f"delete its two lines in {images_file}"
+        else:
+            advice = (
+                "remove it from the model in Python: "
+                f"import pycolmap; model = pycolmap.Reconstruction({str(model)!r}); "
+                f"model.deregister_frame(model.find_image_with_name({missing[0]!r}).frame_id); "
+                f"model.write({str(model)!r})"
+            )
+        raise FileNotFoundError(
+            f"{folder / missing[0]}: no such image, but the model has a camera for it{more}; put it there, or {advice}"
+        )
+    return [file for file in found if file is not None]
+
+
 def _observed_points(
-    image: Any, viewmat: np.ndarray, ids: np.ndarray, positions: np.ndarray, lens: Lens, read: Reading
+    image: ImageRecord, viewmat: np.ndarray, points: np.ndarray, lens: Lens, read: Reading
 ) -> ObservedPoints | None:
-    """Return the points that a registered image observed, in units of the original world; None if it observed none.
+    """Return the points that an image observed, in units of the original world; None if it observed none.
 
     Args:
-      image: of the reconstruction.
+      image: of the model.
       viewmat: its world-to-camera matrix [4, 4].
-      ids: [P] uint64 ids of all points, in ascending order.
-      positions: [P, 3].
+      points: [P] `POINT`, all points of the model by ascending ids.
       lens: of its photograph.
       read: the photograph.
     """
-    own = np.array([feature.point3D_id for feature in image.get_observation_points2D()], np.uint64)
-    own = own[np.isin(own, ids)]
+    own = image.point_ids[np.isin(image.point_ids, points["id"])]
     if not len(own):
         return None
-    points, size = before_camera(positions[np.searchsorted(ids, own)], viewmat), read.picture.size
-    return observed_points(lens.projected(points, read.K, size[::-1]), points[:, 2], size)
+    positions = points["position"][np.searchsorted(points["id"], own)]
+    places, size = before_camera(positions, viewmat), read.picture.size
+    return observed_points(lens.projected(places, read.K, size[::-1]), places[:, 2], size)
 
 
-def spacing(images: Sequence[Any]) -> float:
-    """Return the median distance of a frame of images (pycolmap.Image) to the nearest other one; 0 of one frame."""
-    viewmats = {image.frame_id: viewmat_of(image) for image in images}
-    if len(viewmats) < 2:
-        return 0.0
-    centers = camera_centers(np.stack(list(viewmats.values())))
-    distances, _ = cKDTree(centers).query(centers, k=2)
-    return float(np.median(distances[:, 1]))
+def _panoramas(model: Model) -> dict[int, int]:
+    """Return the number of the frame of each image whose rig looks around from one point, by the image's id.
 
-
-def panorama_of(image: Any, reach: float = 0.0) -> int | None:
-    """Return the number of the frame of a pycolmap.Image whose rig looks around from one point; None of others.
-
-    Args:
-      image: a registered image.
-      reach: largest distance of a camera from the rig's origin, for what a refinement of the rig leaves of zero.
+    A rig's cameras are at one point if they are within `SAME_PLACE` of it, which is what a refinement of the rig leaves
+    of zero, in units of the median distance of a frame to the nearest other one.
     """
-    rig = image.frame.rig
-    if rig.num_sensors() < 2:
-        return None
-    poses = rig.non_ref_sensors.values()
-    is_one_point = all(pose is not None and np.linalg.norm(pose.translation) <= reach for pose in poses)
-    return int(image.frame_id) if is_one_point else None
+    frames = {image_id: frame for frame in model.frames for image_id in frame.image_ids}
+    places = {frames[image.id].id if image.id in frames else -image.id: viewmat_of(image) for image in model.images}
+    reach = 0.0
+    if len(places) > 1:
+        centers = camera_centers(np.stack(list(places.values())))
+        reach = SAME_PLACE * float(np.median(cKDTree(centers).query(centers, k=2)[0][:, 1]))
+    around = {
+        rig.id
+        for rig in model.rigs
+        if rig.translations and all(place is not None and np.linalg.norm(place) <= reach for place in rig.translations)
+    }
+    return {image_id: frame.id for image_id, frame in frames.items() if frame.rig_id in around}
 
 
-def _model_suffix(folder: Path) -> str | None:
-    """Return ".bin" or ".txt", the format of the model in a folder (COLMAP prefers .bin), or None."""
-    for suffix in EMPTY_POINTS:
-        if all(is_regular(folder / f"{name}{suffix}") for name in ("cameras", "images")):
-            return suffix
-    return None
+def _model_files(folder: Path) -> dict[str, Path]:
+    """Return the files of the model in a folder by kind, whatever their capitals; none if it has no model.
+
+    COLMAP prefers .bin to .txt.
+    """
+    names = {name.lower(): name for name in names_in(folder)}
+    for suffix in SUFFIXES:
+        own = {kind: folder / names[each] for kind in KINDS if (each := f"{kind}{suffix}".lower()) in names}
+        files = {kind: file for kind, file in own.items() if is_regular(file)}
+        if "cameras" in files and "images" in files:
+            return files
+    return {}
 
 
-def _read_model(model: Path) -> Any:
-    """Return the pycolmap.Reconstruction in a folder; without a points3D file, it has no points."""
-    suffix = _model_suffix(model) or ".bin"
-    check = check_binary if suffix == ".bin" else check_text
-    with _on_disk(model, suffix) as on_disk:
-        for name in (f"{kind}{suffix}" for kind in RECORDS):
-            if is_regular(on_disk / name):
-                check(model / name, on_disk / name)
-        try:
-            with _with_points_file(on_disk, suffix) as folder:
-                return pycolmap().Reconstruction(str(folder))
-        except Exception as error:  # whatever pycolmap makes of C++'s
-            reason = " ".join(str(error).split())
-            raise ValueError(f"{model}: cannot be read as a COLMAP model ({reason}); export it again") from None
+def _num_images(model: Path) -> int:
+    """Return the number of images that a model has or announces."""
+    file = _model_files(model)["images"]
+    return count_binary(file) if file.suffix.lower() == ".bin" else count_text_images(file)
 
 
-@contextmanager
-def _on_disk(model: Path, suffix: str) -> Iterator[Path]:
-    """Return the model's folder, or a temporary copy of a remote one."""
-    if not is_remote(model):
-        yield model
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        for file in (model / f"{kind}{suffix}" for kind in RECORDS):
-            if is_regular(file):
-                with open_regular(file) as source, open(Path(folder) / file.name, "wb") as target:
-                    shutil.copyfileobj(source, target)
-        yield Path(folder)
+def _read_model(model: Path) -> Model:
+    """Return the model in a folder; without a points3D file, it has no points.
+
+    Raises:
+      ValueError: naming the file, if one cannot be read.
+    """
+    files = _model_files(model)
+    read = read_binary if files["images"].suffix.lower() == ".bin" else read_text
+    found = {kind: read(file, kind) for kind, file in files.items()}
+    cameras = {}
+    for camera in found["cameras"]:
+        cameras[camera.id] = pycolmap().Camera(
+            model=camera.model, width=camera.width, height=camera.height, params=camera.params
+        )
+    for image in found["images"]:
+        if image.camera_id not in cameras:
+            raise ValueError(
+                f"{files['images']}: {image.name} has the camera {image.camera_id}, which is not in "
+                f"{files['cameras'].name}; export the model again"
+            )
+    points = found.get("points3D", np.empty(0, POINT))
+    points = points[np.argsort(points["id"], kind="stable")]
+    return Model(cameras, found["images"], points, found.get("rigs", []), found.get("frames", []))
 
 
-@contextmanager
-def _with_points_file(model: Path, suffix: str) -> Iterator[Path]:
-    """Return the model's folder, or a temporary copy with an empty points3D if that file is missing."""
-    if is_regular(model / f"points3D{suffix}"):
-        yield model
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        for file in (model / f"{kind}{suffix}" for kind in RECORDS):
-            if file.is_file():
-                (Path(folder) / file.name).write_bytes(file.read_bytes())
-        (Path(folder) / f"points3D{suffix}").write_bytes(EMPTY_POINTS[suffix])
-        yield Path(folder)
+def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downscale: int) -> tuple[Path, Path]:
+    """Return the scene folder of a model and the folder below which its images are named.
 
-
-def _find_images_folder(path: Path, model: Path, downscale: int) -> Path:
-    """Return the folder `images` of the model's scene; it need not exist if `images_k` does."""
+    That is `images`, which need not exist if `images_k` does, or else the scene folder itself, with the photographs
+    beside the model or named with their folder.
+    """
     model = model.resolve()
-    for base in (path.resolve(), model, *model.parents[:2]):
-        if is_folder(base / "images") or (downscale > 1 and is_folder(base / f"images_{downscale}")):
-            return base / "images"
+    bases = [path.resolve(), model, *model.parents[:2]]
+    bases += [base.parent for base in bases if base.name == "colmap"]  # as nerfstudio has it: colmap/sparse/0
+
+    def holds_some(folder: Path) -> bool:
+        return any(on_disk(folder, image.name.replace("\\", "/")) for image in images[:TRIED_NAMES])
+
+    for base in bases:
+        if is_folder(base / IMAGES):
+            is_beside = not holds_some(base / IMAGES) and holds_some(base)
+            return base, base if is_beside else base / IMAGES
+        if downscale > 1 and is_folder(base / f"{IMAGES}_{downscale}"):
+            return base, base / IMAGES
+    for base in bases:
+        if holds_some(base):
+            return base, base
     raise FileNotFoundError(f"{path}: has no folder 'images'; put the model's photographs there")
 
 
-def _log_unregistered(images_folder: Path, num_registered: int) -> None:
-    """Log the number of files in a folder of this machine that are not registered images."""
-    if not is_remote(images_folder) and images_folder.is_dir():
-        others = sum(file.is_file() for file in images_folder.rglob("*")) - num_registered
-        if others > 0:
-            logger.info("%s: %d files have no pose in the model and are not used", images_folder, others)
+def _warn_of_others(folder: Path, images: Sequence[ImageRecord]) -> None:
+    """Warn of photographs in a folder of this machine that are no images of the model."""
+    if is_remote(folder) or not folder.is_dir():
+        return
+    own = {PurePath(image.name).with_suffix("").as_posix().casefold() for image in images}
+    below = folder.rglob("*") if folder.name == IMAGES else folder.iterdir()
+    files = (file.relative_to(folder) for file in below if file.suffix.lower() in PHOTO_SUFFIXES)
+    others = sorted(file.as_posix() for file in files if file.with_suffix("").as_posix().casefold() not in own)
+    if others:
+        told = f"{counted(len(others), 'photograph')} without a pose in the model, such as {shortened(others[0])}"
+        warnings.warn(f"{folder}: {told}: not used", stacklevel=3)

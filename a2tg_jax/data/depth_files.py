@@ -12,9 +12,10 @@ from PIL import Image
 
 from a2tg_jax.data.decoding import MAX_PIXELS, MOST_BYTES
 from a2tg_jax.data.depths import DepthMap
+from a2tg_jax.data.images import on_disk
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.host.npz import read_npy
-from a2tg_jax.host.regular_files import is_regular, open_regular
+from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.remote_files import Unreachable
 from a2tg_jax.host.text import shortened
 
@@ -36,7 +37,7 @@ def find_depths(images: Path, name: str) -> Path | None:
     """
     folder = images.with_name(FOLDER)
     own = [f"{stem}{suffix}" for suffix in SUFFIXES for stem in (str(Path(name).with_suffix("")), name)]
-    return next((folder / each for each in own if is_regular(folder / each)), None)
+    return on_disk(folder, *own)
 
 
 def depth_map(file: Path | None, lens: Lens, stored: tuple[int, int], size: tuple[int, int]) -> DepthMap | None:

@@ -1,15 +1,16 @@
 """Finding and resizing photographs. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4]."""
 
 import os
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import TypeVar
 
 import numpy as np
 from PIL import Image
 
-from a2tg_jax.host.regular_files import is_folder, is_regular
+from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
 from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import shortened
 
@@ -38,23 +39,26 @@ def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
       FileNotFoundError: naming the image, if it is not there.
       ValueError: if the name leads out of the folder.
     """
-    check_inside(folder, name)
+    name = inside(folder, name)
     smaller = folder.with_name(f"{folder.name}_{downscale}")
     if downscale > 1 and is_folder(smaller):
         folder, downscale = smaller, 1
     for candidate in (folder / name, folder / f"{name}.png", *_with_suffixes(folder, name)):
         if is_regular(candidate):
             return candidate, downscale
+    if (found := on_disk(folder, name)) is not None:
+        return found, downscale
     raise FileNotFoundError(
         f"{folder / name}: no such image, but the scene has a camera for it; "
-        f"put the image there or remove the camera from the model"
+        f"put the image there, or remove its frame from the file that names it"
     )
 
 
 def named_image(folder: Path, name: str) -> Path | None:
     """Return the image of a name, with or without its suffix, or None."""
     own = [folder / name] if Path(name).suffix.lower() in PHOTO_SUFFIXES else []
-    return next((file for file in (*own, *_with_suffixes(folder, name)) if name and is_regular(file)), None)
+    found = next((file for file in (*own, *_with_suffixes(folder, name)) if name and is_regular(file)), None)
+    return found or (on_disk(folder, name) if own else None)
 
 
 def _with_suffixes(folder: Path, name: str) -> Iterator[Path]:
@@ -63,19 +67,48 @@ def _with_suffixes(folder: Path, name: str) -> Iterator[Path]:
         yield folder / f"{name}{suffix.upper()}"
 
 
-def check_inside(folder: Path, name: str) -> None:
-    """Refuse a name in a file of the scene that leads out of the scene's folder. Links may lead anywhere.
+def inside(folder: Path, name: str) -> str:
+    """Return the path below a folder of what a file of the scene names, with "/" between its parts.
+
+    A backslash separates parts as "/" does, unless a file has the very name. An absolute path in the folder becomes a
+    relative one.
 
     Raises:
-      ValueError: naming both, if it is absolute, climbs by "..", or is no name.
+      ValueError: naming both, if it leads out of the folder, by ".." or as an absolute path, or is no name. Links may
+        lead anywhere.
     """
-    if os.path.isabs(name) or os.pardir in Path(name).parts or "\0" in name:
+    if len(name) > LONGEST_NAME:
+        raise ValueError(f"{folder}: {shortened(name)} is too long a name ({len(name)} letters); shorten it")
+    is_file = "\0" not in name and "\\" in name and is_regular(folder / name)
+    path = Path(name if is_file else name.replace("\\", "/"))
+    if path.is_absolute() and not is_remote(folder):
+        roots = os.path.abspath(folder), os.path.realpath(folder)
+        path = next((path.relative_to(root) for root in roots if path.is_relative_to(root)), path)
+    if PureWindowsPath(path).root or path.drive or os.pardir in path.parts or "\0" in name:
         raise ValueError(
             f"{folder}: {shortened(name)} leads out of the scene's folder, and nothing outside is read; "
             "move it there, or put a link there to where it is, and name that"
         )
-    if len(name) > LONGEST_NAME:
-        raise ValueError(f"{folder}: {shortened(name)} is too long a name ({len(name)} letters); shorten it")
+    return path.as_posix()
+
+
+def on_disk(folder: Path, *names: str) -> Path | None:
+    """Return the first file of some paths below a folder that exists; None without one.
+
+    If none exists, return the first that differs from a file in capitals alone, unless it does from several.
+    """
+    files = [folder / name for name in names if is_regular(folder / name)]
+    for name in () if files else names:
+        found = [folder]
+        for part in Path(name).parts:
+            found = [each / own for each in found for own in names_in(each) if _letters(own) == _letters(part)]
+        files += [found[0]] if len(found) == 1 and is_regular(found[0]) else []
+    return files[0] if files else None
+
+
+def _letters(name: str) -> str:
+    """Return a name without capitals. macOS writes accents as letters of their own, which are joined."""
+    return unicodedata.normalize("NFC", name.casefold())
 
 
 def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from a2tg_jax.core.checks import check_literal
-from a2tg_jax.data.colmap import find_model, load_colmap
+from a2tg_jax.data.colmap import find_models, load_colmap
 from a2tg_jax.data.division import Division, among_processes, sharing_errors
 from a2tg_jax.data.frames import Frames, load_frames
 from a2tg_jax.data.lenses import LensUse, forget_rays
@@ -50,7 +50,8 @@ def load_scene(
 
     Recognised, in this order: a COLMAP model (`sparse/0`, `sparse` or the folder itself, .bin or .txt) with its images,
     nerfstudio's or instant-ngp's `transforms.json`, Blender's `transforms_train.json` (and `transforms_test.json`),
-    Polycam's raw data, Record3D's frames with their metadata, Metashape's cameras (.xml), RealityScan's XMP files.
+    nerfstudio's `colmap/sparse/0`, Polycam's raw data, Record3D's frames with their metadata, Metashape's cameras
+    (.xml), RealityScan's XMP files. Of several COLMAP models, the one with the most images is read.
     Photographs of distorted cameras are undistorted to pinholes unless `lens` keeps them. Images in the folder without
     a pose are ignored. Masks, black at excluded pixels, lie in `masks` beside `images`, or at `mask_path`.
 
@@ -95,9 +96,7 @@ def load_scene(
 
 def is_scene(folder: Path) -> bool:
     """Return whether a folder holds a scene in a known format."""
-    names = (NERFSTUDIO_FILE, BLENDER_FILES[0])
-    has_cameras = find_model(folder) is not None or any(is_regular(folder / name) for name in names)
-    return has_cameras or _frames(folder) is not None
+    return _loader(folder) is not None or _frames(folder) is not None
 
 
 def _load(
@@ -129,6 +128,9 @@ def _load(
     if told is not None:
         anew = f"; or find cameras anew: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
         raise FileNotFoundError(f"{path}: {told}{anew}")
+    scene = next((parent for parent in path.resolve().parents[:2] if _loader(parent) is not None), None)
+    if scene is not None:
+        raise FileNotFoundError(f"{path}: is a folder in the scene {scene}; give that folder instead")
     raise FileNotFoundError(
         f"{path}: has no sparse model (sparse/0) and no transforms.json or transforms_train.json; "
         f"for plain photographs, run `a2tg sfm {as_argument(path)} SCENE` first"
@@ -137,11 +139,14 @@ def _load(
 
 def _loader(path: Path) -> Callable[..., Scene] | None:
     """Return what loads a folder with a COLMAP model or a transforms file, or None."""
-    if find_model(path) is not None:
+    if find_models(path):
         return functools.partial(load_colmap, path)
     if is_regular(path / NERFSTUDIO_FILE):
         return functools.partial(load_transforms, path / NERFSTUDIO_FILE)
-    return functools.partial(load_blender, path) if is_regular(path / BLENDER_FILES[0]) else None
+    if is_regular(path / BLENDER_FILES[0]):
+        return functools.partial(load_blender, path)
+    below = path / "colmap"  # nerfstudio's, whose transforms.json is preferred
+    return functools.partial(load_colmap, below) if find_models(below) else None
 
 
 def _load_remote(path: Path, options: dict[str, Any]) -> Scene:

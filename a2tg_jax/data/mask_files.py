@@ -11,11 +11,11 @@ import numpy as np
 from a2tg_jax.data.assembly import Shot
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.data.division import Division, divided_masks
-from a2tg_jax.data.images import resize_pixels
+from a2tg_jax.data.images import on_disk, resize_pixels
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.scene import Scene, View
-from a2tg_jax.host.regular_files import is_folder, is_regular
+from a2tg_jax.host.regular_files import is_folder
 
 FOLDER = "masks"
 """Folder of masks, beside the folder of images."""
@@ -31,12 +31,7 @@ def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, int] | Non
       name: path of the image below the folder; its mask is NAME.EXT.png, as in COLMAP, NAME.png, or has the same name.
       downscale: k >= 1.
     """
-    folder = images.with_name(FOLDER)
-    for candidate in (f"{name}.png", str(Path(name).with_suffix(".png")), name):
-        found = _at_scale(folder, candidate, downscale)
-        if found is not None:
-            return found
-    return None
+    return _at_scale(images.with_name(FOLDER), downscale, f"{name}.png", str(Path(name).with_suffix(".png")), name)
 
 
 def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
@@ -45,7 +40,7 @@ def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
     Raises:
       FileNotFoundError: if it is missing.
     """
-    found = _at_scale(path.parent, path.name, downscale)
+    found = _at_scale(path.parent, downscale, path.name)
     if found is None:
         raise FileNotFoundError(f"{path}: no such mask, but the scene names it; add the mask or remove its mask_path")
     return found
@@ -140,11 +135,12 @@ def _opaque(view: View, mask: Mask | None) -> View:
     return dataclasses.replace(view, picture=picture, mask=mask)
 
 
-def _at_scale(folder: Path, name: str, downscale: int) -> tuple[Path, int] | None:
-    smaller = folder.with_name(f"{folder.name}_{downscale}") / name
-    if downscale > 1 and is_regular(smaller):
-        return smaller, 1
-    return (folder / name, downscale) if is_regular(folder / name) else None
+def _at_scale(folder: Path, downscale: int, *names: str) -> tuple[Path, int] | None:
+    """Return the file of one of the names in a folder, or in its smaller sibling, and the remaining factor."""
+    if downscale > 1 and (found := on_disk(folder.with_name(f"{folder.name}_{downscale}"), *names)) is not None:
+        return found, 1
+    found = on_disk(folder, *names)
+    return None if found is None else (found, downscale)
 
 
 def _check_left(mask: Mask, name: str, source: str) -> None:

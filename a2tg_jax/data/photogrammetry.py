@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from a2tg_jax.data.frames import Frames
-from a2tg_jax.data.images import PHOTO_SUFFIXES, check_inside, named_image
+from a2tg_jax.data.images import PHOTO_SUFFIXES, inside, named_image
 from a2tg_jax.host.json_text import MOST_BYTES
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
@@ -72,7 +72,7 @@ def image_of(folder: Path, label: str, below: Mapping[str, Path]) -> str | None:
     It is looked for in `images`, in the folder itself, and then among the images `below`.
     """
     name = re.split(r"[/\\]", label)[-1]
-    check_inside(folder, name)
+    inside(folder, name)
     found = named_image(folder / "images", name) or named_image(folder, name) or below.get(name)
     return None if found is None else found.relative_to(folder).as_posix()
 

@@ -20,7 +20,7 @@ from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
-from a2tg_jax.data.images import check_inside, locate_image, map_in_threads, num_readers
+from a2tg_jax.data.images import inside, locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import check_masks, find_mask, named_mask
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
@@ -145,16 +145,19 @@ def check_meta(file: Path, meta: Any) -> None:
 
 
 def _check_texts(file: Path, values: dict[str, Any]) -> None:
-    """Raise ValueError unless file names are texts, or lists of texts."""
+    """Make file names relative to the scene folder. Raise ValueError unless they are texts, or lists of texts."""
     for key in FILE_KEYS:
         name = values.get(key)
         if ((key == "file_path" and key in values) or name) and not (isinstance(name, str) and name):
             raise ValueError(f"{file}: {key} must be the name of a file; got {shortened(name)}")
-        check_inside(file.parent, name or "")
+        if name:
+            values[key] = inside(file.parent, name)
     for key in SPLIT_KEYS:
         names = values.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError(f"{file}: {key} must be a list of names; got {shortened(names)}")
+        if names:
+            values[key] = [inside(file.parent, name) for name in names]
 
 
 def read_shots(

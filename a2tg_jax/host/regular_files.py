@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import cast
 
 from a2tg_jax.host.operating_system import reading_flags
-from a2tg_jax.host.remote_files import fetched, is_remote, is_remote_file, is_remote_folder, remote_size
+from a2tg_jax.host.remote_files import (
+    fetched,
+    is_remote,
+    is_remote_file,
+    is_remote_folder,
+    remote_names,
+    remote_size,
+)
 
 MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
@@ -36,6 +43,13 @@ def is_regular(path: str | os.PathLike[str]) -> bool:
 def is_folder(path: Path) -> bool:
     """Return whether a path is a folder."""
     return is_remote_folder(path) if is_remote(path) else path.is_dir()
+
+
+def names_in(folder: Path) -> list[str]:
+    """Return the sorted names of the files and folders in a folder; none if there is no such folder."""
+    if is_remote(folder):
+        return remote_names(folder)
+    return sorted(os.listdir(folder)) if folder.is_dir() else []
 
 
 def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTES) -> BufferedReader:

@@ -125,6 +125,11 @@ def is_remote_folder(path: Path) -> bool:
     return bool(_listed(path))
 
 
+def remote_names(folder: Path) -> list[str]:
+    """Return the sorted names in a folder; none if there is no such folder."""
+    return sorted(_listed(folder))
+
+
 def remote_size(path: Path) -> int | None:
     """Return the number of bytes of a file; None if its store does not tell it.
 
