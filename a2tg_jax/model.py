@@ -257,6 +257,8 @@ class Model:
 def _indices(rows: Any, num: int) -> np.ndarray:
     """Return the indices of the rows that a mask, indices or a slice choose of `num`."""
     if isinstance(rows, int | np.integer) and not isinstance(rows, bool):
+        if not -num <= rows < num:
+            raise ValueError(f"rows must choose among {num} Gaussians; got {rows}")
         end = f"{rows + 1}" if rows != -1 else ""
         raise ValueError(f"rows must be a mask [{num}], indices or a slice; for one Gaussian say model[{rows}:{end}]")
     chosen = rows if isinstance(rows, slice) else np.asarray(rows)

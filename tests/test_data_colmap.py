@@ -235,7 +235,7 @@ def break_model_file(folder):
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
-        (break_missing_path, FileNotFoundError, "nowhere: no such scene folder"),
+        (break_missing_path, FileNotFoundError, "nowhere: no such scene folder$"),
         (break_no_model, FileNotFoundError, "has no sparse model"),
         (break_no_images_folder, FileNotFoundError, "no folder 'images'"),
         (break_missing_image, FileNotFoundError, "img_04.png: no such image"),
@@ -347,3 +347,272 @@ def test_threads_wait_for_the_whole_library(tmp_path):
         check=False,
     )
     assert done.stdout == "[1, 1]\n", done.stderr
+
+
+# Layouts of other programs, and files changed by hand. Dots in the images say where each camera sees the target.
+
+
+def change(file, old, new):
+    """Replaces bytes that are there."""
+    assert old in file.read_bytes()
+    file.write_bytes(file.read_bytes().replace(old, new))
+
+
+def loaded(folder, num_views=9, tolerance=0.05, **options):
+    """The scene, in which all cameras see the target where the images show it."""
+    scene = load_scene(folder, test_every=0, **options)
+    assert len(scene.train) == num_views
+    check_dots(scene, tolerance)
+    return scene
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_the_model_of_the_most_images_is_read(tmp_path, text):
+    """COLMAP numbers its models in no order of size."""
+    names = [f"{index:02d}.png" for index in range(15)]
+    for index, own in enumerate((names[:3], names[3:13], names[13:])):
+        write_scene(tmp_path / str(index), names=own, text=text)
+        shutil.copytree(tmp_path / str(index) / "images", tmp_path / "scene" / "images", dirs_exist_ok=True)
+        shutil.copytree(tmp_path / str(index) / "sparse" / "0", tmp_path / "scene" / "sparse" / f"{index}")
+    with pytest.warns(UserWarning) as told:
+        assert [view.name for view in loaded(tmp_path / "scene", 10).train] == names[3:13]
+    models, photographs = (str(warning.message) for warning in told)
+    assert "3 COLMAP models; sparse/1 (10 images) is read, and not sparse/0 (3 images), sparse/2 (2 images)" in models
+    assert "5 photographs without a pose in the model, such as 00.png: not used" in photographs
+    other = models.rpartition("give its folder, such as ")[2]
+    with pytest.warns(UserWarning, match="12 photographs without a pose"):
+        assert [view.name for view in loaded(other, 3).train] == names[:3]
+
+
+def test_a_model_in_the_folder_itself_comes_first(tmp_path):
+    """Of nested models, too, the one whose folder is given is read."""
+    write_scene(tmp_path)
+    shutil.copytree(tmp_path / "sparse" / "0", tmp_path / "sparse", dirs_exist_ok=True)
+    for folder, chosen in ((tmp_path, "sparse/0"), (tmp_path / "sparse", "its own")):
+        with pytest.warns(UserWarning, match=rf"2 COLMAP models; {chosen} \(9 images\) is read"):
+            loaded(folder)
+
+
+def test_a_single_model_may_have_any_number(tmp_path):
+    write_scene(tmp_path)
+    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "11")
+    loaded(tmp_path)
+
+
+@pytest.mark.parametrize("folder", [".", "colmap", "colmap/sparse", "colmap/sparse/0"])
+def test_layout_of_nerfstudio(tmp_path, folder):
+    """ns-process-data writes colmap/sparse/0 beside images."""
+    write_scene(tmp_path)
+    (tmp_path / "colmap").mkdir()
+    (tmp_path / "sparse").rename(tmp_path / "colmap" / "sparse")
+    assert loaded(tmp_path / folder).name == tmp_path.name
+
+
+@pytest.mark.parametrize("is_named_with_folder", [False, True])
+def test_photographs_beside_the_model(tmp_path, is_named_with_folder):
+    """As RealityScan exports them. A folder that is called yard_2 is not theirs at a downscale of 2."""
+    scene = tmp_path / "yard"
+    write_scene(scene, text=True, names=[f"{index}.png" for index in range(9)])
+    for file in [*(scene / "sparse" / "0").iterdir()]:
+        file.rename(scene / f"{file.stem.capitalize()}.txt")
+    shutil.rmtree(scene / "sparse")
+    if is_named_with_folder:
+        for index in range(9):
+            change(scene / "Images.txt", b" %d.png" % index, b" images/%d.png" % index)
+    else:
+        for file in [*(scene / "images").iterdir()]:
+            file.rename(scene / file.name)
+        (scene / "images").rmdir()
+    (tmp_path / "yard_2").mkdir()
+    assert loaded(scene).name == "yard"
+    assert loaded(scene, downscale=2, tolerance=0.1).train[0].image.shape == (HEIGHT // 2, WIDTH // 2, 3)
+
+
+def strip_last_line(model):
+    (model / "images.txt").write_text((model / "images.txt").read_text().rstrip())
+
+
+def add_byte_order_marks(model):
+    for file in model.iterdir():
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+
+
+def write_floats(model):
+    change(model / "cameras.txt", b" 128 96 ", b" 128.0 96.0 ")
+    change(model / "points3D.txt", b" 255 128 ", b" 255.0 128.0 ")
+
+
+def write_crlf(model):
+    for file in model.iterdir():
+        file.write_bytes(file.read_bytes().replace(b"\n", b"\r\n"))
+
+
+def scale_quaternions(model):
+    lines = (model / "images.txt").read_text().splitlines()
+    for index, line in enumerate(lines):
+        words = line.split()
+        if words and words[0].isdecimal():
+            lines[index] = " ".join([words[0], *(str(3 * float(word)) for word in words[1:5]), *words[5:]])
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("spoil", [strip_last_line, add_byte_order_marks, write_floats, write_crlf, scale_quaternions])
+def test_text_as_other_programs_write_it(tmp_path, spoil):
+    write_scene(tmp_path, text=True)
+    spoil(tmp_path / "sparse" / "0")
+    scene = loaded(tmp_path)
+    np.testing.assert_allclose(scene.colors[7], np.array([255, 128, 7]) / 255, rtol=1e-6)
+    assert len(scene.points) == 50
+
+
+def test_a_point_of_text_that_is_nowhere_is_left_out(tmp_path):
+    write_scene(tmp_path, text=True)
+    file = tmp_path / "sparse" / "0" / "points3D.txt"
+    lines = [line.split() for line in file.read_text().splitlines()]
+    file.write_text("\n".join(" ".join(["2", "nan", *own[2:]] if own[0] == "2" else own) for own in lines) + "\n")
+    with pytest.warns(UserWarning, match="1 points are not finite, or beyond .*left out"):
+        scene = loaded(tmp_path)
+    assert [round(255 * float(blue)) for blue in scene.colors[:3, 2]] == [0, 2, 3]
+
+
+def test_a_camera_that_no_file_has(tmp_path):
+    write_scene(tmp_path, text=True)
+    change(tmp_path / "sparse" / "0" / "cameras.txt", b"\n4 PINHOLE", b"\n44 PINHOLE")
+    with pytest.raises(ValueError, match=r"images\.txt: img_03\.png has the camera 4, which is not in cameras\.txt"):
+        load_scene(tmp_path)
+
+
+def with_tracks(folder, text):
+    """A model in which every image observes two points, as far as COLMAP is concerned."""
+    colmap = pycolmap()
+    reconstruction = write_scene(folder, text=text)
+    for key in (1, 2):
+        for image in reconstruction.images.values():
+            if key == 1:
+                image.points2D = colmap.Point2DList([colmap.Point2D(np.array([5.0, 5])) for _ in range(2)])
+            reconstruction.add_observation(key, colmap.TrackElement(image.image_id, key - 1))
+    (reconstruction.write_text if text else reconstruction.write_binary)(str(folder / "sparse" / "0"))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_an_image_is_removed_as_the_error_says(tmp_path, text):
+    """In text, its lines of rigs, frames and tracks stay, with which pycolmap rejects the model."""
+    with_tracks(tmp_path, text)
+    (tmp_path / "images" / "img_04.png").unlink()
+    with pytest.raises(
+        FileNotFoundError, match=r"img_04\.png: no such image, but the model has a camera for it"
+    ) as told:
+        load_scene(tmp_path)
+    advice = str(told.value).rpartition("or ")[2]
+    if text:
+        file = tmp_path / "sparse" / "0" / "images.txt"
+        assert advice == f"delete its two lines in {file}"
+        lines = file.read_text().splitlines(keepends=True)
+        at = next(index for index, line in enumerate(lines) if "img_04.png" in line)
+        file.write_text("".join(lines[:at] + lines[at + 2 :]))
+        with pytest.warns(UserWarning, match="says that it has 9 images, and has 8"):
+            loaded(tmp_path, 8)
+        with pytest.raises(Exception, match="Image with ID 5 does not exist"):
+            pycolmap().Reconstruction(str(file.parent))
+    else:
+        code = str(told.value).partition("in Python: ")[2]
+        subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+        assert loaded(tmp_path, 8).train[0].points.depths.shape == (2,)
+
+
+def test_missing_photographs_are_counted(tmp_path):
+    write_scene(tmp_path)
+    for index in (2, 4, 5):
+        (tmp_path / "images" / f"img_{index:02d}.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"img_02\.png: no such image.*, and 2 more of its 9 are missing; put"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["points3D.txt", "points3D.bin"])
+def test_empty_points_do_not_hide_a_ply_file(tmp_path, name):
+    write_scene(tmp_path, num_points=0, text=name.endswith(".txt"))
+    (tmp_path / "sparse" / "0" / "Points3D.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+        "0.3 -0.2 0.1\n1 0 0\n0 1 0\n"
+    )
+    assert len(loaded(tmp_path).points) == 3
+
+
+def test_names_from_windows(tmp_path):
+    """Backslashes separate folders, and capitals of the files may differ; masks have the same names."""
+    names = [f"left/IMG {index}.png" for index in range(9)]
+    write_scene(tmp_path, names=names)
+    for text in (False, True):
+        reconstruction = pycolmap().Reconstruction(str(tmp_path / "sparse" / "0"))
+        for image in reconstruction.images.values():
+            image.name = image.name.replace("/", "\\").replace("IMG", "img")
+        folder = tmp_path / f"sparse{text}"
+        folder.mkdir()
+        (reconstruction.write_text if text else reconstruction.write_binary)(str(folder))
+        if text:
+            continue
+        (tmp_path / "masks" / "Left").mkdir(parents=True)
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[:5] = 0
+        for index in range(9):
+            Image.fromarray(mask).save(tmp_path / "masks" / "Left" / f"IMG {index}.PNG.png")
+    for folder in ("sparseFalse", "sparseTrue"):
+        scene = loaded(tmp_path / folder)
+        assert [view.name for view in scene.train] == [f"left/img {index}.png" for index in range(9)]
+        assert all(not view.mask.read()[:5].any() and view.mask.read()[5:].all() for view in scene.train)
+
+
+def test_jpg_for_capital_jpg(tmp_path):
+    write_scene(tmp_path, names=[f"IMG_{index}.jpg" for index in range(9)])
+    for file in [*(tmp_path / "images").iterdir()]:
+        file.rename(file.with_suffix(".JPG"))
+    loaded(tmp_path, tolerance=0.2)  # JPEG's own errors
+
+
+def test_capitals_that_fit_two_files(tmp_path):
+    write_scene(tmp_path)
+    (tmp_path / "images" / "img_03.png").rename(tmp_path / "images" / "IMG_03.png")
+    if (tmp_path / "images" / "img_03.png").exists():
+        pytest.skip("the file system does not tell capitals apart")
+    shutil.copy(tmp_path / "images" / "IMG_03.png", tmp_path / "images" / "Img_03.png")
+    with pytest.raises(FileNotFoundError, match=r"img_03\.png: no such image"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["images", "images/left", "sparse/0/more"])
+def test_a_folder_in_a_scene_names_the_scene(tmp_path, name):
+    write_scene(tmp_path)
+    (tmp_path / name).mkdir(exist_ok=True)
+    with pytest.raises(FileNotFoundError, match=r"is a folder in the scene .*; give that folder instead") as told:
+        load_scene(tmp_path / name)
+    loaded(str(told.value).partition("the scene ")[2].removesuffix("; give that folder instead"))
+
+
+def test_a_lens_that_folds_can_be_kept_as_the_error_says(tmp_path, monkeypatch):
+    monkeypatch.setitem(CAMERAS, "SIMPLE_RADIAL", [110.0, 64, 48, -3.0])
+    write_scene(tmp_path, models=("SIMPLE_RADIAL",))
+    with pytest.raises(ValueError, match=r'folds the image .* keep the photographs .*lens="keep"'):
+        load_scene(tmp_path)
+    assert load_scene(tmp_path, lens="keep").train[0].camera.rays is not None
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_files_say_what_pycolmap_reads_in_them(tmp_path, text):
+    """Poses, observed points, points and the frames of rigs, in a model of several rigs."""
+    from a2tg_jax.data.colmap import _model_of, _read_model, viewmat_of
+
+    with_tracks(tmp_path, text)
+    model = _read_model(_model_of(tmp_path))
+    expected = pycolmap().Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert len(model.images) == expected.num_reg_images() == 9
+    for image in model.images:
+        own = expected.images[image.id]
+        assert (image.name, image.camera_id) == (own.name, own.camera_id)
+        assert image.point_ids.tolist() == [feature.point3D_id for feature in own.points2D] == [1, 2]
+        np.testing.assert_allclose(viewmat_of(image)[:3], own.cam_from_world().matrix(), atol=1e-14)
+    for point in model.points:
+        assert (point["position"] == expected.points3D[point["id"]].xyz).all()
+        assert (point["color"] == expected.points3D[point["id"]].color).all()
+    assert {frame.id: (frame.rig_id, frame.image_ids) for frame in model.frames} == {
+        key: (frame.rig_id, [data.id for data in frame.data_ids]) for key, frame in expected.frames.items()
+    }

@@ -18,7 +18,7 @@ from a2tg_jax.data.colmap_text import count_text_images, read_text
 from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import PHOTO_SUFFIXES, inside, locate_image, map_in_threads, num_readers, on_disk
-from a2tg_jax.data.lenses import KeptLens, Lens, LensUse, checked_lens
+from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
 from a2tg_jax.data.observations import ObservedPoints, before_camera, observed_points
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
@@ -175,14 +175,9 @@ def viewmat_of(image: ImageRecord) -> np.ndarray:
 
 def _photo(name: str, file: Path, still_to_downscale: int, lens: Lens, scene: Path, downscale: int) -> PhotoFiles:
     """Return the files and the lens of one image. Masks and depth maps are beside `images` in the scene."""
-
-    def error_message(error: Exception) -> str:
-        if isinstance(lens, KeptLens):
-            return f"{file}: its camera model {error}"
-        return f"{file}: its camera model {error}; undistort the scene with COLMAP first"
-
     return PhotoFiles(
-        name, file, still_to_downscale, lambda _: lens, error_message,
+        name, file, still_to_downscale, lambda _: lens,
+        error_message=lambda error: f"{file}: its camera model {error}",
         mask=find_mask(scene / IMAGES, name, downscale),
         depths=find_depths(scene / IMAGES, name),
     )  # fmt: skip

@@ -29,6 +29,8 @@ FARTHEST_FROM_RAY = 0.1
 """Largest distance in pixels at which a ray may be seen from its pixel; farther ones are no ray of it."""
 LEAST_SEEN = 0.05
 """Smallest share of pixels with a ray."""
+CUT = ": find cameras anew with a2tg sfm, which cuts panoramas into views"
+"""What to do about cameras that look all around."""
 LensUse = Literal["undistort", "keep"]
 """Whether photographs are undistorted to pinholes, or kept as they are and drawn through the lens."""
 
@@ -68,10 +70,13 @@ class Lens:
                 return self.camera.calibration_matrix(), self.size
             pinhole = pycolmap().undistort_camera(pycolmap().UndistortCameraOptions(), self.camera)
         except (ValueError, RuntimeError):  # COLMAP's own check that the model is perspective
-            raise ValueError(f"{self.camera.model.name} cannot be undistorted to a pinhole camera") from None
+            raise ValueError(f"{self.camera.model.name} cannot be undistorted to a pinhole camera{CUT}") from None
         K, size = pinhole.calibration_matrix(), (pinhole.width, pinhole.height)
         if not self._is_seen_in_order(K, *size):
-            raise ValueError(f"{self.camera.model.name} has a distortion that folds the image or leaves it")
+            raise ValueError(
+                f"{self.camera.model.name} has a distortion that folds the image or leaves it: correct its parameters, "
+                'or keep the photographs as they are with --lens keep (lens="keep")'
+            )
         return K, size
 
     def _is_seen_in_order(self, K: np.ndarray, width: int, height: int) -> bool:
@@ -202,7 +207,7 @@ class KeptLens(Lens):
         try:
             matrix: np.ndarray = self.camera.calibration_matrix()
         except (ValueError, RuntimeError):
-            raise ValueError(f"{self.camera.model.name} has no image plane: cut its photographs into views") from None
+            raise ValueError(f"{self.camera.model.name} has no image plane{CUT}") from None
         return matrix
 
 

@@ -108,7 +108,8 @@ def _load(
     check_test_every(test_every)
     is_here = not is_remote(path)
     if is_here and not path.exists():
-        raise FileNotFoundError(f"{path}: no such scene folder")
+        built_in = "; the built-in scene is synthetic_scene()" if str(path) == "synthetic" else ""
+        raise FileNotFoundError(f"{path}: no such scene folder{built_in}")
     if room is not None and room < 0:
         raise ValueError(f"room must be at least 0 bytes; got {room}")
     options: dict[str, Any] = {

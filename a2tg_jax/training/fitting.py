@@ -146,7 +146,11 @@ def fit(
 def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None) -> None:
     """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
     is_path = str, os.PathLike
-    check_kind("scene", scene, Scene, f"say load_scene({shortened(scene)!r})" if isinstance(scene, is_path) else "")
+    example = ""
+    if isinstance(scene, is_path):
+        path = os.fspath(scene)
+        example = "say synthetic_scene()" if path == "synthetic" else f"say load_scene({path!r})"
+    check_kind("scene", scene, Scene, example)
     if isinstance(system, str):
         raise ValueError(f"system must be a System; got a name: say find_system({shortened(system)!r}).preset('quick')")
     example = f"say {system.__name__}() or {system.__name__}.preset('quick')" if isinstance(system, type) else ""
