@@ -178,7 +178,7 @@ def test_images_without_a_pose_are_counted(tmp_path):
     write_scene(tmp_path)
     Image.new("RGB", (10, 10)).save(tmp_path / "images" / "zzz.png")
     (tmp_path / "images" / "notes.txt").touch()
-    with pytest.warns(UserWarning, match=r"images: 1 photograph without a pose in the model, such as zzz\.png: not us"):
+    with pytest.warns(UserWarning, match=r"images: 1 photograph without a pose, such as zzz\.png: not us"):
         assert len(load_scene(tmp_path).train) == 7
 
 
@@ -378,7 +378,7 @@ def test_the_model_of_the_most_images_is_read(tmp_path, text):
         assert [view.name for view in loaded(tmp_path / "scene", 10).train] == names[3:13]
     models, photographs = (str(warning.message) for warning in told)
     assert "3 COLMAP models; sparse/1 (10 images) is read, and not sparse/0 (3 images), sparse/2 (2 images)" in models
-    assert "5 photographs without a pose in the model, such as 00.png: not used" in photographs
+    assert "5 photographs without a pose, such as 00.png: not used" in photographs
     other = models.rpartition("give its folder, such as ")[2]
     with pytest.warns(UserWarning, match="12 photographs without a pose"):
         assert [view.name for view in loaded(other, 3).train] == names[:3]
@@ -391,6 +391,17 @@ def test_a_model_in_the_folder_itself_comes_first(tmp_path):
     for folder, chosen in ((tmp_path, "sparse/0"), (tmp_path / "sparse", "its own")):
         with pytest.warns(UserWarning, match=rf"2 COLMAP models; {chosen} \(9 images\) is read"):
             loaded(folder)
+
+
+def test_text_beside_a_binary_model_is_said(tmp_path):
+    """COLMAP prefers .bin; changes of the text would have no effect."""
+    reconstruction = write_scene(tmp_path)
+    reconstruction.write_text(str(tmp_path / "sparse" / "0"))
+    loaded(tmp_path)
+    file = tmp_path / "sparse" / "0" / "images.txt"
+    file.write_text("\n".join(file.read_text().splitlines()[:-2]) + "\n")
+    with pytest.warns(UserWarning, match=r"from its \.bin files, with 9 images, and not from its \.txt files, with 8;"):
+        loaded(tmp_path)
 
 
 def test_a_single_model_may_have_any_number(tmp_path):

@@ -5,6 +5,7 @@ import re
 import signal
 import tempfile
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from small_models import some_model
 from small_values import some_gaussians, some_world
+from test_data_colmap import write_scene as write_colmap
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Banded, Shaped
@@ -390,3 +392,63 @@ def test_an_unknown_statistic_is_refused():
     model, camera = some_model(), a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=50).test[0].camera
     with pytest.raises(ValueError, match=r"^statistic must be one of position, screen, center; got 'foo'$"):
         a2tg.view_gradients(lambda model, output: output.color.sum(), model, camera, statistic="foo")
+
+
+class Said(dict):
+    """Names in advice: those of the library, and some values."""
+
+    def __missing__(self, name):
+        return getattr(a2tg, name)
+
+
+ADVICE = {
+    "synthetic scene": (lambda: a2tg.fit("synthetic", a2tg.A2tg()), a2tg.Scene),
+    "scene folder": (lambda: a2tg.fit(Path("fox"), a2tg.A2tg()), a2tg.Scene),
+    "name of a system": (lambda: a2tg.fit(scene(), "a2tg"), a2tg.System),
+    "class of a system": (lambda: a2tg.fit(scene(), a2tg.A2tg), a2tg.System),
+    "Gaussians": (lambda: a2tg.save_model("g.npz", GAUSSIANS), a2tg.Model),
+    "Gaussians for parameters": (lambda: MODEL.with_parameters(GAUSSIANS), a2tg.Parameters),
+    "colours of 0 to 1": (lambda: a2tg.View("a", CAMERA, np.zeros((12, 16, 3))), np.ndarray),
+    "one row": (lambda: MODEL[3], a2tg.Model),
+    "last row": (lambda: MODEL[-1], a2tg.Model),
+    "group of options": (lambda: a2tg.A2tg(texture={"cap": 8}).check(), a2tg.TextureConfig),
+}
+
+
+@pytest.mark.parametrize("mistake", ADVICE)
+def test_what_a_message_says_to_write_works(mistake, tmp_path, monkeypatch):
+    call, made = ADVICE[mistake]
+    with pytest.raises(ValueError, match="say ") as told:
+        call()
+    monkeypatch.chdir(tmp_path)
+    write_colmap(tmp_path / "fox")
+    said = Said(gaussians=GAUSSIANS, model=MODEL, image=np.zeros((12, 16, 3)), np=np)
+    for code in str(told.value).rpartition("say ")[2].partition(" of an")[0].split(" or "):
+        assert isinstance(eval(code, {}, said), made)
+
+
+@pytest.mark.parametrize("layer", [Banded, Shaped])
+def test_what_a_message_says_to_build_works(layer):
+    change = {
+        Banded: lambda: MODEL.with_bands(*SPLIT),
+        Shaped: lambda: MODEL.appearance.with_shapes((), jnp.zeros(7)),
+    }
+    with pytest.raises(ValueError, match="say shown = ") as told:
+        change[layer]()
+    said = str(told.value).rpartition("say ")[2]
+    code = said.replace(", params, layout =", "; params, layout =").replace(", and Model", "; made = Model")
+    names = {layer.__name__: layer, "appearance": MODEL.appearance, "gaussians": GAUSSIANS, "Model": a2tg.Model}
+    names["key"] = jax.random.key(0)
+    exec(code, names)
+    assert isinstance(names["made"].appearance, layer) and names["made"].num == MODEL.num
+
+
+@pytest.mark.parametrize("row", [7, -8])
+def test_a_row_that_no_model_has_gets_no_advice(row):
+    with pytest.raises(ValueError, match=f"rows must choose among 7 Gaussians; got {row}$"):
+        MODEL[row]
+
+
+def test_the_built_in_scene_is_no_folder():
+    with pytest.raises(FileNotFoundError, match=r"synthetic: no such scene folder; .* is synthetic_scene\(\)$"):
+        a2tg.load_scene("synthetic")

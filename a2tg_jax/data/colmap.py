@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from a2tg_jax.data.colmap_records import KINDS, POINT, FrameRecord, ImageRecord,
 from a2tg_jax.data.colmap_text import count_text_images, read_text
 from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
-from a2tg_jax.data.images import PHOTO_SUFFIXES, inside, locate_image, map_in_threads, num_readers, on_disk
+from a2tg_jax.data.images import inside, locate_image, map_in_threads, num_readers, on_disk, warn_of_unposed
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
 from a2tg_jax.data.observations import ObservedPoints, before_camera, observed_points
@@ -27,8 +27,6 @@ from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
 from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
-from a2tg_jax.host.remote_files import is_remote
-from a2tg_jax.host.text import shortened
 
 SUFFIXES = (".bin", ".txt")
 """Suffixes of a model's files, in order of preference."""
@@ -119,7 +117,7 @@ def load_colmap(
     cameras = contents.cameras.items()
     lenses = {key: checked_lens(camera, f"{model}: camera {key}", lens) for key, camera in cameras}
     files = _located(folder, images, downscale, model)
-    _warn_of_others(folder, images)
+    warn_of_unposed(folder, [image.name for image in images], is_deep=folder.name == IMAGES)
     photos = [
         _photo(image.name, *file, lenses[image.camera_id], scene, downscale)
         for image, file in zip(images, files, strict=True)
@@ -285,8 +283,15 @@ def _read_model(model: Path) -> Model:
       ValueError: naming the file, if one cannot be read.
     """
     files = _model_files(model)
-    read = read_binary if files["images"].suffix.lower() == ".bin" else read_text
-    found = {kind: read(file, kind) for kind, file in files.items()}
+    is_binary = files["images"].suffix.lower() == ".bin"
+    found = {kind: (read_binary if is_binary else read_text)(file, kind) for kind, file in files.items()}
+    text = on_disk(model, "images.txt") if is_binary else None
+    if text is not None and (num := count_text_images(text)) != len(found["images"]):
+        warnings.warn(
+            f"{model}: is read from its .bin files, with {counted(len(found['images']), 'image')}, and not from its "
+            f".txt files, with {num}; to read those, move the .bin files away",
+            stacklevel=3,
+        )
     cameras = {}
     for camera in found["cameras"]:
         cameras[camera.id] = pycolmap().Camera(
@@ -326,16 +331,3 @@ def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downsca
         if holds_some(base):
             return base, base
     raise FileNotFoundError(f"{path}: has no folder 'images'; put the model's photographs there")
-
-
-def _warn_of_others(folder: Path, images: Sequence[ImageRecord]) -> None:
-    """Warn of photographs in a folder of this machine that are no images of the model."""
-    if is_remote(folder) or not folder.is_dir():
-        return
-    own = {PurePath(image.name).with_suffix("").as_posix().casefold() for image in images}
-    below = folder.rglob("*") if folder.name == IMAGES else folder.iterdir()
-    files = (file.relative_to(folder) for file in below if file.suffix.lower() in PHOTO_SUFFIXES)
-    others = sorted(file.as_posix() for file in files if file.with_suffix("").as_posix().casefold() not in own)
-    if others:
-        told = f"{counted(len(others), 'photograph')} without a pose in the model, such as {shortened(others[0])}"
-        warnings.warn(f"{folder}: {told}: not used", stacklevel=3)

@@ -2,14 +2,16 @@
 
 import os
 import unicodedata
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePath, PureWindowsPath
 from typing import TypeVar
 
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.core.display import counted
 from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
 from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import shortened
@@ -84,7 +86,7 @@ def inside(folder: Path, name: str) -> str:
     if path.is_absolute() and not is_remote(folder):
         roots = os.path.abspath(folder), os.path.realpath(folder)
         path = next((path.relative_to(root) for root in roots if path.is_relative_to(root)), path)
-    if PureWindowsPath(path).root or path.drive or os.pardir in path.parts or "\0" in name:
+    if PureWindowsPath(str(path)).root or path.drive or os.pardir in path.parts or "\0" in name:
         raise ValueError(
             f"{folder}: {shortened(name)} leads out of the scene's folder, and nothing outside is read; "
             "move it there, or put a link there to where it is, and name that"
@@ -109,6 +111,25 @@ def on_disk(folder: Path, *names: str) -> Path | None:
 def _letters(name: str) -> str:
     """Return a name without capitals. macOS writes accents as letters of their own, which are joined."""
     return unicodedata.normalize("NFC", name.casefold())
+
+
+def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) -> None:
+    """Warn of photographs in a folder of this machine that are not among some names.
+
+    Args:
+      folder: the folder of photographs.
+      names: paths below it of photographs with a pose; suffixes and capitals may differ.
+      is_deep: whether folders in it hold photographs, too.
+    """
+    if is_remote(folder) or not folder.is_dir():
+        return
+    own = {_letters(PurePath(name).with_suffix("").as_posix()) for name in names}
+    files = (file.relative_to(folder) for file in (folder.rglob("*") if is_deep else folder.iterdir()))
+    photos = (file for file in files if file.suffix.lower() in PHOTO_SUFFIXES)
+    others = sorted(file.as_posix() for file in photos if _letters(file.with_suffix("").as_posix()) not in own)
+    if others:
+        told = f"{counted(len(others), 'photograph')} without a pose, such as {shortened(others[0])}"
+        warnings.warn(f"{folder}: {told}: not used", stacklevel=3)
 
 
 def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:

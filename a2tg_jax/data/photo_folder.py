@@ -83,7 +83,7 @@ def _skipped(folder: Path, files: list[Path]) -> str:
     foreign = next((file for file in files if file.suffix.lower() in FOREIGN_SUFFIXES), None)
     video = next((file for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
     if foreign is not None:
-        pattern = folder / foreign.parent / f"*{foreign.suffix}"
+        pattern = as_argument(folder / foreign.parent / f"*{foreign.suffix}")  # ImageMagick itself expands the star.
         told += f". To make JPEG files of them: magick mogrify -format jpg {pattern}"
     if video is not None:
         told += f". A video is given by itself: a2tg sfm {as_argument(folder / video)} SCENE"

@@ -7,7 +7,7 @@ import numpy as np
 
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.frames import Frames, warn_of_missing_images
-from a2tg_jax.data.images import named_image
+from a2tg_jax.data.images import named_image, warn_of_unposed
 from a2tg_jax.data.photogrammetry import (
     LARGEST_SKEW,
     OPENGL,
@@ -56,6 +56,9 @@ def realityscan_frames(path: Path, files: list[Path]) -> Frames:
     if not frames:
         raise ValueError(f"{path}: no photograph lies beside an XMP file of its name; put them together")
     warn_of_missing_images(path / "*.xmp", lacking, len(files))
+    folder = path / "images" if files[0].is_relative_to(path / "images") else path
+    posed = [(path / frame["file_path"]).relative_to(folder).as_posix() for frame in frames]
+    warn_of_unposed(folder, posed, is_deep=folder != path)
     return near_origin(Frames(path / "*.xmp", frames))
 
 
