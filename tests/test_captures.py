@@ -1,6 +1,7 @@
 """Captures of other programs: files as each program writes them, of images that show one point as a white dot."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -231,6 +232,10 @@ def write_realityscan(folder, position=(0, 0, 0)):
 def test_realityscan(tmp_path):
     write_realityscan(tmp_path)
     check_dots(load_scene(tmp_path), 0.1)
+    shutil.copy(tmp_path / "0.png", tmp_path / "later.png")
+    with pytest.warns(UserWarning, match="1 photograph without a pose, such as later.png: not used"):
+        load_scene(tmp_path)
+    (tmp_path / "later.png").unlink()
     (tmp_path / "0.xmp").write_text(realityscan_xmp(poses()[0], more='xcr:DistortionCoeficients="0 0 0 0 0.1 0"'))
     with pytest.raises(ValueError, match=r"0\.xmp: has the distortion model brown3 with skew, k4, t1 or t2"):
         load_scene(tmp_path)

@@ -580,6 +580,27 @@ def test_jpg_for_capital_jpg(tmp_path):
     loaded(tmp_path, tolerance=0.2)  # JPEG's own errors
 
 
+def test_a_folder_called_images_in_capitals(tmp_path):
+    write_scene(tmp_path)
+    (tmp_path / "images").rename(tmp_path / "Images")
+    loaded(tmp_path)
+
+
+def test_two_images_of_one_file_are_refused(tmp_path):
+    """Where capitals were lost, one photograph would stand for two."""
+    write_scene(tmp_path, names=["a.png", "A.png", *(f"{index}.png" for index in range(4))])
+    (tmp_path / "images" / "A.png").unlink()
+    with pytest.raises(ValueError, match=r"a\.png: is the only file for (a|A)\.png and (a|A)\.png; put both there"):
+        load_scene(tmp_path)
+
+
+def test_a_camera_that_no_image_has_need_not_be_usable(tmp_path):
+    write_scene(tmp_path, text=True)
+    file = tmp_path / "sparse" / "0" / "cameras.txt"
+    file.write_text(file.read_text().replace("# Number of cameras: 9", "") + "99 EQUIRECTANGULAR 128 64 128 64\n")
+    loaded(tmp_path)
+
+
 def test_capitals_that_fit_two_files(tmp_path):
     write_scene(tmp_path)
     (tmp_path / "images" / "img_03.png").rename(tmp_path / "images" / "IMG_03.png")

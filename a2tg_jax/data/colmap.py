@@ -114,10 +114,10 @@ def load_colmap(
     contents = _read_model(model)
     scene, folder = _find_photos(path, model, contents.images, downscale)
     images = [image._replace(name=inside(folder, image.name)) for image in contents.images]
-    cameras = contents.cameras.items()
-    lenses = {key: checked_lens(camera, f"{model}: camera {key}", lens) for key, camera in cameras}
-    files = _located(folder, images, downscale, model)
-    warn_of_unposed(folder, [image.name for image in images], is_deep=folder.name == IMAGES)
+    used = sorted({image.camera_id for image in images})
+    lenses = {key: checked_lens(contents.cameras[key], f"{model}: camera {key}", lens) for key in used}
+    files = _located(folder, images, downscale, model, has_siblings=folder != scene)
+    warn_of_unposed(folder, [image.name for image in images], is_deep=folder != scene)
     photos = [
         _photo(image.name, *file, lenses[image.camera_id], scene, downscale)
         for image, file in zip(images, files, strict=True)
@@ -181,8 +181,17 @@ def _photo(name: str, file: Path, still_to_downscale: int, lens: Lens, scene: Pa
     )  # fmt: skip
 
 
-def _located(folder: Path, images: Sequence[ImageRecord], downscale: int, model: Path) -> list[tuple[Path, int]]:
+def _located(
+    folder: Path, images: Sequence[ImageRecord], downscale: int, model: Path, has_siblings: bool
+) -> list[tuple[Path, int]]:
     """Return the file of each image of a model and the remaining factor of downscaling.
+
+    Args:
+      folder: the folder of photographs.
+      images: of the model.
+      downscale: k >= 1.
+      model: its folder.
+      has_siblings: whether `<folder>_k` holds the downscaled photographs of the folder.
 
     Raises:
       FileNotFoundError: if some are missing, with their number and what to do.
@@ -190,9 +199,9 @@ def _located(folder: Path, images: Sequence[ImageRecord], downscale: int, model:
 
     def locate(image: ImageRecord) -> tuple[Path, int] | None:
         try:
-            if folder.name == IMAGES:
+            if has_siblings:
                 return locate_image(folder, image.name, downscale)
-            return locate_image(folder, image.name, 1)[0], downscale  # Only `images` has smaller siblings.
+            return locate_image(folder, image.name, 1)[0], downscale
         except FileNotFoundError:
             return None
 
@@ -322,9 +331,10 @@ def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downsca
         return any(on_disk(folder, image.name.replace("\\", "/")) for image in images[:TRIED_NAMES])
 
     for base in bases:
-        if is_folder(base / IMAGES):
-            is_beside = not holds_some(base / IMAGES) and holds_some(base)
-            return base, base if is_beside else base / IMAGES
+        names = sorted((name for name in names_in(base) if name.lower() == IMAGES), reverse=True)  # "images" first
+        folder = next((base / name for name in names if is_folder(base / name)), None)
+        if folder is not None:
+            return base, base if holds_some(base) and not holds_some(folder) else folder
         if downscale > 1 and is_folder(base / f"{IMAGES}_{downscale}"):
             return base, base / IMAGES
     for base in bases:

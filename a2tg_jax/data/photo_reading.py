@@ -89,6 +89,13 @@ def read_photos(photos: Sequence[PhotoFiles], shelf: Shelf, division: Division |
       FileNotFoundError, ValueError, OSError: if a photograph or a mask cannot be used. `sharing_errors` raises it in
         every process.
     """
+    names: dict[Path, str] = {}
+    for photo in photos:
+        if names.setdefault(photo.file, photo.name) != photo.name:
+            raise ValueError(
+                f"{photo.file}: is the only file for {names[photo.file]} and {photo.name}; put both there, or remove "
+                "one from the scene"
+            )
     threads = num_readers(place)
     if division is None:
         return map_in_threads(lambda photo: _read(photo, shelf), photos, threads)
@@ -98,8 +105,8 @@ def read_photos(photos: Sequence[PhotoFiles], shelf: Shelf, division: Division |
         read[number] = _read(photos[number], shelf)
         return read[number].facts.to_json()
 
-    names = [f"{photo.name} downscaled by {photo.downscale}" for photo in photos]
-    facts = [Facts.from_json(values) for values in division.results(names, facts_of, "photographs", threads)]
+    told = [f"{photo.name} downscaled by {photo.downscale}" for photo in photos]
+    facts = [Facts.from_json(values) for values in division.results(told, facts_of, "photographs", threads)]
     others = [number for number in range(len(photos)) if number not in read]
     fitting = shelf.fitting([math.prod(facts[number].shape) for number in others])
 
