@@ -105,6 +105,11 @@ def test_lines_that_are_cut_off_are_noticed(tmp_path, kind):
         ("cameras", "1 PINHOLE wide 96 110 120 70 40", "line 1"),
         ("images", "1 1 0 0 0 0 0 0 1", "an image needs 10 words"),
         ("images", "1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 0 1 b.png\n", "the line of its points is missing"),
+        (
+            "images",
+            "1 1 0 0 0 0 0 0 1 my a.png\n2 1 0 0 0 0 0 0 1 my photo b.png\n",
+            "the line of its points is missing",
+        ),
         ("points3D", "1 0 0 0 1 2 3.5.1 0.5", "line 1"),
         ("points3D", "1.5 0 0 0 1 2 3 0.5", "1.5 is no whole number of at least 0"),
         ("cameras", "1 PINHOLE nan 96 110 120 70 40", "nan is no whole number"),

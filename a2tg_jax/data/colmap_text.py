@@ -117,11 +117,14 @@ def _image(entry: _Entry) -> ImageRecord:
     if len(words) < 10:
         raise ValueError(f"an image needs 10 words (id, pose, camera, name); got {len(words)}")
     points = entry.points.split()
-    if len(points) % 3:
-        raise ValueError("the line of its points is missing or cut off")
-    ids = np.array([_point_id(word) for word in points[2::3]], np.uint64)
+    try:
+        # Each feature has x, y and the id of its point.
+        ids = [_point_id(point_id) for _, _, point_id in zip(*[iter(points)] * 3, strict=True)]
+    except ValueError:
+        raise ValueError("the line of its points is missing or cut off") from None
     name = decoded_name(entry.path, words[9].strip())
-    return ImageRecord(_whole(words[0]), _floats(words[1:8]), _whole(words[8]), name, ids)
+    pose, camera = _floats(words[1:8]), _whole(words[8])
+    return ImageRecord(_whole(words[0]), pose, camera, name, np.array(ids, np.uint64))
 
 
 def _point(entry: _Entry) -> tuple[int, list[float], list[int], float]:
