@@ -1,6 +1,7 @@
 """Captures of other programs: files as each program writes them, of images that show one point as a white dot."""
 
 import json
+import shlex
 import shutil
 
 import numpy as np
@@ -19,10 +20,11 @@ from test_data_transforms import (
     save_dot,
     to_camera,
     write_frames,
+    write_json,
     write_ply,
 )
 
-from a2tg_jax.data import load_scene, run_sfm
+from a2tg_jax.data import decoding, load_scene, run_sfm
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*sparse points; starting from")
 COUNT = 4
@@ -255,6 +257,31 @@ def test_cameras_without_an_image_are_told(tmp_path, writer):
         load_scene(tmp_path)
 
 
+def write_nerfstudio(folder):
+    write_ply(folder / "points.ply")
+    write_json(folder, write_frames(folder), ply_file_path="points.ply", **FOCAL)
+
+
+def write_realityscan_in_images(folder):
+    write_realityscan(folder)
+    (folder / "images").mkdir()
+    for file in [*folder.glob("*.*")]:
+        file.rename(folder / "images" / file.name)
+
+
+@pytest.mark.parametrize("writer", [write_nerfstudio, write_metashape, write_realityscan_in_images])
+def test_photographs_that_are_too_large_are_read_smaller_as_the_error_says(tmp_path, monkeypatch, writer):
+    """Their size is read from the large files where no other file has it."""
+    writer(tmp_path)
+    monkeypatch.setattr(decoding, "MAX_PIXELS", 6000)
+    with pytest.raises(ValueError, match=r"is the limit; .* copies of all images .* \(images_2 and --downscale 2\)"):
+        load_scene(tmp_path)
+    (tmp_path / "images_2").mkdir()
+    for file in (tmp_path / "images").glob("*.png"):
+        Image.open(file).reduce(2).save(tmp_path / "images_2" / file.name)
+    check_dots(load_scene(tmp_path, downscale=2), 0.2)
+
+
 @pytest.mark.parametrize("writer", [write_metashape, write_realityscan])
 def test_photographs_in_folders_below_images(tmp_path, writer):
     writer(tmp_path)
@@ -365,3 +392,13 @@ def test_transforms_come_first(tmp_path):
     (tmp_path / "cameras.xml").write_text("<sensors")
     (tmp_path / "images.psx").touch()
     check_dots(load_scene(tmp_path))
+
+
+def test_the_command_that_converts_photographs_is_one_argument_a_path(tmp_path):
+    folder = tmp_path / "my photos"
+    folder.mkdir()
+    (folder / "a.cr2").touch()
+    with pytest.raises(ValueError, match="mogrify") as told:
+        run_sfm(folder, tmp_path / "scene", progress=False)
+    command = str(told.value).partition("To make JPEG files of them: ")[2]
+    assert shlex.split(command) == ["magick", "mogrify", "-format", "jpg", str(folder / "*.cr2")]

@@ -67,8 +67,12 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Return (width, height) of an image file as stored, without decoding it. Raises as `read_pixels` does."""
-    with _opened(path) as image:
+    """Return (width, height) of an image file as stored, without decoding it, so that it may be larger than others.
+
+    Raises:
+      ValueError: naming the file, if it is no image.
+    """
+    with _opened(path, is_decoded=False) as image:
         return _stored_size(image)
 
 
@@ -150,7 +154,7 @@ def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 @contextmanager
-def _opened(path: str | os.PathLike[str], most_bits: int = 8) -> Iterator[Image.Image]:
+def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool = True) -> Iterator[Image.Image]:
     """Open an image within the block; every decoding error becomes one ValueError."""
     try:
         opened = open_regular(path, MOST_BYTES)
@@ -159,15 +163,18 @@ def _opened(path: str | os.PathLike[str], most_bits: int = 8) -> Iterator[Image.
     except OSError as error:
         raise _unreadable(path, error) from error
     with opened as file:
-        yield from _decoded(path, file, most_bits)
+        yield from _decoded(path, file, most_bits, is_decoded)
 
 
-def _decoded(path: str | os.PathLike[str], file: BufferedReader, most_bits: int) -> Iterator[Image.Image]:
-    """Yield the image in an open file, once."""
+def _decoded(
+    path: str | os.PathLike[str], file: BufferedReader, most_bits: int, is_decoded: bool
+) -> Iterator[Image.Image]:
+    """Yield the image in an open file, once; its size and bits are checked if it is decoded."""
     try:
         with Image.open(file, formats=_formats_of(path, file)) as image:
-            _check_size(path, image)
-            if most_bits == 8:
+            if is_decoded:
+                _check_size(path, image)
+            if is_decoded and most_bits == 8:
                 _check_depth(path, image)
             yield image
     except PictureRefused:
