@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 
 from a2tg_jax.data import load_scene, view_image
 from a2tg_jax.data.colmap_library import pycolmap
@@ -547,6 +547,20 @@ def test_empty_points_do_not_hide_a_ply_file(tmp_path, name):
         "0.3 -0.2 0.1\n1 0 0\n0 1 0\n"
     )
     assert len(loaded(tmp_path).points) == 3
+
+
+def test_a_photograph_on_its_side_is_turned_as_the_error_says(tmp_path):
+    """Its camera was estimated from the pixels as EXIF turns them."""
+    write_scene(tmp_path)
+    for file in (tmp_path / "images").iterdir():
+        turned = Image.open(file).transpose(Image.Transpose.ROTATE_90)
+        turned.getexif()[ExifTags.Base.Orientation] = 6
+        turned.save(file, exif=turned.getexif())
+    with pytest.raises(ValueError, match=r"is 96x128, but its camera is 128x96.* turned as EXIF says .*-auto-orient"):
+        load_scene(tmp_path)
+    for file in (tmp_path / "images").iterdir():
+        ImageOps.exif_transpose(Image.open(file)).save(file)
+    loaded(tmp_path)
 
 
 def test_names_from_windows(tmp_path):

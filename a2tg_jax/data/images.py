@@ -156,9 +156,11 @@ def check_aspect(path: Path, stored: tuple[int, int], camera: tuple[int, int]) -
     (image_width, image_height), (width, height) = stored, camera
     ratio = (image_width * height) / (image_height * width)
     if abs(ratio - 1) > max(MAX_ASPECT_ERROR, 1 / min(image_width, image_height)):
+        is_turned = (image_height, image_width) == camera
+        advice = "write it turned as EXIF says (magick mogrify -auto-orient FILE), or " if is_turned else ""
         raise ValueError(
             f"{path}: is {image_width}x{image_height}, but its camera is {width}x{height}, of another aspect; "
-            f"use the image that the camera was estimated from"
+            f"{advice}use the image that the camera was estimated from"
         )
 
 
