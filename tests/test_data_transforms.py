@@ -164,6 +164,63 @@ def test_downscale(tmp_path, has_folder):
     check_dots(scene)
 
 
+def shades(scene):
+    """The grey of each view's photograph, by name."""
+    return {view.name: int(view.image.mean().round()) for view in (*scene.train, *scene.test)}
+
+
+def write_shades(folder, sizes):
+    """A scene without points whose photographs, of given names and sizes, are each of one grey."""
+    frames = [dict(transform_matrix=camera_to_world(index, len(sizes)).tolist()) for index in range(len(sizes))]
+    for index, (frame, (name, size)) in enumerate(zip(frames, sizes.items(), strict=True)):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((size[1], size[0], 3), 10 * index, np.uint8)).save(folder / name)
+        frame["file_path"] = name
+    write_json(folder, frames, **FOCAL, **SIZE)
+
+
+@pytest.mark.filterwarnings("ignore:.*sparse points")
+@pytest.mark.parametrize("second", [(WIDTH, HEIGHT), (WIDTH // 2, HEIGHT // 2)])
+def test_a_second_clip_is_no_folder_of_smaller_copies(tmp_path, second):
+    """images/clip_2 is a clip of the scene, even if its photographs have half the size."""
+    names = [f"images/clip{'_2' * (index % 2)}/{index // 2}.png" for index in range(6)]
+    write_shades(tmp_path, {name: second if "_2/" in name else (WIDTH, HEIGHT) for name in names})
+    assert shades(load_scene(tmp_path, downscale=2)) == {name: 10 * index for index, name in enumerate(names)}
+
+
+@pytest.mark.filterwarnings("ignore:.*sparse points")
+@pytest.mark.parametrize(
+    ("size", "told"),
+    [
+        ((WIDTH, HEIGHT), r"6 of 6, such as 0\.png, which is 120x90 for 120x90: not used"),
+        ((WIDTH // 2, HEIGHT // 2 - 2), r"6 of 6, such as 0\.png, which is 60x43 for 120x90: not used"),
+        (None, r"1 of 6, such as 5\.png, which is missing: not used"),
+    ],
+)
+def test_a_folder_that_holds_no_smaller_copies_is_told(tmp_path, size, told):
+    names = [f"images/{index}.png" for index in range(6)]
+    write_shades(tmp_path, dict.fromkeys(names, (WIDTH, HEIGHT)))
+    (tmp_path / "images_2").mkdir()
+    for name in names if size else names[:-1]:
+        pixels = np.full((*(size or (WIDTH // 2, HEIGHT // 2))[::-1], 3), 255, np.uint8)
+        Image.fromarray(pixels).save(tmp_path / name.replace("images", "images_2"))
+    with pytest.warns(UserWarning, match=rf"images_2: does not hold the files of .*images at 1/2 .* {told}"):
+        scene = load_scene(tmp_path, downscale=2)
+    assert shades(scene) == {name: 10 * index for index, name in enumerate(names)}
+    assert scene.train[0].picture.size == (45, 60)
+
+
+@pytest.mark.filterwarnings("ignore:.*sparse points")
+def test_the_scene_beside_is_no_folder_of_smaller_copies(tmp_path):
+    """Photographs may be in the scene's folder itself, whose siblings are other scenes."""
+    names = [f"{index}.png" for index in range(4)]
+    write_shades(tmp_path / "scene", dict.fromkeys(names, (WIDTH, HEIGHT)))
+    (tmp_path / "scene_2").mkdir()
+    for name in names:
+        Image.fromarray(np.full((HEIGHT // 2, WIDTH // 2, 3), 255, np.uint8)).save(tmp_path / "scene_2" / name)
+    assert shades(load_scene(tmp_path / "scene", downscale=2)) == {name: 10 * index for index, name in enumerate(names)}
+
+
 @pytest.mark.parametrize("is_full_there", [True, False])
 @pytest.mark.parametrize("values", [FOCAL, FOCAL | {"w": WIDTH}, dict(camera_angle_x=2 * np.arctan(WIDTH / 200))])
 def test_intrinsics_without_a_size_belong_to_the_full_images(tmp_path, values, is_full_there):

@@ -20,12 +20,13 @@ from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import KeptLens, Lens, LensUse, checked_lens
-from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
+from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, mask_to_read
 from a2tg_jax.data.observations import ObservedPoints, before_camera, observed_points
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
+from a2tg_jax.data.smaller_copies import SmallerCopies, find_copies
 from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.regular_files import is_folder, is_regular, open_regular
 from a2tg_jax.host.remote_files import is_remote
@@ -82,8 +83,13 @@ def load_colmap(
     _log_unregistered(images_folder, len(registered))
     reach = SAME_PLACE * spacing(registered)
 
+    masks = {image.name: find_mask(images_folder, image.name, downscale) for image in registered}
+    files = [*((images_folder, name) for name in masks), *(mask for mask in masks.values() if mask is not None)]
+    copies = find_copies(files, downscale, images_folder.parent)
+
     def photo(image: Any) -> PhotoFiles:
-        return _photo(image, lenses[image.camera_id], images_folder, downscale)
+        mask = mask_to_read(masks[image.name], copies)
+        return _photo(image, lenses[image.camera_id], images_folder, copies, mask)
 
     photos = map_in_threads(photo, registered, num_readers(path))
     found = read_photos(photos, Shelf(room), division, path)
@@ -140,9 +146,12 @@ def viewmat_of(image: Any) -> np.ndarray:
     return rigid_viewmat(viewmat, image.name)
 
 
-def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> PhotoFiles:
+def _photo(
+    image: Any, lens: Lens, images_folder: Path, copies: SmallerCopies, mask: tuple[Path, int] | None
+) -> PhotoFiles:
     """Return the files and the lens of one registered image."""
-    file, still_to_downscale = locate_image(images_folder, image.name, downscale)
+    folder, still_to_downscale = copies.of(images_folder)
+    file = locate_image(folder, image.name)
 
     def error_message(error: Exception) -> str:
         if isinstance(lens, KeptLens):
@@ -151,8 +160,7 @@ def _photo(image: Any, lens: Lens, images_folder: Path, downscale: int) -> Photo
 
     return PhotoFiles(
         image.name, file, still_to_downscale, lambda _: lens, error_message,
-        mask=find_mask(images_folder, image.name, downscale),
-        depths=find_depths(images_folder, image.name),
+        mask=mask, depths=find_depths(images_folder, image.name),
     )  # fmt: skip
 
 

@@ -22,11 +22,12 @@ from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import check_inside, locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
-from a2tg_jax.data.mask_files import check_masks, find_mask, named_mask
+from a2tg_jax.data.mask_files import check_masks, find_mask, mask_to_read
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
+from a2tg_jax.data.smaller_copies import SmallerCopies, find_copies
 from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -169,7 +170,8 @@ def read_shots(
     """
     frames = [(file, {**meta, **frame}) for file, meta in files for frame in meta["frames"]]
     place = files[0][0]
-    photos = map_in_threads(lambda item: _photo(*item, downscale, use), frames, num_readers(place))
+    copies = find_copies(_named_files(frames, downscale), downscale, place.parent)
+    photos = map_in_threads(lambda item: _photo(*item, copies, use), frames, num_readers(place))
     found = iter(read_photos(photos, shelf, division, place))
     groups = []
     for file, meta in files:
@@ -179,39 +181,47 @@ def read_shots(
     return groups
 
 
-def _photo(file: Path, frame: dict[str, Any], downscale: int, use: LensUse) -> PhotoFiles:
+def _named_files(frames: Sequence[tuple[Path, dict[str, Any]]], downscale: int) -> list[tuple[Path, str]]:
+    """Return folder and name of the photographs and masks of all frames."""
+    files: list[tuple[Path, str] | None] = []
+    for file, frame in frames:
+        if "file_path" not in frame or "transform_matrix" not in frame:
+            raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
+        image = _beside(file, frame["file_path"])
+        files += [(image.parent, image.name), _find_mask(file, frame, image, downscale)]
+    return [each for each in files if each is not None]
+
+
+def _photo(file: Path, frame: dict[str, Any], copies: SmallerCopies, use: LensUse) -> PhotoFiles:
     """Return the files of one frame; `frame` also holds the file's global values, which the frame's own override."""
-    if "file_path" not in frame or "transform_matrix" not in frame:
-        raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
-    path = _beside(file, frame["file_path"])
+    path, downscale = _beside(file, frame["file_path"]), copies.downscale
     name = Path(frame["file_path"]).as_posix()
-    # Only a folder of images below the scene has siblings of the form images_k.
-    image_folder, image_name = (path.parent, path.name) if path.parent != file.parent else (file.parent, name)
-    image_file, still_to_downscale = locate_image(image_folder, image_name, downscale)
+    folder, still_to_downscale = copies.of(path.parent)
+    image_file = locate_image(folder, path.name)
 
     def lens_of(stored: tuple[int, int]) -> Lens:
         has_size = frame.get("w") and frame.get("h")
         is_reduced = still_to_downscale < downscale
-        full = _full_size(image_folder, image_name, stored, downscale) if is_reduced and not has_size else stored
+        full = _full_size(path, stored, downscale) if is_reduced and not has_size else stored
         return _lens(frame, full, f"{file}: {name}", use)
 
     return PhotoFiles(
         name, image_file, still_to_downscale, lens_of,
         error_message=lambda error: f"{file}: {name}: its camera model {error}",
-        mask=_find_mask(file, frame, image_folder / image_name, downscale),
-        depths=_find_depths(file, frame, image_folder / image_name),
+        mask=mask_to_read(_find_mask(file, frame, path, downscale), copies, is_named=bool(frame.get("mask_path"))),
+        depths=_find_depths(file, frame, path),
     )  # fmt: skip
 
 
-def _full_size(folder: Path, name: str, stored: tuple[int, int], downscale: int) -> tuple[int, int]:
+def _full_size(path: Path, stored: tuple[int, int], downscale: int) -> tuple[int, int]:
     """Return the (width, height) of the full image of a reduced one, to which the intrinsics belong.
 
     It is that of the full image's file, or `downscale` times the size `stored` of the reduced one if that file is
     missing or in object storage.
     """
-    if not is_remote(folder):
+    if not is_remote(path):
         with suppress(FileNotFoundError):
-            return picture_size(locate_image(folder, name, 1)[0])
+            return picture_size(locate_image(path.parent, path.name))
     return downscale * stored[0], downscale * stored[1]
 
 
@@ -235,10 +245,11 @@ def _find_depths(file: Path, frame: dict[str, Any], image: Path) -> Path | None:
     return find_depths(images, str(image.relative_to(images))) if image.is_relative_to(images) else None
 
 
-def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, int] | None:
-    """Return the mask that a frame names, or else that of its image in the folder `masks` beside `images`."""
+def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, str] | None:
+    """Return folder and name of the mask that a frame names, or of the one for its image in `masks` beside `images`."""
     if frame.get("mask_path"):
-        return named_mask(_beside(file, frame["mask_path"]), downscale)
+        path = _beside(file, frame["mask_path"])
+        return path.parent, path.name
     images = file.parent / "images"
     return find_mask(images, str(image.relative_to(images)), downscale) if image.is_relative_to(images) else None
 
