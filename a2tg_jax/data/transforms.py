@@ -312,6 +312,8 @@ def _distortion(frame: dict[str, Any], what: str) -> tuple[str, list[float]]:
     values = {key: _number(frame, key, 0.0, what) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
     if model == "OPENCV_FISHEYE":
         return model, [values[key] for key in FISHEYE_KEYS]
+    if model == "THIN_PRISM_FISHEYE":
+        return model, [*(values[key] for key in (*OPENCV_KEYS, "k3", "k4")), 0.0, 0.0]
     if model not in PERSPECTIVE_MODELS:
         wanted = "a perspective one or OPENCV_FISHEYE"
         raise ValueError(f"{what}: has the camera_model {shortened(model)}; {wanted} is expected")
