@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.core.cameras import LONGEST_SIDE
-from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, random_points, rigid_viewmat
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.depth_files import find_depths
@@ -36,8 +36,8 @@ from a2tg_jax.host.text import shortened
 
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
-BLENDER_HALF_SIDE = 1.3
-"""Half the side of the cube that holds the objects of NeRF-synthetic scenes."""
+POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
+"""Names of the points of nerfstudio and of 3DGS beside a transforms file, in order of preference."""
 OPENCV_KEYS = ("k1", "k2", "p1", "p2")
 FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "ply_file_path")
@@ -70,7 +70,7 @@ def load_transforms(
     (shots,) = read_shots([(file, meta)], downscale, Shelf(room), lens, division)
     listed = {key: _names(meta[key]) for key in SPLIT_KEYS if key in meta}
     train, test = _listed_split(file, shots, listed) if listed else every_kth(shots, test_every)
-    cloud = read_ply_points(_beside(file, meta["ply_file_path"])) if meta.get("ply_file_path") else None
+    cloud = _points_beside(file, meta)
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
 
 
@@ -80,8 +80,8 @@ def load_blender(
 ) -> Scene:  # fmt: skip
     """Read a Blender scene in the format of NeRF: transforms_train.json, transforms_test.json, images with alpha.
 
-    Such scenes have no points: the scene starts from random ones in the cube of ±1.3. Without a test file, every
-    test_every-th training view is a test view.
+    Most such scenes have no points, and start from random ones in a cube around what all cameras look at. Without a
+    test file, every test_every-th training view is a test view.
 
     Args:
       folder: the scene folder.
@@ -93,11 +93,19 @@ def load_blender(
     """
     train_file, test_file = (folder / name for name in BLENDER_FILES)
     files = [train_file, test_file] if is_regular(test_file) else [train_file]
-    groups = read_shots([(file, _read_json(file)) for file in files], downscale, Shelf(room), lens, division)
+    metas = [_read_json(file) for file in files]
+    groups = read_shots(list(zip(files, metas, strict=True)), downscale, Shelf(room), lens, division)
     train, test = groups if len(groups) == 2 else every_kth(groups[0], test_every)
-    cloud = PointCloud(*random_points(np.zeros(3), BLENDER_HALF_SIDE))
-    logger.info("%s: a Blender scene, starting from %s random points", folder, f"{len(cloud.points):,}")
-    return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder))
+    cloud = _points_beside(train_file, *metas)
+    logger.info("%s: a Blender scene, starting from %s points", folder, "random" if cloud is None else "its")
+    return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder), is_object=True)
+
+
+def _points_beside(file: Path, *metas: dict[str, Any]) -> PointCloud | None:
+    """Return the points that transforms files of a folder name, or else those in one of `POINT_FILES`, or None."""
+    named = [meta["ply_file_path"] for meta in metas if meta.get("ply_file_path")]
+    usual = [name for name in POINT_FILES if not named and is_regular(file.parent / name)]
+    return next((read_ply_points(_beside(file, name)) for name in (*named, *usual)), None)
 
 
 def _listed_split(file: Path, shots: Sequence[Shot], listed: dict[str, set[str]]) -> tuple[list[Shot], list[Shot]]:
