@@ -127,6 +127,13 @@ def test_record3d(tmp_path, metadata, images, changes):
         load_scene(tmp_path)
 
 
+def test_images_of_record3d_without_a_pose_are_told(tmp_path):
+    write_record3d(tmp_path)
+    save_dot(tmp_path / "rgbd" / f"{COUNT}.jpg", (9, 9))
+    with pytest.warns(UserWarning, match=rf"1 of {COUNT + 1} images have no pose, such as {COUNT}\.jpg: not used"):
+        assert len(load_scene(tmp_path, test_every=0).train) == COUNT
+
+
 def metashape_place(pose, f=100.0, b1=-4.0, cx=-2.0, cy=2.0, k1=-0.1, k2=0.02, k3=0.001, p1=0.004, p2=-0.003):
     """The place of the target by Metashape's manual: Brown's distortion, then f, b1 and the offset from the middle."""
     x, y, z = to_camera(pose, TARGET)

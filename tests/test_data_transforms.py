@@ -258,6 +258,11 @@ def test_full_images_tell_their_size_where_reduced_ones_are_rounded(tmp_path):
         (dict(k1=-0.1, k2=0.02, k3=0.01), "FULL_OPENCV", [-0.1, 0.02, 0, 0, 0.01, 0, 0, 0]),
         (dict(camera_model="OPENCV_FISHEYE", k1=0.03, k3=0.001), "OPENCV_FISHEYE", [0.03, 0, 0.001, 0]),
         (dict(is_fisheye=True, k1=0.03), "OPENCV_FISHEYE", [0.03, 0, 0, 0]),
+        (
+            dict(camera_model="THIN_PRISM_FISHEYE", k1=0.03, k4=0.002, p1=0.003, p2=-0.002, sx1=0.004),
+            "THIN_PRISM_FISHEYE",
+            [0.03, 0, 0.003, -0.002, 0, 0.002, 0.004, 0],
+        ),
     ],
 )
 def test_distortion_is_taken_out(tmp_path, distortion, model, params):

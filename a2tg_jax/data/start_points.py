@@ -1,7 +1,7 @@
 """Points to start from: whether views see them, and random ones where the cameras look. All in the normalised world."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class Sight(NamedTuple):
     """[2] largest ones."""
 
     @staticmethod
-    def of(viewmat: np.ndarray, K: np.ndarray, size: tuple[int, ...], rays: np.ndarray | None) -> "Sight":
+    def of(viewmat: np.ndarray, K: np.ndarray, size: tuple[int, ...], rays: Any) -> "Sight":
         """Return what a view of (height, width) shows, with `rays` as `Camera.rays` has them."""
         if rays is None:
             return Sight(viewmat, K, np.zeros(2), np.array(size[::-1], np.float64))

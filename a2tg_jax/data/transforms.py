@@ -40,6 +40,7 @@ POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
 """Names of the points of nerfstudio and of 3DGS beside a transforms file, in order of preference."""
 OPENCV_KEYS = ("k1", "k2", "p1", "p2")
 FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
+PRISM_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "ply_file_path")
 SPLIT_KEYS = ("train_filenames", "test_filenames", "val_filenames")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
@@ -317,13 +318,13 @@ def _focal_lengths(frame: dict[str, Any], width: int, height: int, what: str) ->
 def _distortion(frame: dict[str, Any], what: str) -> tuple[str, list[float]]:
     """Return COLMAP's camera model and its distortion parameters; nerfstudio's have the same names and meaning."""
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
-    values = {key: _number(frame, key, 0.0, what) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    values = {key: _number(frame, key, 0.0, what) for key in PRISM_KEYS}
     if model == "OPENCV_FISHEYE":
         return model, [values[key] for key in FISHEYE_KEYS]
     if model == "THIN_PRISM_FISHEYE":
-        return model, [*(values[key] for key in (*OPENCV_KEYS, "k3", "k4")), 0.0, 0.0]
+        return model, [values[key] for key in PRISM_KEYS]
     if model not in PERSPECTIVE_MODELS:
-        wanted = "a perspective one or OPENCV_FISHEYE"
+        wanted = "a perspective one, OPENCV_FISHEYE or THIN_PRISM_FISHEYE"
         raise ValueError(f"{what}: has the camera_model {shortened(model)}; {wanted} is expected")
     if values["k4"] != 0:
         raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are known there")
