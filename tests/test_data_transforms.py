@@ -457,6 +457,14 @@ def test_colors_of_points_in_any_range(tmp_path, kind, factor):
     np.testing.assert_allclose(load_scene(tmp_path).colors, wanted, atol=1e-6)
 
 
+@pytest.mark.parametrize("names", [("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")])
+def test_colors_of_points_by_other_names(tmp_path, names):
+    write_scene(tmp_path)
+    file = tmp_path / "sparse_pc.ply"
+    write_points(file, TARGET + 0.1 * np.eye(2, 3), [[255, 0, 51], [51, 102, 0]], names=names)
+    np.testing.assert_allclose(load_scene(tmp_path).colors, [[1, 0, 0.2], [0.2, 0.4, 0]], atol=1e-6)
+
+
 def test_floats_a_little_above_one_are_clipped(tmp_path):
     write_scene(tmp_path)
     write_points(tmp_path / "sparse_pc.ply", TARGET + 0.1 * np.eye(2, 3), [[1.3, 0.2, -0.1], [0.4, 0.6, 1.5]], "float")
