@@ -244,7 +244,7 @@ def test_rigs_of_metashape(tmp_path, master):
         save_dot(tmp_path / "images" / f"{index}_0.png", pinhole_place(pose, **lens))
         save_dot(tmp_path / "images" / f"{index}_1.png", pinhole_place(pose @ OPENCV @ in_rig @ OPENCV, **lens))
     (tmp_path / "cameras.xml").write_text(rig_xml(in_rig, master=master))
-    told = f"4 of 8 cameras have no pose of their own, such as 0_{1 - master}.png: placed by their sensors' offsets"
+    told = f"4 of 8 cameras have no own pose, such as 0_{1 - master}.png: placed by their sensors' offsets"
     with pytest.warns(UserWarning, match=told):
         scene = load_scene(tmp_path)
     assert len(scene.train) + len(scene.test) == 8

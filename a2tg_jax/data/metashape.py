@@ -107,7 +107,10 @@ def _posed_cameras(file: Path) -> list[tuple[str, Element, np.ndarray]]:
             own = numbers_in(pose.text, 16, file).reshape(4, 4) @ offset
             found.append((label, sensor, _placed(of_chunk if world is None else world, own)))
     for labels, told in (
-        (in_rigs, "have no pose of their own, such as {}: placed by their sensors' offsets from the master camera"),
+        (
+            in_rigs,
+            "have no own pose, such as {}: placed by their sensors' offsets from the master, in units of its pose",
+        ),
         (unused, "have no pose or are switched off, such as {}: not used"),
     ):
         if labels:
