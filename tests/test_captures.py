@@ -364,6 +364,13 @@ def test_realityscan(tmp_path):
         load_scene(tmp_path)
 
 
+def test_points_beside_xmp_files(tmp_path):
+    write_realityscan(tmp_path)
+    write_ply(tmp_path / "points.ply")
+    scene = load_scene(tmp_path)
+    np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
+
+
 @pytest.mark.parametrize("writer", [write_polycam, write_record3d, write_metashape, write_realityscan])
 def test_cameras_without_an_image_are_told(tmp_path, writer):
     writer(tmp_path)

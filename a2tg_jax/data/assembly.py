@@ -92,7 +92,7 @@ def assemble_scene(
     points = None if cloud is None or len(cloud.points) < 2 else transform.apply(cloud.points)
     unseen_by = [] if points is None else unseeing(points, sights)
     if cloud is None or points is None or len(unseen_by) == len(sights):
-        if points is not None or not is_object:
+        if cloud is not None or not is_object:
             lack = "has no sparse points" if points is None else "no training view sees any of its sparse points"
             message = f"{source}: {lack}; starting from {NUM_RANDOM_POINTS:,} random points instead"
             warnings.warn(message, stacklevel=3)

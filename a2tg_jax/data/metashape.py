@@ -21,9 +21,9 @@ from a2tg_jax.data.photogrammetry import (
     images_below,
     near_origin,
     numbers_in,
+    points_beside,
     read_xml,
 )
-from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
 
@@ -71,11 +71,7 @@ def metashape_frames(file: Path) -> Frames:
             f"{file}: none of its cameras has a pose and an image beside it; put the photographs into images/"
         )
     warn_of_missing_images(file, lacking, len(frames) + len(lacking))
-    points = sorted(file.parent.glob("*.ply"))
-    if len(points) > 1:
-        names = ", ".join(point.name for point in points)
-        warnings.warn(f"{file}: {len(points)} PLY files are beside it, {shortened(names)}: none used", stacklevel=2)
-    return near_origin(Frames(file, frames, read_ply_points(points[0]) if len(points) == 1 else None))
+    return near_origin(Frames(file, frames, points_beside(file)))
 
 
 def _posed_cameras(file: Path) -> list[tuple[str, Element, np.ndarray]]:
