@@ -93,8 +93,8 @@ def assemble_scene(
     unseen_by = [] if points is None else unseeing(points, sights)
     if cloud is None or points is None or len(unseen_by) == len(sights):
         if cloud is not None or not is_object:
-            lack = "has no sparse points" if points is None else "no training view sees any of its sparse points"
-            message = f"{source}: {lack}; starting from {NUM_RANDOM_POINTS:,} random points instead"
+            lack = "has no" if points is None else "no training view sees any of its"
+            message = f"{source}: {lack} sparse points; starting from {NUM_RANDOM_POINTS:,} random points instead"
             warnings.warn(message, stacklevel=3)
         points = random_points(sights, transform.rotation if is_object else None)
         colors = np.full(points.shape, RANDOM_COLOR, np.uint8)
