@@ -61,6 +61,18 @@ def test_polycam(tmp_path, prefix):
         load_scene(tmp_path)
 
 
+def test_polycam_without_sizes(tmp_path):
+    """Present exports have no width and height; points of depth maps need them, too."""
+    write_polycam_with_depth(tmp_path)
+    for file in tmp_path.rglob("*.json"):
+        values = json.loads(file.read_text())
+        file.write_text(json.dumps({key: value for key, value in values.items() if key not in ("width", "height")}))
+    scene = load_scene(tmp_path)
+    check_dots(scene, 0.1)
+    points = scene.transform.inverse().apply(scene.points)
+    assert np.linalg.norm(points - TARGET, axis=1).min() < 0.03
+
+
 def write_polycam_with_depth(folder):
     """The target's depth all over each map, in mm; the first map has low confidence."""
     keyframes = write_polycam(folder).parent
@@ -118,6 +130,13 @@ def test_record3d(tmp_path, metadata, images, changes):
         load_scene(tmp_path)
 
 
+def test_images_of_record3d_without_a_pose_are_told(tmp_path):
+    write_record3d(tmp_path)
+    save_dot(tmp_path / "rgbd" / f"{COUNT}.jpg", (9, 9))
+    with pytest.warns(UserWarning, match=rf"1 of {COUNT + 1} images have no pose, such as {COUNT}\.jpg: not used"):
+        assert len(load_scene(tmp_path, test_every=0).train) == COUNT
+
+
 def metashape_place(pose, f=100.0, b1=-4.0, cx=-2.0, cy=2.0, k1=-0.1, k2=0.02, k3=0.001, p1=0.004, p2=-0.003):
     """The place of the target by Metashape's manual: Brown's distortion, then f, b1 and the offset from the middle."""
     x, y, z = to_camera(pose, TARGET)
@@ -155,8 +174,7 @@ def metashape_xml(world, within="component", lens=LENS):
         <sensors next_id="1"><sensor id="0" label="Phone" type="frame"><resolution width="{WIDTH}" height="{HEIGHT}"/>
         <calibration type="frame" class="adjusted"><resolution width="{WIDTH}" height="{HEIGHT}"/>{lens}</calibration>
         </sensor></sensors><components>{component}</components>
-        <cameras><group id="0" label="g">{cameras}</group><camera id="9" sensor_id="0" label="9.png"/>
-        <camera id="8" sensor_id="0" label="0.png" enabled="false"><transform>0</transform></camera></cameras>
+        <cameras><group id="0" label="g">{cameras}</group></cameras>
         {transform if within == "chunk" else ""}</chunk></document>"""
 
 
@@ -178,6 +196,109 @@ def test_metashape(tmp_path, within):
     assert load_scene(tmp_path / "cameras.xml").name == tmp_path.name
 
 
+def test_cameras_of_metashape_that_are_not_used_are_told(tmp_path):
+    write_metashape(tmp_path)
+    file = tmp_path / "cameras.xml"
+    unaligned = '<camera id="9" sensor_id="0" label="9.png"/>'
+    off = '<camera id="8" sensor_id="0" label="0.png" enabled="false"><transform>0</transform></camera>'
+    file.write_text(file.read_text().replace("</cameras>", f"{unaligned}{off}</cameras>"))
+    (tmp_path / "mesh.ply").touch()
+    with pytest.warns(UserWarning) as told:
+        scene = load_scene(tmp_path)
+    texts = " ".join(str(warning.message) for warning in told)
+    assert "2 of 6 cameras have no pose or are switched off, such as 9.png: not used" in texts
+    assert "2 PLY files are beside it, mesh.ply, points.ply: none used" in texts
+    assert len(scene.train) + len(scene.test) == COUNT
+
+
+def rig_xml(in_rig, sensors=("",), master=0):
+    """cameras.xml of two-camera rigs: each second camera has no pose but a master, and its sensor a place in the rig.
+
+    Args:
+      in_rig: [4, 4] from the second sensor's frame to the first one's.
+      sensors: further elements of both sensors, or of the second.
+      master: number of the camera of each rig that has the pose.
+    """
+    rotation, translation = numbers(in_rig[:3, :3]), numbers(in_rig[:3, 3])
+    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
+    lens = f'<calibration type="frame" class="adjusted">{size}<f>100</f><b1>-4</b1></calibration>'
+    place = f"<rotation>{rotation}</rotation><translation>{translation}</translation>"
+    cameras = ""
+    for index, pose in enumerate(poses()):
+        placed = pose @ OPENCV @ (in_rig if master else np.eye(4))
+        own = f"<transform>{numbers(placed)}</transform>"
+        for number in range(2):
+            tag = f'camera id="{2 * index + number}" sensor_id="{number}" label="{index}_{number}.png"'
+            cameras += f"<{tag}>{own}</camera>" if number == master else f'<{tag} master_id="{2 * index + master}"/>'
+    return f"""<document version="2.0.0"><chunk><sensors>
+        <sensor id="0" type="frame">{size}{lens}</sensor>
+        <sensor id="1" type="frame" master_id="0">{size}{lens}{"".join(sensors) or place}</sensor></sensors>
+        <cameras>{cameras}</cameras></chunk></document>"""
+
+
+@pytest.mark.parametrize("master", [0, 1])
+def test_rigs_of_metashape(tmp_path, master):
+    """The dot of every photograph is where the rig's own second camera sees it."""
+    in_rig = np.eye(4)
+    in_rig[:3, :3] = Rotation.from_rotvec([0.05, -0.1, 0.2]).as_matrix()
+    in_rig[:3, 3] = 0.3, -0.1, 0.05
+    lens = dict(fl_x=96.0, fl_y=100.0, cx=WIDTH / 2, cy=HEIGHT / 2)
+    for index, pose in enumerate(poses()):
+        save_dot(tmp_path / "images" / f"{index}_0.png", pinhole_place(pose, **lens))
+        save_dot(tmp_path / "images" / f"{index}_1.png", pinhole_place(pose @ OPENCV @ in_rig @ OPENCV, **lens))
+    (tmp_path / "cameras.xml").write_text(rig_xml(in_rig, master=master))
+    told = f"4 of 8 cameras have no own pose, such as 0_{1 - master}.png: placed by their sensors' offsets"
+    with pytest.warns(UserWarning, match=told):
+        scene = load_scene(tmp_path)
+    assert len(scene.train) + len(scene.test) == 8
+    check_dots(scene, 0.05)
+
+
+def test_rigs_of_metashape_without_offsets_are_told(tmp_path):
+    save_dots(tmp_path / "images", [f"{index}_0.png" for index in range(COUNT)])
+    (tmp_path / "cameras.xml").write_text(rig_xml(np.eye(4), sensors=(" ",)))
+    with pytest.warns(
+        UserWarning, match=r"4 of 8 cameras have no pose or are switched off, such as 0_1\.png: not used"
+    ):
+        scene = load_scene(tmp_path)
+    assert len(scene.train) + len(scene.test) == COUNT
+
+
+def fisheye_place(pose, projection, k=(0.0, 0.0, 0.0, 0.0), p1=0.0, p2=0.0):
+    """The place of the target by Metashape's manual: the fisheye's radius of the angle, then Brown's distortion."""
+    x, y, z = to_camera(pose, TARGET)
+    angle = np.arctan2(np.hypot(x, y), z)
+    radius = {"fisheye": angle, "equidistant_fisheye": angle, "equisolid_fisheye": 2 * np.sin(angle / 2)}[projection]
+    x, y = np.array([x, y]) / np.hypot(x, y) * radius
+    r2 = radius**2
+    radial = 1 + sum(term * r2**power for power, term in enumerate(k, 1))
+    moved_x = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+    moved_y = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    return WIDTH / 2 - 2 + moved_x * 96, HEIGHT / 2 + 2 + moved_y * 100
+
+
+@pytest.mark.parametrize(
+    ("projection", "terms"),
+    [
+        ("fisheye", dict(k=(0.05, -0.02, 0.01, 0.005), p1=0.004, p2=-0.003)),
+        ("equidistant_fisheye", dict(k=(0.05, -0.02, 0.0, 0.0))),
+        ("equisolid_fisheye", dict(k=(0.05, -0.02, 0.01, 0.005))),
+    ],
+)
+def test_fisheyes_of_metashape(tmp_path, projection, terms):
+    save_dots(
+        tmp_path / "images", [f"{index}.png" for index in range(COUNT)],
+        lambda pose: fisheye_place(pose, projection, **terms),
+    )  # fmt: skip
+    values = {f"k{power}": term for power, term in enumerate(terms["k"], 1)} | {"p1": 0.0, "p2": 0.0} | terms
+    lens = "<f>100</f><b1>-4</b1><cx>-2</cx><cy>2</cy>" + "".join(
+        f"<{name}>{values[name]}</{name}>" for name in ("k1", "k2", "k3", "k4", "p1", "p2")
+    )
+    xml = metashape_xml(WORLD, lens=lens).replace('type="frame"', f'type="{projection}"')
+    (tmp_path / "cameras.xml").write_text(xml)
+    check_dots(load_scene(tmp_path), 0.06)
+
+
 def test_the_adjusted_lens_of_metashape_is_taken(tmp_path):
     """Metashape writes the calibration that the adjustment began with before the one that it ended with."""
     write_metashape(tmp_path)
@@ -192,8 +313,15 @@ def test_the_adjusted_lens_of_metashape_is_taken(tmp_path):
 @pytest.mark.parametrize(
     ("xml", "message"),
     [
-        (metashape_xml(WORLD, lens="<f>100</f><k4>0.1</k4>"), r"\.png: its lens has k4, p3, p4 or b2"),
-        (metashape_xml(WORLD, lens="<f>100</f><p4>0.1</p4>"), r"\.png: its lens has k4, p3, p4 or b2"),
+        (metashape_xml(WORLD, lens="<f>100</f><k4>0.1</k4>"), r"\.png: its frame lens has k4, p3, p4 or b2"),
+        (metashape_xml(WORLD, lens="<f>100</f><p4>0.1</p4>"), r"\.png: its frame lens has k4, p3, p4 or b2"),
+        (metashape_xml(WORLD).replace('type="frame"', 'type="spherical"'), "of type spherical, .* views with a2tg sfm"),
+        (
+            metashape_xml(WORLD).replace('type="frame"', 'type="fisheye"').replace("</f>", "</f><p3>1</p3>"),
+            "p3, p4 or b2",
+        ),
+        (metashape_xml(WORLD).replace('type="frame"', 'type="equisolid_fisheye"'), "its equisolid lens has p1, p2"),
+        (metashape_xml(WORLD, lens=""), "is of a sensor without a calibration"),
         (metashape_xml(WORLD).replace("<f>100</f>", "<f>long</f>"), "1 numbers are expected; got long"),
         ('<!DOCTYPE x [<!ENTITY a "a">]><chunk><sensors/></chunk>', "it declares entities"),
         ("<chunk><sensors>", "cannot be read as XML"),
@@ -241,6 +369,13 @@ def test_realityscan(tmp_path):
     (tmp_path / "0.xmp").write_text(realityscan_xmp(poses()[0], more='xcr:DistortionCoeficients="0 0 0 0 0.1 0"'))
     with pytest.raises(ValueError, match=r"0\.xmp: has the distortion model brown3 with skew, k4, t1 or t2"):
         load_scene(tmp_path)
+
+
+def test_points_beside_xmp_files(tmp_path):
+    write_realityscan(tmp_path)
+    write_ply(tmp_path / "points.ply")
+    scene = load_scene(tmp_path)
+    np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
 
 
 @pytest.mark.parametrize("writer", [write_polycam, write_record3d, write_metashape, write_realityscan])

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
+from test_data_transforms import shares_seen
 
 from a2tg_jax.data import load_scene, view_image
 from a2tg_jax.data.colmap_library import pycolmap
@@ -170,8 +171,7 @@ def test_model_without_points_starts_from_random_ones(tmp_path, text, is_missing
     with pytest.warns(UserWarning, match="no sparse points"):
         scene = load_scene(tmp_path)
     assert scene.points.shape == scene.colors.shape == (10_000, 3)
-    centers = np.stack([np.asarray(view.camera.center) for view in (*scene.train, *scene.test)])
-    assert np.abs(scene.points).max() == pytest.approx(np.abs(centers).max(), rel=1e-2)
+    assert shares_seen(scene).min() > 0.1
 
 
 def test_images_without_a_pose_are_counted(tmp_path):

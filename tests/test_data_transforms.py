@@ -164,6 +164,63 @@ def test_downscale(tmp_path, has_folder):
     check_dots(scene)
 
 
+def shades(scene):
+    """The grey of each view's photograph, by name."""
+    return {view.name: int(view.image.mean().round()) for view in (*scene.train, *scene.test)}
+
+
+def write_shades(folder, sizes):
+    """A scene without points whose photographs, of given names and sizes, are each of one grey."""
+    frames = [dict(transform_matrix=camera_to_world(index, len(sizes)).tolist()) for index in range(len(sizes))]
+    for index, (frame, (name, size)) in enumerate(zip(frames, sizes.items(), strict=True)):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((size[1], size[0], 3), 10 * index, np.uint8)).save(folder / name)
+        frame["file_path"] = name
+    write_json(folder, frames, **FOCAL, **SIZE)
+
+
+@pytest.mark.filterwarnings("ignore:.*sparse points")
+@pytest.mark.parametrize("second", [(WIDTH, HEIGHT), (WIDTH // 2, HEIGHT // 2)])
+def test_a_second_clip_is_no_folder_of_smaller_copies(tmp_path, second):
+    """images/clip_2 is a clip of the scene, even if its photographs have half the size."""
+    names = [f"images/clip{'_2' * (index % 2)}/{index // 2}.png" for index in range(6)]
+    write_shades(tmp_path, {name: second if "_2/" in name else (WIDTH, HEIGHT) for name in names})
+    assert shades(load_scene(tmp_path, downscale=2)) == {name: 10 * index for index, name in enumerate(names)}
+
+
+@pytest.mark.filterwarnings("ignore:.*sparse points")
+@pytest.mark.parametrize(
+    ("size", "told"),
+    [
+        ((WIDTH, HEIGHT), r"6 of 6, such as 0\.png, which is 120x90 for 120x90: not used"),
+        ((WIDTH // 2, HEIGHT // 2 - 2), r"6 of 6, such as 0\.png, which is 60x43 for 120x90: not used"),
+        (None, r"1 of 6, such as 5\.png, which is missing: not used"),
+    ],
+)
+def test_a_folder_that_holds_no_smaller_copies_is_told(tmp_path, size, told):
+    names = [f"images/{index}.png" for index in range(6)]
+    write_shades(tmp_path, dict.fromkeys(names, (WIDTH, HEIGHT)))
+    (tmp_path / "images_2").mkdir()
+    for name in names if size else names[:-1]:
+        pixels = np.full((*(size or (WIDTH // 2, HEIGHT // 2))[::-1], 3), 255, np.uint8)
+        Image.fromarray(pixels).save(tmp_path / name.replace("images", "images_2"))
+    with pytest.warns(UserWarning, match=rf"images_2: does not hold the files of .*images at 1/2 .* {told}"):
+        scene = load_scene(tmp_path, downscale=2)
+    assert shades(scene) == {name: 10 * index for index, name in enumerate(names)}
+    assert scene.train[0].picture.size == (45, 60)
+
+
+@pytest.mark.filterwarnings("ignore:.*sparse points")
+def test_the_scene_beside_is_no_folder_of_smaller_copies(tmp_path):
+    """Photographs may be in the scene's folder itself, whose siblings are other scenes."""
+    names = [f"{index}.png" for index in range(4)]
+    write_shades(tmp_path / "scene", dict.fromkeys(names, (WIDTH, HEIGHT)))
+    (tmp_path / "scene_2").mkdir()
+    for name in names:
+        Image.fromarray(np.full((HEIGHT // 2, WIDTH // 2, 3), 255, np.uint8)).save(tmp_path / "scene_2" / name)
+    assert shades(load_scene(tmp_path / "scene", downscale=2)) == {name: 10 * index for index, name in enumerate(names)}
+
+
 @pytest.mark.parametrize("is_full_there", [True, False])
 @pytest.mark.parametrize("values", [FOCAL, FOCAL | {"w": WIDTH}, dict(camera_angle_x=2 * np.arctan(WIDTH / 200))])
 def test_intrinsics_without_a_size_belong_to_the_full_images(tmp_path, values, is_full_there):
@@ -201,6 +258,11 @@ def test_full_images_tell_their_size_where_reduced_ones_are_rounded(tmp_path):
         (dict(k1=-0.1, k2=0.02, k3=0.01), "FULL_OPENCV", [-0.1, 0.02, 0, 0, 0.01, 0, 0, 0]),
         (dict(camera_model="OPENCV_FISHEYE", k1=0.03, k3=0.001), "OPENCV_FISHEYE", [0.03, 0, 0.001, 0]),
         (dict(is_fisheye=True, k1=0.03), "OPENCV_FISHEYE", [0.03, 0, 0, 0]),
+        (
+            dict(camera_model="THIN_PRISM_FISHEYE", k1=0.03, k4=0.002, p1=0.003, p2=-0.002, sx1=0.004),
+            "THIN_PRISM_FISHEYE",
+            [0.03, 0, 0.003, -0.002, 0, 0.002, 0.004, 0],
+        ),
     ],
 )
 def test_distortion_is_taken_out(tmp_path, distortion, model, params):
@@ -264,8 +326,159 @@ def test_blender(tmp_path):
     assert scene.test[0].name == "test/00"
     assert scene.train[0].alpha is not None and (scene.train[0].image == 255).all()
     check_dots(scene)
+    assert shares_seen(scene).min() > 0.5
+
+
+def shares_seen(scene):
+    """The share of the scene's points in each training view's picture."""
+    points, shares = np.asarray(scene.points, np.float64), []
+    for view in scene.train:
+        viewmat, K = np.asarray(view.camera.viewmat, np.float64), np.asarray(view.camera.K, np.float64)
+        x, y, z = K @ (viewmat[:3, :3] @ points.T + viewmat[:3, 3:])
+        is_within = (z > 0) & (x >= 0) & (x <= z * view.camera.width) & (y >= 0) & (y <= z * view.camera.height)
+        shares.append(is_within.mean())
+    return np.array(shares)
+
+
+def write_poses(folder, centers, forwards, name="transforms.json", angle=0.6911112070083618):
+    """Black photographs of cameras at some places that look somewhere, upright."""
+    frames = []
+    for index, (center, forward) in enumerate(zip(centers, forwards, strict=True)):
+        backward = -forward / np.linalg.norm(forward)
+        right = np.cross([0, 0, 1.0], backward)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(backward, right), backward, center], axis=1)
+        frames.append({"file_path": f"train/{index}.png", "transform_matrix": pose.tolist()})
+        (folder / "train").mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.zeros((40, 40, 3), np.uint8)).save(folder / f"train/{index}.png")
+    write_json(folder, frames, name, camera_angle_x=angle)
+
+
+def ring(count=8, radius=1.0):
+    angles = 2 * np.pi * np.arange(count) / count
+    return radius * np.stack([np.cos(angles), np.sin(angles), 0.2 + 0.1 * np.sin(3 * angles)], axis=1)
+
+
+def test_random_points_of_nerfs_objects_fill_their_cube(tmp_path):
+    """Cameras 4.031 from the origin with 39.6° see objects within ±1.3 (github.com/bmild/nerf)."""
+    places = ring()
+    places *= 4.031128874 / np.linalg.norm(places, axis=1, keepdims=True)
+    write_poses(tmp_path, places, -places, "transforms_train.json")
+    scene = load_scene(tmp_path)
     original = scene.transform.inverse().apply(scene.points)
-    assert np.abs(original).max() == pytest.approx(1.3, abs=0.01)
+    np.testing.assert_allclose(np.abs(original).max(axis=0), 1.3, atol=2e-3)
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 60.0])
+def test_random_points_follow_the_cameras_of_an_object(tmp_path, scale):
+    """Cameras that look at a place far from the origin, at any scale."""
+    places = ring(radius=scale)
+    write_poses(tmp_path, places + np.array([50, 0, 0]), -places, "transforms_train.json")
+    scene = load_scene(tmp_path)
+    assert len(scene.points) == 10_000 and shares_seen(scene).min() > 0.5
+    original = scene.transform.inverse().apply(scene.points)
+    np.testing.assert_allclose(original.mean(axis=0), [50, 0, 0], atol=0.02 * scale)
+
+
+LOOKS = {
+    "inward": lambda places: -places,
+    "outward": lambda places: places * [1, 1, 0],
+    "ahead": lambda places: np.tile([1.0, 0, 0], (len(places), 1)),
+    "scattered": lambda places: np.random.default_rng(3).normal(size=places.shape),
+}
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])
+@pytest.mark.parametrize("look", LOOKS)
+def test_every_view_sees_random_points(tmp_path, look, name):
+    places = ring()
+    write_poses(tmp_path, places, LOOKS[look](places), name)
+    if name == "transforms.json":
+        with pytest.warns(UserWarning, match="no sparse points"):
+            scene = load_scene(tmp_path)
+    else:
+        scene = load_scene(tmp_path)
+    assert len(scene.points) == 10_000 and shares_seen(scene).min() >= 0.12
+
+
+@pytest.mark.parametrize(
+    ("file", "values"),
+    [("points3d.ply", {}), ("points3D.ply", {}), ("sparse_pc.ply", {}), ("p/x.ply", {"ply_file_path": "p/x.ply"})],
+)
+@pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])
+def test_points_beside_a_transforms_file(tmp_path, file, values, name):
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    write_ply(tmp_path / file)
+    write_json(tmp_path, write_frames(tmp_path), name, **FOCAL, **SIZE, **values)
+    scene = load_scene(tmp_path)
+    assert len(scene.points) == 4
+    np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
+
+
+def test_points_that_no_view_sees_are_replaced(tmp_path):
+    write_scene(tmp_path)
+    write_points(tmp_path / "sparse_pc.ply", TARGET + np.array([[0, 0, 300.0], [5, 0, 300], [0, 5, 320]]))
+    with pytest.warns(UserWarning, match="no training view sees any of its sparse points; starting from 10,000 random"):
+        scene = load_scene(tmp_path)
+    assert shares_seen(scene).min() > 0.1
+
+
+def test_views_that_see_no_points_are_told(tmp_path):
+    """Points close before the camera of one view, out of the picture of others."""
+    write_scene(tmp_path)
+    pose = camera_to_world(1, 8)
+    write_points(tmp_path / "sparse_pc.ply", pose[:3, 3] - pose[:3, 2] * np.array([[0.9], [1.0], [1.1]]))
+    with pytest.warns(
+        UserWarning, match=r"\d of 7 training views see none of its points, such as images/0\d\.png: nothing"
+    ):
+        scene = load_scene(tmp_path)
+    assert len(scene.points) == 3 and (shares_seen(scene) > 0).any() and not (shares_seen(scene) > 0).all()
+
+
+def write_points(file, points, colors=None, kind="uchar", names=("red", "green", "blue")):
+    """Points with colours, as text."""
+    colors = np.zeros((len(points), 3), int) if colors is None else colors
+    rows = [" ".join(map(str, [*map(float, point), *color])) for point, color in zip(points, colors, strict=True)]
+    header = [f"ply\nformat ascii 1.0\nelement vertex {len(points)}"]
+    header += [f"property float {name}" for name in "xyz"] + [f"property {kind} {name}" for name in names]
+    file.write_text("\n".join([*header, "end_header", *rows, ""]))
+
+
+@pytest.mark.parametrize(
+    ("kind", "factor"), [("uchar", 255), ("ushort", 65535), ("ushort", 255), ("float", 1), ("float", 255), ("int", 255)]
+)
+def test_colors_of_points_in_any_range(tmp_path, kind, factor):
+    """16 bits, whole numbers of 8 bits in wider types, and floats in 0..1 or 0..255."""
+    wanted = np.array([[1.0, 0, 0.2], [0.4, 0.6, 0.8], [0.2, 0.2, 0.2], [0, 0, 0]])
+    given = wanted * factor if kind == "float" else np.rint(wanted * factor).astype(int)
+    write_scene(tmp_path)
+    write_points(tmp_path / "sparse_pc.ply", TARGET + 0.1 * np.eye(4, 3), given, kind)
+    np.testing.assert_allclose(load_scene(tmp_path).colors, wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("names", [("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")])
+def test_colors_of_points_by_other_names(tmp_path, names):
+    write_scene(tmp_path)
+    file = tmp_path / "sparse_pc.ply"
+    write_points(file, TARGET + 0.1 * np.eye(2, 3), [[255, 0, 51], [51, 102, 0]], names=names)
+    np.testing.assert_allclose(load_scene(tmp_path).colors, [[1, 0, 0.2], [0.2, 0.4, 0]], atol=1e-6)
+
+
+def test_floats_a_little_above_one_are_clipped(tmp_path):
+    write_scene(tmp_path)
+    write_points(tmp_path / "sparse_pc.ply", TARGET + 0.1 * np.eye(2, 3), [[1.3, 0.2, -0.1], [0.4, 0.6, 1.5]], "float")
+    np.testing.assert_allclose(load_scene(tmp_path).colors, [[1, 0.2, 0], [0.4, 0.6, 1]], atol=1e-6)
+
+
+def test_gaussians_as_points_have_their_colors(tmp_path):
+    """3DGS stores (colour - 0.5) / 0.2820948 as f_dc."""
+    wanted = np.array([[1.0, 0, 0.2], [0.4, 0.6, 0.8]])
+    write_scene(tmp_path)
+    names = ("f_dc_0", "f_dc_1", "f_dc_2")
+    file = tmp_path / "sparse_pc.ply"
+    write_points(file, TARGET + 0.1 * np.eye(2, 3), (wanted - 0.5) / 0.28209479177387814, "float", names)
+    np.testing.assert_allclose(load_scene(tmp_path).colors, wanted, atol=1e-6)
 
 
 def test_blender_downscale_weights_with_alpha(tmp_path):

@@ -394,6 +394,7 @@ def test_links_to_files_are_followed(tmp_path):
     assert len(read_ply_points(tmp_path / "link.ply").points) == 4
 
 
+@pytest.mark.filterwarnings("ignore:.*views see none of its points")
 def test_points_that_are_nowhere_in_the_normalised_world_are_left_out(tmp_path):
     """Cameras that stand close together make its unit small."""
     frames = write_frames(tmp_path)

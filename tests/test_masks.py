@@ -70,6 +70,36 @@ def test_a_mask_is_undistorted_with_its_photograph(tmp_path):
         )
 
 
+def rgba(colors, alpha):
+    return np.dstack([np.broadcast_to(colors, (HEIGHT, WIDTH, 3)), alpha]).astype(np.uint8)
+
+
+HALF_ALPHA = np.where(np.arange(WIDTH) < WIDTH // 2, 255, 0) * np.ones((HEIGHT, 1))
+TOP_LIT = np.where(np.arange(HEIGHT) < 30, 255, 0)[:, None, None] * np.ones((1, WIDTH, 3))
+CUT_OUT = np.random.default_rng(0).integers(0, 2, (HEIGHT, WIDTH, 3)) * 255
+
+
+@pytest.mark.parametrize(
+    ("pixels", "top_only"),
+    [
+        (rgba(255, HALF_ALPHA), False),
+        (rgba(0, HALF_ALPHA), False),
+        (rgba(CUT_OUT, HALF_ALPHA), False),
+        (rgba(TOP_LIT, HALF_ALPHA), True),
+        (rgba(255, HALF_ALPHA)[..., [0, 3]], False),
+    ],
+    ids=["white", "black", "cut-out", "both", "grey"],
+)
+def test_a_mask_in_an_alpha_channel(tmp_path, pixels, top_only):
+    write_scene(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for name in NAMES:
+        Image.fromarray(pixels).save(tmp_path / "masks" / name)
+    wanted = left_half() & (np.arange(HEIGHT) < (30 if top_only else HEIGHT))[:, None]
+    for view in views_of(load_scene(tmp_path)):
+        np.testing.assert_array_equal(view.mask.read(), wanted)
+
+
 def test_masks_that_keep_everything_are_none(tmp_path):
     write_scene(tmp_path)
     for name in NAMES:
@@ -114,6 +144,21 @@ def test_mask_path_of_nerfstudio(tmp_path):
     (tmp_path / "held" / "3.png").unlink()
     with pytest.raises(FileNotFoundError, match=r"3.png: no such mask, but the scene names it"):
         load_scene(tmp_path)
+
+
+def test_masks_of_another_clip_are_no_smaller_masks(tmp_path):
+    """Frames of two clips have the same names; each has masks of its own."""
+    frames = write_frames(tmp_path)
+    for index, frame in enumerate(frames):
+        frame["mask_path"] = f"masks/clip{'_2' * (index % 2)}/{index // 2}.png"
+        counts = left_half(SIZE["w"], SIZE["h"])
+        write_mask(tmp_path / frame["mask_path"], ~counts if index % 2 else counts)
+    write_json(tmp_path, frames, **FOCAL, **SIZE)
+    with pytest.warns(UserWarning, match="random points"):
+        views = views_of(load_scene(tmp_path, downscale=2))
+    for view in views:
+        kept = view.mask.read()[:, [20, 40]]
+        assert (kept == ([False, True] if int(view.name[-6:-4]) % 2 else [True, False])).all()
 
 
 def test_alpha_is_transparency_or_a_mask(tmp_path):

@@ -16,9 +16,11 @@ from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene, View
+from a2tg_jax.data.start_points import NUM_RANDOM_POINTS, Sight, random_points, unseeing
 from a2tg_jax.data.world import normalizing_similarity, scene_scale
 
-NUM_RANDOM_POINTS = 10_000
+RANDOM_COLOR = 128
+"""Mid-grey of random points."""
 FARTHEST = 1e5
 """Largest distance of a camera from the median centre, in units of the median distance."""
 
@@ -57,17 +59,20 @@ class PointCloud:
 
 
 def assemble_scene(
-    name: str, train: Sequence[Shot], test: Sequence[Shot], cloud: PointCloud | None, *, source: str
-) -> Scene:
+    name: str, train: Sequence[Shot], test: Sequence[Shot], cloud: PointCloud | None, *, source: str,
+    is_object: bool = False,
+) -> Scene:  # fmt: skip
     """Normalise the world and assemble the scene.
 
     Args:
       name: of the scene.
       train: shots to train on, any order.
       test: shots to test on; may be empty.
-      cloud: surface points. With fewer than two, random points in a cube around the cameras and their target are used,
-        with a warning.
+      cloud: surface points. With fewer than two, or if no training view sees one, random points where the cameras look
+        are used, with a warning. Another warning counts training views that see no point.
       source: name of the input in messages.
+      is_object: whether the scene is an object that all views show whole: random points are then in a cube around it,
+        and expected.
 
     Raises:
       ValueError: if there are fewer than two shots or no training shot, two shots share a name, a pose is not a rigid
@@ -82,13 +87,22 @@ def assemble_scene(
         raise ValueError(f"{source}: {error}") from None
     viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
     centers = camera_centers(np.stack(list(viewmats.values())))
+    sights = [Sight.of(viewmats[shot.name], shot.K, shot.pixels.shape[:2], shot.rays) for shot in train]
     cloud = cloud and _usable(cloud, transform, source)
-    if cloud is None or len(cloud.points) < 2:
-        message = f"{source}: has no sparse points; starting from {NUM_RANDOM_POINTS:,} random points instead"
-        warnings.warn(message, stacklevel=3)
-        points, colors = random_points(np.zeros(3), float(np.abs(centers).max()))
+    points = None if cloud is None or len(cloud.points) < 2 else transform.apply(cloud.points)
+    unseen_by = [] if points is None else unseeing(points, sights)
+    if cloud is None or points is None or len(unseen_by) == len(sights):
+        if cloud is not None or not is_object:
+            lack = "has no" if points is None else "no training view sees any of its"
+            message = f"{source}: {lack} sparse points; starting from {NUM_RANDOM_POINTS:,} random points instead"
+            warnings.warn(message, stacklevel=3)
+        points = random_points(sights, transform.rotation if is_object else None)
+        colors = np.full(points.shape, RANDOM_COLOR, np.uint8)
     else:
-        points, colors = transform.apply(cloud.points), cloud.colors
+        colors = cloud.colors
+        if unseen_by:
+            message = f"{source}: {len(unseen_by)} of {len(sights)} training views see none of its points, such as "
+            warnings.warn(f"{message}{train[unseen_by[0]].name}: nothing to start from there", stacklevel=3)
 
     def views(group: Sequence[Shot]) -> tuple[View, ...]:
         return tuple(
@@ -104,12 +118,6 @@ def assemble_scene(
         transform=transform,
         scale=scene_scale(centers),
     )
-
-
-def random_points(center: np.ndarray, half_side: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return points [NUM_RANDOM_POINTS, 3] uniform in a cube and mid-grey colours (uint8) of the same shape."""
-    offsets = np.random.default_rng(seed).uniform(-half_side, half_side, (NUM_RANDOM_POINTS, 3))
-    return center + offsets, np.full((NUM_RANDOM_POINTS, 3), 128, np.uint8)
 
 
 def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:

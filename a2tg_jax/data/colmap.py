@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,12 +20,13 @@ from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import inside, locate_image, map_in_threads, num_readers, on_disk, warn_of_unposed
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
-from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask
+from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, mask_to_read
 from a2tg_jax.data.observations import ObservedPoints, before_camera, observed_points
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
+from a2tg_jax.data.smaller_copies import find_copies
 from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
 
@@ -116,12 +118,22 @@ def load_colmap(
     images = [image._replace(name=inside(folder, image.name)) for image in contents.images]
     used = sorted({image.camera_id for image in images})
     lenses = {key: checked_lens(contents.cameras[key], f"{model}: camera {key}", lens) for key in used}
-    files = _located(folder, images, downscale, model, has_siblings=folder != scene)
+    # Masks and depth maps are beside `images` in the scene.
+    masks = map_in_threads(lambda image: find_mask(scene / IMAGES, image.name, downscale), images, num_readers(folder))
+    named = [*((folder, image.name) for image in images), *(mask for mask in masks if mask is not None)]
+    copies = find_copies(named, downscale, scene)
+    photos_folder, still_to_downscale = copies.of(folder)
+    files = _located(photos_folder, images, model)
     warn_of_unposed(folder, [image.name for image in images], is_deep=folder != scene)
-    photos = [
-        _photo(image.name, *file, lenses[image.camera_id], scene, downscale)
-        for image, file in zip(images, files, strict=True)
-    ]
+
+    def photo(image: ImageRecord, file: Path, mask: tuple[Path, str] | None) -> PhotoFiles:
+        return PhotoFiles(
+            image.name, file, still_to_downscale, lambda _: lenses[image.camera_id],
+            error_message=lambda error: f"{file}: its camera model {error}",
+            mask=mask_to_read(mask, copies), depths=find_depths(scene / IMAGES, image.name),
+        )  # fmt: skip
+
+    photos = list(map(photo, images, files, masks))
     found = read_photos(photos, Shelf(room), division, path)
     cloud, panoramas = contents.cloud, _panoramas(contents)
 
@@ -171,39 +183,22 @@ def viewmat_of(image: ImageRecord) -> np.ndarray:
     return rigid_viewmat(viewmat, image.name)
 
 
-def _photo(name: str, file: Path, still_to_downscale: int, lens: Lens, scene: Path, downscale: int) -> PhotoFiles:
-    """Return the files and the lens of one image. Masks and depth maps are beside `images` in the scene."""
-    return PhotoFiles(
-        name, file, still_to_downscale, lambda _: lens,
-        error_message=lambda error: f"{file}: its camera model {error}",
-        mask=find_mask(scene / IMAGES, name, downscale),
-        depths=find_depths(scene / IMAGES, name),
-    )  # fmt: skip
-
-
-def _located(
-    folder: Path, images: Sequence[ImageRecord], downscale: int, model: Path, has_siblings: bool
-) -> list[tuple[Path, int]]:
-    """Return the file of each image of a model and the remaining factor of downscaling.
+def _located(folder: Path, images: Sequence[ImageRecord], model: Path) -> list[Path]:
+    """Return the file of each image of a model.
 
     Args:
-      folder: the folder of photographs.
+      folder: the folder of photographs, or of smaller copies.
       images: of the model.
-      downscale: k >= 1.
       model: its folder.
-      has_siblings: whether `<folder>_k` holds the downscaled photographs of the folder.
 
     Raises:
       FileNotFoundError: if some are missing, with their number and what to do.
     """
 
-    def locate(image: ImageRecord) -> tuple[Path, int] | None:
-        try:
-            if has_siblings:
-                return locate_image(folder, image.name, downscale)
-            return locate_image(folder, image.name, 1)[0], downscale
-        except FileNotFoundError:
-            return None
+    def locate(image: ImageRecord) -> Path | None:
+        with suppress(FileNotFoundError):
+            return locate_image(folder, image.name)
+        return None
 
     found = map_in_threads(locate, images, num_readers(folder))
     missing = [image.name for image, file in zip(images, found, strict=True) if file is None]

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from a2tg_jax.core.display import counted
-from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
+from a2tg_jax.host.regular_files import is_regular, names_in
 from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import shortened
 
@@ -29,27 +29,23 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def locate_image(folder: Path, name: str, downscale: int) -> tuple[Path, int]:
-    """Return the file of one image and the remaining factor of downscaling.
+def locate_image(folder: Path, name: str) -> Path:
+    """Return the file of one image.
 
     Args:
-      folder: the folder of the full images; with downscale k, its sibling `<folder>_k` is preferred if it exists.
+      folder: the folder of images.
       name: path of the image below the folder; the suffix may be missing.
-      downscale: k >= 1.
 
     Raises:
       FileNotFoundError: naming the image, if it is not there.
       ValueError: if the name leads out of the folder.
     """
     name = inside(folder, name)
-    smaller = folder.with_name(f"{folder.name}_{downscale}")
-    if downscale > 1 and is_folder(smaller):
-        folder, downscale = smaller, 1
     for candidate in (folder / name, folder / f"{name}.png", *_with_suffixes(folder, name)):
         if is_regular(candidate):
-            return candidate, downscale
+            return candidate
     if (found := on_disk(folder, name)) is not None:
-        return found, downscale
+        return found
     raise FileNotFoundError(
         f"{folder / name}: no such image, but the scene has a camera for it; "
         f"put the image there, or remove its frame from the file that names it"

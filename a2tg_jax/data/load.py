@@ -58,7 +58,8 @@ def load_scene(
     Args:
       path: the scene folder, a transforms.json, or an XML file of Metashape's cameras; or a URL, such as s3://bucket/x,
         or UPath of universal_pathlib, of a COLMAP, transforms.json or Blender scene.
-      downscale: k >= 1; images are read from `images_k` if it exists, and downscaled from the full ones otherwise.
+      downscale: k >= 1; images are read from `images_k` if it holds all of them at 1/k of their size, and downscaled
+        from the full ones otherwise.
       test_every: every k-th of the name-sorted views, from the first, is a test view; 0 keeps none. The views of a
         panorama count as one. Has no effect if the scene names its own test views.
       room: bytes of memory for photographs, at 3 or 4 a pixel; those beyond it stay on disk and are read when

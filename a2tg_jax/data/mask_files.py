@@ -1,4 +1,4 @@
-"""Masks on disk: 0 (black) excludes a pixel and all else keeps it, as with COLMAP and nerfstudio."""
+"""Masks on disk: 0 (black, or transparent) excludes a pixel and all else keeps it, as with COLMAP and nerfstudio."""
 
 import dataclasses
 import warnings
@@ -15,6 +15,7 @@ from a2tg_jax.data.images import on_disk, resize_pixels
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.scene import Scene, View
+from a2tg_jax.data.smaller_copies import SmallerCopies
 from a2tg_jax.host.regular_files import is_folder
 
 FOLDER = "masks"
@@ -23,27 +24,44 @@ AlphaMeaning = Literal["transparency", "mask"]
 """Meaning of the alpha channel of photographs: transparency over a background, or a mask."""
 
 
-def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, int] | None:
-    """Return the mask of an image and the remaining factor of downscaling; None without a mask.
+def find_mask(images: Path, name: str, downscale: int) -> tuple[Path, str] | None:
+    """Return the folder of an image's mask and the mask's path below it; None without a mask.
 
     Args:
-      images: the folder of the full images; masks lie in its sibling `masks`, or `masks_k` for a downscale of k.
+      images: the folder of the full images; masks are in its sibling `masks`, or only in `masks_k` for a downscale k.
       name: path of the image below the folder; its mask is NAME.EXT.png, as in COLMAP, NAME.png, or has the same name.
       downscale: k >= 1.
     """
-    return _at_scale(images.with_name(FOLDER), downscale, f"{name}.png", str(Path(name).with_suffix(".png")), name)
+    folder = images.with_name(FOLDER)
+    names = f"{name}.png", str(Path(name).with_suffix(".png")), name
+    for place in (folder, folder.with_name(f"{folder.name}_{downscale}")) if downscale > 1 else (folder,):
+        if (found := on_disk(place, *names)) is not None:
+            return folder, found.relative_to(place).as_posix()
+    return None
 
 
-def named_mask(path: Path, downscale: int) -> tuple[Path, int]:
-    """Read a mask that a scene names, as `find_mask` does.
+def mask_to_read(
+    mask: tuple[Path, str] | None, copies: SmallerCopies, *, is_named: bool = False
+) -> tuple[Path, int] | None:
+    """Return the file of a mask and the remaining factor of downscaling; None without one.
+
+    Args:
+      mask: folder of the full mask, and path below it.
+      copies: smaller copies of the scene's files.
+      is_named: whether the scene names the mask.
 
     Raises:
-      FileNotFoundError: if it is missing.
+      FileNotFoundError: if a mask that the scene names is missing.
     """
-    found = _at_scale(path.parent, downscale, path.name)
-    if found is None:
+    if mask is None:
+        return None
+    folder, still_to_downscale = copies.of(mask[0])
+    if (found := on_disk(folder, mask[1])) is not None:
+        return found, still_to_downscale
+    if is_named:
+        path = mask[0] / mask[1]
         raise FileNotFoundError(f"{path}: no such mask, but the scene names it; add the mask or remove its mask_path")
-    return found
+    return None
 
 
 def load_mask(
@@ -54,7 +72,7 @@ def load_mask(
     A pixel counts if all its source pixels count.
 
     Args:
-      found: file and factor from `find_mask`.
+      found: file and factor from `mask_to_read`.
       lens: the photograph's camera.
       stored: (width, height) of the photograph as stored.
       view_size: (width, height) of the view.
@@ -65,7 +83,7 @@ def load_mask(
     if found is None:
         return None
     file, still_to_downscale = found
-    counts = read_pixels(file)[..., :3].any(axis=-1)
+    counts = _counts(read_pixels(file))
     size = counts.shape[::-1]
     if size not in (stored, lens.size):
         told = "x".join(map(str, size)), "x".join(map(str, stored))
@@ -135,12 +153,17 @@ def _opaque(view: View, mask: Mask | None) -> View:
     return dataclasses.replace(view, picture=picture, mask=mask)
 
 
-def _at_scale(folder: Path, downscale: int, *names: str) -> tuple[Path, int] | None:
-    """Return the file of one of the names in a folder, or in its smaller sibling, and the remaining factor."""
-    if downscale > 1 and (found := on_disk(folder.with_name(f"{folder.name}_{downscale}"), *names)) is not None:
-        return found, 1
-    found = on_disk(folder, *names)
-    return None if found is None else (found, downscale)
+def _counts(pixels: np.ndarray) -> np.ndarray:
+    """Return [H, W] whether pixels of a mask file count: those that are not black, or not transparent in a file whose
+    alpha channel is the mask. A file with a mask in both excludes what either does."""
+    is_lit = np.asarray(pixels[..., :3].any(axis=-1))
+    if pixels.shape[2] == 3 or (pixels[..., 3] == pixels[0, 0, 3]).all():
+        return is_lit
+    is_opaque = pixels[..., 3].astype(bool)
+    lit = pixels[is_opaque & is_lit]
+    # Colours hold a mask too if there are two of them, one black: not in a cut-out photograph, nor where all are black.
+    has_both = 0 < len(lit) < is_opaque.sum() and (lit[:, :3] == lit[0, :3]).all()
+    return is_opaque & is_lit if has_both else is_opaque
 
 
 def _check_left(mask: Mask, name: str, source: str) -> None:

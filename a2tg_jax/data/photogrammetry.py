@@ -10,8 +10,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.frames import Frames
 from a2tg_jax.data.images import PHOTO_SUFFIXES, inside, named_image
+from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.host.json_text import MOST_BYTES
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
@@ -48,6 +50,15 @@ def near_origin(frames: Frames) -> Frames:
         warnings.warn(f"{frames.file}: its world lies far from its origin, which was moved to {told}", stacklevel=2)
     moved = [{**frame, "transform_matrix": pose.tolist()} for frame, pose in zip(frames.frames, poses, strict=True)]
     return frames._replace(frames=moved)
+
+
+def points_beside(file: Path) -> PointCloud | None:
+    """Return the points of the only PLY file in the folder of a file; None, with a warning, of several."""
+    points = sorted(file.parent.glob("*.ply"))
+    if len(points) > 1:
+        names = ", ".join(point.name for point in points)
+        warnings.warn(f"{file}: {len(points)} PLY files are beside it, {shortened(names)}: none used", stacklevel=3)
+    return read_ply_points(points[0]) if len(points) == 1 else None
 
 
 def _are_near(points: np.ndarray, middle: np.ndarray, farthest: float) -> bool:

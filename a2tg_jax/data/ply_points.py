@@ -6,20 +6,26 @@ from typing import BinaryIO
 
 import numpy as np
 
+from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.ply_header import LONGEST_LINE, VertexHeader, read_vertex_header
 from a2tg_jax.host.regular_files import is_regular, open_regular
 
-COLORS = ("red", "green", "blue")
+COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+"""Names of colours, in order of preference."""
+SH_DEGREE0 = ("f_dc_0", "f_dc_1", "f_dc_2")
+FLOAT_RANGES, INTEGER_RANGES = (1, 255, 65535), (255, 65535, 2**32 - 1)
+"""Largest values of colours in files."""
 LEAST_BYTES = 2
 """Least number of bytes of a number in text: a digit and a separator."""
 
 
 def read_ply_points(path: Path) -> PointCloud:
-    """Return the points of a PLY file whose first element is `vertex` with x, y, z. Points without colours are
-    mid-grey.
+    """Return the points of a PLY file whose first element is `vertex` with x, y, z.
 
-    Colours are whole numbers in 0..255, or floats in [0, 1]; those beyond are clipped.
+    Colours are whole numbers of 8 bits or, if some are above 255, of 16 or 32; or floats in [0, 1] or, if their mean
+    is above 1, in 0..255 (above 255: 0..65535). Numbers beyond are clipped. Gaussians have the colours of their f_dc.
+    Points without colours are mid-grey.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -54,10 +60,16 @@ def _read_ascii(file: BinaryIO, header: VertexHeader) -> np.ndarray:
 
 def _colors(columns: Mapping[str, np.ndarray], header: VertexHeader) -> np.ndarray:
     """Return uint8 colours [P, 3] of the vertices."""
-    if not set(COLORS).issubset(columns):
+    names = next((names for names in (*COLORS, SH_DEGREE0) if set(names).issubset(columns)), None)
+    if names is None or not header.count:
         return np.full((header.count, 3), 128, np.uint8)
-    colors = np.stack([columns[name] for name in COLORS], axis=-1)
-    if header.fields["red"].startswith("f"):
-        colors = np.rint(np.clip(np.nan_to_num(colors), 0, 1) * 255)
-    pixels: np.ndarray = np.clip(np.nan_to_num(colors), 0, 255).astype(np.uint8)
+    given = np.nan_to_num(np.stack([columns[name] for name in names], axis=-1).astype(np.float64))
+    if names == SH_DEGREE0:
+        colors = 0.5 + SH_C0 * given
+    elif header.fields[names[0]].startswith("f"):  # Some floats are a little above 1, or far: the mean decides.
+        mean = np.clip(given, 0, FLOAT_RANGES[-1]).mean()
+        colors = given / next(largest for largest in FLOAT_RANGES if mean <= largest)
+    else:
+        colors = given / next(largest for largest in INTEGER_RANGES if given.max() <= largest)
+    pixels: np.ndarray = np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)
     return pixels

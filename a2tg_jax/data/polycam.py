@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label
 
 from a2tg_jax.data.assembly import PointCloud
-from a2tg_jax.data.decoding import read_depth, read_pixels
+from a2tg_jax.data.decoding import picture_size, read_depth, read_pixels
 from a2tg_jax.data.frames import Frames, warn_of_missing_images
 from a2tg_jax.data.images import map_in_threads, named_image
 from a2tg_jax.host.json_text import read_object
@@ -18,7 +18,7 @@ from a2tg_jax.host.regular_files import is_regular
 
 FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "corrected_images"), ("cameras", "images"))
 """Folders of cameras and images of the keyframes; those after Polycam's optimisation come first."""
-INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
+INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
 NUM_POINTS = 50_000
 """Number of points taken from all depth maps."""
 FARTHEST_MM, LEAST_CONFIDENCE = 5000, 127
@@ -39,7 +39,8 @@ def polycam_folders(path: Path) -> tuple[Path, Path] | None:
 def polycam_frames(cameras: Path, images: Path) -> Frames:
     """Return the frames of Polycam's raw data: a JSON file for each image, of the same name, and perhaps a depth map.
 
-    Corrected images have a black border where undistortion found nothing, which is masked.
+    Corrected images have a black border where undistortion found nothing, which is masked. Newer exports have no width
+    and height: the image's own are taken.
 
     Raises:
       ValueError: if a file is no JSON object, or lacks a number of the pose, or no camera has an image.
@@ -56,6 +57,10 @@ def polycam_frames(cameras: Path, images: Path) -> Frames:
             raise ValueError(f"{file}: lacks {missing[0]}, a number of the camera; export the raw data again")
         rows = [[values[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
         frame: dict[str, Any] = {key: values[name] for key, name in INTRINSICS.items()}
+        size = values.get("width"), values.get("height")
+        frame["w"], frame["h"] = (
+            size if all(isinstance(side, int | float) and side > 0 for side in size) else picture_size(image)
+        )
         frames.append({**frame, "file_path": f"{images.name}/{image.name}", "transform_matrix": rows})
     if not frames:
         raise ValueError(

@@ -14,6 +14,7 @@ from a2tg_jax.data.photogrammetry import (
     UNDISTORTED,
     near_origin,
     numbers_in,
+    points_beside,
     read_xml,
 )
 from a2tg_jax.host.json_text import MOST_BYTES
@@ -35,7 +36,7 @@ def realityscan_files(path: Path) -> list[Path]:
 
 
 def realityscan_frames(path: Path, files: list[Path]) -> Frames:
-    """Return the frames of XMP files, each beside its image.
+    """Return the frames of XMP files, each beside its image. The only PLY file in the folder holds the points.
 
     Raises:
       ValueError: if a file is no such XMP, or a lens has a distortion that COLMAP's models do not know.
@@ -59,7 +60,7 @@ def realityscan_frames(path: Path, files: list[Path]) -> Frames:
     folder = path / "images" if files[0].is_relative_to(path / "images") else path
     posed = [(path / frame["file_path"]).relative_to(folder).as_posix() for frame in frames]
     warn_of_unposed(folder, posed, is_deep=folder != path)
-    return near_origin(Frames(path / "*.xmp", frames))
+    return near_origin(Frames(path / "*.xmp", frames, points_beside(path / "*.xmp")))
 
 
 def _xcr_values(file: Path) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """Record3D's frames: images named by number beside metadata with ARKit's poses, read as frames of `transforms.json`."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,10 @@ def record3d_frames(file: Path) -> Frames:
             frames.append({**lens, "file_path": name, "transform_matrix": pose.tolist()})
     if not frames:
         raise ValueError(f"{file}: no images rgb/0.jpg, rgb/1.jpg, … lie beside it; export RGB frames with Record3D")
+    unposed = [image.name for number, image in sorted(images.items()) if number >= len(poses)]
+    if unposed:
+        message = f"{file}: {len(unposed)} of {len(images)} images have no pose, such as {unposed[0]}: not used"
+        warnings.warn(message, stacklevel=2)
     lacking = sorted(set(range(len(poses))) - set(images))
     warn_of_missing_images(file, [str(number) for number in lacking], len(poses))
     return Frames(file, frames)

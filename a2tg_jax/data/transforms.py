@@ -15,18 +15,19 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.core.cameras import LONGEST_SIDE
-from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, random_points, rigid_viewmat
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
 from a2tg_jax.data.images import inside, locate_image, map_in_threads, num_readers
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
-from a2tg_jax.data.mask_files import check_masks, find_mask, named_mask
+from a2tg_jax.data.mask_files import check_masks, find_mask, mask_to_read
 from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
+from a2tg_jax.data.smaller_copies import SmallerCopies, find_copies
 from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -35,10 +36,11 @@ from a2tg_jax.host.text import shortened
 
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
-BLENDER_HALF_SIDE = 1.3
-"""Half the side of the cube that holds the objects of NeRF-synthetic scenes."""
+POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
+"""Names of the points of nerfstudio and of 3DGS beside a transforms file, in order of preference."""
 OPENCV_KEYS = ("k1", "k2", "p1", "p2")
 FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
+PRISM_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "ply_file_path")
 SPLIT_KEYS = ("train_filenames", "test_filenames", "val_filenames")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
@@ -69,7 +71,7 @@ def load_transforms(
     (shots,) = read_shots([(file, meta)], downscale, Shelf(room), lens, division)
     listed = {key: _names(meta[key]) for key in SPLIT_KEYS if key in meta}
     train, test = _listed_split(file, shots, listed) if listed else every_kth(shots, test_every)
-    cloud = read_ply_points(_beside(file, meta["ply_file_path"])) if meta.get("ply_file_path") else None
+    cloud = _points_beside(file, meta)
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
 
 
@@ -79,8 +81,8 @@ def load_blender(
 ) -> Scene:  # fmt: skip
     """Read a Blender scene in the format of NeRF: transforms_train.json, transforms_test.json, images with alpha.
 
-    Such scenes have no points: the scene starts from random ones in the cube of ±1.3. Without a test file, every
-    test_every-th training view is a test view.
+    Most such scenes have no points, and start from random ones in a cube around what all cameras look at. Without a
+    test file, every test_every-th training view is a test view.
 
     Args:
       folder: the scene folder.
@@ -92,11 +94,19 @@ def load_blender(
     """
     train_file, test_file = (folder / name for name in BLENDER_FILES)
     files = [train_file, test_file] if is_regular(test_file) else [train_file]
-    groups = read_shots([(file, _read_json(file)) for file in files], downscale, Shelf(room), lens, division)
+    metas = [_read_json(file) for file in files]
+    groups = read_shots(list(zip(files, metas, strict=True)), downscale, Shelf(room), lens, division)
     train, test = groups if len(groups) == 2 else every_kth(groups[0], test_every)
-    cloud = PointCloud(*random_points(np.zeros(3), BLENDER_HALF_SIDE))
-    logger.info("%s: a Blender scene, starting from %s random points", folder, f"{len(cloud.points):,}")
-    return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder))
+    cloud = _points_beside(train_file, *metas)
+    logger.info("%s: a Blender scene, starting from %s points", folder, "random" if cloud is None else "its")
+    return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder), is_object=True)
+
+
+def _points_beside(file: Path, *metas: dict[str, Any]) -> PointCloud | None:
+    """Return the points that transforms files of a folder name, or else those in one of `POINT_FILES`, or None."""
+    named = [meta["ply_file_path"] for meta in metas if meta.get("ply_file_path")]
+    usual = [name for name in POINT_FILES if not named and is_regular(file.parent / name)]
+    return next((read_ply_points(_beside(file, name)) for name in (*named, *usual)), None)
 
 
 def _listed_split(file: Path, shots: Sequence[Shot], listed: dict[str, set[str]]) -> tuple[list[Shot], list[Shot]]:
@@ -172,7 +182,8 @@ def read_shots(
     """
     frames = [(file, {**meta, **frame}) for file, meta in files for frame in meta["frames"]]
     place = files[0][0]
-    photos = map_in_threads(lambda item: _photo(*item, downscale, use), frames, num_readers(place))
+    copies = find_copies(_named_files(frames, downscale), downscale, place.parent)
+    photos = map_in_threads(lambda item: _photo(*item, copies, use), frames, num_readers(place))
     found = iter(read_photos(photos, shelf, division, place))
     groups = []
     for file, meta in files:
@@ -182,39 +193,47 @@ def read_shots(
     return groups
 
 
-def _photo(file: Path, frame: dict[str, Any], downscale: int, use: LensUse) -> PhotoFiles:
+def _named_files(frames: Sequence[tuple[Path, dict[str, Any]]], downscale: int) -> list[tuple[Path, str]]:
+    """Return folder and name of the photographs and masks of all frames."""
+    files: list[tuple[Path, str] | None] = []
+    for file, frame in frames:
+        if "file_path" not in frame or "transform_matrix" not in frame:
+            raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
+        image = _beside(file, frame["file_path"])
+        files += [(image.parent, image.name), _find_mask(file, frame, image, downscale)]
+    return [each for each in files if each is not None]
+
+
+def _photo(file: Path, frame: dict[str, Any], copies: SmallerCopies, use: LensUse) -> PhotoFiles:
     """Return the files of one frame; `frame` also holds the file's global values, which the frame's own override."""
-    if "file_path" not in frame or "transform_matrix" not in frame:
-        raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
-    path = _beside(file, frame["file_path"])
+    path, downscale = _beside(file, frame["file_path"]), copies.downscale
     name = Path(frame["file_path"]).as_posix()
-    # Only a folder of images below the scene has siblings of the form images_k.
-    image_folder, image_name = (path.parent, path.name) if path.parent != file.parent else (file.parent, name)
-    image_file, still_to_downscale = locate_image(image_folder, image_name, downscale)
+    folder, still_to_downscale = copies.of(path.parent)
+    image_file = locate_image(folder, path.name)
 
     def lens_of(stored: tuple[int, int]) -> Lens:
         has_size = frame.get("w") and frame.get("h")
         is_reduced = still_to_downscale < downscale
-        full = _full_size(image_folder, image_name, stored, downscale) if is_reduced and not has_size else stored
+        full = _full_size(path, stored, downscale) if is_reduced and not has_size else stored
         return _lens(frame, full, f"{file}: {name}", use)
 
     return PhotoFiles(
         name, image_file, still_to_downscale, lens_of,
         error_message=lambda error: f"{file}: {name}: its camera model {error}",
-        mask=_find_mask(file, frame, image_folder / image_name, downscale),
-        depths=_find_depths(file, frame, image_folder / image_name),
+        mask=mask_to_read(_find_mask(file, frame, path, downscale), copies, is_named=bool(frame.get("mask_path"))),
+        depths=_find_depths(file, frame, path),
     )  # fmt: skip
 
 
-def _full_size(folder: Path, name: str, stored: tuple[int, int], downscale: int) -> tuple[int, int]:
+def _full_size(path: Path, stored: tuple[int, int], downscale: int) -> tuple[int, int]:
     """Return the (width, height) of the full image of a reduced one, to which the intrinsics belong.
 
     It is that of the full image's file, or `downscale` times the size `stored` of the reduced one if that file is
     missing or in object storage.
     """
-    if not is_remote(folder):
+    if not is_remote(path):
         with suppress(FileNotFoundError):
-            return picture_size(locate_image(folder, name, 1)[0])
+            return picture_size(locate_image(path.parent, path.name))
     return downscale * stored[0], downscale * stored[1]
 
 
@@ -238,10 +257,11 @@ def _find_depths(file: Path, frame: dict[str, Any], image: Path) -> Path | None:
     return find_depths(images, str(image.relative_to(images))) if image.is_relative_to(images) else None
 
 
-def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, int] | None:
-    """Return the mask that a frame names, or else that of its image in the folder `masks` beside `images`."""
+def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, str] | None:
+    """Return folder and name of the mask that a frame names, or of the one for its image in `masks` beside `images`."""
     if frame.get("mask_path"):
-        return named_mask(_beside(file, frame["mask_path"]), downscale)
+        path = _beside(file, frame["mask_path"])
+        return path.parent, path.name
     images = file.parent / "images"
     return find_mask(images, str(image.relative_to(images)), downscale) if image.is_relative_to(images) else None
 
@@ -301,11 +321,13 @@ def _focal_lengths(frame: dict[str, Any], width: int, height: int, what: str) ->
 def _distortion(frame: dict[str, Any], what: str) -> tuple[str, list[float]]:
     """Return COLMAP's camera model and its distortion parameters; nerfstudio's have the same names and meaning."""
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
-    values = {key: _number(frame, key, 0.0, what) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    values = {key: _number(frame, key, 0.0, what) for key in PRISM_KEYS}
     if model == "OPENCV_FISHEYE":
         return model, [values[key] for key in FISHEYE_KEYS]
+    if model == "THIN_PRISM_FISHEYE":
+        return model, [values[key] for key in PRISM_KEYS]
     if model not in PERSPECTIVE_MODELS:
-        wanted = "a perspective one or OPENCV_FISHEYE"
+        wanted = "a perspective one, OPENCV_FISHEYE or THIN_PRISM_FISHEYE"
         raise ValueError(f"{what}: has the camera_model {shortened(model)}; {wanted} is expected")
     if values["k4"] != 0:
         raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are known there")

@@ -15,6 +15,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.data.scene import Scene
+from a2tg_jax.data.start_points import Sight, unseeing
 from a2tg_jax.events import FieldError
 from a2tg_jax.model import Model
 from a2tg_jax.training.batches import check_loss_data
@@ -103,8 +104,8 @@ def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarra
 
 
 def check_start(scene: Scene, system: System, num_given: int | None = None) -> None:
-    """Refuse a first stage whose events cannot work with the initial number of Gaussians, depth priors of a scene
-    without depth maps, and Gaussians of a sky that no view sees.
+    """Refuse points that no training view sees, a first stage whose events cannot work with the initial number of
+    Gaussians, depth priors of a scene without depth maps, and Gaussians of a sky that no view sees.
 
     Args:
       scene: its photographs and points.
@@ -116,6 +117,7 @@ def check_start(scene: Scene, system: System, num_given: int | None = None) -> N
     """
     num = initial_number(scene, system) if num_given is None else num_given
     if num_given is None:
+        _check_seen(scene, system)
         with system.naming_options():
             _rows_needed(system.stages()[0], num, system)
     (system.check_number if num_given is None else system.check_given_number)(num)
@@ -123,6 +125,17 @@ def check_start(scene: Scene, system: System, num_given: int | None = None) -> N
         check_loss_data(scene.train, stage.extras, stage.has_ssim)
     if system.sky_gaussians:
         check_sky(scene, system.sky_gaussians)
+
+
+def _check_seen(scene: Scene, system: System) -> None:
+    """Raise ValueError if no training view sees any of a scene's points, unless there are Gaussians of a sky."""
+    cameras = [view.camera for view in scene.train]
+    sights = [Sight.of(np.asarray(c.viewmat), np.asarray(c.K), (c.height, c.width), c.rays) for c in cameras]
+    if len(unseeing(np.asarray(scene.points), sights)) == len(sights) and not system.sky_gaussians:
+        raise ValueError(
+            f"scene.points: no training view sees any of the {len(scene.points):,} points: they must be in the "
+            "world of the views' cameras; scene.transform.apply leads there from the original world"
+        )
 
 
 def _rows_needed(stage: Stage, num: int, system: System) -> int:
