@@ -17,6 +17,8 @@ PLY_TYPES = dict(zip(OLD_TYPES + NEW_TYPES, NUMPY_TYPES * 2, strict=True))
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 LONGEST_LINE, MOST_LINES = 4096, 10_000
 MOST_DIGITS = 20
+OFFSET = "offset"
+"""First word of the comment that says what positions are relative to."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,6 +113,18 @@ def read_headers(file: BinaryIO, path: Path) -> dict[str, VertexHeader]:
             case ["property", *_]:
                 raise ValueError(f"{path}: cannot read the property '{shortened(' '.join(words[1:]))}'")
     return found
+
+
+def offset_of(file: BinaryIO, path: Path) -> np.ndarray:
+    """Return what the positions of a PLY are relative to, [3] float64: zeros without the comment "offset X Y Z"."""
+    file.seek(0)
+    for words in header_lines(file, path):
+        if words[:2] == ["comment", OFFSET] and len(words) == 5:
+            try:
+                return np.array([float(word) for word in words[2:]])
+            except ValueError:
+                continue  # Words of another program.
+    return np.zeros(3)
 
 
 def header_lines(file: BinaryIO, path: Path) -> Iterator[list[str]]:

@@ -7,7 +7,7 @@ from typing import BinaryIO
 import numpy as np
 
 from a2tg_jax.data.assembly import PointCloud
-from a2tg_jax.data.ply_header import LONGEST_LINE, VertexHeader, read_vertex_header
+from a2tg_jax.data.ply_header import LONGEST_LINE, VertexHeader, offset_of, read_vertex_header
 from a2tg_jax.host.regular_files import is_regular, open_regular
 
 COLORS = ("red", "green", "blue")
@@ -17,7 +17,7 @@ LEAST_BYTES = 2
 
 def read_ply_points(path: Path) -> PointCloud:
     """Return the points of a PLY file whose first element is `vertex` with x, y, z. Points without colours are
-    mid-grey.
+    mid-grey. Positions that are relative to an offset, as `save_ply` writes those of maps, are in the original world.
 
     Colours are whole numbers in 0..255, or floats in [0, 1]; those beyond are clipped.
 
@@ -35,7 +35,8 @@ def read_ply_points(path: Path) -> PointCloud:
         else:
             vertices = header.read_binary(file)
             columns = {name: vertices[name] for name in header.fields}
-    points = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=-1)
+        offset = offset_of(file, path)
+    points = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=-1) + offset
     return PointCloud(points, _colors(columns, header))
 
 

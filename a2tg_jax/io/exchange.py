@@ -4,7 +4,6 @@ A model's own world has +z up, and lengths in which its cameras are 1 away. A fi
 original one, and the up axis that its format asks for; the model lies where it does in its own.
 """
 
-import dataclasses
 import os
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -59,7 +58,7 @@ def splats_of(model: Model, *, keeps_shapes: bool = False) -> Splats:
     If splats have degrees of their own, coefficients go up to the highest of these. `keeps_shapes` is as in
     `plain_gaussians`.
     """
-    gaussians = plain_gaussians(dataclasses.replace(model, origin=None), keeps_shapes=keeps_shapes)
+    gaussians = plain_gaussians(model, keeps_shapes=keeps_shapes)
     quats = np.asarray(gaussians.quats, np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     units = np.where(norms > 0, quats / np.maximum(norms, LEAST_SCALE), [1.0, 0.0, 0.0, 0.0])
