@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import struct
 import warnings
 import zipfile
 
@@ -201,3 +202,100 @@ def test_float32_positions_far_away_are_not_moved(tmp_path):
     far = dataclasses.replace(model.gaussians, means=np.asarray(model.gaussians.means) + UTM.astype(np.float32))
     a2tg.save_ply(tmp_path / "a.ply", far)
     np.testing.assert_array_equal(a2tg.load_ply(tmp_path / "a.ply").means, far.means)
+
+
+def json_of(glb: bytes) -> dict:
+    return json.loads(glb[20 : 20 + struct.unpack("<I", glb[12:16])[0]])
+
+
+def glb_positions(glb: bytes) -> np.ndarray:
+    """The first accessor of a GLB file, which has the positions."""
+    described = json_of(glb)
+    count = described["accessors"][0]["count"]
+    start = 28 + struct.unpack("<I", glb[12:16])[0] + described["bufferViews"][0]["byteOffset"]
+    return np.frombuffer(glb, "<f4", 3 * count, start).reshape(count, 3).astype(np.float64)
+
+
+def in_map(positions: np.ndarray, kept: dict) -> np.ndarray:
+    """Positions of the model's world in the original one, as docs/formats.md says."""
+    return (positions - kept["translation"]) @ np.array(kept["rotation"]) / kept["scale"]
+
+
+def test_gltf_and_usd_lead_back_to_the_map(tmp_path):
+    """Their positions are those of the model; the origin beside them has the transform in float64."""
+    model, true = map_scene()
+    a2tg.save_gltf(tmp_path / "a.glb", model)
+    glb = (tmp_path / "a.glb").read_bytes()
+    kept = json_of(glb)["meshes"][0]["primitives"][0]["extras"]["a2tg"]["origin"]
+    assert np.abs(in_map(glb_positions(glb), kept) - true).max() < 1e-6
+    usd = pytest.importorskip("pxr.Usd", reason="usd-core is missing")
+    a2tg.save_usd(tmp_path / "a.usdc", model)
+    stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
+    prim = stage.GetPrimAtPath("/World/Splats")
+    kept = json.loads(prim.GetCustomDataByKey("a2tg:origin"))
+    assert np.abs(in_map(np.array(prim.GetAttribute("positions").Get(), float), kept) - true).max() < 1e-6
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".usda"])
+def test_files_whose_nodes_lie_in_a_map_are_read_without_rounding(tmp_path, suffix):
+    """Two sets of splats, the second 5 m above the first."""
+    gaussians = some_gaussians(9)
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".glb":
+        a2tg.save_gltf(tmp_path / "near.gltf", a2tg.Model(gaussians))
+        file = json.loads((tmp_path / "near.gltf").read_text())
+        del file["nodes"][0]["matrix"]
+        east, up, south = UTM[0], UTM[2], -UTM[1]
+        file["nodes"] = [{"mesh": 0, "translation": [east, up + 5 * k, south]} for k in range(2)]
+        file["scenes"][0]["nodes"] = [0, 1]
+        path = tmp_path / "near.gltf"
+        path.write_text(json.dumps(file))
+    else:
+        pytest.importorskip("pxr.Usd", reason="usd-core is missing")
+        from pxr import Usd, UsdGeom
+
+        a2tg.save_usd(tmp_path / "near.usda", a2tg.Model(gaussians))
+        stage = Usd.Stage.CreateNew(str(path))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        for k in range(2):
+            node = UsdGeom.Xform.Define(stage, f"/Part{k}")
+            node.GetPrim().GetReferences().AddReference(str(tmp_path / "near.usda"))
+            node.AddTranslateOp().Set(tuple(UTM + np.array([0, 0, 5.0 * k])))
+        stage.Save()
+    found = a2tg.load_splats(path)
+    means = np.asarray(gaussians.means, np.float64)
+    if suffix == ".glb":  # Numbers stand in the file as in the model, and +y is up there.
+        means = means @ np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
+    true = np.concatenate([means + UTM, means + UTM + [0, 0, 5]])
+    again = found.origin.transform.inverse().apply(np.asarray(found.gaussians.means, np.float64))
+    assert np.abs(again - true).max() < 1e-5
+
+
+def map_mesh() -> tuple[a2tg.Mesh, Similarity, np.ndarray]:
+    model, true = map_scene()
+    faces = np.arange(39, dtype=np.int32).reshape(13, 3)
+    colors = np.full((40, 3), 100, np.uint8)
+    return a2tg.Mesh(np.asarray(model.gaussians.means), faces, colors), model.origin.transform, true
+
+
+def test_meshes_hold_map_coordinates(tmp_path):
+    mesh, transform, true = map_mesh()
+    for suffix in (".ply", ".obj", ".glb"):
+        a2tg.save_mesh(tmp_path / f"a{suffix}", mesh, transform)
+    _, rows = ply_parts((tmp_path / "a.ply").read_bytes())
+    assert np.abs(xyz(rows) - true).max() < 1e-8
+    lines = [line.split() for line in (tmp_path / "a.obj").read_text().splitlines() if line.startswith("v ")]
+    assert np.abs(np.array([line[1:4] for line in lines], float) - true).max() < 1e-6
+    glb = (tmp_path / "a.glb").read_bytes()
+    assert np.abs(in_map(glb_positions(glb), json_of(glb)["nodes"][0]["extras"]["a2tg"]) - true).max() < 1e-6
+
+
+def test_meshes_near_the_origin_have_nine_digits_and_no_extras(tmp_path):
+    mesh, _, _ = map_mesh()
+    near = Similarity(0.25, TURN, np.zeros(3))
+    for suffix in (".obj", ".glb"):
+        a2tg.save_mesh(tmp_path / f"a{suffix}", mesh, near)
+    words = (tmp_path / "a.obj").read_text().split()
+    assert max(len(word.lstrip("-").replace(".", "").lstrip("0").partition("e")[0]) for word in words) <= 9
+    assert "extras" not in json_of((tmp_path / "a.glb").read_bytes())["nodes"][0]

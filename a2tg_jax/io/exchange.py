@@ -4,8 +4,9 @@ A model's own world has +z up, and lengths in which its cameras are 1 away. A fi
 original one, and the up axis that its format asks for; the model lies where it does in its own.
 """
 
+import dataclasses
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax.numpy as jnp
@@ -19,8 +20,9 @@ from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.flattening import flattened, third_log_scales
 from a2tg_jax.io.model_file import LONGEST_REASON, origin_arrays, origin_of, origin_to_dict
+from a2tg_jax.io.number_ranges import offset_for, origin_at
 from a2tg_jax.io.ply import LEAST_OPACITY, plain_gaussians
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, concatenate
 
 Up = Literal["y", "z"]
 UPRIGHT: Mapping[Up, np.ndarray] = {
@@ -133,22 +135,33 @@ def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
     return Similarity(largest, u @ v, matrix[:3, 3])
 
 
-def placed(model: Model, world: Similarity, up: Up, origin: Origin | None = None) -> Model:
-    """Return a model of a file in its own world, which has +z up (host).
+def placed(parts: Sequence[tuple[Model, Similarity]], up: Up) -> Model:
+    """Return the parts of a file as one model in its own world, which has +z up (host).
 
-    A model stays as it is where its file places it as it was written. Else it moves, and its origin along.
+    A part stays as it is where its file places it as it was written. Else it moves, and its origin along. Positions
+    that float32 would round too far there, as in map coordinates, are relative to an offset, which the origin of a
+    model without one then has.
 
     Args:
-      model: the model as the file holds it.
-      world: the similarity from there to the world of the file.
+      parts: at least one model as the file holds it, and the similarity from there to the world of the file.
       up: the axis that is up there.
-      origin: where another part of the same file was trained; None takes the model's own.
     """
-    move = world.then(upright(origin or model.origin, up).inverse())
-    if np.allclose(matrix_of(move), np.eye(4), rtol=0, atol=SAME_PLACE):
-        return model
-    check_similarity(move, "its transform")
-    return model.transform(move)
+    origin, offset, models = None, None, list[Model]()
+    for model, world in parts:
+        origin = origin or model.origin
+        move = world.then(upright(origin, up).inverse())
+        if is_same := np.allclose(matrix_of(move), np.eye(4), rtol=0, atol=SAME_PLACE):
+            move = Similarity(1.0, np.eye(3), np.zeros(3))
+        check_similarity(move, "its transform")
+        if offset is None:
+            means, log_scales = np.asarray(model.gaussians.means, np.float64), np.asarray(model.gaussians.log_scales)
+            offset = offset_for("ply", move.apply(means), log_scales + np.log(move.scale))
+        if offset.any():
+            move = dataclasses.replace(move, translation=move.translation - offset)
+        models.append(model if is_same and not offset.any() else model.transform(move))
+    if offset is not None and models[0].origin is None:
+        models[0] = dataclasses.replace(models[0], origin=origin_at(offset))
+    return models[0] if len(models) == 1 else concatenate(models)
 
 
 # Origins as text

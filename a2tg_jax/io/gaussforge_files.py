@@ -27,8 +27,8 @@ from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.exchange import reading
 from a2tg_jax.io.flattening import third_log_scales
-from a2tg_jax.io.number_ranges import check_positions, warn_of_offset
-from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, offset_comment, relative_model, world_gaussians
+from a2tg_jax.io.number_ranges import check_positions, origin_at, warn_of_offset
+from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, offset_comment, world_gaussians
 from a2tg_jax.io.quantise import morton
 from a2tg_jax.model import Model
 
@@ -90,7 +90,8 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
     gaussians = decode_ply(io.BytesIO(converted), path, is_flat=header.get("model") == SOG_FLAT).gaussians
     if kind == "ksplat":
         gaussians = _with_sh_order(gaussians, _order(kind, gaussians.sh_degree))
-    return reading(path, lambda: relative_model(gaussians, np.array(header.get(OFFSET, (0, 0, 0)), float).reshape(3)))
+    origin = reading(path, lambda: origin_at(np.array(header.get(OFFSET, (0, 0, 0)), np.float64).reshape(3)))
+    return Model(gaussians, origin=origin)
 
 
 def import_gaussforge(path: Path) -> Any:

@@ -8,6 +8,9 @@ import numpy as np
 
 from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.io.validate import check_origin
 
 SPZ_STEP = 2.0**-12
 SPZ_REACH = 2048 - SPZ_STEP
@@ -65,6 +68,19 @@ def offset_for(kind: str, means: np.ndarray, log_scales: np.ndarray) -> np.ndarr
         before, after = (_excess(kind, positions, scales) for positions in (means, means - offset))
         is_outside = kind == "spz" and bool(np.abs(means).max() > SPZ_REACH)
     return offset if is_outside or (before > 1 and after < before / 2) else np.zeros(3)
+
+
+def origin_at(offset: np.ndarray) -> Origin | None:
+    """Return the origin, without cameras, of a model whose positions are relative to an offset [3]; None for zeros.
+
+    Raises:
+      ValueError: if the offset is not finite or too large.
+    """
+    if not offset.any():
+        return None
+    origin = Origin.of_cameras([], transform=Similarity(1.0, np.eye(3), -offset))
+    check_origin(origin)
+    return origin
 
 
 def warn_of_offset(kind: str, offset: np.ndarray, name: str) -> None:

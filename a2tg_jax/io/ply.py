@@ -23,7 +23,6 @@ import numpy as np
 from a2tg_jax.appearance.copies import LARGEST_OPACITY
 from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
-from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
@@ -31,11 +30,11 @@ from a2tg_jax.data.ply_header import OFFSET, header_lines, offset_of, read_verte
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io.flattening import flattened, third_log_scales
-from a2tg_jax.io.number_ranges import in_words, offset_for, offset_words, warn_of_offset
+from a2tg_jax.io.number_ranges import in_words, offset_for, offset_words, origin_at, warn_of_offset
 from a2tg_jax.io.ply_packed import is_packed, read_packed
 from a2tg_jax.io.sh_degrees import degree_to_read
 from a2tg_jax.io.suffixes import check_suffix
-from a2tg_jax.io.validate import check_model, check_origin
+from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -251,22 +250,9 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     )
     try:
         _check(gaussians)
-        return relative_model(gaussians, inside + offset_of(file, path))
+        return Model(gaussians, origin=origin_at(inside + offset_of(file, path)))
     except ValueError as error:
         raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
-
-
-def relative_model(gaussians: Gaussians, offset: np.ndarray) -> Model:
-    """Return a model whose origin leads back to the original world if the means are relative to an offset [3].
-
-    Raises:
-      ValueError: if the offset is not finite or too large.
-    """
-    if not offset.any():
-        return Model(gaussians)
-    origin = Origin.of_cameras([], transform=Similarity(1.0, np.eye(3), -offset))
-    check_origin(origin)
-    return Model(gaussians, origin=origin)
 
 
 def _is_marked(file: BinaryIO, path: Path) -> bool:
