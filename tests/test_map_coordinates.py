@@ -17,6 +17,9 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.io.gaussforge_files import SUFFIXES
+from a2tg_jax.results.first_stage import GivenSplats, write_first_stage
+from a2tg_jax.results.folder import create_run
+from a2tg_jax.results.record import RunRecord, SceneSource
 
 UTM = np.array([431234.5, 5411222.25, 312.0])
 OFFSET = np.array([431234.0, 5411222.0, 312.0])
@@ -299,3 +302,34 @@ def test_meshes_near_the_origin_have_nine_digits_and_no_extras(tmp_path):
     words = (tmp_path / "a.obj").read_text().split()
     assert max(len(word.lstrip("-").replace(".", "").lstrip("0").partition("e")[0]) for word in words) <= 9
     assert "extras" not in json_of((tmp_path / "a.glb").read_bytes())["nodes"][0]
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.ply", "b.ply"])
+def test_training_in_a_map_starts_from_a_file_where_it_is(tmp_path, name):
+    """The splats are at the places in the scene's normalised world that their map coordinates have there."""
+    model, true = map_scene()
+    a2tg.save_model(tmp_path / "a.npz", model)
+    with pytest.warns(UserWarning, match="positions are relative to"):
+        a2tg.save_ply(tmp_path / "a.ply", model)
+    a2tg.save_ply(tmp_path / "b.ply", model, float64=True)
+    world = Similarity(0.5, TURN.T, -0.5 * TURN.T @ (UTM + 1))
+    scene = dataclasses.replace(a2tg.synthetic_scene(width=8, height=8, num_views=2, num_points=5), transform=world)
+    planned = RunRecord(SceneSource("synthetic"), "gaussians-2d", a2tg.Gaussians2d()).plan.stages[0]
+    run = create_run(tmp_path / "run")
+    write_first_stage(run, planned, GivenSplats(tmp_path / name), scene)
+    found = a2tg.load_model(run.model(planned.name)).gaussians.means
+    np.testing.assert_allclose(found, 0.5 * (true - UTM - 1) @ TURN, rtol=0, atol=1e-5)
+
+
+def test_a_file_with_an_offset_is_shown_and_written_on(tmp_path, capsys):
+    """It has an origin, and no cameras."""
+    with pytest.warns(UserWarning, match="positions are relative to"):
+        a2tg.save_ply(tmp_path / "a.ply", map_scene()[0])
+    assert main(["export", str(tmp_path / "a.ply"), "--web", str(tmp_path / "a.html")]) == 0
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.npz")]) == 0
+    assert main(["compress", str(tmp_path / "a.npz"), "--out", str(tmp_path / "b.a2tgz")]) != 0
+    assert "the model has no cameras" in capsys.readouterr().err
+    assert main(["mesh", str(tmp_path / "a.npz")]) != 0
+    assert "has no cameras to fuse depths from" in capsys.readouterr().err
+    again = a2tg.load_model(tmp_path / "a.npz")
+    assert again.origin == a2tg.load_splats(tmp_path / "a.ply").origin

@@ -87,8 +87,10 @@ def warn_of_offset(kind: str, offset: np.ndarray, name: str) -> None:
     """Warn that the positions of a file are relative to an offset [3], unless it is zero."""
     if offset.any():
         place = OFFSET_PLACES.get(kind, "the file has no place to say so: write this down")
-        why = "because the format would round such large coordinates too far"
-        message = f"{name}: positions are relative to {in_words(offset)}, {why}; {place}"
+        message = (
+            f"{name}: positions are relative to {in_words(offset)}, because the format would round such large "
+            f"coordinates too far; {place}"
+        )
         warnings.warn(message, stacklevel=4)
 
 

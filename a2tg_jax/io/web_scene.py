@@ -241,8 +241,8 @@ def _appearance_of(header: Mapping[str, Any]) -> Appearance:
 
 
 def _origin_to_dict(origin: Origin | None) -> dict[str, Any]:
-    if origin is None or not origin.names:
-        return {"background": [0.0, 0.0, 0.0] if origin is None else list(origin.background), "cameras": None}
+    if origin is None:
+        return {"background": [0.0, 0.0, 0.0], "cameras": None}
 
     def as_floats(x: ArrayLike) -> list[float]:
         return [float(str(number)) for number in np.asarray(x, np.float32).ravel()]
