@@ -14,9 +14,9 @@ from a2tg_jax.data.photogrammetry import (
     Element,
     image_of,
     images_below,
-    near_origin,
     numbers_in,
     read_xml,
+    with_near_points,
 )
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.host.regular_files import is_regular, open_regular
@@ -59,7 +59,7 @@ def metashape_frames(file: Path) -> Frames:
         )
     warn_of_missing_images(file, lacking, len(frames) + len(lacking))
     points = sorted(file.parent.glob("*.ply"))
-    return near_origin(Frames(file, frames, read_ply_points(points[0]) if len(points) == 1 else None))
+    return with_near_points(Frames(file, frames, read_ply_points(points[0]) if len(points) == 1 else None))
 
 
 def _posed_cameras(file: Path) -> Iterator[tuple[str, Element, np.ndarray]]:

@@ -12,9 +12,9 @@ from a2tg_jax.data.photogrammetry import (
     LARGEST_SKEW,
     OPENGL,
     UNDISTORTED,
-    near_origin,
     numbers_in,
     read_xml,
+    with_near_points,
 )
 from a2tg_jax.host.json_text import MOST_BYTES
 from a2tg_jax.host.regular_files import read_regular
@@ -56,7 +56,7 @@ def realityscan_frames(path: Path, files: list[Path]) -> Frames:
     if not frames:
         raise ValueError(f"{path}: no photograph lies beside an XMP file of its name; put them together")
     warn_of_missing_images(path / "*.xmp", lacking, len(files))
-    return near_origin(Frames(path / "*.xmp", frames))
+    return with_near_points(Frames(path / "*.xmp", frames))
 
 
 def _xcr_values(file: Path) -> dict[str, str]:

@@ -63,7 +63,7 @@ def offset_for(kind: str, means: np.ndarray, log_scales: np.ndarray) -> np.ndarr
     if not len(means):
         return np.zeros(3)
     with np.errstate(all="ignore"):  # Numbers that are not finite are refused later.
-        offset: np.ndarray = np.rint(np.median(means, axis=0))
+        offset: np.ndarray = np.rint(np.median(means, axis=0)) + 0.0  # Not -0.0.
         scales = np.exp(np.asarray(log_scales, np.float64).mean(axis=1))
         before, after = (_excess(kind, positions, scales) for positions in (means, means - offset))
         is_outside = kind == "spz" and bool(np.abs(means).max() > SPZ_REACH)
