@@ -42,7 +42,7 @@ from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_r
 from a2tg_jax.results.viewing import open_source
 from a2tg_jax.results.whole_run import begin_run
 
-OTHERS = [".ply", *SUFFIXES]
+OTHERS = [".ply", ".ksplat", *SUFFIXES]
 TEXTURES = "textures (--bake turns them into plain splats)"
 CUT = "colours of 1 Gaussian beyond the format's range (cut)"
 RNG = np.random.default_rng(0)

@@ -2,17 +2,14 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from a2tg_jax.data.assembly import PointCloud
-from a2tg_jax.data.ply_header import LONGEST_LINE, VertexHeader, offset_of, read_vertex_header
+from a2tg_jax.data.ply_header import VertexHeader, offset_of, read_vertex_header
 from a2tg_jax.host.regular_files import is_regular, open_regular
 
 COLORS = ("red", "green", "blue")
-LEAST_BYTES = 2
-"""Least number of bytes of a number in text: a digit and a separator."""
 
 
 def read_ply_points(path: Path) -> PointCloud:
@@ -30,27 +27,11 @@ def read_ply_points(path: Path) -> PointCloud:
     with open_regular(path) as file:
         header = read_vertex_header(file, path)
         header.require("xyz", "a PLY file of points")
-        if header.encoding == "ascii":
-            columns = dict(zip(header.fields, _read_ascii(file, header).T, strict=True))
-        else:
-            vertices = header.read_binary(file)
-            columns = {name: vertices[name] for name in header.fields}
+        vertices = header.read(file)
+        columns = {name: vertices[name] for name in header.fields}
         offset = offset_of(file, path)
     points = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=-1) + offset
     return PointCloud(points, _colors(columns, header))
-
-
-def _read_ascii(file: BinaryIO, header: VertexHeader) -> np.ndarray:
-    """Return [count, properties] of the vertices, one per line."""
-    num = len(header.fields)
-    header.check_room(file, LEAST_BYTES * num - 1)
-    rows = np.empty((header.count, num))
-    try:
-        for row in rows:
-            row[:] = [float(word) for word in file.readline(LONGEST_LINE).split()[:num]]
-    except ValueError:
-        raise ValueError(f"{header.path}: a line of it is not a vertex of {num} numbers; export it again") from None
-    return rows
 
 
 def _colors(columns: Mapping[str, np.ndarray], header: VertexHeader) -> np.ndarray:

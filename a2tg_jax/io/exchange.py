@@ -18,7 +18,7 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.flattening import flattened, third_log_scales
+from a2tg_jax.io.flattening import flattened, third_log_scales, whole_rows
 from a2tg_jax.io.model_file import LONGEST_REASON, origin_arrays, origin_of, origin_to_dict
 from a2tg_jax.io.number_ranges import offset_for, origin_at
 from a2tg_jax.io.ply import LEAST_OPACITY, plain_gaussians
@@ -70,6 +70,12 @@ def splats_of(model: Model, *, keeps_shapes: bool = False) -> Splats:
     sh = gaussians.sh if model.bands is None else gaussians.sh[:, : NUM_BASES[model.bands[1].degrees.max(initial=0)]]
     numbers = (gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), sh)
     return Splats(*(np.asarray(values, np.float32) for values in numbers))
+
+
+def whole_splats(splats: Splats, path: str | os.PathLike[str]) -> Splats:
+    """Return the splats whose numbers are finite; the others are counted in a warning that names the file."""
+    kept = whole_rows(os.fspath(path), splats.scales, splats.means, splats.quats, splats.opacities, splats.sh)
+    return Splats(*(values[kept] for values in splats))
 
 
 def gaussians_of(splats: Splats, path: str | os.PathLike[str], *, is_flat: bool) -> Gaussians:

@@ -1,11 +1,11 @@
-"""Files of other programs' splats by the library gaussforge: SPZ, SOG, compressed PLY, .splat and .ksplat.
+"""Files of other programs' splats by the library gaussforge: SPZ, SOG, compressed PLY and .splat.
 
 They pass through a PLY file in memory. Rows are written in the order of a Z curve, and all with one third scale, the
 smallest: formats that round scales by a table then spend one entry on it. What a format can say of flat splats is added
 to its file.
 
-gaussforge 0.6 writes the spherical harmonics of compressed PLY in another order than it reads them, and those of
-.ksplat in another order than GaussianSplats3D. Here they have the order that SuperSplat and GaussianSplats3D read.
+gaussforge 0.6 writes the spherical harmonics of compressed PLY in another order than it reads them. Here they have the
+order that SuperSplat reads. Its .ksplat files are empty for GaussianSplats3D; `ksplat.py` writes and reads those.
 """
 
 import dataclasses
@@ -37,7 +37,6 @@ SUFFIXES = {
     ".spz": "spz",
     ".sog": "sog",
     ".splat": "splat",
-    ".ksplat": "ksplat",
 }
 """gaussforge's names of formats, by suffix."""
 LEAST_LOG_SCALE = -20.0
@@ -63,7 +62,7 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
     check_positions(kind, gaussians, str(path))
     gaussians = _along_curve(gaussians)
     third = third_log_scales(np.asarray(gaussians.log_scales)).min(axis=0, keepdims=True, initial=0.0)
-    source = _with_sh_order(gaussians, np.argsort(_order(kind, gaussians.sh_degree)))
+    source = _by_coefficient(gaussians) if kind == "compressed.ply" else gaussians
     ply = encode_ply(source, np.repeat(third.clip(LEAST_LOG_SCALE), gaussians.num, axis=0))
     data = _marked(_converted(ply, "ply", kind, Path(path)), kind, offset)
     with replacing(path) as temporary:
@@ -88,8 +87,6 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
     header = _sog_header(data) if kind == "sog" else {}
     converted = _converted(data, kind, "ply", path)
     gaussians = decode_ply(io.BytesIO(converted), path, is_flat=header.get("model") == SOG_FLAT).gaussians
-    if kind == "ksplat":
-        gaussians = _with_sh_order(gaussians, _order(kind, gaussians.sh_degree))
     origin = reading(path, lambda: origin_at(np.array(header.get(OFFSET, (0, 0, 0)), np.float64).reshape(3)))
     return Model(gaussians, origin=origin)
 
@@ -123,26 +120,13 @@ def _along_curve(gaussians: Gaussians) -> Gaussians:
     return gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]
 
 
-def _order(kind: str, degree: int) -> np.ndarray:
-    """Return for each coefficient above degree 0, channel by channel, its place in gaussforge's order of a file."""
-    each = (degree + 1) ** 2 - 1
-    places = np.arange(3 * each)
-    if kind == "compressed.ply":
-        return places % 3 * each + places // 3
-    if kind == "ksplat":  # Degree by degree, and within each channel by channel.
-        channel, coefficient = np.divmod(places, max(each, 1))
-        own = np.sqrt(coefficient + 1).astype(int)
-        first, width = own**2 - 1, 2 * own + 1
-        places = 3 * first + channel * width + coefficient - first
-    return places
-
-
-def _with_sh_order(gaussians: Gaussians, order: np.ndarray) -> Gaussians:
-    """Return Gaussians whose coefficients above degree 0, channel by channel, are taken in an order."""
+def _by_coefficient(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians of which gaussforge writes the SH above degree 0 channel by channel, which it takes for the
+    order coefficient by coefficient."""
     sh = np.asarray(gaussians.sh)
-    rest = sh[:, 1:].transpose(0, 2, 1)
-    taken = rest.reshape(len(sh), -1)[:, order].reshape(rest.shape).transpose(0, 2, 1)
-    return dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], taken], axis=1)))
+    num, num_bases, _ = sh.shape
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(num, num_bases - 1, 3)
+    return dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], rest], axis=1)))
 
 
 def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:

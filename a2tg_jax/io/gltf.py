@@ -30,6 +30,7 @@ from a2tg_jax.io.exchange import (
     similarity_of,
     splats_of,
     upright,
+    whole_splats,
 )
 from a2tg_jax.io.gltf_nodes import mesh_nodes
 from a2tg_jax.io.gltf_reader import Document
@@ -195,7 +196,7 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
     degree = NUM_BASES.index(splats.sh.shape[1])
     extended = described.get("extensions", {}).get(EXTENSION)
     if extended is None:
-        gaussians = gaussians_of(splats, document.path, is_flat=False)
+        gaussians = gaussians_of(whole_splats(splats, document.path), document.path, is_flat=False)
         appearance = kept_appearance(kept, Plain(), is_told=False)
         model = Model(gaussians, appearance=appearance, origin=origin)
         check_model(model)

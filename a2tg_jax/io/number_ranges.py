@@ -36,12 +36,12 @@ class NumberRange:
 
 
 RANGES = {
-    "spz": NumberRange(0.5 / 0.15, 1.0, (-10.0, 255 / 16 - 10)),
-    "compressed.ply": NumberRange(rest=4.0),
-    "splat": NumberRange(0.5 / SH_C0),
-    "ksplat": NumberRange(0.5 / SH_C0),
+    "SPZ": NumberRange(0.5 / 0.15, 1.0, (-10.0, 255 / 16 - 10)),
+    "compressed PLY": NumberRange(rest=4.0),
+    ".splat": NumberRange(0.5 / SH_C0),
+    ".ksplat": NumberRange(0.5 / SH_C0),
 }
-"""Ranges by gaussforge's name of a format; those of the others adapt."""
+"""Ranges by the name of a format; the others have none."""
 
 
 OFFSET_PLACES = {
@@ -127,10 +127,10 @@ def check_positions(kind: str, gaussians: Gaussians, name: str) -> None:
         warnings.warn(message, stacklevel=4)
 
 
-def cut_numbers(kind: str, gaussians: Gaussians) -> list[str]:
-    """Return in words how many Gaussians a format cuts the colours and the scales of."""
-    found, sizes = RANGES.get(kind, NumberRange()), np.abs(np.asarray(gaussians.sh))
-    if kind == "splat":
+def cut_numbers(name: str, gaussians: Gaussians) -> list[str]:
+    """Return in words how many Gaussians a format of `RANGES` cuts the colours and the scales of."""
+    found, sizes = RANGES[name], np.abs(np.asarray(gaussians.sh))
+    if name == ".splat":
         sizes = sizes[:, :1]
     largest = np.where(np.arange(sizes.shape[1]) == 0, found.first, found.rest)[:, None] * (1 + SLACK)
     low, high = found.log_scales

@@ -1,11 +1,11 @@
 """PLY files of Gaussians with the attribute names of 2DGS, and a third scale for programs made for 3DGS.
 
-x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 scale_2 rot_0..3, little-endian float32: opacities as
-logits, scales as logarithms, quaternions wxyz. f_rest lists the coefficients of degree 1 to 3 channel by channel: all
-of red, then green, then blue. scale_2 belongs to the axis along the normal; files of 2DGS lack it. The comment
-"SplatRenderMode: 2dgs" says that splats are flat. What splats show besides has no place in this format: textures,
-movable kernels and billboards, and with them the colours and opacities that they carry, are lost; `save_model` keeps
-all.
+Written are x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 scale_2 rot_0..3, little-endian float32:
+opacities as logits, scales as logarithms, quaternions wxyz. f_rest lists the coefficients of degree 1 to 3 channel by
+channel: all of red, then green, then blue. scale_2 belongs to the axis along the normal; files of 2DGS lack it. The
+comment "SplatRenderMode: 2dgs" says that splats are flat. What splats show besides has no place in this format:
+textures, movable kernels and billboards, and with them the colours and opacities that they carry, are lost;
+`save_model` keeps all.
 
 Positions that float32 would round too far, as those of maps, are relative to an offset: "comment offset X Y Z".
 """
@@ -19,17 +19,18 @@ from typing import BinaryIO, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.lib.recfunctions import append_fields
 
 from a2tg_jax.appearance.copies import LARGEST_OPACITY
 from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
-from a2tg_jax.core.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
+from a2tg_jax.core.gaussians import SH_C0, Gaussians, check_gaussians, logit, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.data.ply_header import OFFSET, header_lines, offset_of, read_vertex_header
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
-from a2tg_jax.io.flattening import flattened, third_log_scales
+from a2tg_jax.io.flattening import flattened, third_log_scales, whole_rows
 from a2tg_jax.io.number_ranges import in_words, offset_for, offset_words, origin_at, warn_of_offset
 from a2tg_jax.io.ply_packed import is_packed, read_packed
 from a2tg_jax.io.sh_degrees import degree_to_read
@@ -41,7 +42,8 @@ MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 SH_DEGREE0, SH_REST = tuple(f"f_dc_{i}" for i in range(3)), tuple(f"f_rest_{i}" for i in range(45))
 SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
-REQUIRED = (*MEANS, *SH_DEGREE0, "opacity", *SCALES, *QUATS)
+COLORS = ("red", "green", "blue")
+"""What some programs write in place of f_dc_*."""
 NUM_REST = (0, 9, 24, 45, 72)
 """Number of attributes f_rest_* by degree of the spherical harmonics; some programs write degree 4."""
 THIRD_SCALE = "scale_2"
@@ -197,7 +199,9 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     A file of map coordinates (`save_ply`) is read relative to whole numbers that a warning names; `load_splats` keeps
     these in the model's origin. So are positions in float64 that float32 would round too far.
 
-    They have the SH degree of the file. Degrees above 3 are left out with a warning; further attributes are ignored.
+    Text and binary files of either byte order are read, and colours red, green, blue where f_dc_* are missing. They
+    have the SH degree of the file. Degrees above 3 are left out with a warning, and so are Gaussians with numbers that
+    are not finite; further attributes are ignored.
     The third scale (scale_2) of a file that says that its splats are flat is dropped. Any other holds ellipsoids: the
     thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more than a thousandth
     of the others.
@@ -207,7 +211,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is not a binary little-endian PLY, is cut off, lacks an attribute, or a number is not finite.
+      ValueError: if it is no PLY, is cut off, lacks an attribute, or has no Gaussian of finite numbers.
     """
     check_suffix(path, "load_ply")
     model = load_ply_model(path)
@@ -235,19 +239,18 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
       is_flat: whether the splats are known to be flat; if not, the header may say so.
     """
     vertices = read_packed(file, path) if is_packed(file, path) else _read_vertices(file, path)
-    quats, log_scales = _columns(vertices, QUATS), _columns(vertices, SCALES)
-    if THIRD_SCALE in (vertices.dtype.names or ()) and not (is_flat or _is_marked(file, path)):
-        three = _columns(vertices, (*SCALES, THIRD_SCALE))
-        quats, log_scales = flattened(quats, three, str(path))
-    means = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1)
+    has_third = THIRD_SCALE in (vertices.dtype.names or ()) and not (is_flat or _is_marked(file, path))
+    log_scales = _columns(vertices, (*SCALES, THIRD_SCALE) if has_third else SCALES)
+    means, quats = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1), _columns(vertices, QUATS)
+    logits, sh = _logits_of(vertices), _sh_of(vertices, path)
+    kept = whole_rows(str(path), log_scales, means, quats, logits, sh)
+    means, quats, log_scales = means[kept], quats[kept], log_scales[kept]
+    if has_third:
+        quats, log_scales = flattened(quats, log_scales, str(path))
     inside = offset_for("ply", means, log_scales)  # Zeros where the file has float32.
-    gaussians = Gaussians(
-        means=jnp.asarray(means - inside, jnp.float32) if inside.any() else jnp.asarray(_columns(vertices, MEANS)),
-        quats=jnp.asarray(quats),
-        log_scales=jnp.asarray(log_scales),
-        logit_opacities=jnp.asarray(_logits_of(vertices)),
-        sh=jnp.asarray(_sh_of(vertices, path)),
-    )
+    with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
+        means = (means - inside).astype(np.float32)
+    gaussians = Gaussians(*(jnp.asarray(rows) for rows in (means, quats, log_scales, logits[kept], sh[kept])))
     try:
         _check(gaussians)
         return Model(gaussians, origin=origin_at(inside + offset_of(file, path)))
@@ -278,10 +281,18 @@ def _check(gaussians: Gaussians) -> None:
 def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:
     """Return the vertices, structured, with the attributes that 2DGS gives them."""
     header = read_vertex_header(file, path)
-    if header.encoding != ENCODING:
-        raise ValueError(f"{path}: is a PLY in {header.encoding}; save it as {ENCODING}")
-    header.require(REQUIRED, "a PLY of 2D Gaussians")
-    return header.read_binary(file)
+    has_colors = set(COLORS) <= set(header.fields) and not set(SH_DEGREE0) & set(header.fields)
+    header.require((*MEANS, *(COLORS if has_colors else SH_DEGREE0), "opacity", *SCALES, *QUATS), "a PLY of Gaussians")
+    vertices = header.read(file)
+    if not has_colors:
+        return vertices
+    colors = np.stack([vertices[name].astype(np.float64) for name in COLORS], axis=1)
+    kind = np.dtype(header.fields[COLORS[0]])
+    if kind.kind != "f":
+        colors /= np.iinfo(kind).max
+    elif np.max(colors, initial=0.0, where=np.isfinite(colors)) > 1:
+        colors /= 255  # Floats of 0 to 255, as some programs write them.
+    return append_fields(vertices, SH_DEGREE0, ((colors - 0.5) / SH_C0).T, usemask=False)
 
 
 def _logits_of(vertices: np.ndarray) -> np.ndarray:

@@ -34,6 +34,7 @@ from a2tg_jax.io.exchange import (
     similarity_of,
     splats_of,
     upright,
+    whole_splats,
 )
 from a2tg_jax.io.sh_degrees import degree_to_read
 from a2tg_jax.io.suffixes import check_saved, check_suffix
@@ -190,7 +191,7 @@ def _model_of(usd: Any, field: Any, path: Path) -> Model:
     kernels = set(prim.GetAppliedSchemas()) & {SURFLET, ELLIPSOID}
     if len(kernels) != 1:
         raise ValueError(f"its particle field {shortened(str(prim.GetPath()))} must have a kernel of Gaussians")
-    gaussians = gaussians_of(_splats(usd, prim, path), path, is_flat=SURFLET in kernels)
+    gaussians = gaussians_of(whole_splats(_splats(usd, prim, path), path), path, is_flat=SURFLET in kernels)
     kept = prim.GetCustomDataByKey(ORIGIN)
     origin = origin_from_json(parse_json(kept)) if isinstance(kept, str) else None
     model = Model(gaussians, origin=origin)
