@@ -173,7 +173,7 @@ def test_an_offset_that_is_no_number_is_refused_and_other_comments_are_ignored(t
             assert a2tg.load_splats(tmp_path / "b.ply").origin is None
 
 
-@pytest.mark.parametrize("suffix", [".ply", *SUFFIXES])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog", ".spz", ".splat", ".ksplat"])
 def test_scenes_near_the_origin_have_no_offset(tmp_path, suffix):
     """Also those of a local grid a few hundred metres away, which float32 holds."""
     if suffix != ".ply":
@@ -333,3 +333,17 @@ def test_a_file_with_an_offset_is_shown_and_written_on(tmp_path, capsys):
     assert "has no cameras to fuse depths from" in capsys.readouterr().err
     again = a2tg.load_model(tmp_path / "a.npz")
     assert again.origin == a2tg.load_splats(tmp_path / "a.ply").origin
+
+
+def test_models_with_different_offsets_are_joined_with_a_warning_whose_advice_works(tmp_path):
+    offsets = UTM, UTM + np.array([20.0, 0, 0])
+    scenes = [map_scene(middle) for middle in offsets]
+    for name, (model, _) in zip("ab", scenes, strict=True):
+        a2tg.save_ply(tmp_path / f"{name}.ply", model, float64=True)
+    models = [a2tg.load_splats(tmp_path / f"{name}.ply") for name in "ab"]
+    with pytest.warns(UserWarning, match=r"models\[1\] is relative to another offset") as told:
+        a2tg.concatenate(models)
+    move = eval(str(told[0].message).partition("transform it by ")[2], {"models": models})
+    joined = a2tg.concatenate([models[0], models[1].transform(move)])
+    found = joined.origin.transform.inverse().apply(np.asarray(joined.gaussians.means, np.float64))
+    assert np.abs(found - np.concatenate([true for _, true in scenes])).max() < 1e-5
