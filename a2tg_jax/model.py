@@ -1,6 +1,7 @@
 """A model: Gaussians and their appearance, as one value that is trained, rendered, counted, moved and saved."""
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -24,6 +25,9 @@ from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.render import render_appearance, with_features
 from a2tg_jax.texture import AtlasLayout, Textures
+
+SAME_PLACE = 1e-5
+"""Largest distance of two models' origins that are taken for one."""
 
 
 class Parameters(NamedTuple):
@@ -278,8 +282,8 @@ def check_is_model(model: Any, name: str = "model") -> None:
 def concatenate(models: Sequence[Model]) -> Model:
     """Return the Gaussians of several models as one model, in their order.
 
-    The models lie in one world: move them first (`Model.transform`). Spherical harmonics of lower degrees are filled
-    up with zeros.
+    The models lie in one world: move them first (`Model.transform`). A warning names a model that was read relative to
+    another offset than the first. Spherical harmonics of lower degrees are filled up with zeros.
 
     Args:
       models: at least one, of the same appearance with the same options.
@@ -304,6 +308,12 @@ def concatenate(models: Sequence[Model]) -> Model:
         str(m.gaussians.means.dtype) for m in models if m.gaussians.means.dtype != first.gaussians.means.dtype
     ]:
         raise ValueError(f"models must have one dtype; got {first.gaussians.means.dtype} and {dtypes[0]}")
+    for index, model in enumerate(models[1:], 1):
+        if first.origin is not None and model.origin is not None and not model.origin.names:
+            apart = model.origin.transform.inverse().then(first.origin.transform).apply(np.zeros(3))
+            if np.abs(apart).max() > SAME_PLACE:
+                move = f"models[{index}].origin.transform.inverse().then(models[0].origin.transform)"
+                warnings.warn(f"models[{index}] is relative to another offset; transform it by {move}", stacklevel=2)
     highest = max(model.gaussians.sh.shape[1] for model in models)
     several = [_with_bases(model.gaussians, 0 if first.appearance.has_degrees else highest) for model in models]
     if len({gaussians.sh_degree for gaussians in several}) > 1:

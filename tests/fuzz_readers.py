@@ -15,6 +15,7 @@ JSON = (mutate.of_json, mutate.of_json, mutate.of_json, mutate.of_text, mutate.o
 ARCHIVE = (mutate.of_npz, mutate.of_npz, mutate.of_npz, mutate.of_bytes)
 COLMAP = ("cameras", "images", "points3D", "rigs", "frames")
 OF_RUN = ("metrics.json", ".a2tg-run")
+KSPLAT = ("0-degree1", "1-degree2", "2-degree2")
 DEPTHS = ("depth", "confidence")
 PICTURES = ("png", "jpg", "tif", "webp", "avif", "bmp", "gif", "ppm")
 
@@ -54,7 +55,9 @@ READERS = (
     Reader("models", ("a2tg.npz", "bytewise.npz", "supergaussians.npz", "bbsplat.npz"), ARCHIVE, "model"),
     Reader("compact", ("a2tg.a2tgz", "bytewise.a2tgz"), (mutate.of_compact, mutate.of_bytes), "compact"),
     Reader("checkpoints", ("a2tg.npz", "bytewise.npz", "gaussians-2d.npz"), ARCHIVE, "checkpoint"),
-    Reader("gaussians", ("gaussians.ply", "third.ply"), BINARY, "gaussians"),
+    Reader("gaussians", ("gaussians.ply", "third.ply", "big.ply", "packed.ply"), BINARY, "gaussians"),
+    Reader("gaussians", ("ascii.ply",), TEXT, "gaussians"),
+    Reader("ksplat", tuple(f"level{level}.ksplat" for level in KSPLAT), BINARY, "splats"),
     Reader("gltf", ("a2tg.glb", "bytewise.glb"), (mutate.of_glb, mutate.of_glb, mutate.of_bytes), "gltf"),
     Reader("gltf", ("a2tg.gltf",), JSON, "gltf"),
     Reader("lpips", ("squeeze.npz",), ARCHIVE, "lpips"),
@@ -181,6 +184,12 @@ def _gaussians(folder: Path, file: Path):
     return _check_model(Model(load_ply(file)))
 
 
+def _splats(folder: Path, file: Path):
+    from a2tg_jax import load_splats
+
+    return _check_model(load_splats(file))
+
+
 def _gltf(folder: Path, file: Path):
     from a2tg_jax import load_gltf
 
@@ -237,6 +246,6 @@ def _run(folder: Path, file: Path) -> None:
 
 TARGETS = {
     "scene": _scene, "points": _points, "picture": _picture, "model": _model, "compact": _compact,
-    "checkpoint": _checkpoint, "gaussians": _gaussians, "gltf": _gltf, "lpips": _lpips, "info": _info,
-    "history": _history, "record": _record, "marker": _marker, "run": _run,
+    "checkpoint": _checkpoint, "gaussians": _gaussians, "splats": _splats, "gltf": _gltf, "lpips": _lpips,
+    "info": _info, "history": _history, "record": _record, "marker": _marker, "run": _run,
 }  # fmt: skip

@@ -15,10 +15,13 @@ from test_captures import write_metashape, write_polycam_with_depth, write_reali
 from test_data_colmap import CAMERAS
 from test_data_colmap import write_scene as write_colmap
 from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write_json, write_ply
+from test_io import write_ply as write_splats
+from test_others import OTHERS
 
 import a2tg_jax as a2tg
 from a2tg_jax import save_compact, save_gltf, save_model, save_ply
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.io.ply import ATTRIBUTES
 from a2tg_jax.model import Model
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.folder import write_json as write_run_json
@@ -47,7 +50,7 @@ def write_seeds(folder: Path) -> None:
     """A folder for each name of `READERS`."""
     _write_scenes(folder)
     _write_pictures(folder / "pictures")
-    for name in ("models", "compact", "checkpoints", "gaussians", "gltf", "lpips"):
+    for name in ("models", "compact", "checkpoints", "gaussians", "ksplat", "gltf", "lpips"):
         (folder / name).mkdir()
     for name, system in SYSTEMS.items():
         model = _with_shapes(some_model(system()))
@@ -59,6 +62,11 @@ def write_seeds(folder: Path) -> None:
         save_checkpoint(folder / "checkpoints" / f"{name}.npz", some_checkpoint(system()))
     save_ply(folder / "gaussians" / "gaussians.ply", some_model(), third_scale=False)
     save_ply(folder / "gaussians" / "third.ply", some_model())
+    for name, encoding in (("ascii", "ascii"), ("big", "binary_big_endian")):
+        write_splats(folder / "gaussians" / f"{name}.ply", ATTRIBUTES, np.ones((4, len(ATTRIBUTES))), encoding)
+    shutil.copy(OTHERS / "scene.compressed.ply", folder / "gaussians" / "packed.ply")
+    for file in OTHERS.glob("*.ksplat"):
+        shutil.copy(file, folder / "ksplat")
     _write_lpips(folder / "lpips" / "squeeze.npz")
     _write_run(folder / "run")
     write_runs(folder / "commands")

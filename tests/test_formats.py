@@ -28,6 +28,7 @@ from a2tg_jax import (
 from a2tg_jax.appearance import MovableKernels, Shaped, Textured
 from a2tg_jax.cli import train
 from a2tg_jax.cli.main import main
+from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.archive import write_archive
@@ -41,7 +42,7 @@ from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_r
 from a2tg_jax.results.viewing import open_source
 from a2tg_jax.results.whole_run import begin_run
 
-OTHERS = [".ply", *SUFFIXES]
+OTHERS = [".ply", ".ksplat", *SUFFIXES]
 TEXTURES = "textures (--bake turns them into plain splats)"
 CUT = "colours of 1 Gaussian beyond the format's range (cut)"
 RNG = np.random.default_rng(0)
@@ -126,16 +127,17 @@ def test_a_missing_library_is_told_with_its_command(tmp_path, monkeypatch):
 def test_positions_beyond_a_format_are_refused_or_told(tmp_path):
     needs_gaussforge()
     path, near = tmp_path / "a.spz", small_scene()
-    far = dataclasses.replace(near, gaussians=dataclasses.replace(near.gaussians, means=near.gaussians.means + 2050))
+    means = near.gaussians.means.at[0].add(4100).at[1].add(-2050)  # No other origin has all within reach.
+    far = dataclasses.replace(near, gaussians=dataclasses.replace(near.gaussians, means=means))
     with pytest.raises(ValueError, match=r"holds positions up to 2048 units.*write \*\.ply or"):
         save_splats(path, far)
     assert not path.exists()
     shrunk = transform_gaussians(near.gaussians, Similarity(1e-2, np.eye(3), np.zeros(3)))
     with pytest.warns(UserWarning, match=r"a\.spz: positions are rounded by .* or enlarge the scene"):
         save_splats(path, Model(shrunk))
-    remote = dataclasses.replace(near.gaussians, means=near.gaussians.means + 500_000)
-    with pytest.warns(UserWarning, match=r"a\.sog: positions are rounded by .* or recentre the scene"):
-        save_splats(tmp_path / "a.sog", Model(remote))
+    spread = dataclasses.replace(near.gaussians, means=near.gaussians.means * 500_000)
+    with pytest.warns(UserWarning, match=r"a\.sog: positions are rounded by .*; write \*\.ply$"):
+        save_splats(tmp_path / "a.sog", Model(spread))
 
 
 @pytest.mark.parametrize(("suffix", "num"), [(".spz", 5), (".splat", 3), (".ksplat", 3), (".compressed.ply", 2)])
@@ -163,7 +165,8 @@ def test_a_file_without_gaussians_is_refused(tmp_path, suffix):
 
 def test_what_a_format_does_not_keep():
     world = Similarity(2.0, np.eye(3), np.zeros(3))
-    model = dataclasses.replace(textured(), origin=Origin.of_cameras([], transform=world))
+    camera = Camera(jnp.eye(4), jnp.eye(3), 8, 8)
+    model = dataclasses.replace(textured(), origin=Origin.of_cameras([camera], transform=world))
     assert lost_by(model, "a.npz") == []
     assert lost_by(model, "a.ply") == [TEXTURES, "cameras and background"]
     assert lost_by(model, "a.SPZ") == [TEXTURES, CUT, "cameras and background", "last digits"]

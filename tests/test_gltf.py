@@ -210,7 +210,7 @@ def test_a_moved_node_moves_the_model_and_its_cameras(tmp_path):
     described["nodes"] = [{"children": [1], "matrix": matrix_of(move).T.ravel().tolist()}, described["nodes"][0]]
     write_parts(path, described, binary)
     found = load_gltf(path)
-    wanted = placed(model, upright(model.origin, "y").then(move), "y")
+    wanted = placed([(model, upright(model.origin, "y").then(move))], "y")
     assert_shows_the_same(found, wanted)
     np.testing.assert_allclose(own, matrix_of(upright(model.origin, "y")))
     assert np.abs(np.asarray(found.gaussians.means) - np.asarray(model.gaussians.means)).max() > 0.1
@@ -472,8 +472,8 @@ def test_an_origin_elsewhere_is_taken_along():
     model = plain()
     origin = Origin.of_cameras(model.origin.cameras, transform=Similarity(2.0, np.eye(3), np.zeros(3)))
     model = dataclasses.replace(model, origin=origin)
-    assert placed(model, upright(origin, "y"), "y") is model
-    assert placed(model, upright(None, "y"), "y") is not model
+    assert placed([(model, upright(origin, "y"))], "y") is model
+    assert placed([(model, upright(None, "y"))], "y") is not model
 
 
 # The schema of the extension

@@ -352,10 +352,13 @@ def test_json_of_pythons_own_library_is_read():
 def test_ply_with_numbers_that_are_not_finite(tmp_path, value):
     path = tmp_path / "g.ply"
     save_ply(path, some_gaussians())
-    data = bytearray(path.read_bytes())
-    data[-4:] = np.float32(value).tobytes()
-    path.write_bytes(bytes(data))
-    refused(load_ply, path, r"gaussians\.quats must be finite")
+    whole, number = path.read_bytes(), np.float32(value).tobytes()
+    path.write_bytes(whole[:-4] + number)
+    with pytest.warns(UserWarning, match=f"1 Gaussian of {NUM} left out"):
+        assert load_ply(path).num == NUM - 1
+    start = whole.index(b"end_header\n") + len(b"end_header\n")
+    path.write_bytes(whole[:start] + number * ((len(whole) - start) // 4))
+    refused(load_ply, path, r"gaussians\.\w+ must be finite")
 
 
 @pytest.mark.parametrize("count", [2**64 - 1, 2 * 10**9, 13])

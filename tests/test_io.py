@@ -26,11 +26,16 @@ from a2tg_jax.render import render_image
 from a2tg_jax.texture import textures_from_arrays
 
 
-def write_ply(path, names, rows, encoding="binary_little_endian") -> None:
-    """A PLY file written apart from the package."""
-    properties = "".join(f"property float {name}\n" for name in names)
+def write_ply(path, names, rows, encoding="binary_little_endian", types=None) -> None:
+    """A PLY file written apart from the package, of floats but for the properties whose types are given."""
+    types = {name: (types or {}).get(name, "float") for name in names}
+    properties = "".join(f"property {kind} {name}\n" for name, kind in types.items())
     header = f"ply\nformat {encoding} 1.0\ncomment made by hand\nelement vertex {len(rows)}\n{properties}end_header\n"
-    path.write_bytes(header.encode() + np.asarray(rows, "<f4").tobytes())
+    kinds = {"float": "f4", "uchar": "u1", "ushort": "u2"}
+    dtype = [(name, (">" if "big" in encoding else "<") + kinds[kind]) for name, kind in types.items()]
+    body = np.array([tuple(row) for row in np.asarray(rows).tolist()], dtype)
+    text = "".join(" ".join(repr(number) for number in row) + "\n" for row in body.tolist())
+    path.write_bytes(header.encode() + (text.encode() if encoding == "ascii" else body.tobytes()))
 
 
 # PLY
@@ -96,6 +101,59 @@ def test_ply_of_other_numbers_of_coefficients_is_refused(tmp_path, num):
     write_ply(tmp_path / "g.ply", names, np.ones((2, len(names))))
     with pytest.raises(ValueError, match=rf"has {num} attributes f_rest_\*; .* have 0, 9, 24, 45 or 72"):
         load_ply(tmp_path / "g.ply")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_big_endian"])
+def test_ply_in_text_and_of_the_other_byte_order(tmp_path, encoding):
+    rows = np.random.default_rng(0).normal(size=(5, len(ATTRIBUTES)))
+    write_ply(tmp_path / "little.ply", ATTRIBUTES, rows)
+    write_ply(tmp_path / "other.ply", ATTRIBUTES, rows, encoding)
+    assert_same(load_ply(tmp_path / "other.ply"), load_ply(tmp_path / "little.ply"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "largest", "encoding"),
+    [
+        ("uchar", 255, "binary_little_endian"),
+        ("uchar", 255, "ascii"),
+        ("ushort", 65535, "binary_big_endian"),
+        ("float", 1, "binary_little_endian"),
+        ("float", 255, "binary_little_endian"),
+    ],
+)
+def test_ply_with_red_green_and_blue(tmp_path, kind, largest, encoding):
+    """A colour c is 0.5 + f_dc / (2 √π)."""
+    names = [name for name in ATTRIBUTES if not name.startswith(("f_", "n"))] + ["red", "green", "blue"]
+    rows = np.random.default_rng(0).normal(size=(4, len(names)))
+    colors = np.array([[0, 0.2, 1], [0.4, 0.6, 0.8], [0.2, 0.2, 0], [1, 0, 0.4]])
+    rows[:, -3:] = largest * colors
+    write_ply(tmp_path / "g.ply", names, rows, encoding, dict.fromkeys(("red", "green", "blue"), kind))
+    sh = np.asarray(load_ply(tmp_path / "g.ply").sh)
+    assert sh.shape == (4, 1, 3)
+    np.testing.assert_allclose(0.5 + sh[:, 0] / (2 * np.sqrt(np.pi)), colors, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["x", "f_dc_1", "f_rest_44", "opacity", "scale_1", "rot_3"])
+def test_rows_of_nan_are_left_out_and_counted(tmp_path, name):
+    rows = np.random.default_rng(0).normal(size=(6, len(ATTRIBUTES)))
+    write_ply(tmp_path / "whole.ply", ATTRIBUTES, rows[[0, 1, 3, 5]])
+    rows[[2, 4], ATTRIBUTES.index(name)] = np.nan
+    write_ply(tmp_path / "g.ply", ATTRIBUTES, rows)
+    with pytest.warns(UserWarning, match=r"g\.ply: 2 Gaussians of 6 left out.*; the first is row 2 \(from 0\)"):
+        found = load_ply(tmp_path / "g.ply")
+    assert_same(found, load_ply(tmp_path / "whole.ply"))
+
+
+def test_a_third_scale_of_0_is_flat(tmp_path):
+    """Its logarithm is −inf; in other places that is no number."""
+    names, rows = (*ATTRIBUTES, "scale_2"), np.random.default_rng(0).normal(size=(3, len(ATTRIBUTES) + 1))
+    rows[:, -1] = -np.inf
+    write_ply(tmp_path / "g.ply", names, rows)
+    np.testing.assert_allclose(load_ply(tmp_path / "g.ply").means, rows[:, :3], rtol=1e-6)
+    rows[1, names.index("scale_0")] = -np.inf
+    write_ply(tmp_path / "g.ply", names, rows)
+    with pytest.warns(UserWarning, match="1 Gaussian of 3 left out"):
+        assert load_ply(tmp_path / "g.ply").num == 2
 
 
 def test_infinite_logits_of_opacities_become_finite(tmp_path):
@@ -168,7 +226,10 @@ def test_ply_of_a_model_is_in_its_original_world(tmp_path):
     [
         (lambda path: path.write_bytes(b"ply\nelement vertex -3\n"), "announces -3 of vertex"),
         (lambda path: path.write_bytes(b"not a ply\n"), "is not a PLY file"),
-        (lambda path: path.write_bytes(path.read_bytes().replace(b"binary_little_endian", b"ascii")), "save it as"),
+        (
+            lambda path: path.write_bytes(path.read_bytes().replace(b"binary_little_endian", b"ascii")),
+            "a line of it is",
+        ),
         (lambda path: path.write_bytes(b"ply\nformat binary_little_endian 1.0\n"), "header does not end"),
         (lambda path: path.write_bytes(path.read_bytes()[:-1]), "is cut off"),
         (lambda path: write_ply(path, ("x", "y", "z"), np.ones((2, 3))), "no attribute f_dc_0"),

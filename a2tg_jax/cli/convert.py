@@ -41,6 +41,9 @@ class Convert:
     bake_iterations: int = BakeOptions.iterations
     """Iterations of training in --bake; each draws one view. 0 leaves training out."""
 
+    float64: bool = False
+    """Write the positions of a PLY as float64, so that map coordinates stay whole."""
+
     overwrite: bool = False
     """Replace the output file."""
 
@@ -49,4 +52,7 @@ class Convert:
         if not self.bake and options != BakeOptions():
             raise ValueError("--bake-growth and --bake-iterations have no effect without --bake: add it")
         baking = options if self.bake else None
-        print(convert(self.source, self.out, self.model, baking=baking, overwrite=self.overwrite).text)
+        result = convert(
+            self.source, self.out, self.model, baking=baking, float64=self.float64, overwrite=self.overwrite
+        )
+        print(result.text)

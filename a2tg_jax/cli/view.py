@@ -74,6 +74,8 @@ class Export:
     """Output folder of the page; a name that ends in .html is one HTML file that needs no other."""
     ply: Annotated[Path | None, arg(metavar="FILE")] = None
     """Output file of the Gaussians."""
+    float64: bool = False
+    """Write the positions of --ply as float64, so that map coordinates stay whole."""
     single_file: bool = False
     """Write one HTML file, whatever its name."""
     photographs: bool = False
@@ -86,6 +88,8 @@ class Export:
     def run(self) -> None:
         if self.web is None and (self.ply is None or self.single_file or self.photographs):
             raise ValueError("give --web PATH for a page, or --ply FILE for other programs")
+        if self.float64 and self.ply is None:
+            raise ValueError("--float64 has no effect without --ply: add it")
         if self.ply is not None:
             self._check_ply(self.ply)
         if self.web is not None:
@@ -101,7 +105,7 @@ class Export:
             )
             print(exported_text(result))
         if self.ply is not None:
-            print(export_ply(source, self.ply))
+            print(export_ply(source, self.ply, float64=self.float64))
 
     def _check_ply(self, ply: Path) -> None:
         check_output(ply)

@@ -19,10 +19,10 @@ from a2tg_jax.data.photogrammetry import (
     Element,
     image_of,
     images_below,
-    near_origin,
     numbers_in,
     points_beside,
     read_xml,
+    with_near_points,
 )
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
@@ -71,7 +71,7 @@ def metashape_frames(file: Path) -> Frames:
             f"{file}: none of its cameras has a pose and an image beside it; put the photographs into images/"
         )
     warn_of_missing_images(file, lacking, len(frames) + len(lacking))
-    return near_origin(Frames(file, frames, points_beside(file)))
+    return with_near_points(Frames(file, frames, points_beside(file)))
 
 
 def _posed_cameras(file: Path) -> list[tuple[str, Element, np.ndarray]]:

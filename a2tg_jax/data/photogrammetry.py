@@ -1,6 +1,5 @@
 """Parts that readers of photogrammetry programs share: XML, numbers in texts, images by name, and worlds of maps."""
 
-import dataclasses
 import re
 import warnings
 from collections import defaultdict
@@ -21,8 +20,6 @@ from a2tg_jax.host.text import shortened
 Element = ElementTree.Element
 LARGEST_SKEW = 0.5
 """Largest skew, in pixels over an image, that is ignored."""
-FARTHEST = 1e3
-"""Largest distance of the cameras' middle from the origin, in units of their spread, that keeps the origin."""
 FARTHEST_POINTS = 100.0
 """Largest distance of the points' median from the cameras' middle, in units of the cameras' spread."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -30,11 +27,10 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 UNDISTORTED = "export undistorted images in COLMAP's format instead"
 
 
-def near_origin(frames: Frames) -> Frames:
-    """Return frames with poses as lists. The origin of a map's world is moved to the cameras, and points far
-    from them are left out, with a warning each."""
+def with_near_points(frames: Frames) -> Frames:
+    """Return frames with poses as lists. Points far from the cameras are left out, with a warning."""
     poses = np.stack([frame["transform_matrix"] for frame in frames.frames])
-    middle = np.rint(np.median(poses[:, :3, 3], axis=0))
+    middle = np.median(poses[:, :3, 3], axis=0)
     spread = np.linalg.norm(poses[:, :3, 3] - middle, axis=1).max()
     if frames.cloud is not None and not _are_near(frames.cloud.points, middle, FARTHEST_POINTS * spread):
         warnings.warn(
@@ -42,14 +38,8 @@ def near_origin(frames: Frames) -> Frames:
             stacklevel=2,
         )
         frames = frames._replace(cloud=None)
-    if np.linalg.norm(middle) > FARTHEST * spread > 0:
-        poses[:, :3, 3] -= middle
-        if frames.cloud is not None:
-            frames = frames._replace(cloud=dataclasses.replace(frames.cloud, points=frames.cloud.points - middle))
-        told = " ".join(f"{value:.0f}" for value in middle)
-        warnings.warn(f"{frames.file}: its world lies far from its origin, which was moved to {told}", stacklevel=2)
-    moved = [{**frame, "transform_matrix": pose.tolist()} for frame, pose in zip(frames.frames, poses, strict=True)]
-    return frames._replace(frames=moved)
+    listed = [{**frame, "transform_matrix": pose.tolist()} for frame, pose in zip(frames.frames, poses, strict=True)]
+    return frames._replace(frames=listed)
 
 
 def points_beside(file: Path) -> PointCloud | None:

@@ -16,7 +16,11 @@ NUMPY_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 PLY_TYPES = dict(zip(OLD_TYPES + NEW_TYPES, NUMPY_TYPES * 2, strict=True))
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 LONGEST_LINE, MOST_LINES = 4096, 10_000
+LEAST_BYTES = 2
+"""Least number of bytes of a number in text: a digit and a separator."""
 MOST_DIGITS = 20
+OFFSET = "offset"
+"""First word of the comment that says what positions are relative to."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +44,22 @@ class VertexHeader:
         missing = [name for name in names if name not in self.fields]
         if missing:
             raise ValueError(f"{self.path}: has no attribute {', '.join(missing)}; {wanted} is expected")
+
+    def read(self, file: BinaryIO) -> np.ndarray:
+        """Return the structured vertices [count]; float64 from text. Raise ValueError if they are truncated."""
+        return self._read_ascii(file) if self.encoding == "ascii" else self.read_binary(file)
+
+    def _read_ascii(self, file: BinaryIO) -> np.ndarray:
+        """Return the vertices of a text file, one per line."""
+        num = len(self.fields)
+        self.check_room(file, LEAST_BYTES * num - 1)
+        rows = np.empty((self.count, num))
+        try:
+            for row in rows:
+                row[:] = [float(word) for word in file.readline(LONGEST_LINE).split()[:num]]
+        except ValueError:
+            raise ValueError(f"{self.path}: a line of it is not a vertex of {num} numbers; export it again") from None
+        return rows.view([(name, np.float64) for name in self.fields])[:, 0]
 
     def read_binary(self, file: BinaryIO) -> np.ndarray:
         """Return the structured vertices [count] of a binary file. Raise ValueError if it is truncated."""
@@ -111,6 +131,18 @@ def read_headers(file: BinaryIO, path: Path) -> dict[str, VertexHeader]:
             case ["property", *_]:
                 raise ValueError(f"{path}: cannot read the property '{shortened(' '.join(words[1:]))}'")
     return found
+
+
+def offset_of(file: BinaryIO, path: Path) -> np.ndarray:
+    """Return what the positions of a PLY are relative to, [3] float64: zeros without the comment "offset X Y Z"."""
+    file.seek(0)
+    for words in header_lines(file, path):
+        if words[:2] == ["comment", OFFSET] and len(words) == 5:
+            try:
+                return np.array([float(word) for word in words[2:]])
+            except ValueError:
+                continue  # Words of another program.
+    return np.zeros(3)
 
 
 def header_lines(file: BinaryIO, path: Path) -> Iterator[list[str]]:

@@ -2,13 +2,12 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.assembly import PointCloud
-from a2tg_jax.data.ply_header import LONGEST_LINE, VertexHeader, read_vertex_header
+from a2tg_jax.data.ply_header import VertexHeader, offset_of, read_vertex_header
 from a2tg_jax.host.regular_files import is_regular, open_regular
 
 COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
@@ -16,12 +15,12 @@ COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_bl
 SH_DEGREE0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 FLOAT_RANGES, INTEGER_RANGES = (1, 255, 65535), (255, 65535, 2**32 - 1)
 """Largest values of colours in files."""
-LEAST_BYTES = 2
-"""Least number of bytes of a number in text: a digit and a separator."""
 
 
 def read_ply_points(path: Path) -> PointCloud:
     """Return the points of a PLY file whose first element is `vertex` with x, y, z.
+
+    Positions that are relative to an offset, as `save_ply` writes those of maps, are in the original world.
 
     Colours are whole numbers of 8 bits or, if some are above 255, of 16 or 32; or floats in [0, 1] or, if their mean
     is above 1, in 0..255 (above 255: 0..65535). Numbers beyond are clipped. Gaussians have the colours of their f_dc.
@@ -36,26 +35,11 @@ def read_ply_points(path: Path) -> PointCloud:
     with open_regular(path) as file:
         header = read_vertex_header(file, path)
         header.require("xyz", "a PLY file of points")
-        if header.encoding == "ascii":
-            columns = dict(zip(header.fields, _read_ascii(file, header).T, strict=True))
-        else:
-            vertices = header.read_binary(file)
-            columns = {name: vertices[name] for name in header.fields}
-    points = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=-1)
+        vertices = header.read(file)
+        columns = {name: vertices[name] for name in header.fields}
+        offset = offset_of(file, path)
+    points = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=-1) + offset
     return PointCloud(points, _colors(columns, header))
-
-
-def _read_ascii(file: BinaryIO, header: VertexHeader) -> np.ndarray:
-    """Return [count, properties] of the vertices, one per line."""
-    num = len(header.fields)
-    header.check_room(file, LEAST_BYTES * num - 1)
-    rows = np.empty((header.count, num))
-    try:
-        for row in rows:
-            row[:] = [float(word) for word in file.readline(LONGEST_LINE).split()[:num]]
-    except ValueError:
-        raise ValueError(f"{header.path}: a line of it is not a vertex of {num} numbers; export it again") from None
-    return rows
 
 
 def _colors(columns: Mapping[str, np.ndarray], header: VertexHeader) -> np.ndarray:

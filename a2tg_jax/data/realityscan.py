@@ -12,10 +12,10 @@ from a2tg_jax.data.photogrammetry import (
     LARGEST_SKEW,
     OPENGL,
     UNDISTORTED,
-    near_origin,
     numbers_in,
     points_beside,
     read_xml,
+    with_near_points,
 )
 from a2tg_jax.host.json_text import MOST_BYTES
 from a2tg_jax.host.regular_files import read_regular
@@ -60,7 +60,7 @@ def realityscan_frames(path: Path, files: list[Path]) -> Frames:
     folder = path / "images" if files[0].is_relative_to(path / "images") else path
     posed = [(path / frame["file_path"]).relative_to(folder).as_posix() for frame in frames]
     warn_of_unposed(folder, posed, is_deep=folder != path)
-    return near_origin(Frames(path / "*.xmp", frames, points_beside(path / "*.xmp")))
+    return with_near_points(Frames(path / "*.xmp", frames, points_beside(path / "*.xmp")))
 
 
 def _xcr_values(file: Path) -> dict[str, str]:

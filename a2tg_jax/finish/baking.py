@@ -84,7 +84,7 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
     """Return a plain model with a splat per texel or fewer, without training. Arguments as in `bake`."""
     options = model.appearance.texture_options if model.appearance.is_portable else None
     if options is None or model.textures is None:
-        whole = plain_gaussians(dataclasses.replace(model, origin=None))
+        whole = plain_gaussians(model)
         degree = fitting_degree(model, whole.sh_degree, growth)
         return as_plain(dataclasses.replace(whole, sh=whole.sh[:, : NUM_BASES[degree]]), model)
     degree = fitting_degree(model, least_degree(model, cameras), growth)

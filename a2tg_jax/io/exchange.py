@@ -6,7 +6,7 @@ original one, and the up axis that its format asks for; the model lies where it 
 
 import dataclasses
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax.numpy as jnp
@@ -18,10 +18,11 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.flattening import flattened, third_log_scales
+from a2tg_jax.io.flattening import flattened, third_log_scales, whole_rows
 from a2tg_jax.io.model_file import LONGEST_REASON, origin_arrays, origin_of, origin_to_dict
+from a2tg_jax.io.number_ranges import offset_for, origin_at
 from a2tg_jax.io.ply import LEAST_OPACITY, plain_gaussians
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, concatenate
 
 Up = Literal["y", "z"]
 UPRIGHT: Mapping[Up, np.ndarray] = {
@@ -59,7 +60,7 @@ def splats_of(model: Model, *, keeps_shapes: bool = False) -> Splats:
     If splats have degrees of their own, coefficients go up to the highest of these. `keeps_shapes` is as in
     `plain_gaussians`.
     """
-    gaussians = plain_gaussians(dataclasses.replace(model, origin=None), keeps_shapes=keeps_shapes)
+    gaussians = plain_gaussians(model, keeps_shapes=keeps_shapes)
     quats = np.asarray(gaussians.quats, np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     units = np.where(norms > 0, quats / np.maximum(norms, LEAST_SCALE), [1.0, 0.0, 0.0, 0.0])
@@ -69,6 +70,12 @@ def splats_of(model: Model, *, keeps_shapes: bool = False) -> Splats:
     sh = gaussians.sh if model.bands is None else gaussians.sh[:, : NUM_BASES[model.bands[1].degrees.max(initial=0)]]
     numbers = (gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), sh)
     return Splats(*(np.asarray(values, np.float32) for values in numbers))
+
+
+def whole_splats(splats: Splats, path: str | os.PathLike[str]) -> Splats:
+    """Return the splats whose numbers are finite; the others are counted in a warning that names the file."""
+    kept = whole_rows(os.fspath(path), splats.scales, splats.means, splats.quats, splats.opacities, splats.sh)
+    return Splats(*(values[kept] for values in splats))
 
 
 def gaussians_of(splats: Splats, path: str | os.PathLike[str], *, is_flat: bool) -> Gaussians:
@@ -134,22 +141,33 @@ def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
     return Similarity(largest, u @ v, matrix[:3, 3])
 
 
-def placed(model: Model, world: Similarity, up: Up, origin: Origin | None = None) -> Model:
-    """Return a model of a file in its own world, which has +z up (host).
+def placed(parts: Sequence[tuple[Model, Similarity]], up: Up) -> Model:
+    """Return the parts of a file as one model in its own world, which has +z up (host).
 
-    A model stays as it is where its file places it as it was written. Else it moves, and its origin along.
+    A part stays as it is where its file places it as it was written. Else it moves, and its origin along. Positions
+    that float32 would round too far there, as in map coordinates, are relative to an offset, which the origin of a
+    model without one then has.
 
     Args:
-      model: the model as the file holds it.
-      world: the similarity from there to the world of the file.
+      parts: at least one model as the file holds it, and the similarity from there to the world of the file.
       up: the axis that is up there.
-      origin: where another part of the same file was trained; None takes the model's own.
     """
-    move = world.then(upright(origin or model.origin, up).inverse())
-    if np.allclose(matrix_of(move), np.eye(4), rtol=0, atol=SAME_PLACE):
-        return model
-    check_similarity(move, "its transform")
-    return model.transform(move)
+    origin, offset, models = None, None, list[Model]()
+    for model, world in parts:
+        origin = origin or model.origin
+        move = world.then(upright(origin, up).inverse())
+        if is_same := np.allclose(matrix_of(move), np.eye(4), rtol=0, atol=SAME_PLACE):
+            move = Similarity(1.0, np.eye(3), np.zeros(3))
+        check_similarity(move, "its transform")
+        if offset is None:
+            means, log_scales = np.asarray(model.gaussians.means, np.float64), np.asarray(model.gaussians.log_scales)
+            offset = offset_for("ply", move.apply(means), log_scales + np.log(move.scale))
+        if offset.any():
+            move = dataclasses.replace(move, translation=move.translation - offset)
+        models.append(model if is_same and not offset.any() else model.transform(move))
+    if offset is not None and models[0].origin is None:
+        models[0] = dataclasses.replace(models[0], origin=origin_at(offset))
+    return models[0] if len(models) == 1 else concatenate(models)
 
 
 # Origins as text

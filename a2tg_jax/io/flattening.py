@@ -1,8 +1,10 @@
-"""Flat Gaussians from ellipsoids, as files of 3DGS hold them, and thin ellipsoids from flat Gaussians."""
+"""Flat Gaussians from the ellipsoids of other programs' files, and thin ellipsoids from flat Gaussians."""
 
 import warnings
 
 import numpy as np
+
+from a2tg_jax.core.display import counted
 
 THICKNESS = 1e-3
 """Ratio of the third scale of a flat Gaussian in a file to its shorter one."""
@@ -14,6 +16,31 @@ def third_log_scales(log_scales: np.ndarray) -> np.ndarray:
     """Return the logarithms [N, 1] of third scales: of flat Gaussians [N, 2], a thousandth of the shorter one."""
     third: np.ndarray = log_scales.min(axis=1, keepdims=True) + np.log(THICKNESS)
     return third
+
+
+def whole_rows(name: str, scales: np.ndarray, *columns: np.ndarray) -> np.ndarray:
+    """Return which rows [N] have finite numbers only. The others are counted in a warning.
+
+    If no row is finite, all are returned, for the checks of a model to refuse.
+
+    Args:
+      name: the file, for the warning.
+      scales: [N, 2] or [N, 3], or their logarithms. The smallest of three may be −inf: `flattened` drops it.
+      columns: other arrays [N, ...].
+    """
+    seen = np.sort(scales, axis=1)[:, -2:]  # NaN is sorted to the end.
+    finite = [np.isfinite(column).all(axis=tuple(range(1, column.ndim))) for column in (seen, *columns)]
+    is_whole: np.ndarray = np.logical_and.reduce(finite)
+    bad = np.flatnonzero(~is_whole)
+    if len(bad) == len(is_whole):
+        return np.ones(len(bad), bool)
+    if len(bad):
+        message = (
+            f"{name}: {counted(len(bad), 'Gaussian')} of {len(is_whole):,} left out, with NaN or infinite numbers; the "
+            f"first is row {bad[0]:,} (from 0)"
+        )
+        warnings.warn(message, stacklevel=4)
+    return is_whole
 
 
 def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:

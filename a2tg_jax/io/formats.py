@@ -10,11 +10,12 @@ from typing import Any
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.compact import load_compact, save_compact
-from a2tg_jax.io.gaussforge_files import import_gaussforge, kind_of, load_by_gaussforge, save_by_gaussforge
+from a2tg_jax.io.gaussforge_files import import_gaussforge, load_by_gaussforge, save_by_gaussforge
 from a2tg_jax.io.gltf_reader import buffer_files
+from a2tg_jax.io.ksplat import load_ksplat, save_ksplat
 from a2tg_jax.io.model_file import load_model, save_model
-from a2tg_jax.io.number_ranges import cut_numbers
-from a2tg_jax.io.ply import load_ply, plain_gaussians, save_ply
+from a2tg_jax.io.number_ranges import RANGES, cut_numbers
+from a2tg_jax.io.ply import load_ply_model, save_ply, world_gaussians
 from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians
 from a2tg_jax.model import Model
 
@@ -95,13 +96,13 @@ FORMATS = {
     ".npz": FileFormat("model", load_model, save_model, True, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
     ".compressed.ply": FileFormat(
-        "compressed PLY", load_ply, save_by_gaussforge, is_exact=False, import_library=import_gaussforge
+        "compressed PLY", load_ply_model, save_by_gaussforge, is_exact=False, import_library=import_gaussforge
     ),
-    ".ply": FileFormat("PLY", load_ply, save_ply),
+    ".ply": FileFormat("PLY", load_ply_model, save_ply),
     ".spz": _by_gaussforge("SPZ"),
     ".sog": _by_gaussforge("SOG"),
     ".splat": _by_gaussforge(".splat", degree=0),
-    ".ksplat": _by_gaussforge(".ksplat"),
+    ".ksplat": FileFormat(".ksplat", load_ksplat, save_ksplat, highest_degree=2, is_exact=False),
     ".glb": _GLTF,
     ".gltf": _GLTF,
     ".usda": _USD,
@@ -216,9 +217,9 @@ def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     degree = model.gaussians.sh_degree if model.bands is None else 3
     if degree > into.highest_degree:
         lost.append(f"spherical harmonics above degree {into.highest_degree}")
-    if into.save is save_by_gaussforge:
-        lost += cut_numbers(kind_of(path), plain_gaussians(model))
-    if model.origin is not None and not into.keeps_origin:
+    if into.name in RANGES:
+        lost += cut_numbers(into.name, world_gaussians(model).gaussians)
+    if model.origin is not None and model.origin.names and not into.keeps_origin:
         lost.append("cameras and background")
     if model.origin is not None and not into.keeps_corrections:
         lost += [LEARNED.get(name, f"learned {name}") for name in sorted(model.origin.corrections)]

@@ -1,11 +1,11 @@
-"""Files of other programs' splats by the library gaussforge: SPZ, SOG, compressed PLY, .splat and .ksplat.
+"""Files of other programs' splats by the library gaussforge: SPZ, SOG, compressed PLY and .splat.
 
 They pass through a PLY file in memory. Rows are written in the order of a Z curve, and all with one third scale, the
 smallest: formats that round scales by a table then spend one entry on it. What a format can say of flat splats is added
 to its file.
 
-gaussforge 0.6 writes the spherical harmonics of compressed PLY in another order than it reads them, and those of
-.ksplat in another order than GaussianSplats3D. Here they have the order that SuperSplat and GaussianSplats3D read.
+gaussforge 0.6 writes the spherical harmonics of compressed PLY in another order than it reads them. Here they have the
+order that SuperSplat reads. Its .ksplat files are empty for GaussianSplats3D; `ksplat.py` writes and reads those.
 """
 
 import dataclasses
@@ -21,12 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.data.ply_header import OFFSET
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
+from a2tg_jax.io.exchange import reading
 from a2tg_jax.io.flattening import third_log_scales
-from a2tg_jax.io.number_ranges import check_positions
-from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, plain_gaussians
+from a2tg_jax.io.number_ranges import check_positions, origin_at, warn_of_offset
+from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, offset_comment, world_gaussians
 from a2tg_jax.io.quantise import morton
 from a2tg_jax.model import Model
 
@@ -35,7 +37,6 @@ SUFFIXES = {
     ".spz": "spz",
     ".sog": "sog",
     ".splat": "splat",
-    ".ksplat": "ksplat",
 }
 """gaussforge's names of formats, by suffix."""
 LEAST_LOG_SCALE = -20.0
@@ -47,27 +48,32 @@ MOST_HEADER_BYTES = 1 << 24
 def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
     """Write the Gaussians of a model, in its original world, in the format of the suffix.
 
-    Positions that the format rounds by a tenth of a typical scale or more are told with a warning.
+    Positions that the format would round too far are relative to whole numbers, which a warning says, and compressed
+    PLY and SOG too. If it rounds them by a tenth of a typical scale even so, another warning says this.
 
     Raises:
       ValueError: if gaussforge is not installed or cannot write them, there are none, or the format cannot hold their
         positions.
     """
-    kind, gaussians = kind_of(path), plain_gaussians(model)
+    kind = kind_of(path)
+    gaussians, offset, _ = world_gaussians(model, kind=kind)
     if not gaussians.num:
         raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
     check_positions(kind, gaussians, str(path))
     gaussians = _along_curve(gaussians)
     third = third_log_scales(np.asarray(gaussians.log_scales)).min(axis=0, keepdims=True, initial=0.0)
-    source = _with_sh_order(gaussians, np.argsort(_order(kind, gaussians.sh_degree)))
+    source = _by_coefficient(gaussians) if kind == "compressed.ply" else gaussians
     ply = encode_ply(source, np.repeat(third.clip(LEAST_LOG_SCALE), gaussians.num, axis=0))
-    data = _marked(_converted(ply, "ply", kind, Path(path)), kind)
+    data = _marked(_converted(ply, "ply", kind, Path(path)), kind, offset)
     with replacing(path) as temporary:
         temporary.write_bytes(data)
+    warn_of_offset(kind, offset, str(path))
 
 
-def load_by_gaussforge(path: str | os.PathLike[str]) -> Gaussians:
+def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
     """Read Gaussians from a file, in its world. Ellipsoids are flattened as `load_ply` does, with a warning.
+
+    If positions of a SOG file are relative to an offset, the model's origin has this.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -78,10 +84,11 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Gaussians:
         raise FileNotFoundError(f"{path}: no such file")
     with open_regular(path) as file:
         data = file.read()
-    is_flat = kind == "sog" and _is_marked_sog(data)
+    header = _sog_header(data) if kind == "sog" else {}
     converted = _converted(data, kind, "ply", path)
-    gaussians = decode_ply(io.BytesIO(converted), path, is_flat=is_flat)
-    return _with_sh_order(gaussians, _order(kind, gaussians.sh_degree)) if kind == "ksplat" else gaussians
+    gaussians = decode_ply(io.BytesIO(converted), path, is_flat=header.get("model") == SOG_FLAT).gaussians
+    origin = reading(path, lambda: origin_at(np.array(header.get(OFFSET, (0, 0, 0)), np.float64).reshape(3)))
+    return Model(gaussians, origin=origin)
 
 
 def import_gaussforge(path: Path) -> Any:
@@ -113,26 +120,13 @@ def _along_curve(gaussians: Gaussians) -> Gaussians:
     return gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]
 
 
-def _order(kind: str, degree: int) -> np.ndarray:
-    """Return for each coefficient above degree 0, channel by channel, its place in gaussforge's order of a file."""
-    each = (degree + 1) ** 2 - 1
-    places = np.arange(3 * each)
-    if kind == "compressed.ply":
-        return places % 3 * each + places // 3
-    if kind == "ksplat":  # Degree by degree, and within each channel by channel.
-        channel, coefficient = np.divmod(places, max(each, 1))
-        own = np.sqrt(coefficient + 1).astype(int)
-        first, width = own**2 - 1, 2 * own + 1
-        places = 3 * first + channel * width + coefficient - first
-    return places
-
-
-def _with_sh_order(gaussians: Gaussians, order: np.ndarray) -> Gaussians:
-    """Return Gaussians whose coefficients above degree 0, channel by channel, are taken in an order."""
+def _by_coefficient(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians of which gaussforge writes the SH above degree 0 channel by channel, which it takes for the
+    order coefficient by coefficient."""
     sh = np.asarray(gaussians.sh)
-    rest = sh[:, 1:].transpose(0, 2, 1)
-    taken = rest.reshape(len(sh), -1)[:, order].reshape(rest.shape).transpose(0, 2, 1)
-    return dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], taken], axis=1)))
+    num, num_bases, _ = sh.shape
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(num, num_bases - 1, 3)
+    return dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], rest], axis=1)))
 
 
 def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
@@ -145,10 +139,10 @@ def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
     return converted
 
 
-def _marked(data: bytes, kind: str) -> bytes:
-    """Return a file that says that its splats are flat, if its format can."""
+def _marked(data: bytes, kind: str, offset: np.ndarray) -> bytes:
+    """Return a file that says that its splats are flat, and what they are relative to, if its format can."""
     if kind == "compressed.ply":
-        return data.replace(b" 1.0\n", f" 1.0\ncomment {FLAT_MARK}\n".encode(), 1)
+        return data.replace(b" 1.0\n", f" 1.0\ncomment {FLAT_MARK}\n{offset_comment(offset)}".encode(), 1)
     if kind != "sog":
         return data
     marked = io.BytesIO()
@@ -156,16 +150,18 @@ def _marked(data: bytes, kind: str) -> bytes:
         for entry in old.infolist():
             content = old.read(entry)
             if entry.filename == SOG_HEADER:
-                content = json.dumps({**json.loads(content), "model": SOG_FLAT}, separators=(",", ":")).encode()
+                header = {**json.loads(content), "model": SOG_FLAT}
+                header |= {OFFSET: offset.tolist()} if offset.any() else {}
+                content = json.dumps(header, separators=(",", ":")).encode()
             new.writestr(zipfile.ZipInfo(entry.filename), content)
     return marked.getvalue()
 
 
-def _is_marked_sog(data: bytes) -> bool:
-    """Return whether a SOG file says that its splats are flat; False if it is none."""
+def _sog_header(data: bytes) -> dict[str, Any]:
+    """Return the header of a SOG file; empty if it is none."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open(SOG_HEADER) as file:
             header = json.loads(file.read(MOST_HEADER_BYTES))
     except (zipfile.BadZipFile, KeyError, ValueError, OSError, NotImplementedError, RuntimeError):
-        return False
-    return isinstance(header, dict) and header.get("model") == SOG_FLAT
+        return {}
+    return header if isinstance(header, dict) else {}

@@ -15,8 +15,8 @@ import numpy as np
 
 from a2tg_jax.appearance import Plain
 from a2tg_jax.core.gaussians import SH_C0, check_gaussians
-from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.exchange import (
     Splats,
@@ -30,6 +30,7 @@ from a2tg_jax.io.exchange import (
     similarity_of,
     splats_of,
     upright,
+    whole_splats,
 )
 from a2tg_jax.io.gltf_nodes import mesh_nodes
 from a2tg_jax.io.gltf_reader import Document
@@ -40,7 +41,7 @@ from a2tg_jax.io.rows import Rows, check_encodable, model_of, rows_of
 from a2tg_jax.io.sh_degrees import HIGHEST_DEGREE, degree_to_read
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
-from a2tg_jax.model import Model, concatenate
+from a2tg_jax.model import Model
 
 SPLATS = "KHR_gaussian_splatting"
 READ = {SPLATS, EXTENSION, "KHR_mesh_quantization"}
@@ -166,17 +167,14 @@ def _loaded(path: str | os.PathLike[str]) -> Model:
     required = document.json.get("extensionsRequired", [])
     if unknown := [name for name in required if name not in READ]:
         raise ValueError(f"needs the extension {shortened(unknown[0])}, which this program does not read")
-    models: list[Model] = []
-    first: Origin | None = None
+    parts: list[tuple[Model, Similarity]] = []
     for primitive, matrix in _primitives(document):
-        model = _model_of(document, primitive)
-        first = first or model.origin
-        models.append(placed(model, similarity_of(matrix, "the transform of its node"), "y", first))
-        if len(models) > MOST_PRIMITIVES:
+        parts.append((_model_of(document, primitive), similarity_of(matrix, "the transform of its node")))
+        if len(parts) > MOST_PRIMITIVES:
             raise ValueError(f"holds more than {MOST_PRIMITIVES} sets of splats")
-    if not models:
+    if not parts:
         raise ValueError(f"holds no splats ({SPLATS})")
-    return models[0] if len(models) == 1 else concatenate(models)
+    return placed(parts, "y")
 
 
 def _primitives(document: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
@@ -198,7 +196,7 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
     degree = NUM_BASES.index(splats.sh.shape[1])
     extended = described.get("extensions", {}).get(EXTENSION)
     if extended is None:
-        gaussians = gaussians_of(splats, document.path, is_flat=False)
+        gaussians = gaussians_of(whole_splats(splats, document.path), document.path, is_flat=False)
         appearance = kept_appearance(kept, Plain(), is_told=False)
         model = Model(gaussians, appearance=appearance, origin=origin)
         check_model(model)

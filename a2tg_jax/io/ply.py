@@ -1,32 +1,37 @@
 """PLY files of Gaussians with the attribute names of 2DGS, and a third scale for programs made for 3DGS.
 
-x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 scale_2 rot_0..3, little-endian float32: opacities as
-logits, scales as logarithms, quaternions wxyz. f_rest lists the coefficients of degree 1 to 3 channel by channel: all
-of red, then green, then blue. scale_2 belongs to the axis along the normal; files of 2DGS lack it. The comment
-"SplatRenderMode: 2dgs" says that splats are flat. What splats show besides has no place in this format: textures,
-movable kernels and billboards, and with them the colours and opacities that they carry, are lost; `save_model` keeps
-all.
+Written are x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 scale_2 rot_0..3, little-endian float32:
+opacities as logits, scales as logarithms, quaternions wxyz. f_rest lists the coefficients of degree 1 to 3 channel by
+channel: all of red, then green, then blue. scale_2 belongs to the axis along the normal; files of 2DGS lack it. The
+comment "SplatRenderMode: 2dgs" says that splats are flat. What splats show besides has no place in this format:
+textures, movable kernels and billboards, and with them the colours and opacities that they carry, are lost;
+`save_model` keeps all.
+
+Positions that float32 would round too far, as those of maps, are relative to an offset: "comment offset X Y Z".
 """
 
 import dataclasses
 import os
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.lib.recfunctions import append_fields
 
 from a2tg_jax.appearance.copies import LARGEST_OPACITY
 from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
-from a2tg_jax.core.gaussians import Gaussians, check_gaussians, logit, rotation_matrices
+from a2tg_jax.core.gaussians import SH_C0, Gaussians, check_gaussians, logit, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
-from a2tg_jax.data.ply_header import header_lines, read_vertex_header
+from a2tg_jax.data.ply_header import OFFSET, header_lines, offset_of, read_vertex_header
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
-from a2tg_jax.io.flattening import flattened, third_log_scales
+from a2tg_jax.io.flattening import flattened, third_log_scales, whole_rows
+from a2tg_jax.io.number_ranges import in_words, offset_for, offset_words, origin_at, warn_of_offset
 from a2tg_jax.io.ply_packed import is_packed, read_packed
 from a2tg_jax.io.sh_degrees import degree_to_read
 from a2tg_jax.io.suffixes import check_suffix
@@ -37,7 +42,8 @@ MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 SH_DEGREE0, SH_REST = tuple(f"f_dc_{i}" for i in range(3)), tuple(f"f_rest_{i}" for i in range(45))
 SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
-REQUIRED = (*MEANS, *SH_DEGREE0, "opacity", *SCALES, *QUATS)
+COLORS = ("red", "green", "blue")
+"""What some programs write in place of f_dc_*."""
 NUM_REST = (0, 9, 24, 45, 72)
 """Number of attributes f_rest_* by degree of the spherical harmonics; some programs write degree 4."""
 THIRD_SCALE = "scale_2"
@@ -53,8 +59,12 @@ def save_ply(
     transform: Similarity | None = None,
     *,
     third_scale: bool = True,
+    float64: bool = False,
 ) -> None:
     """Write Gaussians with the attributes of 2DGS, normals along the splats' own, and a third scale.
+
+    If float32 would round positions in the original world, as in map coordinates, they are relative to whole numbers
+    near the scene's middle. A warning and the comment "offset X Y Z" in the file say these.
 
     Args:
       path: the file; an older one is replaced once the new one is whole.
@@ -66,37 +76,77 @@ def save_ply(
         model back to the original world of its origin, if it has one.
       third_scale: write scale_2, a thousandth of the shorter scale, which programs for 3DGS want. False leaves it out,
         as 2DGS does.
+      float64: write x, y and z as float64, and never relative to an offset.
 
     Raises:
       ValueError: if a field of the Gaussians has another shape than it must have, or `load_ply` would refuse them, as
         it does numbers that are not finite.
     """
     check_suffix(path, "save_ply")
-    gaussians = plain_gaussians(gaussians, transform)
-    third = third_log_scales(np.asarray(gaussians.log_scales)) if third_scale else None
+    found = world_gaussians(gaussians, transform)
+    third = third_log_scales(np.asarray(found.gaussians.log_scales)) if third_scale else None
+    means, offset = (found.means, np.zeros(3)) if float64 else (None, found.offset)
     with replacing(path) as temporary:
-        temporary.write_bytes(encode_ply(gaussians, third))
+        temporary.write_bytes(encode_ply(found.gaussians, third, offset, means))
+    warn_of_offset("ply", offset, os.fspath(path))
 
 
-def plain_gaussians(
-    gaussians: Gaussians | Model, transform: Similarity | None = None, *, keeps_shapes: bool = False
-) -> Gaussians:
+def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False) -> Gaussians:
+    """Return the Gaussians of a model without what they show, in the model's world.
+
+    Args:
+      gaussians: as in `save_ply`.
+      keeps_shapes: the file keeps the shapes of kernels besides. If not, each kernel becomes the nearest Gaussian.
+    """
+    if isinstance(gaussians, Model):
+        gaussians = _as_plain(gaussians.live, keeps_shapes)
+    check_gaussians(gaussians)
+    return gaussians
+
+
+class WorldGaussians(NamedTuple):
+    """Plain Gaussians in the original world, as files hold them."""
+
+    gaussians: Gaussians
+    """Their means are relative to the offset."""
+    offset: np.ndarray
+    """[3] float64 whole numbers, zeros where the format holds the positions as they are."""
+    means: np.ndarray
+    """[N, 3] float64 positions, without the offset."""
+
+
+def world_gaussians(
+    gaussians: Gaussians | Model, transform: Similarity | None = None, kind: str = "ply"
+) -> WorldGaussians:
     """Return the Gaussians of a model without what they show, in the original world.
 
     Args:
       gaussians, transform: as in `save_ply`.
-      keeps_shapes: the file keeps the shapes of kernels besides. If not, each kernel becomes the nearest Gaussian.
+      kind: gaussforge's name of the format.
     """
-    if isinstance(gaussians, Model):
-        model = gaussians.live
-        gaussians = _as_plain(model, keeps_shapes)
-        transform = model.origin.transform if transform is None and model.origin is not None else transform
-    check_gaussians(gaussians)
-    return gaussians if transform is None else transform_gaussians(gaussians, transform.inverse())
+    plain = plain_gaussians(gaussians)
+    if transform is None and isinstance(gaussians, Model) and gaussians.origin is not None:
+        transform = gaussians.origin.transform
+    to_world = Similarity(1.0, np.eye(3), np.zeros(3)) if transform is None else transform.inverse()
+    means = to_world.apply(np.asarray(plain.means, np.float64))
+    offset = offset_for(kind, means, np.asarray(plain.log_scales, np.float64) + np.log(to_world.scale))
+    if offset.any():
+        # The offset goes before means are rounded to float32.
+        to_world = dataclasses.replace(to_world, translation=to_world.translation - offset)
+    moved = plain if transform is None and not offset.any() else transform_gaussians(plain, to_world)
+    return WorldGaussians(moved, offset, means)
 
 
-def encode_ply(gaussians: Gaussians, third: np.ndarray | None) -> bytes:
-    """Return a PLY file of Gaussians, with the logarithms [N, 1] of third scales, or without a third scale.
+def encode_ply(
+    gaussians: Gaussians, third: np.ndarray | None, offset: np.ndarray | None = None, means: np.ndarray | None = None
+) -> bytes:
+    """Return a PLY file of Gaussians.
+
+    Args:
+      gaussians: N Gaussians.
+      third: logarithms [N, 1] of third scales; None leaves these out.
+      offset: [3] what the means are relative to, for a comment; None or zeros if nothing.
+      means: [N, 3] to write as float64 in place of those of the Gaussians.
 
     Raises:
       ValueError: if `load_ply` would refuse the Gaussians, as it does numbers that are not finite.
@@ -109,7 +159,6 @@ def encode_ply(gaussians: Gaussians, third: np.ndarray | None) -> bytes:
         names.insert(names.index(SCALES[-1]) + 1, THIRD_SCALE)
         log_scales = np.concatenate([log_scales, third], axis=1)
     columns = [
-        np.asarray(gaussians.means),
         np.asarray(rotation_matrices(gaussians.quats)[:, :, 2]),
         sh[:, 0],
         rest,
@@ -117,9 +166,18 @@ def encode_ply(gaussians: Gaussians, third: np.ndarray | None) -> bytes:
         log_scales,
         np.asarray(gaussians.quats),
     ]
-    properties = "".join(f"property float {name}\n" for name in names)
-    start = f"ply\nformat {ENCODING} 1.0\ncomment {FLAT_MARK}\nelement vertex {gaussians.num}\n"
-    return f"{start}{properties}end_header\n".encode("ascii") + np.concatenate(columns, 1).astype("<f4").tobytes()
+    kind, positions = ("float", np.asarray(gaussians.means, "<f4")) if means is None else ("double", means)
+    properties = "".join(f"property {kind if name in MEANS else 'float'} {name}\n" for name in names)
+    comments = f"comment {FLAT_MARK}\n{'' if offset is None else offset_comment(offset)}"
+    header = f"ply\nformat {ENCODING} 1.0\n{comments}element vertex {gaussians.num}\n{properties}end_header\n"
+    parts = (positions.astype(positions.dtype.newbyteorder("<")), np.concatenate(columns, 1).astype("<f4"))
+    rows = np.concatenate([np.ascontiguousarray(part).view(np.uint8) for part in parts], axis=1)
+    return header.encode("ascii") + rows.tobytes()
+
+
+def offset_comment(offset: np.ndarray) -> str:
+    """Return the line of a header that says what positions are relative to; "" for zeros."""
+    return f"comment {OFFSET} {' '.join(offset_words(offset))}\n" if offset.any() else ""
 
 
 def _as_plain(model: Model, keeps_shapes: bool) -> Gaussians:
@@ -138,7 +196,12 @@ def _as_plain(model: Model, keeps_shapes: bool) -> Gaussians:
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a PLY file of 2DGS, of a program that uses its attribute names, or as SuperSplat packs it.
 
-    They have the SH degree of the file. Degrees above 3 are left out with a warning; further attributes are ignored.
+    A file of map coordinates (`save_ply`) is read relative to whole numbers that a warning names; `load_splats` keeps
+    these in the model's origin. So are positions in float64 that float32 would round too far.
+
+    Text and binary files of either byte order are read, and colours red, green, blue where f_dc_* are missing. They
+    have the SH degree of the file. Degrees above 3 are left out with a warning, and so are Gaussians with numbers that
+    are not finite; further attributes are ignored.
     The third scale (scale_2) of a file that says that its splats are flat is dropped. Any other holds ellipsoids: the
     thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more than a thousandth
     of the others.
@@ -148,9 +211,18 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is not a binary little-endian PLY, is cut off, lacks an attribute, or a number is not finite.
+      ValueError: if it is no PLY, is cut off, lacks an attribute, or has no Gaussian of finite numbers.
     """
     check_suffix(path, "load_ply")
+    model = load_ply_model(path)
+    if model.origin is not None:
+        offset = in_words(-model.origin.transform.translation)
+        warnings.warn(f"{path}: positions are relative to {offset}; load_splats keeps this offset", stacklevel=2)
+    return model.gaussians
+
+
+def load_ply_model(path: str | os.PathLike[str]) -> Model:
+    """Return the Gaussians of `load_ply` as a model, whose origin has the offset of the positions if there is one."""
     path = Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such PLY file")
@@ -158,8 +230,8 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
         return decode_ply(file, path)
 
 
-def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Gaussians:
-    """Read Gaussians from an open PLY file.
+def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
+    """Read Gaussians from an open PLY file, as `load_ply_model` does.
 
     Args:
       file: at its beginning.
@@ -167,22 +239,23 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Gaussian
       is_flat: whether the splats are known to be flat; if not, the header may say so.
     """
     vertices = read_packed(file, path) if is_packed(file, path) else _read_vertices(file, path)
-    quats, log_scales = _columns(vertices, QUATS), _columns(vertices, SCALES)
-    if THIRD_SCALE in (vertices.dtype.names or ()) and not (is_flat or _is_marked(file, path)):
-        three = _columns(vertices, (*SCALES, THIRD_SCALE))
-        quats, log_scales = flattened(quats, three, str(path))
-    gaussians = Gaussians(
-        means=jnp.asarray(_columns(vertices, MEANS)),
-        quats=jnp.asarray(quats),
-        log_scales=jnp.asarray(log_scales),
-        logit_opacities=jnp.asarray(_logits_of(vertices)),
-        sh=jnp.asarray(_sh_of(vertices, path)),
-    )
+    has_third = THIRD_SCALE in (vertices.dtype.names or ()) and not (is_flat or _is_marked(file, path))
+    log_scales = _columns(vertices, (*SCALES, THIRD_SCALE) if has_third else SCALES)
+    means, quats = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1), _columns(vertices, QUATS)
+    logits, sh = _logits_of(vertices), _sh_of(vertices, path)
+    kept = whole_rows(str(path), log_scales, means, quats, logits, sh)
+    means, quats, log_scales = means[kept], quats[kept], log_scales[kept]
+    if has_third:
+        quats, log_scales = flattened(quats, log_scales, str(path))
+    inside = offset_for("ply", means, log_scales)  # Zeros where the file has float32.
+    with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
+        means = (means - inside).astype(np.float32)
+    gaussians = Gaussians(*(jnp.asarray(rows) for rows in (means, quats, log_scales, logits[kept], sh[kept])))
     try:
         _check(gaussians)
+        return Model(gaussians, origin=origin_at(inside + offset_of(file, path)))
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return gaussians
+        raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
 
 
 def _is_marked(file: BinaryIO, path: Path) -> bool:
@@ -208,10 +281,18 @@ def _check(gaussians: Gaussians) -> None:
 def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:
     """Return the vertices, structured, with the attributes that 2DGS gives them."""
     header = read_vertex_header(file, path)
-    if header.encoding != ENCODING:
-        raise ValueError(f"{path}: is a PLY in {header.encoding}; save it as {ENCODING}")
-    header.require(REQUIRED, "a PLY of 2D Gaussians")
-    return header.read_binary(file)
+    has_colors = set(COLORS) <= set(header.fields) and not set(SH_DEGREE0) & set(header.fields)
+    header.require((*MEANS, *(COLORS if has_colors else SH_DEGREE0), "opacity", *SCALES, *QUATS), "a PLY of Gaussians")
+    vertices = header.read(file)
+    if not has_colors:
+        return vertices
+    colors = np.stack([vertices[name].astype(np.float64) for name in COLORS], axis=1)
+    kind = np.dtype(header.fields[COLORS[0]])
+    if kind.kind != "f":
+        colors /= np.iinfo(kind).max
+    elif np.max(colors, initial=0.0, where=np.isfinite(colors)) > 1:
+        colors /= 255  # Floats of 0 to 255, as some programs write them.
+    return append_fields(vertices, SH_DEGREE0, ((colors - 0.5) / SH_C0).T, usemask=False)
 
 
 def _logits_of(vertices: np.ndarray) -> np.ndarray:

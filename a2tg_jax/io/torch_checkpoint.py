@@ -26,7 +26,7 @@ import numpy as np
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.flattening import flattened
+from a2tg_jax.io.flattening import flattened, whole_rows
 from a2tg_jax.io.sh_degrees import degree_to_read
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
@@ -249,6 +249,8 @@ def _fields_of(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, np.nda
 
 
 def _gaussians_of(fields: Mapping[str, np.ndarray], path: Path) -> Gaussians:
+    kept = whole_rows(str(path), fields["scales"], *(fields[name] for name in ("means", "quats", "opacities", "sh")))
+    fields = {name: values[kept] for name, values in fields.items()}
     quats, log_scales = fields["quats"], fields["scales"]
     if log_scales.shape[1] == 3:
         quats, log_scales = flattened(quats, log_scales, str(path))

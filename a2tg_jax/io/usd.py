@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.core.gaussians import check_gaussians
-from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, open_regular
@@ -34,11 +34,12 @@ from a2tg_jax.io.exchange import (
     similarity_of,
     splats_of,
     upright,
+    whole_splats,
 )
 from a2tg_jax.io.sh_degrees import degree_to_read
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
-from a2tg_jax.model import Model, concatenate
+from a2tg_jax.model import Model
 
 ORIGIN = "a2tg:origin"
 """Name of the origin, as JSON, in the custom data of a particle field."""
@@ -166,19 +167,16 @@ def _loaded(usd: Any, path: Path) -> Model:
     stage = usd.Usd.Stage.Open(str(path))
     up: Up = "z" if usd.UsdGeom.GetStageUpAxis(stage) == usd.UsdGeom.Tokens.z else "y"
     unit = float(usd.UsdGeom.GetStageMetersPerUnit(stage))
-    models: list[Model] = []
-    first: Origin | None = None
+    parts: list[tuple[Model, Similarity]] = []
     for field in _fields(usd, stage):
-        model = _model_of(usd, field, path)
-        first = first or model.origin
         matrix = np.array(field.ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())).T
         matrix[:3] *= unit
-        models.append(placed(model, similarity_of(matrix, "the transform of its splats"), up, first))
-        if len(models) > MOST_FIELDS:
+        parts.append((_model_of(usd, field, path), similarity_of(matrix, "the transform of its splats")))
+        if len(parts) > MOST_FIELDS:
             raise ValueError(f"holds more than {MOST_FIELDS} particle fields")
-    if not models:
+    if not parts:
         raise ValueError("holds no splats (ParticleField)")
-    return models[0] if len(models) == 1 else concatenate(models)
+    return placed(parts, up)
 
 
 def _fields(usd: Any, stage: Any) -> Iterator[Any]:
@@ -193,7 +191,7 @@ def _model_of(usd: Any, field: Any, path: Path) -> Model:
     kernels = set(prim.GetAppliedSchemas()) & {SURFLET, ELLIPSOID}
     if len(kernels) != 1:
         raise ValueError(f"its particle field {shortened(str(prim.GetPath()))} must have a kernel of Gaussians")
-    gaussians = gaussians_of(_splats(usd, prim, path), path, is_flat=SURFLET in kernels)
+    gaussians = gaussians_of(whole_splats(_splats(usd, prim, path), path), path, is_flat=SURFLET in kernels)
     kept = prim.GetCustomDataByKey(ORIGIN)
     origin = origin_from_json(parse_json(kept)) if isinstance(kept, str) else None
     model = Model(gaussians, origin=origin)

@@ -32,7 +32,8 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
 
     GLB holds the texture or linear colours of vertices, unlit, as the photographs show them. PLY holds colours of
     vertices, and no texture. OBJ has its texture in NAME.png and its material in NAME.mtl beside it. PLY and OBJ are in
-    the original world. GLB stands upright, with +y up and the original lengths, as the splats of `save_gltf` do.
+    the original world, map coordinates without rounding. GLB stands upright, with +y up and the original lengths, as
+    the splats of `save_gltf` do; of map coordinates, the extras of its node have the transform.
 
     Args:
       path: the file; an older one is replaced once the new one is whole.
@@ -50,7 +51,7 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".glb":
-        save_glb(path, mesh, None if transform is None else float(transform.scale))
+        save_glb(path, mesh, transform)
         return [path]
     mesh = mesh if transform is None else mesh.transform(transform.inverse())
     if suffix == ".obj":
@@ -103,7 +104,8 @@ def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
         rows = mesh.vertices
         if mesh.colors is not None and mesh.texture is None:
             rows = np.hstack([rows, mesh.colors / 255])
-        np.savetxt(file, rows, "v" + " %.9g" * 3 + " %.4g" * (rows.shape[1] - 3))
+        number = " %.15g" if needs_doubles(mesh.vertices) else " %.9g"
+        np.savetxt(file, rows, "v" + number * 3 + " %.4g" * (rows.shape[1] - 3))
         if mesh.uv is not None:
             np.savetxt(file, mesh.uv, "vt %.6f %.6f")
             np.savetxt(file, np.repeat(mesh.faces + 1, 2, axis=1), "f %d/%d %d/%d %d/%d")

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.exchange import linear_colors, matrix_of, upright_from
+from a2tg_jax.io.gltf import OWN
 from a2tg_jax.io.gltf_writer import Builder
 from a2tg_jax.mesh.triangles import Mesh
 
@@ -16,22 +18,25 @@ FAR = 100.0
 """Distance from the origin, in extents, from which on positions are relative to the middle, as float32 needs."""
 
 
-def save_glb(path: Path, mesh: Mesh, scale: float | None) -> None:
+def save_glb(path: Path, mesh: Mesh, transform: Similarity | None) -> None:
     """Write a GLB file of a mesh, unlit.
 
     Args:
       path: the file; an older one is replaced once the new one is whole.
       mesh: a mesh.
-      scale: factor of lengths from the original world to that of the mesh. The node then leads to the upright world
-        that `save_gltf` places splats in. None writes the mesh as it is; far from the origin, positions are relative to
-        the translation of the node.
+      transform: from the original world to that of the mesh. The node then leads to the upright world that `save_gltf`
+        places splats in, and its extras have the transform if the original world lies far from there. None writes the
+        mesh as it is; far from the origin, positions are relative to the translation of the node.
     """
     builder = Builder()
-    middle = _middle(mesh.vertices) if scale is None else np.zeros(3)
+    middle = _middle(mesh.vertices) if transform is None else np.zeros(3)
     primitive, material = _primitive(mesh, middle, builder)
     node: dict[str, Any] = {"name": "mesh", "mesh": 0}
-    if scale is not None:
-        node["matrix"] = matrix_of(upright_from(scale, "y")).T.ravel().tolist()
+    if transform is not None:
+        node["matrix"] = matrix_of(upright_from(float(transform.scale), "y")).T.ravel().tolist()
+        if _middle(mesh.transform(transform.inverse()).vertices).any():
+            kept = {"scale": float(transform.scale), "rotation": np.asarray(transform.rotation).tolist()}
+            node["extras"] = {OWN: kept | {"translation": np.asarray(transform.translation).tolist()}}
     elif middle.any():
         node["translation"] = middle.tolist()
     described: dict[str, Any] = {

@@ -214,7 +214,7 @@ def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict
         train = refined_views(scene.train[:: -(-len(scene.train) // MOST_VIEWS)], model)
         losses = {"training views": loss_on_views(model, train, settings=settings)}
         return losses | ({"test views": loss_on_views(model, scene.test, settings=settings)} if scene.test else {})
-    if model.origin is None:
+    if model.origin is None or not model.origin.names:
         raise ValueError(
             "the model has no cameras to measure a loss with; use save_compact in Python with your own choices"
         )

@@ -21,6 +21,7 @@ from a2tg_jax.io.formats import (
     unseen_elsewhere,
     writer_of,
 )
+from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
 from a2tg_jax.results.output import check_new, check_output
 from a2tg_jax.results.viewing import open_source
@@ -73,7 +74,13 @@ class BakeOptions:
 
 
 def convert(
-    source: Path, out: Path, name: str | None = None, *, baking: BakeOptions | None = None, overwrite: bool = False
+    source: Path,
+    out: Path,
+    name: str | None = None,
+    *,
+    baking: BakeOptions | None = None,
+    float64: bool = False,
+    overwrite: bool = False,
 ) -> Converted:
     """Write a model in the format of another suffix.
 
@@ -82,6 +89,7 @@ def convert(
       out: the file.
       name: which model of a run; None is the last of its main system.
       baking: how textures become plain splats; None leaves them as they are.
+      float64: write the positions of a PLY as float64, as `save_ply` does.
       overwrite: whether an existing file is replaced.
 
     Raises:
@@ -89,6 +97,8 @@ def convert(
       ValueError: if a format is unknown, or the source cannot be read or written.
     """
     writer_of(out)  # Baking takes minutes.
+    if float64 and format_of(out).save is not save_ply:
+        raise ValueError(f"--float64 needs an OUT that ends in .ply and is not packed; got {out}")
     _check_files(source, out, overwrite=overwrite)
     check_output(out)
     if baking is not None:
@@ -96,7 +106,10 @@ def convert(
     start = time.perf_counter()
     opened = open_source(source, name)
     model, baked = (opened.model, "") if baking is None else _baked(source, opened.model, baking)
-    save_splats(out, model)
+    if float64:
+        save_ply(out, model, float64=True)
+    else:
+        save_splats(out, model)
     lost, seconds = tuple(lost_by(model, out)), time.perf_counter() - start
     return Converted(source, out, model, opened.num_bytes, file_bytes(out), lost, seconds, baked)
 

@@ -80,7 +80,8 @@ def write_first_stage(run: RunFolder, planned: PlannedStage, given: GivenSplats,
     """
     splats, appearance, system = given.taken().live, planned.stage.appearance, planned.system
     shapes = splats.appearance.shapes(splats.params) if are_shapes_taken(splats, appearance) else None
-    gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=shapes is not None), scene.transform)
+    to_scene = scene.transform if splats.origin is None else splats.origin.transform.inverse().then(scene.transform)
+    gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=shapes is not None), to_scene)
     gaussians = _of_degree(gaussians, system.initial_sh_degree)
     params, layout = new_parameters(appearance, gaussians, system)
     if shapes is not None:

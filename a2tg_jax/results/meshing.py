@@ -99,7 +99,7 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
     """
     start = time.perf_counter()
     origin = source.model.origin
-    if origin is None:
+    if origin is None or not origin.names:
         raise ValueError(f"{source.title} has no cameras to fuse depths from; give a run folder, or a model of a run")
     pictures = _pictures(source, options.texture)
     result = _extracted(source, options)

@@ -53,7 +53,7 @@ class Source:
     @functools.cached_property
     def near_plane(self) -> float:
         """Distance of the near plane; small for files whose world has an unknown size."""
-        if self.model.origin is not None or not self.model.num:
+        if (self.model.origin is not None and self.model.origin.names) or not self.model.num:
             return self.settings.near_plane
         return min(self.settings.near_plane, 0.02 * middle_of(self.model)[1])
 

@@ -141,7 +141,7 @@ def _losses_of(source: Source) -> dict[str, float]:
         chosen = {name: found[:: -(-len(found) // MOST_VIEWS)] for name, found in views.items() if found}
         model = source.model
         return {name: loss_on_views(model, found, settings=settings)(again) for name, found in chosen.items()}
-    cameras = _ring(source.model) if source.model.origin is None else source.model.origin.cameras
+    cameras = ([] if source.model.origin is None else source.model.origin.cameras) or _ring(source.model)
     cameras = cameras[:: -(-len(cameras) // MOST_VIEWS)]
     loss = loss_beside_renders(source.model, cameras, settings=settings)(again)
     return {f"were it a model of {ASSUMED_PSNR:g} dB": loss}

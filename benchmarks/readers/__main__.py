@@ -1,15 +1,16 @@
 """Files of `a2tg convert`, read by other programs and compared with the model.
 
-    npm install --prefix OTHERS @playcanvas/splat-transform playcanvas @sparkjsdev/spark three \
-        babylonjs babylonjs-loaders
+    npm install --prefix OTHERS @playcanvas/splat-transform @mkkellogg/gaussian-splats-3d playcanvas \
+        @sparkjsdev/spark three babylonjs babylonjs-loaders
     python -m benchmarks.readers scene.npz --others OTHERS --chromium chromium
 
-Writes every format, reads each by splat-transform and prints how far 99 % of the numbers are off; draws the view of a
-camera by PlayCanvas, by Spark and, from glTF, by Babylon.js in a headless Chromium and prints the PSNR of their
-pictures beside ours.
+Writes every format, reads each by splat-transform and some by GaussianSplats3D, and prints how far 99 % of the numbers
+are off; has splat-transform write the formats that it can, and reads those; draws the view of a camera by PlayCanvas,
+by Spark and, from glTF, by Babylon.js in a headless Chromium and prints the PSNR of their pictures beside ours.
 """
 
 import argparse
+import json
 import subprocess
 import tempfile
 import warnings
@@ -19,21 +20,39 @@ import numpy as np
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from a2tg_jax import Gaussians, Origin, Similarity, load_model, load_splats, save_splats
+from a2tg_jax import Gaussians, Origin, Similarity, load_splats, save_splats
+from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.finish.distilling import pictures
 from a2tg_jax.io.exchange import upright
 from benchmarks.readers.browser import Camera, draw
 
 SUFFIXES = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".ksplat")
 BY_PLAYCANVAS = (".ply", ".compressed.ply", ".sog")
+BY_GAUSSIAN_SPLATS_3D = (".ply", ".splat", ".ksplat")
+WRITTEN_BY_SPLAT_TRANSFORM = (".compressed.ply", ".spz", ".sog")
 CLI = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
 
 
 def by_splat_transform(file: Path, others: Path) -> Gaussians:
     """Return the Gaussians of a file after splat-transform has written it as a PLY."""
     out = file.with_name(f"{file.name}.read.ply")
-    subprocess.run(["node", str(others / CLI), "-w", "-q", str(file), str(out)], check=True)
+    transform(file, out, others)
     return load_splats(out).gaussians
+
+
+def transform(file: Path, out: Path, others: Path) -> None:
+    """Have splat-transform write a file in another format."""
+    subprocess.run(["node", str(others / CLI), "-w", "-q", "-g", "cpu", str(file), str(out)], check=True)
+
+
+def by_gaussian_splats_3d(file: Path, others: Path, degree: int) -> Gaussians:
+    """Return the Gaussians that GaussianSplats3D reads, with colours and opacities as bytes and degrees up to 2."""
+    script = Path(__file__).with_name("gaussian_splats_3d.mjs")
+    command = ["node", "--no-deprecation", str(script), str(others), str(file), str(degree)]
+    rows = np.array(json.loads(subprocess.run(command, check=True, capture_output=True).stdout))
+    opacities = np.clip(rows[:, 13] / 255, 1e-6, 1 - 1e-6)
+    sh = np.concatenate([(rows[:, 10:13] / 255 - 0.5) / SH_C0, rows[:, 14:]], axis=1).reshape(len(rows), -1, 3)
+    return Gaussians(rows[:, :3], rows[:, 6:10], np.log(rows[:, 3:5]), np.log(opacities / (1 - opacities)), sh)
 
 
 def differences(found: Gaussians, wanted: Gaussians) -> str:
@@ -68,14 +87,14 @@ def camera_in(world: Similarity, origin: Origin, index: int) -> Camera:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", type=Path, help="plain model (*.npz) with cameras")
+    parser.add_argument("model", type=Path, help="plain model, with cameras (*.npz) for pictures")
     parser.add_argument("--others", type=Path, required=True, help="folder with node_modules of the programs")
     parser.add_argument("--chromium", help="command of Chromium; without it no pictures are drawn")
     parser.add_argument("--camera", type=int, default=0, help="index of the camera")
     parser.add_argument("--out", type=Path, help="folder of the files and pictures")
     chosen = parser.parse_args()
     warnings.simplefilter("ignore")
-    model = load_model(chosen.model)
+    model = load_splats(chosen.model)
     out = (chosen.out or Path(tempfile.mkdtemp())).resolve()
     out.mkdir(parents=True, exist_ok=True)
     for suffix in SUFFIXES:
@@ -85,6 +104,16 @@ def main() -> None:
         file = out / f"scene{suffix}"
         read = differences(by_splat_transform(file, chosen.others), wanted)
         print(f"{suffix}: {file.stat().st_size:,} bytes; splat-transform: {read}", flush=True)
+        if suffix in BY_GAUSSIAN_SPLATS_3D:
+            degree = 0 if suffix == ".splat" else min(wanted.sh_degree, 2)
+            found = by_gaussian_splats_3d(file, chosen.others, degree)
+            print(f"{suffix}: GaussianSplats3D: {differences(found, wanted)}", flush=True)
+    for suffix in WRITTEN_BY_SPLAT_TRANSFORM:
+        file = out / f"theirs{suffix}"
+        transform(out / "scene.ply", file, chosen.others)
+        found, theirs = load_splats(file).gaussians, by_splat_transform(file, chosen.others)
+        print(f"{suffix} by splat-transform, against the model: {differences(found, wanted)}")
+        print(f"{suffix} by splat-transform, against its own reader: {differences(found, theirs)}", flush=True)
     if chosen.chromium is None or model.origin is None:
         return
     (ours,) = pictures(model, [model.origin.cameras[chosen.camera]])
