@@ -170,6 +170,7 @@ def test_what_a_format_does_not_keep():
     assert lost_by(model, "a.npz") == []
     assert lost_by(model, "a.ply") == [TEXTURES, "cameras and background"]
     assert lost_by(model, "a.SPZ") == [TEXTURES, CUT, "cameras and background", "last digits"]
+    assert "spherical harmonics above degree 2" in lost_by(Model(some_gaussians()), "a.ksplat")
     assert lost_by(Model(some_gaussians()), "a.splat") == ["spherical harmonics above degree 0", "last digits"]
     params, layout = Shaped(Textured()).allocate(jax.random.key(0), some_gaussians())
     shaped = Model(some_gaussians(), params, layout, appearance=Shaped(Textured()))

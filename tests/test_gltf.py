@@ -467,6 +467,14 @@ def test_numbers_that_are_not_finite(tmp_path, saved):
     refused(tmp_path / "m.glb", "means must be finite")
 
 
+def test_plain_splats_of_nan_are_left_out_and_counted(tmp_path):
+    save_gltf(tmp_path / "m.glb", Model(some_gaussians()))
+    data = (tmp_path / "m.glb").read_bytes()
+    (tmp_path / "m.glb").write_bytes(data.replace(np.asarray(some_gaussians().means)[2, :1].tobytes(), b"\0\0\xc0\x7f"))
+    with pytest.warns(UserWarning, match=rf"m\.glb: 1 Gaussian of {some_gaussians().num} left out.*first is row 2"):
+        assert load_gltf(tmp_path / "m.glb").num == some_gaussians().num - 1
+
+
 def test_an_origin_elsewhere_is_taken_along():
     """A model in a world of another scale is placed by its own origin."""
     model = plain()

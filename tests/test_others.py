@@ -203,6 +203,28 @@ def test_splat_has_rows_of_32_bytes(tmp_path):
     check(found, scene(), 1e-6, 1e-5, 1.01, 0)
 
 
+def test_ksplat_sections_of_different_degrees(tmp_path):
+    """Two files made one by hand: the first 90 splats lack the coefficients that the others have."""
+    gaussians, parts = load_ply(OTHERS / "scene.ply"), []
+    for degree in (0, 1):
+        save_splats(tmp_path / "a.ksplat", Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, : 1 + 3 * degree])))
+        data = (tmp_path / "a.ksplat").read_bytes()
+        parts.append((data[HEADER : HEADER + SECTION], data[HEADER + SECTION :]))
+    header = data[:4] + struct.pack("<4I", 2, 2, 2 * NUM, 2 * NUM) + data[20:HEADER]
+    (tmp_path / "b.ksplat").write_bytes(header + b"".join(parts[0][i] + parts[1][i] for i in (0, 1)))
+    sh = np.asarray(load_splats(tmp_path / "b.ksplat").gaussians.sh)
+    assert sh.shape == (2 * NUM, 4, 3) and not sh[:NUM, 1:].any()
+    np.testing.assert_allclose(sh[NUM:, 1:], gaussians.sh[:, 1:4], atol=1e-6)
+
+
+def test_ksplat_without_counts_in_its_first_header_is_read(tmp_path):
+    """As gaussforge wrote them, which earlier versions of this library used."""
+    data = bytearray((OTHERS / "level0-degree1.ksplat").read_bytes())
+    data[8:16] = bytes(8)
+    (tmp_path / "a.ksplat").write_bytes(data)
+    check(numbers(load_splats(tmp_path / "a.ksplat").gaussians), scene(), 1e-6, 1e-6, 1, 1e-6)
+
+
 # Damaged .ksplat files
 
 

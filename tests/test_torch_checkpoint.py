@@ -123,6 +123,14 @@ def test_coefficients_above_degree_3_are_left_out_with_a_warning(tmp_path):
         assert_same(load_splats(tmp_path / "a.pt").gaussians, some_gaussians())
 
 
+def test_gaussians_of_nan_are_left_out_and_counted(tmp_path):
+    means = np.array(some_gaussians().means)
+    means[3, 1] = np.nan
+    write_checkpoint(tmp_path / "a.pt", {"splats": {**tensors(), "means": Tensor(means)}})
+    with pytest.warns(UserWarning, match=r"a\.pt: 1 Gaussian of 7 left out.*first is row 3"):
+        assert_same(load_splats(tmp_path / "a.pt").gaussians, some_gaussians()[np.array([0, 1, 2, 4, 5, 6])])
+
+
 class Harm:
     def __reduce__(self):
         return os.system, ("touch harmed",)

@@ -112,6 +112,17 @@ def test_fields_that_lie_are_refused(tmp_path, change, message):
     refused(path, message)
 
 
+def test_particles_of_nan_are_left_out_and_counted(tmp_path):
+    gaussians = some_gaussians()
+    stage, field = stage_of(gaussians)
+    positions = np.array(gaussians.means)
+    positions[2, 1] = np.nan
+    field.GetPrim().GetAttribute("positions").Set(Vt.Vec3fArray.FromNumpy(positions))
+    stage.GetRootLayer().Export(str(tmp_path / "m.usda"))
+    with pytest.warns(UserWarning, match=rf"m\.usda: 1 Gaussian of {gaussians.num} left out.*first is row 2"):
+        assert load_usd(tmp_path / "m.usda").num == gaussians.num - 1
+
+
 def test_a_degree_without_coefficients_takes_no_memory(tmp_path):
     path = tmp_path / "m.usda"
     stage, field = stage_of(some_gaussians())

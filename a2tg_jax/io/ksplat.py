@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
+from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io.exchange import Splats, gaussians_of, splats_of, whole_splats
@@ -34,8 +35,6 @@ of positions, bytes, numbers of full and partially filled buckets, degree of sph
 VERSION = (0, 1)
 BUCKET_BYTES = 12
 DEFAULT_RANGE, DEFAULT_ENDS = 32767, (-1.5, 1.5)
-NUM_REST = (0, 9, 24, 45)
-"""Number of coefficients above degree 0 by degree; some programs write degree 3."""
 HIGHEST_DEGREE = 2
 
 
@@ -125,7 +124,7 @@ def _read_section(
 ) -> tuple[Splats, int]:
     """Return the splats of a section that begins at a byte, and the byte after it."""
     num, most, size, num_buckets, side, centre_bytes, reach, _, num_full, num_partial, degree = section
-    if degree >= len(NUM_REST) or num > most or num_full + num_partial != num_buckets:
+    if degree >= len(NUM_BASES) or num > most or num_full + num_partial != num_buckets:
         raise ValueError(
             f"is damaged: a section has {num} of {most} splats of degree {degree}, and {num_full} full and "
             f"{num_partial} other buckets of {num_buckets}"
@@ -152,7 +151,7 @@ def _read_section(
     if level == 2:
         rest = ends[0] + rest / 255 * (ends[1] - ends[0])
     colors = rows["colors"] / 255
-    sh = np.zeros((num, (degree + 1) ** 2, 3))
+    sh = np.zeros((num, NUM_BASES[degree], 3))
     sh[:, 0] = (colors[:, :3] - 0.5) / SH_C0
     for band in range(1, degree + 1):
         low, high = band**2, (band + 1) ** 2
@@ -167,6 +166,6 @@ def _row_type(level: int, degree: int) -> np.dtype:
     return np.dtype(
         [
             ("means", mean, 3), ("scales", number, 3), ("quats", number, 4), ("colors", "u1", 4),
-            ("rest", rest, (NUM_REST[degree],)),
+            ("rest", rest, (3 * (NUM_BASES[degree] - 1),)),
         ]
     )  # fmt: skip
