@@ -172,7 +172,7 @@ def _hint(value: Any) -> str:
     """Return what to say in place of a value that is no image, if it has one."""
     if hasattr(value, "color"):
         return "say output.color"
-    return "say view_image(view)" if hasattr(value, "picture") else ""
+    return "say view_image(view, background)" if hasattr(value, "picture") else ""
 
 
 def _live_mean(values: Array, num_live: Array | int) -> Array:
