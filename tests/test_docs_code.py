@@ -87,10 +87,11 @@ def test_examples_run_and_learn():
 def test_library_runs(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(a2tg, "fit", untrained)
-    fewer = {"cameras, 200):": "cameras, 2):", "iterations=1000": "iterations=2"}
+    fewer = {"cameras, 200):": "cameras, 2):", "iterations=1000": "iterations=2", "Pool(2)": "Pool(1)"}
     names = run("library", {"__name__": "library"}, fewer)
     assert {path.name for path in tmp_path.iterdir()} == {"scene.npz", "scene.a2tgz"}
     assert names["found"].psnr > 3
+    assert [output.color.shape for output in names["renders"]] == [(48, 64, 3)] * 2
     with pytest.raises(TypeError):
         a2tg.fit(names["scene"], names["system"], no_such_option=1)
 

@@ -7,6 +7,7 @@ import warnings
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.display import counted, in_bytes
+from a2tg_jax.core.forks import check_process
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.host import signals
@@ -145,6 +146,7 @@ def fit(
 
 def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None) -> None:
     """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
+    check_process()
     is_path = str, os.PathLike
     check_kind("scene", scene, Scene, f"say load_scene({shortened(scene)!r})" if isinstance(scene, is_path) else "")
     if isinstance(system, str):
