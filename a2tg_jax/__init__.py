@@ -282,6 +282,7 @@ if not TYPE_CHECKING:  # Type checkers see the imports above, and that no other 
         if name not in _MODULE_OF:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         globals()[name] = value = getattr(importlib.import_module(_MODULE_OF[name]), name)
+        importlib.import_module(f"{__name__}.host.field_docs").tell_fields()
         return value
 
     def __dir__() -> list[str]:
