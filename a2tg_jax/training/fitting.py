@@ -106,7 +106,7 @@ def fit(
         iteration reuses the state's buffers, so save or copy it in the call.
       checkpoint_every: None: at the end of each stage only.
       on_log: called with each new row of the history, every 10 iterations: a dictionary of numbers, with the names of
-        the fields of `History`.
+        the columns of `History.to_dict`.
       progress: show a progress bar.
       is_stopped: asked between steps and after the last. If it returns True, `on_checkpoint` is called a last time and
         `Interrupted` is raised. The first Ctrl-C does the same, unless the program handles it.
