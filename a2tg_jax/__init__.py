@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from a2tg_jax.appearance import Textured as Textured
     from a2tg_jax.appearance import TexturedRule as TexturedRule
     from a2tg_jax.appearance import TextureOptions as TextureOptions
+    from a2tg_jax.core.bilinear import TextureRegion as TextureRegion
     from a2tg_jax.core.cameras import Camera as Camera
     from a2tg_jax.core.cameras import resize_camera as resize_camera
     from a2tg_jax.core.gaussians import Gaussians as Gaussians
@@ -171,6 +172,7 @@ _NAMES = {
         "TexturedRule",
         "TextureOptions",
     ),
+    "a2tg_jax.core.bilinear": ("TextureRegion",),
     "a2tg_jax.core.cameras": ("Camera", "resize_camera"),
     "a2tg_jax.core.gaussians": ("Gaussians", "init_from_points"),
     "a2tg_jax.core.gradient_statistics": ("GradientStatistics",),
@@ -280,6 +282,7 @@ if not TYPE_CHECKING:  # Type checkers see the imports above, and that no other 
         if name not in _MODULE_OF:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         globals()[name] = value = getattr(importlib.import_module(_MODULE_OF[name]), name)
+        importlib.import_module(f"{__name__}.host.field_docs").tell_fields()
         return value
 
     def __dir__() -> list[str]:

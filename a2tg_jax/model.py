@@ -18,6 +18,7 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind, short_repr
 from a2tg_jax.core.display import counted, html_table, in_bytes, short_tuple_repr
+from a2tg_jax.core.forks import check_process
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.similarity import Similarity
@@ -72,6 +73,7 @@ class Model:
     @property
     def rule(self) -> AppearanceRule:
         """Appearance rule for the renderer."""
+        check_process()
         check_given(self.appearance, self.params)
         return PlainRule() if self.gaussians.num == 0 else self.appearance.rule(self.params, self.layout)
 

@@ -148,7 +148,7 @@ def with_neighbours(test: Sequence[a2tg.View], model: a2tg.Model) -> dict[str, f
         at = bisect.bisect(names, view.name)
         exposure = np.mean([learned[name] for name in names[max(at - 1, 0) : at + 1]], axis=0)
         shown = exposed(jnp.asarray(exposure), renderer(view.camera).color)
-        decibels.append(float(a2tg.psnr(shown, jnp.asarray(a2tg.view_image(view)))))
+        decibels.append(float(a2tg.psnr(shown, jnp.asarray(a2tg.view_image(view, model.background)))))
     return {"test_neighbours": float(np.mean(decibels))}
 
 

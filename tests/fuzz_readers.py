@@ -173,7 +173,7 @@ def _checkpoint(folder: Path, file: Path):
         shapes = [leaf.shape for leaf in jax.tree.leaves(got)]
         assert shapes == [leaf.shape for leaf in jax.tree.leaves(like)]
     assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(state.moments.mu))
-    lengths = {len(getattr(found.history, field.name)) for field in dataclasses.fields(found.history)}
+    lengths = {len(column) for column in found.history.to_dict().values()}
     assert len(lengths) == 1
     return found.model
 

@@ -85,6 +85,12 @@ WRONG = {
     "Ks must be [6, 3, 3]; got [2, 3, 3]": {"Ks": np.zeros((2, 3, 3))},
     "points must be [P, 3]; got [5, 2]": {"points": np.zeros((5, 2))},
     "colors must be uint8; got float64: say np.rint(255": {"colors": np.zeros((200, 3))},
+    "colors must be uint8; got float64: say np.clip(np.rint(colors), 0, 255)": {"colors": np.full((200, 3), 99.0)},
+    "got float32 [30, 40, 3]: say np.clip(np.rint(image), 0, 255).astype(np.uint8) of [0, 255]": {
+        "images": [np.full((30, 40, 3), 255, np.float32)] * 6
+    },
+    "got int64 [30, 40, 3]: say np.clip(np.rint(image), 0, 255).astype": {"images": [np.full((30, 40, 3), 200)] * 6},
+    "got uint16 [30, 40, 3]: say (image // 257).astype": {"images": [np.full((30, 40, 3), 65535, np.uint16)] * 6},
     "colors must be [200, 3]; got [2, 3]": {"colors": np.zeros((2, 3), np.uint8)},
     "names must hold one item for each of 6 images; got 1": {"names": ["a"]},
     "observed[1] must hold integers [S] from 0 to 199, indices of points; got int64 [1]": {
@@ -113,3 +119,62 @@ def test_arrays_of_jax_are_fine(given):
         **{**given, "viewmats": jnp.asarray(given["viewmats"]), "Ks": jnp.asarray(given["Ks"])}
     )
     assert len(scene.train) == 4
+
+
+def of_opengl(viewmats):
+    return np.diag([1.0, -1, -1, 1]) @ viewmats
+
+
+CONVENTIONS = {
+    "np.linalg.inv(viewmats)": np.linalg.inv,
+    "np.linalg.inv(viewmats @ np.diag([1, -1, -1, 1]))": lambda given: np.linalg.inv(of_opengl(given)),
+    "np.diag([1, -1, -1, 1]) @ viewmats": of_opengl,
+}
+"""How to make poses of another convention OpenCV's, and how they are made here."""
+
+
+@pytest.mark.parametrize("has_points", [True, False])
+@pytest.mark.parametrize("advice", CONVENTIONS)
+@pytest.mark.filterwarnings("ignore:.*has no sparse points")
+def test_poses_of_another_convention_are_named(given, advice, has_points):
+    """The advice is right. Flipped axes alone are noticed by points only, for cameras may look outwards."""
+    if not has_points and CONVENTIONS[advice] is of_opengl:
+        pytest.skip("needs points")
+    changed = {} if has_points else {"points": None, "colors": None}
+    wrong = CONVENTIONS[advice](given["viewmats"])
+    with pytest.warns(UserWarning, match=re.escape(f"with {advice}, if these")):
+        a2tg.scene_from_arrays(**{**given, **changed, "viewmats": wrong})
+    np.testing.assert_allclose(eval(advice, {"np": np, "viewmats": wrong}), given["viewmats"], atol=1e-6)
+    a2tg.scene_from_arrays(**{**given, **changed})
+
+
+def test_cameras_that_look_outwards_are_fine(given):
+    """On a circle, as those of a room; without points."""
+    outwards = [a2tg.look_at([x, y, 0], [2 * x, 2 * y, 0], width=40, height=30).viewmat
+                for x, y in zip(np.cos(range(6)), np.sin(range(6)), strict=True)]  # fmt: skip
+    with pytest.warns(UserWarning) as told:
+        a2tg.scene_from_arrays(given["images"], outwards, given["Ks"])
+    assert len(told) == 1 and "has no sparse points" in str(told[0].message)
+
+
+@pytest.mark.parametrize(
+    ("factor", "size"), [((4, 4), "160 × 120"), ((0.5, 0.5), "20 × 15"), ((0.75, 4 / 3), "30 × 40")]
+)
+def test_intrinsics_of_another_size_are_named(given, factor, size):
+    """A size that is the principal point's, twice; the last one is of turned photographs."""
+    K = np.diag([*factor, 1]) @ given["Ks"]
+    with pytest.warns(
+        UserWarning, match=rf"6 of 6 .* Ks\[0\] would fit {size} pixels, but the image has 40 × 30\. Multiply"
+    ):
+        a2tg.scene_from_arrays(**{**given, "Ks": K})
+    a2tg.scene_from_arrays(**{**given, "Ks": given["Ks"] + np.array([[0, 0, 9], [0, 0, 0], [0, 0, 0]])})  # a crop
+
+
+def test_colours_without_their_factor_are_named(given):
+    """uint8 of [0, 1] is black but for 1; an image that is dark throughout is one of several."""
+    shares = [(image > 100).astype(np.uint8) for image in given["images"]]
+    with pytest.warns(UserWarning, match="images hold no value above 1 of 255: multiply colours in"):
+        a2tg.scene_from_arrays(**{**given, "images": shares})
+    with pytest.warns(UserWarning, match="colors hold no value above 1 of 255"):
+        a2tg.scene_from_arrays(**{**given, "colors": given["colors"] // 255 + 1})
+    a2tg.scene_from_arrays(**{**given, "images": [*shares[:5], given["images"][5]]})

@@ -154,7 +154,10 @@ def adam(params, grads, rates=0.1):
         (lambda: a2tg.resize_camera(CAMERA, 16, 12.0), "height must be an int, at least 1; got 12.0"),
         (lambda: a2tg.smooth_path([CAMERA, CAMERA], "5"), "num_frames must be an int, at least 1; got '5'"),
         (lambda: a2tg.photometric_loss(OUTPUT, IMAGE), "image must be an array; got RenderOutput: say output.color"),
-        (lambda: a2tg.photometric_loss(IMAGE, VIEW), "target must be an array; got View: say view_image(view)"),
+        (
+            lambda: a2tg.photometric_loss(IMAGE, VIEW),
+            "target must be an array; got View: say view_image(",
+        ),
         (lambda: a2tg.photometric_loss(IMAGE, IMAGE, ssim_weight=2), "ssim_weight must be at least 0 and at most 1"),
         (lambda: a2tg.ssim(None, IMAGE), "image must be an array; got NoneType"),
         (lambda: a2tg.normal_consistency(IMAGE, MAP, MAP, VIEW), "camera must be a Camera; got View: use view.camera"),

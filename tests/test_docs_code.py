@@ -18,8 +18,8 @@ REAL_FIT = inspect.signature(a2tg.fit)
 
 
 def run(page: str, names: dict, replaced: dict[str, str] | None = None) -> dict:
-    """Values of the names after the last block of Python of a page."""
-    text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
+    """Values of the names after the last block of Python of a page, of which the README is one."""
+    text = ((DOCS.parent if page == "README" else DOCS) / f"{page}.md").read_text(encoding="utf-8")
     for number, block in enumerate(re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)):
         for old, new in (replaced or {}).items():
             block = block.replace(old, new)
@@ -40,6 +40,42 @@ def untrained(*args, **kwargs):
     return SimpleNamespace(model=model)
 
 
+def test_the_readme_compares_a_transparent_photograph_on_the_background_of_the_model(monkeypatch, tmp_path):
+    """The photographs show nothing, and the Gaussians are hidden: on white, both are white."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(a2tg, "configure_cpu", lambda: None)
+    cameras = [a2tg.look_at([x, -2, 0], [0, 0, 0], width=16, height=12) for x in (-0.5, 0.0, 0.5)]
+    images = [np.zeros((12, 16, 4), np.uint8)] * 3
+    points = [[0, 0, 0.1 * i] for i in range(4)]
+    scene = a2tg.scene_from_arrays(images, [each.viewmat for each in cameras], cameras[0].K, points)
+    hidden = a2tg.init_from_points(scene.points, scene.colors, opacity=1e-4)
+    model = a2tg.Model(hidden, origin=origin_of_scene(scene, (1.0, 1.0, 1.0)))
+    monkeypatch.setattr(a2tg, "fit", lambda scene, system: SimpleNamespace(model=model))
+    names = run("README", {"given": scene}, {'a2tg.load_scene("scene", downscale=4)': "given"})
+    assert names["loss"](names["view"].camera) < 1e-6
+    with pytest.warns(UserWarning, match=r"transparent and was put on black: say view_image\(view, model.background\)"):
+        black = a2tg.view_image(names["view"])
+    assert a2tg.psnr(black, names["target"]) == 0  # from 0 to 1 at each pixel
+
+
+def test_textures_are_read_edited_and_put_back():
+    """One Gaussian that faces the camera, textured red at the left; mirrored as on the page, it is red at the right."""
+    text = (DOCS / "library.md").read_text(encoding="utf-8").partition("## Textures\n")[2]
+    block = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)[0]
+    quats, sh = jnp.array([[1.0, 0, 0, 0]]), jnp.full((1, 1, 3), -3.0)  # no colour of its own
+    gaussians = a2tg.Gaussians(jnp.zeros((1, 3)), quats, jnp.zeros((1, 2)), jnp.full(1, 2.0), sh)
+    texels = np.zeros((2, 2, 4), np.float32)
+    texels[..., 3], texels[:, 0, 0] = 1, 1
+    textures, layout = a2tg.textures_from_arrays([texels])
+    model = a2tg.Model(gaussians, textures, layout, appearance=a2tg.Textured())
+    camera = a2tg.look_at([0, 0, -4], [0, 0, 0], up=[0, -1, 0], width=16, height=16)
+    names = {"model": model, "camera": camera, "a2tg": a2tg}
+    exec(block, names)
+    before, after = (np.asarray(each.render(camera).color)[..., 0] for each in (model, names["edited"]))
+    assert abs(before[:, :8].sum() - before[:, 8:].sum()) > 0.4 * before.sum()
+    np.testing.assert_allclose(after, before[:, ::-1], atol=1e-4)
+
+
 def test_examples_run_and_learn():
     names = run("examples", {"__name__": "examples"})
     views = [a2tg.photometric_loss(names[model].render(names["cameras"][0]).color, names["photo"])
@@ -51,10 +87,11 @@ def test_examples_run_and_learn():
 def test_library_runs(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(a2tg, "fit", untrained)
-    fewer = {"cameras, 200):": "cameras, 2):", "iterations=1000": "iterations=2"}
+    fewer = {"cameras, 200):": "cameras, 2):", "iterations=1000": "iterations=2", "Pool(2)": "Pool(1)"}
     names = run("library", {"__name__": "library"}, fewer)
     assert {path.name for path in tmp_path.iterdir()} == {"scene.npz", "scene.a2tgz"}
     assert names["found"].psnr > 3
+    assert [output.color.shape for output in names["renders"]] == [(48, 64, 3)] * 2
     with pytest.raises(TypeError):
         a2tg.fit(names["scene"], names["system"], no_such_option=1)
 

@@ -1,7 +1,9 @@
 """Values in a console, a line each, and in a notebook, as pictures."""
 
 import dataclasses
+import inspect
 import io
+import pydoc
 import types
 
 import jax
@@ -12,7 +14,9 @@ from PIL import Image
 from scenes_random import as_camera, as_gaussians, draw_scene
 from small_models import some_model
 
+import a2tg_jax as a2tg
 from a2tg_jax.appearance import Appearance, Banded, Shaped, Textured
+from a2tg_jax.cli.main import main as cli
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics
 from a2tg_jax.model import Model
@@ -154,3 +158,36 @@ def test_scene_shows_a_few_thumbnails():
 def test_model_is_a_short_table():
     text = some_model()._repr_html_()
     assert text.count("<tr>") <= 6 and "Gaussians" in text and "memory" in text
+
+
+@pytest.mark.parametrize(
+    ("kind", "field", "text"),
+    [
+        (a2tg.Model, "num_live", "int32 number of rows that exist; None if all do."),
+        (a2tg.Camera, "K", "[3, 3] intrinsics in pixels, last row (0, 0, 1)."),
+        (a2tg.Parameters, "gaussians", "Floats of the Gaussians."),
+        (a2tg.A2tg, "batch_size", "Views per iteration."),
+        (type(a2tg.A2tg().floaters), "min_views", "Least number of training views in which a Gaussian must show"),
+    ],
+    ids=["dataclass", "camera", "tuple", "inherited", "not public"],
+)
+def test_help_has_the_docstrings_of_fields(kind, field, text):
+    """As `help` prints them, and once. Of subclasses, those of the base classes, too."""
+    told = pydoc.render_doc(kind, renderer=pydoc.plaintext)
+    assert told.count(f" {field}: {text}") == 1 and told.count(" Attributes:\n") == 1
+    assert inspect.getdoc(kind) == kind.__doc__ and f"\n  {field}: {text}" in kind.__doc__
+
+
+def test_every_public_class_can_be_told():
+    """And a class without documented fields keeps its docstring."""
+    classes = [found for name in a2tg.__all__ if isinstance(found := getattr(a2tg, name), type)]
+    assert all(isinstance(found.__doc__, str) for found in classes)
+    assert "Attributes:" not in a2tg.CapacityWarning.__doc__
+
+
+def test_the_command_line_prints_fields_as_options_only(capsys):
+    assert "Attributes:" in a2tg.Gaussians2d.__doc__ + a2tg.LossConfig.__doc__
+    with pytest.raises(SystemExit):
+        cli(["train", "--system", "gaussians-2d", "--help"])
+    told = capsys.readouterr().out
+    assert "Attributes:" not in told and "--loss.ssim-weight" in told

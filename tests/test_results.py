@@ -607,6 +607,22 @@ def test_history_round_trip(tmp_path):
         read_history(tmp_path / "h.csv")
 
 
+def test_loss_terms_are_columns_of_a_history(tmp_path):
+    """Of two stages, one has a term that the other has not; files without terms are read as ever."""
+    one = some_history(num=2).with_point(1, 3, 0.3, 20.0, 5, 0.1, 2.0, l1=0.25, roughness=0.05)
+    both = one.followed_by(some_history(num=1).with_point(2, 2, 0.2, 20.0, 5, 0.1, 2.0, l1=0.2))
+    write_history(tmp_path / "h.csv", both)
+    found = read_history(tmp_path / "h.csv")
+    np.testing.assert_array_equal(found.terms["l1"], [np.nan, np.nan, 0.25, np.nan, 0.2])
+    np.testing.assert_array_equal(found.terms["roughness"], [np.nan, np.nan, 0.05, np.nan, np.nan])
+    first, *_, last = (tmp_path / "h.csv").read_text().splitlines()
+    assert first.endswith(",seconds,loss_l1,loss_roughness") and last.endswith(",2.0,0.2,nan")
+    for columns in ("loss_l1,loss_l1", "roughness"):
+        (tmp_path / "h.csv").write_text(f"{','.join(some_history().to_dict())},{columns}\n")
+        with pytest.raises(ValueError, match=r"has a column twice: loss_l1|has the columns stage"):
+            read_history(tmp_path / "h.csv")
+
+
 # Pictures
 
 

@@ -29,11 +29,19 @@ def test_rows_are_written_once(tmp_path):
     written(run, some_history(num=3), some_history(num=3), some_history(num=7))
     written(run, some_history(num=9), skipped=some_history(num=7))
     found, wanted = scalars(run.tensorboard), some_history(num=9)
-    assert set(found) == {f"{column}/a2tg-gaussians" for column in tensorboard.SHOWN}
-    for column in tensorboard.SHOWN:
+    columns = {"loss", "psnr", "num_gaussians", "megabytes", "seconds"}
+    assert set(found) == {f"{column}/a2tg-gaussians" for column in columns}
+    for column in columns:
         steps, values = zip(*found[f"{column}/a2tg-gaussians"], strict=True)
         assert steps == (*range(1, 10),)
         np.testing.assert_allclose(values, getattr(wanted, column), rtol=1e-6)
+
+
+def test_loss_terms_are_written_where_there_are_any(tmp_path):
+    run, history = RunFolder(tmp_path), some_history(num=2).with_point(1, 3, 0.3, 20.0, 5, 0.1, 2.0, l1=0.25)
+    written(run, history)
+    ((step, value),) = scalars(run.tensorboard)["loss_l1/a2tg-gaussians"]
+    assert step == 3 and value == 0.25
 
 
 def test_the_files_are_the_run_s_own(tmp_path):

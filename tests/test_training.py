@@ -14,12 +14,16 @@ from a2tg_jax import (
     A2tg,
     Change,
     Checkpoint,
+    RenderSettings,
     StepEvent,
+    Term,
     event,
     fit,
     load_checkpoint,
     save_checkpoint,
+    ssim,
     synthetic_scene,
+    view_image,
 )
 from a2tg_jax.appearance import Textured
 from a2tg_jax.mcmc import Mcmc
@@ -351,3 +355,52 @@ def test_batches_of_several_views(scene, trained):
     result = fit_stage(scene, config, 1, trained[0].stages[0].model, progress=False)
     assert np.isfinite(result.history.loss).all()
     assert result.model.params == ()
+
+
+def roughness(model, target, output):
+    return jnp.mean(jnp.abs(jnp.diff(output.color, axis=0)))
+
+
+def test_the_history_has_the_loss_by_term(scene):
+    """The terms sum up to the loss, and are what plain functions give; of two lambdas, both are there."""
+    own = Term(roughness, 0.1), Term(lambda *_: 0.5), Term(lambda *_: 0.25)
+    losses = (*LossConfig(opacity_weight=0.01).terms(), *own)
+
+    class Own(Gaussians2dMcmc):
+        def stages(self):
+            (stage, *others) = super().stages()
+            return (dataclasses.replace(stage, losses=losses), *others)
+
+    logged = []
+    system = Own(stage1_iterations=11, stage2_iterations=0, initial_gaussians=60, densify=McmcConfig(cap=60))
+    history = fit(scene, system, on_log=logged.append, progress=False).history
+    names = ["l1", "ssim", "opacity", "roughness", "lambda", "lambda_5"]
+    assert set(history.terms) == {*names} and len(history.loss) == 2
+    np.testing.assert_allclose(sum(history.terms[name] for name in names), history.loss, rtol=1e-6)
+    np.testing.assert_array_equal(history.terms["lambda"], 0.5)
+    np.testing.assert_array_equal(history.terms["lambda_5"], 0.25)
+    assert logged[1]["loss_roughness"] == history.to_dict()["loss_roughness"][1] > 0
+    start = initial_model(scene, system)
+    first = fit_stage(scene, dataclasses.replace(system, stage1_iterations=1), 0, start, progress=False).history
+    np.testing.assert_allclose(first.terms["opacity"], [0.01 * np.mean(start.gaussians.opacities)], rtol=1e-5)
+    (view,) = [view for view in scene.train if abs(_l1(start, view) * 0.8 - first.terms["l1"][0]) < 1e-6]
+    similarity = ssim(start.render(view.camera).color, view_image(view, (0, 0, 0)))
+    np.testing.assert_allclose(first.terms["ssim"], [0.2 * (1 - similarity)], rtol=1e-4)
+
+
+def _l1(model, view):
+    settings = RenderSettings(sh_degree=0)
+    return float(jnp.mean(jnp.abs(model.render(view.camera, settings=settings).color - view_image(view, (0, 0, 0)))))
+
+
+def test_a_checkpoint_keeps_the_loss_by_term(trained, tmp_path):
+    """And one of an older version, which has none, goes on with them."""
+    kept = trained[1][1]
+    save_checkpoint(tmp_path / "c.npz", kept)
+    found = load_checkpoint(tmp_path / "c.npz").history
+    assert set(found.terms) == {"l1", "ssim"} and len(found.loss)
+    np.testing.assert_array_equal(found.terms["ssim"], kept.history.terms["ssim"])
+    older = dataclasses.replace(kept, history=dataclasses.replace(kept.history, terms={}))
+    save_checkpoint(tmp_path / "o.npz", older)
+    again = load_checkpoint(tmp_path / "o.npz").history.with_point(1, 99, 0.3, 20.0, 5, 0.1, 9.0, l1=0.25)
+    np.testing.assert_array_equal(again.terms["l1"], [*[np.nan] * len(found.loss), 0.25])

@@ -26,6 +26,7 @@ from a2tg_jax.core.checks import (
     plain,
     short_repr,
 )
+from a2tg_jax.core.forks import check_process
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.sh import NUM_BASES
 
@@ -107,6 +108,7 @@ def floats_per_gaussian(sh_degree: int = 3) -> int:
 
 def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
     """Raise ValueError, naming the field, unless all fields have their shapes and one dtype, float32 or float64."""
+    check_process()
     if not isinstance(gaussians, Gaussians):
         raise ValueError(f"{name} must be Gaussians; got {type(gaussians).__name__}")
     for own in dataclasses.fields(gaussians):

@@ -10,6 +10,8 @@ from typing import Any, Generic, ParamSpec, TypeVar
 
 import jax
 
+from a2tg_jax.core.forks import check_process
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -47,6 +49,7 @@ class Jitted(Generic[P, R]):
         )
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        check_process()
         result: R = self._jitted(classes_of((args, kwargs)), *args, **kwargs)
         return result
 

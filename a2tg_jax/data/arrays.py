@@ -1,18 +1,31 @@
 """Scenes of arrays: images and cameras that are already in memory."""
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from a2tg_jax.core.capture import nearest_point
 from a2tg_jax.core.checks import check_kind, check_shape
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.observations import before_camera, observed_points, projected
-from a2tg_jax.data.photo_store import Picture
+from a2tg_jax.data.photo_store import Picture, how_to_convert
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.data.splits import check_test_every, every_kth
+
+OFF_CENTER = 1.25
+"""Least ratio of the size of an image and twice its principal point, on both axes, that is warned of."""
+MOST_COMPARED = 100
+"""Number of views whose poses are compared with other conventions; ten times as many points."""
+LEAST_SEEN, CLEARLY = 0.05, 1.5
+"""Least share of the points that the views see by another convention, and how many times the share of the given one."""
+
+PRECISIONS = 0.2, 0.01
+"""How near to the place, as a share of its distance, the axes of photographs and of rendered images may pass."""
 
 
 def scene_from_arrays(
@@ -44,6 +57,9 @@ def scene_from_arrays(
       observed: for each image the indices [S] of the points that it observed, for `loss.points_weight`; may be empty.
       test_every: every k-th view is a test view; 0 keeps none.
       name: of the scene.
+
+    It warns of what looks like a mistake: camera-to-world matrices, axes of OpenGL, intrinsics of another image size,
+    and colours of [0, 1] that were converted without a factor of 255.
 
     Raises:
       ValueError: naming the argument, if one has another shape or kind, or the views make no scene.
@@ -81,7 +97,92 @@ def scene_from_arrays(
         return Shot(own, viewmat, Ks[index], picture, mask, depth=depth, points=points)
 
     shots = [shot(index) for index in range(num)]
+    told = [
+        *_told_of_values(images, colors),
+        _told_of_sizes(shots),
+        _told_of_poses(shots, None if cloud is None else cloud.points),
+    ]
+    for message in filter(None, told):
+        warnings.warn(f"the scene {name}: {message}", stacklevel=2)
     return assemble_scene(name, *every_kth(shots, test_every), cloud, source=f"the scene {name}")
+
+
+def _told_of_values(images: Sequence[Any], colors: Any) -> Iterator[str]:
+    """Yield what to say of colours that are only 0 and 1 of 255: those of [0, 1] without their factor."""
+    given = {"images": [image for image in images if not isinstance(image, Picture)]}
+    given |= {} if colors is None else {"colors": [colors]}
+    for name, arrays in given.items():
+        largest = 0
+        for array in arrays:  # One image is enough, as a rule.
+            largest = max(largest, int(np.max(np.asarray(array)[..., :3], initial=0)))
+            if largest > 1:
+                break
+        if largest == 1:
+            yield f"{name} hold no value above 1 of 255: multiply colours in [0, 1] by 255 before astype(np.uint8)"
+
+
+def _told_of_sizes(shots: Sequence[Shot]) -> str:
+    """Return what to say if principal points are those of images of another size, which differs on both axes."""
+    sizes = np.array([shot.pixels.shape[1::-1] for shot in shots], float)
+    twice = np.array([2 * shot.K[:2, 2] for shot in shots])
+    is_off = (np.maximum(twice, sizes) > OFF_CENTER * np.minimum(twice, sizes)).all(axis=1)
+    if np.count_nonzero(is_off) <= len(shots) / 2:
+        return ""
+    first = int(np.argmax(is_off))
+    (width, height), (of_width, of_height) = sizes[first], twice[first]
+    return (
+        f"Ks do not fit the images: {np.count_nonzero(is_off)} of {len(shots)} principal points are far from the "
+        f"middle; Ks[{first}] would fit {of_width:g} × {of_height:g} pixels, but the image has {width:g} × {height:g}. "
+        "Multiply the first row of K by the ratio of the widths, the second by that of the heights"
+    )
+
+
+def _told_of_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
+    """Return what to say if the poses make sense by another convention only.
+
+    With points: far more of them are then in the images. Without: all cameras then look at one place, and else do not.
+    """
+    chosen = [shots[i] for i in np.unique(np.linspace(0, len(shots) - 1, MOST_COMPARED).astype(int))]
+    given = np.stack([shot.viewmat for shot in chosen])
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    others = {
+        "np.linalg.inv(viewmats), if these are camera to world": np.linalg.inv(given),
+        "np.linalg.inv(viewmats @ np.diag([1, -1, -1, 1])), if these are camera to world with y up and z backward, as "
+        "in Blender and NeRF": np.linalg.inv(given @ flip),
+        "np.diag([1, -1, -1, 1]) @ viewmats, if these have y up and z backward, as in OpenGL": flip @ given,
+    }
+    said = "viewmats must be world to camera, x right, y down, z forward: "
+    if points is not None and len(points):
+        some = points[np.unique(np.linspace(0, len(points) - 1, 10 * MOST_COMPARED).astype(int))]
+        own, *found = (_share_seen(chosen, viewmats, some) for viewmats in (given, *others.values()))
+        best = int(np.argmax(found))
+        if found[best] < LEAST_SEEN or own * CLEARLY > found[best]:
+            return ""
+        return f"{said}the views see {own:.0%} of the points, and would see {found[best]:.0%} with {[*others][best]}"
+    for precision in PRECISIONS:
+        own, *found = (_share_that_meet(viewmats, precision) for viewmats in (given, *others.values()))
+        best = int(np.argmax(found[:2]))  # Cameras that look outwards meet behind, as flipped ones do.
+        if own <= 0.5 and found[best] >= 0.9:
+            share = f"{own:.0%} of the cameras look at one place, and {found[best]:.0%} would"
+            return f"{said}{share} with {[*others][best]}"
+    return ""
+
+
+def _share_seen(shots: Sequence[Shot], viewmats: np.ndarray, points: np.ndarray) -> float:
+    """Return the share of all points, averaged over the views, that lie in an image."""
+    shares = []
+    for shot, viewmat in zip(shots, viewmats, strict=True):
+        xy = projected(before_camera(points, viewmat), shot.K)
+        shares.append(np.count_nonzero(((xy >= 0) & (xy < shot.pixels.shape[1::-1])).all(axis=1)) / len(points))
+    return float(np.mean(shares))
+
+
+def _share_that_meet(viewmats: np.ndarray, precision: float) -> float:
+    """Return the share of cameras that look at the place nearest to all optical axes, to a share of its distance."""
+    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    offsets = nearest_point(centers, axes) - centers
+    depths = np.sum(offsets * axes, axis=1)
+    return float(np.mean((depths > 0) & (np.linalg.norm(np.cross(offsets, axes), axis=1) < precision * depths)))
 
 
 def _matrices(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -108,9 +209,7 @@ def _cloud(points: Any, colors: Any) -> PointCloud:
     colors = np.full(points.shape, 128, np.uint8) if colors is None else np.asarray(colors)
     check_shape("colors", colors, points.shape)
     if colors.dtype != np.uint8:
-        raise ValueError(
-            f"colors must be uint8; got {colors.dtype}: say np.rint(255 * colors).astype(np.uint8) of [0, 1]"
-        )
+        raise ValueError(f"colors must be uint8; got {colors.dtype}{how_to_convert(colors, 'colors')}")
     return PointCloud(points, colors)
 
 

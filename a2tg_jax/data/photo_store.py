@@ -28,6 +28,18 @@ SHARE_OF_DISK = 0.5
 """Share of the free disk for undistorted or resized photographs of object storage."""
 
 
+def how_to_convert(values: Any, name: str) -> str:
+    """Return how to make uint8 of colours in [0, 1], [0, 255] or 16 bits, which their values tell apart; else ""."""
+    values = np.asarray(values)
+    is_float, is_integer = (np.issubdtype(values.dtype, kind) for kind in (np.floating, np.integer))
+    largest = np.nanmax(values, initial=0)
+    if is_float and largest <= 1:
+        return f": say np.rint(255 * {name}).astype(np.uint8) of [0, 1]"
+    if (is_float or is_integer) and largest <= 255:
+        return f": say np.clip(np.rint({name}), 0, 255).astype(np.uint8) of [0, 255]"
+    return f": say ({name} // 257).astype(np.uint8) of 16 bits" if values.dtype == np.uint16 else ""
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Picture:
     """Pixels, in memory or on disk. `read` always returns the same."""
@@ -56,8 +68,7 @@ class Picture:
             raise ValueError(f"{wanted}; got {type(pixels).__name__}")
         is_image = len(pixels.shape) == 3 and pixels.shape[2] in (3, 4) and min(pixels.shape) > 0
         if not is_image or pixels.dtype != np.uint8:
-            is_share = is_image and np.issubdtype(pixels.dtype, np.floating)
-            advice = ": say np.rint(255 * image).astype(np.uint8) of an image in [0, 1]" if is_share else ""
+            advice = how_to_convert(pixels, "image") if is_image else ""
             raise ValueError(f"{wanted}; got {pixels.dtype} {[*pixels.shape]}{advice}")
         return Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
 

@@ -207,12 +207,13 @@ def counted_pixels(views: Sequence[View]) -> np.ndarray:
     return np.stack(masks)[..., None]
 
 
-def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
+def view_image(view: View, background: Sequence[float] | np.ndarray | None = None) -> np.ndarray:
     """Return the view's image as floats, over a background if it is transparent.
 
     Args:
       view: one view.
-      background: [3] colour in [0, 1], or an image [H, W, 3] of colours.
+      background: [3] colour in [0, 1], or an image [H, W, 3] of colours; to compare with a model, `model.background`.
+        None is black, with a warning if the image is transparent.
 
     Returns:
       [H, W, 3] float32 in [0, 1].
@@ -223,6 +224,14 @@ def view_image(view: View, background: Sequence[float] | np.ndarray = (0.0, 0.0,
     check_kind("view", view, View)
     pixels = view.picture.read()
     color = pixels[..., :3].astype(np.float32) / np.float32(255)
+    if background is None:
+        if view.has_alpha:
+            warnings.warn(
+                "the image is transparent and was put on black: say view_image(view, model.background) to compare it "
+                "with a model, or give the background that you want",
+                stacklevel=2,
+            )
+        background = BLACK
     check_shape("background", background, color.shape if np.ndim(background) == 3 else (3,))
     if not view.has_alpha:
         return color

@@ -1,7 +1,6 @@
 """History of a stage as CSV, one line per logged iteration."""
 
 import csv
-import dataclasses
 import io
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,8 +11,10 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.training import History
+from a2tg_jax.training.checkpoint import TERM
 
-NAMES = tuple(field.name for field in dataclasses.fields(History))
+NAMES = tuple(History.empty().to_dict())
+"""Columns of each file; those of loss terms follow, such as loss_l1."""
 INTEGERS = ("stage", "iteration", "num_gaussians")
 LARGEST = 1e15
 MOST_BYTES = 1 << 26
@@ -22,9 +23,10 @@ MOST_BYTES = 1 << 26
 
 def write_history(path: Path, history: History) -> None:
     """Write the columns of a history, named in the first line."""
-    columns = [np.asarray(getattr(history, name)).tolist() for name in NAMES]
+    columns = history.to_dict()
+    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([NAMES, *zip(*columns, strict=True)])
+        csv.writer(file).writerows([columns, *rows])
 
 
 def read_history(path: Path) -> History:
@@ -33,7 +35,7 @@ def read_history(path: Path) -> History:
     Raises:
       FileNotFoundError: if there is none.
       ValueError: naming the file, if it has other columns, or a row is not one of numbers, of which only PSNR may be
-        infinite.
+        infinite and only loss terms NaN.
     """
     if not is_regular(path):
         raise FileNotFoundError(f"{path} is missing: put it back, or train the stage again")
@@ -41,21 +43,25 @@ def read_history(path: Path) -> History:
         try:
             rows = csv.reader(file)
             first = next(rows, [])
-            if tuple(first) != NAMES:
+            terms = first[len(NAMES) :]
+            if tuple(first[: len(NAMES)]) != NAMES or not all(name.startswith(TERM) for name in terms):
                 raise ValueError(f"has the columns {shortened(', '.join(first))}; {', '.join(NAMES)} are wanted")
-            values = np.fromiter(_numbers(rows), np.dtype((np.float64, len(NAMES))))
-            if np.isnan(values).any() or (np.abs(values[:, [name != "psnr" for name in NAMES]]) > LARGEST).any():
+            if len({*terms}) < len(terms):
+                raise ValueError(f"has a column twice: {shortened(', '.join(terms))}")
+            values = np.fromiter(_numbers(rows, len(first)), np.dtype((np.float64, len(first))))
+            is_large = np.abs(values[:, [name != "psnr" for name in first]]) > LARGEST
+            if np.isnan(values[:, : len(NAMES)]).any() or is_large.any():
                 raise ValueError("has numbers that are not finite")
         except (ValueError, csv.Error) as error:
             raise ValueError(f"{path}: {shortened(str(error), 200)}; train the stage again") from error
-    return History(**{name: values[:, i].astype(_dtype(name)) for i, name in enumerate(NAMES)})
+    return History.of_columns({name: values[:, i].astype(_dtype(name)) for i, name in enumerate(first)})
 
 
-def _numbers(rows: Iterator[list[str]]) -> Iterator[tuple[float, ...]]:
+def _numbers(rows: Iterator[list[str]], num: int) -> Iterator[tuple[float, ...]]:
     """Yield the numbers of each row."""
     for number, row in enumerate(rows, 1):
-        if len(row) != len(NAMES):
-            raise ValueError(f"row {number} has {len(row)} of {len(NAMES)} columns")
+        if len(row) != num:
+            raise ValueError(f"row {number} has {len(row)} of {num} columns")
         yield tuple(map(float, row))
 
 

@@ -10,8 +10,8 @@ from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.training import History
 
 LIBRARY = "tensorboardX"
-SHOWN = ("loss", "psnr", "num_gaussians", "megabytes", "seconds")
-"""Columns of a history that are written."""
+LEFT_OUT = ("stage", "iteration")
+"""Columns of a history that are not written."""
 
 
 def check_tensorboard() -> None:
@@ -35,10 +35,11 @@ class EventWriter:
     def add(self, history: History) -> None:
         """Write the rows that are new, as LOSS/NAME and so on, by iteration of the stage."""
         rows = range(self._written, len(history.iteration))
+        columns = {name: column for name, column in history.to_dict().items() if name not in LEFT_OUT}
         for row in rows:
-            for column in SHOWN:
-                value = float(np.asarray(getattr(history, column))[row])
-                self._writer().add_scalar(f"{column}/{self._name}", value, int(history.iteration[row]))
+            for name, column in columns.items():
+                if not np.isnan(column[row]):
+                    self._writer().add_scalar(f"{name}/{self._name}", float(column[row]), int(history.iteration[row]))
         if rows:
             self._writer().flush()
             self._written = rows.stop

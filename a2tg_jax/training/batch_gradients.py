@@ -16,7 +16,7 @@ from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import corrected_color, penalties
 from a2tg_jax.training.gradients import Differentiated, View, differentiate, differentiate_together
 from a2tg_jax.training.returned import check_scalar
-from a2tg_jax.training.stage import Background, Clock, Stage
+from a2tg_jax.training.stage import Background, Clock, LossTerm, Stage
 from a2tg_jax.training.terms import Target
 
 
@@ -32,6 +32,8 @@ class BatchGradients(NamedTuple):
     drawn at once, those in parameters are [V/G, ...], each a mean over G views."""
     statistic: Array | None
     """[V, N, 4], the gradient at the probe of `render_traced`; None if no event gathers it."""
+    terms: dict[str, Array]
+    """Summands of the loss by name."""
 
 
 def batch_gradients(
@@ -66,26 +68,33 @@ def batch_gradients(
         "statistic": stage.statistic, "has_probe": is_gathering,
     }  # fmt: skip
 
-    def loss(shown: Model, seen: View, output: RenderOutput) -> tuple[Array, tuple[Array, Array]]:
+    def loss(shown: Model, seen: View, output: RenderOutput) -> tuple[Array, tuple[Array, Array, dict[str, Array]]]:
         image, alpha, mask, depth, points = seen.target
         photograph = _black_outside(mask, _over(image, alpha, seen.background))
         target = Target(seen.camera, photograph, seen.background, mask, depth, clock.progress(iteration - 1), points)
         color = corrected_color(seen.corrections, seen.rows, output.color)
         output = output._replace(color=_black_outside(mask, color))
-        terms = [term(shown, target, output) for term in stage.losses]
-        for index, term in enumerate(terms):
-            check_scalar(f"stage {stage.name!r}: losses[{index}]", term)
-        value = functools.reduce(jnp.add, [*terms, *penalties(seen.corrections, seen.rows)])
+        told: dict[str, Array] = {}
+        values: list[Array] = []
+        for index, term in enumerate(stage.losses):
+            parts = term_parts(term, shown, target, output)
+            for name, part in parts.items():
+                check_scalar(f"stage {stage.name!r}: losses[{index}]", part)
+                told[name if name not in told else f"{name}_{index + 1}"] = part
+            values.append(functools.reduce(jnp.add, parts.values()))
+        if added := penalties(seen.corrections, seen.rows):
+            told["corrections"] = functools.reduce(jnp.add, added)
+        value = functools.reduce(jnp.add, [*values, *added])
         error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
-        return value, (error, output.overflow)
+        return value, (error, output.overflow, told)
 
     def gradients_by(derivative: Callable[..., Differentiated], arrays: tuple[Any, ...]) -> BatchGradients:
         viewmat, K, background, rows, pictures = arrays
         view = View(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows, pictures)
         found = derivative(loss, model, view, settings, **options)
-        error, overflow = found.told
+        error, overflow, terms = found.told
         grads = found.gaussians, found.params, found.rows
-        return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe)
+        return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe, terms)
 
     pictures = batch.images, batch.alphas, batch.masks, batch.depths, batch.points
     arrays = batch.viewmats, batch.Ks, backgrounds, own, pictures
@@ -98,6 +107,16 @@ def batch_gradients(
     rounds = jax.tree.map(lambda x: x.reshape(num_at_once, num // num_at_once, *x.shape[1:]).swapaxes(0, 1), arrays)
     gradients = jax.lax.map(functools.partial(gradients_by, differentiate_together), rounds)
     return _of_views(gradients, num_at_once)
+
+
+def term_parts(term: LossTerm, model: Model, target: Target, output: RenderOutput) -> dict[str, Array]:
+    """Return the summands of a loss term by name; most terms are one."""
+    parts: dict[str, Array]
+    if hasattr(term, "parts"):
+        parts = term.parts(model, target, output)
+    else:
+        parts = {getattr(term, "name", type(term).__name__): term(model, target, output)}
+    return parts
 
 
 def _of_views(rounds: BatchGradients, num_at_once: int) -> BatchGradients:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -43,6 +43,8 @@ class History:
     """Reported memory in 10⁶ bytes."""
     seconds: np.ndarray
     """Training time of the stage so far."""
+    terms: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Summands of the loss, weighted, by name: l1, ssim, and other terms of the stage. NaN where there is none."""
 
     @staticmethod
     def empty() -> "History":
@@ -55,23 +57,45 @@ class History:
             return f"History({rows})"
         return f"History({rows} to iteration {self.iteration[-1]:,} of stage {self.stage[-1]}, {self.psnr[-1]:.2f} dB)"
 
+    @staticmethod
+    def row(values: Sequence[Any], terms: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values of `COLUMNS` and those of loss terms by the names of their columns, such as loss_l1."""
+        return dict(zip(COLUMNS, values, strict=True)) | {f"{TERM}{name}": value for name, value in terms.items()}
+
     def to_dict(self) -> dict[str, np.ndarray]:
-        """Return the columns by name, as `pandas.DataFrame` takes them."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        """Return the columns by name, as `pandas.DataFrame` takes them; loss terms as loss_l1 and so on."""
+        return self.row([getattr(self, name) for name in COLUMNS], self.terms)
 
     @property
     def last_seconds(self) -> float:
         return float(self.seconds[-1]) if len(self.seconds) else 0.0
 
-    def with_point(self, *point: float) -> "History":
-        """One more row, its values in the order of the fields."""
-        fields = dataclasses.fields(self)
-        return History(*(np.append(getattr(self, f.name), value) for f, value in zip(fields, point, strict=True)))
+    def with_point(self, /, *point: float, **terms: float) -> "History":
+        """One more row, its values in the order of the fields, and those of loss terms by name."""
+        log = HistoryLog(self)
+        log.add(*point, **terms)
+        return log.history
+
+    @staticmethod
+    def of_columns(columns: Mapping[str, np.ndarray]) -> "History":
+        """Return the history whose `to_dict` the columns are."""
+        terms = {name.removeprefix(TERM): column for name, column in columns.items() if name not in COLUMNS}
+        known: dict[str, Any] = {name: columns[name] for name in COLUMNS}
+        return History(**known, terms=terms)
 
     def followed_by(self, other: "History") -> "History":
         """This history and then another."""
-        names = [field.name for field in dataclasses.fields(self)]
-        return History(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+        both = [(history.to_dict(), np.full(len(history.iteration), np.nan)) for history in (self, other)]
+        names = {**both[0][0], **both[1][0]}
+        return History.of_columns(
+            {name: np.concatenate([columns.get(name, none) for columns, none in both]) for name in names}
+        )
+
+
+COLUMNS = tuple(field.name for field in dataclasses.fields(History) if field.name != "terms")
+"""Columns that each history has."""
+TERM = "loss_"
+"""Beginning of the names of the others."""
 
 
 class HistoryLog:
@@ -82,19 +106,24 @@ class HistoryLog:
         history: the rows so far; its arrays stay as they are.
         """
         self._num = len(history.iteration)
-        self._columns = [np.array(getattr(history, field.name)) for field in dataclasses.fields(History)]
+        self._columns = {name: np.array(column) for name, column in history.to_dict().items()}
 
     @property
     def history(self) -> History:
         """The rows so far. Later rows do not change it."""
-        return History(*(column[: self._num] for column in self._columns))
+        return History.of_columns({name: column[: self._num] for name, column in self._columns.items()})
 
-    def add(self, *point: float) -> None:
-        """Add a row, its values in the order of the fields."""
-        if self._num == len(self._columns[0]):
-            self._columns = [np.resize(column, 2 * self._num + FIRST_ROWS) for column in self._columns]
-        for column, value in zip(self._columns, point, strict=True):
-            column[self._num] = value
+    def add(self, /, *point: float, **terms: float) -> None:
+        """Add a row, its values in the order of the fields, and those of loss terms by name."""
+        size = len(self._columns["iteration"])
+        if self._num == size:
+            size = 2 * self._num + FIRST_ROWS
+            self._columns = {name: np.resize(column, size) for name, column in self._columns.items()}
+        row = History.row(point, terms)
+        for name in row.keys() - self._columns.keys():
+            self._columns[name] = np.full(size, np.nan)
+        for name, column in self._columns.items():
+            column[self._num] = row.get(name, np.nan)
         self._num += 1
 
 
@@ -167,6 +196,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> Non
         "machine": config_to_dict(this_machine()),
         "devices": config_to_dict(checkpoint.devices),
         "num_refused": checkpoint.num_refused,
+        "terms": [*checkpoint.history.terms],
     }
     shown = model.appearance.arrays(model.params, model.layout)
     arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
@@ -213,7 +243,10 @@ def _checkpoint_of(
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     stage.appearance.check(params, layout, gaussians)
     wanted = _wanted(stage, gaussians, params, layout, is_ahead)
-    kept = _rest(wanted), {field.name: 0 for field in dataclasses.fields(History)}
+    terms = header.get("terms", [])  # no history of an older version has them
+    if not isinstance(terms, list) or not all(isinstance(name, str) for name in terms):
+        raise ValueError(f"terms must be a list of names; got {shortened(terms)}")
+    kept = _rest(wanted), dict.fromkeys(COLUMNS, 0) | {"terms": dict.fromkeys(terms, 0)}
     _, (rest, columns) = _filled((gaussians, kept), arrays)
     moments, num_live, *others = jax.tree.map(jnp.asarray, rest)
     model = Model(gaussians, params, layout, num_live, appearance=stage.appearance)

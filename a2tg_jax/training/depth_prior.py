@@ -30,6 +30,7 @@ class DepthPrior:
     weight: float
     kind: DepthKind = static(default="inverse")
 
+    name = "depth"
     has_geometry = True
     has_depths = True
 
@@ -47,6 +48,7 @@ class PointDepths:
 
     weight: float
 
+    name = "points"
     has_geometry = True
     has_points = True
 

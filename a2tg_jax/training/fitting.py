@@ -7,6 +7,7 @@ import warnings
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.display import counted, in_bytes
+from a2tg_jax.core.forks import check_process
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.host import signals
@@ -105,7 +106,7 @@ def fit(
         iteration reuses the state's buffers, so save or copy it in the call.
       checkpoint_every: None: at the end of each stage only.
       on_log: called with each new row of the history, every 10 iterations: a dictionary of numbers, with the names of
-        the fields of `History`.
+        the columns of `History.to_dict`.
       progress: show a progress bar.
       is_stopped: asked between steps and after the last. If it returns True, `on_checkpoint` is called a last time and
         `Interrupted` is raised. The first Ctrl-C does the same, unless the program handles it.
@@ -145,6 +146,7 @@ def fit(
 
 def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None) -> None:
     """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
+    check_process()
     is_path = str, os.PathLike
     example = ""
     if isinstance(scene, is_path):

@@ -56,7 +56,6 @@ WORTH_COMPILING = 1_000
 OnCheckpoint = Callable[[Checkpoint], None]
 OnLog = Callable[[Mapping[str, float]], object]
 IsStopped = Callable[[], bool]
-HISTORY_COLUMNS = tuple(History.empty().to_dict())
 
 
 def never() -> bool:
@@ -355,9 +354,10 @@ class StageRun:
                 self.index + 1, iteration, float(info.loss), float(info.psnr), int(info.num_live),
                 num_bytes / 1e6, self.seconds,
             )  # fmt: skip
-            self._logged.add(*row)
+            terms = {name: float(value) for name, value in info.terms.items()}
+            self._logged.add(*row, **terms)
             if self.on_log is not None:
-                self.on_log(dict(zip(HISTORY_COLUMNS, row, strict=True)))
+                self.on_log(History.row(row, terms))
             self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
 
     def _host_events(self, iteration: int) -> None:

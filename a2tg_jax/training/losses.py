@@ -3,6 +3,7 @@
 Images are [H, W, 3], nominally in [0, 1] and never clipped here; a clip would kill the gradient where it is needed.
 """
 
+import functools
 from typing import Any
 
 import jax.numpy as jnp
@@ -36,14 +37,19 @@ def photometric_loss(image: Array, target: Array, *, ssim_weight: float | Array 
     Raises:
       ValueError: if one is no image, the shapes differ, the weight is out of range, or as `mean_ssim` does.
     """
+    return functools.reduce(jnp.add, photometric_parts(image, target, ssim_weight=ssim_weight).values())
+
+
+def photometric_parts(image: Array, target: Array, *, ssim_weight: float | Array = 0.2) -> dict[str, Array]:
+    """Return the summands of `photometric_loss`, weighted, as "l1" and "ssim"; without "ssim" if its weight is 0."""
     image, target = plain("image", image), plain("target", target)
     check_same_shape(image, target)
     l1 = jnp.mean(jnp.abs(image - target))
     if not isinstance(ssim_weight, Array):
         check_number("ssim_weight", ssim_weight, least=0, most=1)
         if ssim_weight == 0:
-            return l1
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - mean_ssim(image, target))
+            return {"l1": l1}
+    return {"l1": (1 - ssim_weight) * l1, "ssim": ssim_weight * (1 - mean_ssim(image, target))}
 
 
 def mean_ssim(image: Array, target: Array) -> Array:
@@ -172,7 +178,7 @@ def _hint(value: Any) -> str:
     """Return what to say in place of a value that is no image, if it has one."""
     if hasattr(value, "color"):
         return "say output.color"
-    return "say view_image(view)" if hasattr(value, "picture") else ""
+    return "say view_image(view, background)" if hasattr(value, "picture") else ""
 
 
 def _live_mean(values: Array, num_live: Array | int) -> Array:

@@ -5,6 +5,8 @@ residual stays large over whole patches. The mask is found anew in each step, fr
 in RobustNeRF (Sabour et al., 2023).
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -12,7 +14,7 @@ from jax import Array
 from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
-from a2tg_jax.training.losses import photometric_loss
+from a2tg_jax.training.losses import photometric_parts
 from a2tg_jax.training.terms import Target
 
 PATCHES = 32
@@ -36,10 +38,13 @@ class RobustPhotometric:
     """Whether to compute SSIM. Without it, images smaller than its window can be trained on."""
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
+        return functools.reduce(jnp.add, self.parts(model, target, output).values())
+
+    def parts(self, model: Model, target: Target, output: RenderOutput) -> dict[str, Array]:
         residual = jnp.mean(jnp.abs(output.color - target.image), axis=-1)
         counts = inliers(residual, self.share, self.factor, target.mask) | (target.progress < self.start)
         color, image = (jnp.where(counts[..., None], x, jnp.zeros_like(x)) for x in (output.color, target.image))
-        return photometric_loss(color, image, ssim_weight=self.ssim_weight if self.has_ssim else 0)
+        return photometric_parts(color, image, ssim_weight=self.ssim_weight if self.has_ssim else 0)
 
 
 def inliers(residual: Array, share: Array | float, factor: Array | float, mask: Array | None = None) -> Array:

@@ -1,6 +1,5 @@
 """Checks that a checkpoint holds a valid state of training (host)."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -70,13 +69,17 @@ def _check_corrections(state: TrainState, stage: Stage) -> None:
 
 
 def check_history(history: Any) -> None:
-    """Raise ValueError, naming the column, unless its columns are numbers of one length; dB may be infinite."""
-    columns = {field.name: np.asarray(getattr(history, field.name)) for field in dataclasses.fields(history)}
+    """Raise ValueError, naming the column, unless its columns are numbers of one length.
+
+    dB may be infinite, and loss terms NaN.
+    """
+    columns = {name: np.asarray(column) for name, column in history.to_dict().items()}
     num = columns["iteration"].shape
     for name, column in columns.items():
         if column.ndim != 1 or column.shape != num or column.dtype.kind not in "iuf":
             raise ValueError(f"history.{name} must be numbers {list(num)}; got {column.dtype} {list(column.shape)}")
-        if np.isnan(column).any() or (name != "psnr" and np.isinf(column).any()):
+        is_term = name.startswith("loss_")
+        if (np.isnan(column).any() and not is_term) or (name != "psnr" and np.isinf(column).any()):
             raise ValueError(f"history.{name} must be finite; some are not")
-        if name not in ("loss", "psnr") and (column < 0).any():
+        if name not in ("loss", "psnr") and not is_term and (column < 0).any():
             raise ValueError(f"history.{name} must be at least 0; some are below")

@@ -78,6 +78,8 @@ class StepInfo(NamedTuple):
     num_live: Array
     num_refused: Array
     """Number of Gaussians that events could not add for lack of room."""
+    terms: dict[str, Array]
+    """Summands of the loss by name."""
 
 
 def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin: Origin | None = None) -> TrainState:
@@ -149,6 +151,7 @@ def train_step(
     return chosen, StepInfo(
         loss=jnp.mean(found.loss), psnr=jnp.mean(found.psnr), num_pairs=jnp.max(found.num_pairs), status=status,
         num_live=chosen.model.num_live, num_refused=jnp.asarray(tried.info.num_refused),
+        terms=jax.tree.map(jnp.mean, found.terms),
     )  # fmt: skip
 
 

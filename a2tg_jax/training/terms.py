@@ -3,6 +3,7 @@
 A term is a frozen dataclass registered as a pytree, whose numbers are traced; `Term` makes one of any function.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
-from a2tg_jax.training.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss
+from a2tg_jax.training.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss, photometric_parts
 from a2tg_jax.training.returned import check_scalar
 
 EXTRAS = {"depth": "has_depths", "points": "has_points"}
@@ -82,6 +83,11 @@ class Term:
         check_scalar(f"the loss function {getattr(self.function, '__name__', self.function)!r}", value)
         return self.weight * value
 
+    @property
+    def name(self) -> str:
+        """Name in the history: that of the function."""
+        return getattr(self.function, "__name__", type(self.function).__name__).strip("<>")
+
 
 @event
 class Photometric:
@@ -91,8 +97,11 @@ class Photometric:
 
     has_ssim = True
 
+    def parts(self, model: Model, target: Target, output: RenderOutput) -> dict[str, Array]:
+        return photometric_parts(output.color, target.image, ssim_weight=self.ssim_weight)
+
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
-        return photometric_loss(output.color, target.image, ssim_weight=self.ssim_weight)
+        return functools.reduce(jnp.add, self.parts(model, target, output).values())
 
 
 def l1(model: Model, target: Target, output: RenderOutput) -> Array:
