@@ -129,11 +129,14 @@ def check_start(scene: Scene, system: System, num_given: int | None = None) -> N
 
 def _check_seen(scene: Scene, system: System) -> None:
     """Raise ValueError if no training view sees any of a scene's points, unless there are Gaussians of a sky."""
+    points = np.asarray(scene.points)
+    if not np.isfinite(points).all():
+        return  # `init_from_points` names these.
     cameras = [view.camera for view in scene.train]
     sights = [Sight.of(np.asarray(c.viewmat), np.asarray(c.K), (c.height, c.width), c.rays) for c in cameras]
-    if len(unseeing(np.asarray(scene.points), sights)) == len(sights) and not system.sky_gaussians:
+    if len(unseeing(points, sights)) == len(sights) and not system.sky_gaussians:
         raise ValueError(
-            f"scene.points: no training view sees any of the {len(scene.points):,} points: they must be in the "
+            f"scene.points: no training view sees any of the {len(points):,} points: they must be in the "
             "world of the views' cameras; scene.transform.apply leads there from the original world"
         )
 
