@@ -178,13 +178,13 @@ class Upscale(UpscaleChoices, HostEvent):
         model = model.with_textures(rebuilt.textures, rebuilt.layout)
         return Change(model, rebuilt.moments, self.init(model), unused=unused)
 
-    def _unused(self, sizes: np.ndarray, scales: np.ndarray) -> str:
+    def _unused(self, sizes: np.ndarray, scales: np.ndarray) -> str | None:
         """Return which choices about anisotropy that are not the defaults made no difference to textures that grow."""
         names = [name for name in ("anisotropic", "k_a", "k_s") if getattr(self, name) != getattr(UpscaleChoices, name)]
         thin = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, axes=self.axes)
         round_ = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, anisotropic=False)
         if not names or (thin != round_).any():
-            return ""
+            return None
         told = " and ".join(f"{{{name}}}" for name in names)
         return f"{told} made no difference, for no Gaussian whose texture grew was elongated and thin"
 

@@ -133,9 +133,9 @@ class Change(NamedTuple):
     rows: np.ndarray | None = None
     """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved.
     Model, moments and state are those of the new order; what other events have gathered then follows."""
-    unused: str = ""
+    unused: str | None = None
     """Options of an event on the host that made no difference this time, as a sentence with the event's fields in
-    braces. If they made none in the whole stage, a warning says so."""
+    braces; None: all did. If they made none in the whole stage, a warning says so."""
 
 
 def with_names(message: str, name_of: Callable[[str], str]) -> str:

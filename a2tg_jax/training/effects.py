@@ -63,7 +63,8 @@ class StageEffects:
             self._reshaped_by.append(place)
         # Values are compared until the event has changed some once, which is nearly always the first time.
         own.has_changed = own.has_changed or is_reshaped or not _are_equal(before[:2], after[:2])
-        own.unused = change.unused if own.num_applied == 0 or not (own.unused and change.unused) else own.unused
+        if own.num_applied == 0 or not change.unused:
+            own.unused = change.unused
         own.num_applied += 1
 
     def launch(self, iteration: int, seconds: float | None) -> None:
@@ -84,9 +85,9 @@ class StageEffects:
                 left = len(self._ahead(event, iteration))
                 warnings.warn(
                     f"stage {self._stage.name!r}: {type(event).__name__} has changed shapes {MANY_PROGRAMS} times, and "
-                    f"each time a step was compiled, last for {seconds:.0f} s; {counted(left, 'time')} are ahead: "
-                    "keep shapes, by keep_rows(model, moments, state, is_kept) to remove Gaussians, or by padding in "
-                    "with_room for what will be added",
+                    f"each time a step was compiled, last for {seconds:.0f} s; it happens {counted(left, 'time')} "
+                    "more: keep shapes, by keep_rows(model, moments, state, is_kept) to remove Gaussians, or by "
+                    "padding in with_room for what will be added",
                     stacklevel=2,
                 )
 
@@ -96,8 +97,9 @@ class StageEffects:
         for event, own in self._on_host.values():
             if left := len(self._ahead(event, iteration)):
                 times = event.iterations(self._stage.iterations)
-                known = own.num_compiled / max(1, own.num_applied)
-                num += left * (known if own.num_applied else event.num_programs(self._stage.iterations) / len(times))
+                known = own.num_compiled, own.num_applied
+                caused, among = known if own.num_applied else (event.num_programs(self._stage.iterations), len(times))
+                num += left * caused / among
         return round(num * self._num_sizes)
 
     @property

@@ -17,7 +17,7 @@ import numpy as np
 
 from a2tg_jax.core.spread_arrays import mesh_of, on_host
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.events import Due, Event, HostEvent, StepEvent
+from a2tg_jax.events import Change, Due, Event, HostEvent, StepEvent
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.exchange import spread
 from a2tg_jax.rasterize.placement import asked_by_any, check_same, everywhere, gathered, of_first, readable
@@ -161,7 +161,9 @@ class StageRun:
         num, num_bytes = model.num, float(model.num_bytes)
         for event, state in zip(self.stage.events, self.state.events, strict=True):
             if isinstance(event, HostEvent) and state is not None:
-                model, moments = event.with_room(model, moments, num_bytes, self.stage.iterations)
+                found = Change(*event.with_room(model, moments, num_bytes, self.stage.iterations), state)
+                found = checked_change(f"stage {self.stage.name!r}: {type(event).__name__}.with_room", found)
+                model, moments = found.model, found.moments
             num_bytes = event.most_bytes(num_bytes, num, self.stage.iterations)
         self.state = dataclasses.replace(self.state, model=model, moments=moments)
 
