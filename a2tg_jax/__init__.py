@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     from a2tg_jax.events import StepEvent as StepEvent
     from a2tg_jax.events import Times as Times
     from a2tg_jax.events import event as event
+    from a2tg_jax.events import keep_rows as keep_rows
     from a2tg_jax.events import static as static
     from a2tg_jax.finish.compaction import loss_beside_renders as loss_beside_renders
     from a2tg_jax.finish.compaction import loss_on_views as loss_on_views
@@ -202,7 +203,17 @@ _NAMES = {
     "a2tg_jax.densify.pruning": ("Prune",),
     "a2tg_jax.densify.splitting": ("SplitByGradient",),
     "a2tg_jax.densify.view_dependence": ("AdaptDegrees",),
-    "a2tg_jax.events": ("Change", "Due", "EventInfo", "HostEvent", "StepEvent", "Times", "event", "static"),
+    "a2tg_jax.events": (
+        "Change",
+        "Due",
+        "EventInfo",
+        "HostEvent",
+        "StepEvent",
+        "Times",
+        "event",
+        "keep_rows",
+        "static",
+    ),
     "a2tg_jax.finish.compaction": ("loss_beside_renders", "loss_on_views", "measure_choices", "smallest_within"),
     "a2tg_jax.finish.polishing": ("polish",),
     "a2tg_jax.finish.shrinking": ("shrink_textures",),

@@ -166,6 +166,7 @@ class Upscale(UpscaleChoices, HostEvent):
         how = self._how_to_select(model.num_bytes, due)
         mask = select(averages[:num], sizes, proposed, **how)
         grown = np.where(mask[:, None], proposed, sizes)
+        unused = self._unused(sizes[mask], scales[:num][mask])
         if self.select == "budget" and due.index == due.count and (grown == proposed).all():
             left = how["budget_bytes"] - _bytes_between(sizes, grown)
             grown = self._with_the_rest(averages[:num], grown, scales[:num], left)
@@ -175,7 +176,17 @@ class Upscale(UpscaleChoices, HostEvent):
         rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(due.shapes), kept, present)
         due.shapes.add(shape_of(rebuilt.textures, rebuilt.layout))
         model = model.with_textures(rebuilt.textures, rebuilt.layout)
-        return Change(model, rebuilt.moments, self.init(model))
+        return Change(model, rebuilt.moments, self.init(model), unused=unused)
+
+    def _unused(self, sizes: np.ndarray, scales: np.ndarray) -> str | None:
+        """Return which choices about anisotropy that are not the defaults made no difference to textures that grow."""
+        names = [name for name in ("anisotropic", "k_a", "k_s") if getattr(self, name) != getattr(UpscaleChoices, name)]
+        thin = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, axes=self.axes)
+        round_ = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, anisotropic=False)
+        if not names or (thin != round_).any():
+            return None
+        told = " and ".join(f"{{{name}}}" for name in names)
+        return f"{told} made no difference, for no Gaussian whose texture grew was elongated and thin"
 
     def _with_the_rest(self, averages: np.ndarray, sizes: np.ndarray, scales: np.ndarray, left: float) -> np.ndarray:
         """Return the sizes after further upscalings if bytes are left after all textures took what they proposed.

@@ -17,8 +17,9 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import check_mask
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.spread_arrays import rows_moved
+from a2tg_jax.core.spread_arrays import mesh_of, on_host, placed_like, rows_moved
 from a2tg_jax.data import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
@@ -26,6 +27,8 @@ from a2tg_jax.rasterize.pixel import Statistic as Statistic
 from a2tg_jax.texture import Shape
 
 T = TypeVar("T")
+LEAST_LEFT = 2
+"""Smallest number of Gaussians that training needs."""
 
 
 def _as_it_is(tree: Any) -> Any:
@@ -130,6 +133,9 @@ class Change(NamedTuple):
     rows: np.ndarray | None = None
     """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved.
     Model, moments and state are those of the new order; what other events have gathered then follows."""
+    unused: str | None = None
+    """Options of an event on the host that made no difference this time, as a sentence with the event's fields in
+    braces; None: all did. If they made none in the whole stage, a warning says so."""
 
 
 def with_names(message: str, name_of: Callable[[str], str]) -> str:
@@ -243,8 +249,11 @@ class HostEvent(Event):
         raise NotImplementedError(f"{type(self).__name__} must say when it happens")
 
     def num_programs(self, num_iterations: int) -> int:
-        """Return the number of programs compiled because of it, about, for forecasts: one each time (host)."""
-        return len(self.iterations(num_iterations))
+        """Return the number of programs compiled because of it, about, for forecasts (host).
+
+        The default is one each time before the end of the stage. Override it if shapes stay (`keep_rows`).
+        """
+        return sum(1 <= iteration < num_iterations for iteration in self.iterations(num_iterations))
 
     def with_room(
         self, model: Model, moments: AdamState, num_bytes: float, num_iterations: int
@@ -317,6 +326,39 @@ def from_options(kind: type[T], options: Any, **others: Any) -> T:
     fields = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     shared = fields & {field.name for field in dataclasses.fields(options)} - set(others)
     return kind(**{name: getattr(options, name) for name in shared}, **others)
+
+
+def keep_rows(model: Model, moments: AdamState, state: Any, is_kept: Any) -> Change:
+    """Return the change by an event on the host that removes Gaussians, so that no step is compiled again (host).
+
+    All shapes stay: the rows of the Gaussians that are kept come first, in their order, and `Model.num_live` falls.
+
+    Args:
+      model: as given to `HostEvent.apply`.
+      moments: as given to `HostEvent.apply`.
+      state: of the event.
+      is_kept: mask of the Gaussians that stay, [num] bool for those that exist (`Model.num`), or [N] for all rows, such
+        as `model.gaussians.opacities > 0.01`.
+
+    Raises:
+      ValueError: if it is no such mask or keeps fewer than 2, or if Gaussians have degrees of their own or textures of
+        several sizes.
+    """
+    if model.appearance.has_degrees:
+        raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
+    num, rows = model.num, np.arange(model.gaussians.num, dtype=np.int32)
+    is_kept = on_host(is_kept)
+    check_mask("is_kept", is_kept, (len(rows) if is_kept.shape == rows.shape else num,))
+    is_kept = is_kept[:num]
+    if (num_kept := int(is_kept.sum())) < LEAST_LEFT:
+        raise ValueError(f"is_kept must keep at least {LEAST_LEFT} Gaussians; got {num_kept} of {num:,}")
+    rows[:num] = np.concatenate([np.flatnonzero(is_kept), np.flatnonzero(~is_kept)])
+    means = model.gaussians.means
+    moved: Any = jnp.asarray(rows) if mesh_of(means) is None else rows  # To the device once, or moved on the host.
+    moments = gather_moments(model, moments, moved)
+    left = placed_like(np.asarray(num_kept, np.int32), means)
+    model = dataclasses.replace(gather_rows(model, moved), num_live=left)
+    return Change(model, moments, state, rows=rows)
 
 
 def gather_rows(model: Model, rows: Any) -> Model:

@@ -84,6 +84,7 @@ def before_details(scene):
     return system, a2tg.fit_stage(scene, system, 0, progress=False).model
 
 
+@pytest.mark.filterwarnings("ignore:stage 'details'. .* has changed shapes 3 times")
 def test_details_have_their_room_before_they_come(scene, before_details, monkeypatch):
     """The second stage compiles one step for each capacity of the tile lists. Without room it compiles one after each
     event, and the model is the same."""

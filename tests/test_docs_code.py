@@ -81,6 +81,7 @@ def test_examples_run_and_learn():
     views = [a2tg.photometric_loss(names[model].render(names["cameras"][0]).color, names["photo"])
              for model in ("model", "trained")]  # fmt: skip
     assert views[1] < 0.9 * views[0]
+    assert 2 <= names["pruned"].model.num < 200 == names["result"].model.num
     assert names["gradient"].shape == (200, 5) and abs(names["gradient"]).max() > 0
 
 

@@ -78,6 +78,14 @@ def test_methods_of_a_cell_differ_in_what_their_names_say_only():
     assert starts == {jobs["2DGS*-MCMC, first stage"].key}, "the first stage is trained once"
 
 
+def test_anisotropy_acts_at_the_smoke_scale():
+    """Only a Gaussian that is elongated and thin gets a texture that is not square."""
+    grid = read_grid("ablation", "smoke")
+    scene = a2tg.synthetic_scene(num_views=4, width=104, height=78, num_points=500)
+    sizes = a2tg.fit(scene, grid.reference_job(grid.cells[0]).system, progress=False).model.layout.sizes
+    assert (sizes[:, 0] != sizes[:, 1]).sum() > 10
+
+
 @pytest.mark.parametrize("mb", [0.9, 1.504544, 20.0])
 @pytest.mark.parametrize("floats", [58, 85, 122, 1081])
 def test_equal_bytes_are_no_more_and_less_by_a_splat_at_most(mb, floats):

@@ -101,6 +101,9 @@ def test_rows_and_bytes_are_those_that_training_reaches():
     assert first.model_bytes == 232 * 66
     assert second.model_bytes == 232 * 66 + 16 * 66 * (0.5 + 0.5 * 16)
     assert (first.num_programs, second.num_programs) == (1, 3)
+    assert run_of(scene, system).num_programs == 4
+    larger = dataclasses.replace(scene, train=(*scene.train, *scene_of(48, 32).train))
+    assert run_of(larger, system).num_programs == 2 * 4  # Views of two sizes.
 
 
 def test_advice_for_splats_of_a_file_is_a_smaller_file():
@@ -186,7 +189,7 @@ def test_photographs_on_disk_take_what_is_read_ahead():
 
 
 def forecast_with(**sizes):
-    return RunForecast({"a-gaussians": Bytes(**sizes)}, 3e6, 600.0, ("densify.cap",))
+    return RunForecast({"a-gaussians": Bytes(**sizes)}, 3e6, 600.0, ("densify.cap",), num_programs=40)
 
 
 @pytest.mark.parametrize(
@@ -251,7 +254,8 @@ def test_what_is_told():
     told = forecast_with(program=0.5e9, photographs=1e9, model=2e6, pixels=0).told(8e9)
     assert "about 1.50 GB at the peak (a-gaussians: program 500 MB, photographs 1.00 GB, model 2.00 MB" in told
     assert "8.00 GB may be used" in told and "about 3.00 MB in the run folder" in told
-    assert "very roughly 5 min to 20 min" in told
+    assert "very roughly 5 min to 20 min of training" in told
+    assert ", and 2 min to 8 min of compiling 40 programs;" in told  # 3 to 12 s each.
     assert "time" not in dataclasses.replace(forecast_with(), seconds=0).told(8e9)
 
 
@@ -384,6 +388,15 @@ def test_the_pace_is_told_once_when_enough_was_timed():
     assert told(70) is None
     assert told(80, num_compiled=2) is None and told(90, num_compiled=2) is None
     assert told(600, num_compiled=2) == "22 ms an iteration, about 0:00:09 for the other 400, without compiling"
+
+
+def test_the_pace_counts_the_programs_ahead():
+    """950 iterations of 50 ms, and 39 programs of 10 s."""
+    seconds = iter([10.0, 12.0])
+    pace = Pace(0, 1000, lambda: next(seconds), may_grow=False)
+    pace.time(10, 1, 39, 10.0)
+    pace.time(50, 1, 39, 10.0)
+    assert pace.told(50) == "50 ms an iteration, about 0:07:18 for the other 950, with 39 programs to compile"
 
 
 def test_the_pace_does_not_speak_of_growth_where_there_is_none():

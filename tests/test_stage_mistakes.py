@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import pytest
 
 import a2tg_jax as a2tg
+from a2tg_jax.appearance import Shaped
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.training.corrections import Exposure
 from a2tg_jax.training.terms import Photometric, l1
@@ -119,6 +120,11 @@ class Correcting(Exposure):
 GIVEN = {
     "stage 'own': appearance must be an Appearance; got the class Plain: say Plain(…)": {"appearance": a2tg.Plain},
     "stage 'own': rates must be LearningRates; got float": {"rates": 0.1},
+    "stage 'own': params_rate must be the learning rate of the parameters of Shaped, such as 1e-2, or 0 if": {
+        "appearance": Shaped(),
+        "params_rate": None,
+    },
+    "stage 'own': params_rate must be the learning rate of the parameters of Textured": {"appearance": a2tg.Textured()},
     "stage 'own': iterations must be an integer; got '30'": {"iterations": "30"},
     "stage 'own': events must be a tuple or a list; got Noise: one of them stands in (…,)": {"events": a2tg.Noise()},
     "stage 'own': events[1] must be a StepEvent or a HostEvent; got the class Noise: say Noise(…)": {

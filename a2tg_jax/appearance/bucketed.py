@@ -77,6 +77,6 @@ class Bucketed(Appearance):
         """Return the one bucket of images of one size. Raise ValueError if there are several sizes."""
         if len(params.buckets) != 1:
             raise ValueError(
-                f"textures of {len(params.buckets)} sizes cannot change rows inside a step: densify before they grow"
+                f"textures of {len(params.buckets)} sizes cannot change rows: densify and prune before they grow"
             )
         return params.buckets

@@ -10,8 +10,8 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.data import View
-from a2tg_jax.densify.pruning import LEAST_LEFT, kept_first, pruning_times, shown_in
-from a2tg_jax.events import Change, Due, FieldError, HostEvent, event, static
+from a2tg_jax.densify.pruning import pruning_times, shown_in
+from a2tg_jax.events import LEAST_LEFT, Change, Due, FieldError, HostEvent, event, keep_rows, static
 from a2tg_jax.model import Model
 
 NEAREST = 0.02
@@ -73,7 +73,7 @@ class PruneFloaters(HostEvent):
                 stacklevel=2,
             )
             is_kept[:] = True
-        return kept_first(model, moments, state, is_kept)
+        return keep_rows(model, moments, state, is_kept)
 
 
 def are_near(means: np.ndarray, views: Sequence[View], near: np.ndarray) -> np.ndarray:

@@ -21,9 +21,9 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.display import counted
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.spread_arrays import mesh_of, on_host, placed_like
+from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.data import View, counted_pixels, views_by_kind
-from a2tg_jax.events import Change, Due, FieldError, HostEvent, Times, event, gather_moments, gather_rows, static
+from a2tg_jax.events import LEAST_LEFT, Change, Due, FieldError, HostEvent, Times, event, keep_rows, static
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import room_of_view
@@ -32,9 +32,6 @@ from a2tg_jax.rasterize.placement import everywhere
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
-
-LEAST_LEFT = 2
-"""Smallest number of Gaussians that training needs."""
 
 
 @event
@@ -72,7 +69,7 @@ class Prune(HostEvent):
         weights = due.agreed(blending_weights(model, due.views))
         is_kept = np.zeros(num, bool)
         is_kept[np.argsort(-weights[:num], kind="stable")[:left]] = True
-        return kept_first(model, moments, state, is_kept)
+        return keep_rows(model, moments, state, is_kept)
 
     def _num_left(self, num: int) -> int:
         if self.keep is not None:
@@ -207,21 +204,3 @@ def _weights(
     found, _ = jax.lax.scan(of_view, (nothing[:, 0], none), (cameras, counted))
     shown: tuple[Array, Array] = spread(settings.exchange, found)
     return shown
-
-
-def kept_first(model: Model, moments: AdamState, state: Any, is_kept: np.ndarray) -> Change:
-    """Return the change that leaves the marked ones [n] of the n Gaussians, in their order.
-
-    Raises:
-      ValueError: if Gaussians have degrees of their own.
-    """
-    if model.appearance.has_degrees:
-        raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
-    num, rows = model.num, np.arange(model.gaussians.num, dtype=np.int32)
-    rows[:num] = np.concatenate([np.flatnonzero(is_kept), np.flatnonzero(~is_kept)])
-    means = model.gaussians.means
-    moved: Any = jnp.asarray(rows) if mesh_of(means) is None else rows  # To the device once, or moved on the host.
-    moments = gather_moments(model, moments, moved)
-    left = placed_like(np.asarray(is_kept.sum(), np.int32), means)
-    model = dataclasses.replace(gather_rows(model, moved), num_live=left)
-    return Change(model, moments, state, rows=rows)

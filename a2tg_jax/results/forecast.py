@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import jax
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
-from a2tg_jax.core.display import in_bytes
+from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.data import Scene
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.host.cores import num_threads
@@ -41,6 +41,8 @@ PICTURE_PER_PIXEL = 2
 """Bytes on disk of each picture of a sheet."""
 ROUGHLY = 2.0
 """Factor by which the time may be shorter or longer."""
+PROGRAM_SECONDS = 6.0
+"""Time to compile a step on CPUs: 3 to 11 s on two cores, by system."""
 LONG = 1800
 """Seconds beyond which a forecast names a quicker way to train."""
 QUICK = "quick"
@@ -76,6 +78,8 @@ class RunForecast:
     """Names of the options that limit the number of Gaussians."""
     whole: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Bytes that one of several devices must have room for, by stage (`StageForecast.whole_bytes`)."""
+    num_programs: int = 0
+    """Steps that are compiled, as far as events say."""
     of_file: frozenset[str] = frozenset()
     """Names of the phases whose number of Gaussians is that of a file."""
 
@@ -93,10 +97,11 @@ class RunForecast:
             f"disk: about {in_bytes(self.disk_bytes)} in the run folder",
         ]
         if self.seconds:
-            cores = num_threads()
+            compiling = _between(PROGRAM_SECONDS * self.num_programs)
             lines.append(
-                f"time: very roughly {_between(self.seconds)} of training on {cores} core{'s' if cores > 1 else ''}; "
-                "compiling, often 10 to 30 s a stage, comes on top, and the first steps of each stage tell it better"
+                f"time: very roughly {_between(self.seconds)} of training on {counted(num_threads(), 'core')}, and "
+                f"{compiling} of compiling {counted(self.num_programs, 'program')}; the first steps of each stage tell "
+                "it better"
             )
         return "\n".join(lines)
 
@@ -176,7 +181,9 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     whole = {name: stage.whole_bytes for name, stage in stages.items()}
     of_file = {name for name in stages if num_given == stages[name].num_rows and plan.begins_like_main(name)}
     of_file |= {"evaluation"} if of_file == stages.keys() else set()
-    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits, whole, frozenset(of_file))
+    sizes = {view.picture.size for view in scene.train}
+    programs = len(sizes) * sum(stage.num_programs for stage in stages.values())
+    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits, whole, programs, frozenset(of_file))
 
 
 def quick_downscale(longest_side: int) -> int:

@@ -152,7 +152,7 @@ def growing_stage(
     iterations: int,
     events: tuple[Event, ...],
     appearance: Appearance = Plain(),  # noqa: B008 - frozen
-    params_rate: Any = 0.0,
+    params_rate: Any = None,
     name: str = "gaussians",
 ) -> Stage:
     """Return a first stage, in which the degree of spherical harmonics rises and floaters are pruned; it does not cool
@@ -177,7 +177,7 @@ def later_stage(
     appearance: Appearance,
     events: tuple[Event, ...],
     iterations: int,
-    params_rate: Any = 0.0,
+    params_rate: Any = None,
 ) -> Stage:
     """Return a second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
     return Stage(

@@ -17,7 +17,7 @@ import numpy as np
 
 from a2tg_jax.core.spread_arrays import mesh_of, on_host
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.events import Due, Event, HostEvent, StepEvent
+from a2tg_jax.events import Change, Due, Event, HostEvent, StepEvent
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.exchange import spread
 from a2tg_jax.rasterize.placement import asked_by_any, check_same, everywhere, gathered, of_first, readable
@@ -26,11 +26,12 @@ from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
 from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
+from a2tg_jax.training.effects import StageEffects
 from a2tg_jax.training.learning import LearningCheck
 from a2tg_jax.training.options import System
 from a2tg_jax.training.progress import ProgressBar
 from a2tg_jax.training.resume import check_resume, warn_of_uneven_rows
-from a2tg_jax.training.returned import check_change
+from a2tg_jax.training.returned import checked_change
 from a2tg_jax.training.room import Size, StageRoom
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.start import padded
@@ -145,6 +146,7 @@ class StageRun:
             small_budget=system.small_budget,
         )
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
+        self.effects = StageEffects(self.stage, system, len({view.picture.size for view in self.views}))
         self.room = StageRoom(self.stage, self.views, system.tile_size, self.exchange, self.session)
         self.on_log: OnLog | None = None
         """Called with each row of the history."""
@@ -158,7 +160,9 @@ class StageRun:
         num, num_bytes = model.num, float(model.num_bytes)
         for event, state in zip(self.stage.events, self.state.events, strict=True):
             if isinstance(event, HostEvent) and state is not None:
-                model, moments = event.with_room(model, moments, num_bytes, self.stage.iterations)
+                found = Change(*event.with_room(model, moments, num_bytes, self.stage.iterations), state)
+                found = checked_change(f"stage {self.stage.name!r}: {type(event).__name__}.with_room", found)
+                model, moments = found.model, found.moments
             num_bytes = event.most_bytes(num_bytes, num, self.stage.iterations)
         self.state = dataclasses.replace(self.state, model=model, moments=moments)
 
@@ -225,6 +229,7 @@ class StageRun:
         watch: Watch,
     ) -> None:
         iteration, end = int(self.state.iteration), self.stage.iterations
+        self.effects.warn_of_never()
         may_grow = any(event.most_gaussians is not None for event in self.stage.events)
         with ProgressBar(title or self.stage.name, iteration, end, is_shown=progress, may_grow=may_grow) as bar:
             while iteration < end:
@@ -234,7 +239,8 @@ class StageRun:
                     self._log(iteration, info)
                     self.learning.observe(iteration, float(info.psnr))
                     bar.update(info, self.history)
-                bar.tell_pace(iteration, self.num_compiled)
+                ahead = self.effects.programs_ahead(iteration)
+                bar.tell_pace(iteration, self.num_compiled, ahead, self.effects.seconds_a_program)
                 if iteration == stop:
                     self._host_events(iteration)
                 self.started += watch(self, is_stopped)
@@ -244,6 +250,7 @@ class StageRun:
                     on_checkpoint(self.checkpoint)
                 if is_asked:
                     raise Interrupted(self.checkpoint)
+        self.effects.warn_of_unused()
         if self.num_refused:
             advice = "; or ".join(self._told_by_events("refused"))
             warnings.warn(
@@ -309,10 +316,12 @@ class StageRun:
 
     def _launch(self, iteration: int) -> StepInfo:
         arguments, step = self.arguments(iteration), jitted_step()
-        num_compiled = step.num_compiled()
+        num_compiled, started = step.num_compiled(), time.perf_counter()
         info: StepInfo
         self.state, info = step(*arguments)
-        if step.num_compiled() > num_compiled:
+        is_compiled = step.num_compiled() > num_compiled
+        self.effects.launch(iteration, time.perf_counter() - started if is_compiled else None)
+        if is_compiled:
             self.num_compiled += 1
             self.session.after_compiling()
         return info
@@ -382,7 +391,8 @@ class StageRun:
         due, agreed = event.iterations(self.stage.iterations), functools.partial(of_first, self.exchange)
         told = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes, agreed)
         change = event.apply(told, self.state.model, self.state.moments, self.state.events[place])
-        check_change(f"stage {self.stage.name!r}: {type(event).__name__}.apply", change)
+        change = checked_change(f"stage {self.stage.name!r}: {type(event).__name__}.apply", change)
+        self.effects.apply(place, self.state, change)
         self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
         if change.rows is not None:
             self._move_rows(change.rows)

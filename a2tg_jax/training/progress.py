@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from tqdm import tqdm
 
-from a2tg_jax.core.display import in_bytes
+from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.host.bars import has_terminal, is_line_due
 from a2tg_jax.training.checkpoint import History
 from a2tg_jax.training.step import StepInfo
@@ -20,7 +20,7 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}
 
 
 class Pace:
-    """Time of an iteration without compilation, and forecasts of a stage's duration: early, and at a half."""
+    """Time of an iteration, and forecasts of a stage's duration: early, and at a half."""
 
     def __init__(self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, may_grow: bool = True):
         """Args:
@@ -33,15 +33,19 @@ class Pace:
         self._due = [first, (first + total) // 2]
         self._before: tuple[int, float, int] | None = None
         self._steps, self._seconds = 0, 0.0
+        self._ahead, self._seconds_a_program = 0, 0.0
 
-    def time(self, done: int, num_compiled: int) -> None:
+    def time(self, done: int, num_compiled: int, ahead: int = 0, seconds_a_program: float = 0.0) -> None:
         """Time the iterations since the last call, unless programs were compiled meanwhile.
 
         Args:
           done: iterations so far.
           num_compiled: programs compiled so far.
+          ahead: programs that will be compiled, about.
+          seconds_a_program: time of a compilation.
         """
         now = self._now()
+        self._ahead, self._seconds_a_program = ahead, seconds_a_program
         if self._before is not None and self._before[2] == num_compiled:
             self._steps += done - self._before[0]
             self._seconds += now - self._before[1]
@@ -57,13 +61,15 @@ class Pace:
         told = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration, about {left} for the other "
         self._due = [due for due in self._due[1:] if due > done]
         self._steps, self._seconds = 0, 0.0
-        return f"{told}{self._total - done:,}, without compiling{growing}"
+        compiling = f"with {counted(self._ahead, 'program')} to compile" if self._ahead else "without compiling"
+        return f"{told}{self._total - done:,}, {compiling}{growing}"
 
     def left(self, done: int) -> datetime.timedelta | None:
-        """Return the remaining time without compilation; None before a step was timed."""
+        """Return the remaining time, that of known compilations included; None before a step was timed."""
         if self._steps == 0:
             return None
-        return datetime.timedelta(seconds=round((self._total - done) * self._seconds / self._steps))
+        of_steps = (self._total - done) * self._seconds / self._steps
+        return datetime.timedelta(seconds=round(of_steps + self._ahead * self._seconds_a_program))
 
 
 class ProgressBar:
@@ -90,14 +96,12 @@ class ProgressBar:
     def __exit__(self, *_: object) -> None:
         self._bar.close()
 
-    def tell_pace(self, done: int, num_compiled: int) -> None:
+    def tell_pace(self, done: int, num_compiled: int, ahead: int = 0, seconds_a_program: float = 0.0) -> None:
         """Print a forecast if one is due, after a group of steps that were launched together.
 
-        Args:
-          done: iterations so far.
-          num_compiled: programs compiled so far.
+        Args: as of `Pace.time`.
         """
-        self._pace.time(done, num_compiled)
+        self._pace.time(done, num_compiled, ahead, seconds_a_program)
         told = self._pace.told(done)
         if told is not None and self._is_shown:
             self._bar.write(f"{self._title}: {told}")

@@ -1,5 +1,6 @@
 """Checks of what loss functions and events return, traced or not: kinds, shapes and dtypes only."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -23,15 +24,25 @@ def check_scalar(name: str, value: Any) -> None:
         raise ValueError(f"{name} must return a scalar, such as jnp.mean(…); got {described(value)}")
 
 
-def check_change(name: str, change: Any) -> None:
-    """Raise ValueError unless what an event returned is a change whose moments fit its model."""
+def checked_change(name: str, change: Any) -> Change:
+    """Return what an event returned, with the number of Gaussians that exist as an array.
+
+    Raises:
+      ValueError: unless it is a change whose moments fit its model.
+    """
     check_kind(f"{name}: the result", change, Change, "say Change(model, moments, state)")
     check_kind(f"{name}: model", change.model, Model)
     check_kind(f"{name}: moments", change.moments, AdamState)
     check_gaussians(change.model.gaussians, f"{name}: model.gaussians")
     floats = change.model.gaussians, change.model.params
     for field in ("mu", "nu"):
-        check_kept(f"{name}: moments.{field}", getattr(change.moments, field), floats)
+        try:
+            check_kept(f"{name}: moments.{field}", getattr(change.moments, field), floats)
+        except ValueError as error:
+            hint = "keep_rows(model, moments, state, is_kept) removes Gaussians from both"
+            raise ValueError(f"{error}, as in the model: {hint}") from None
+    checked: Change = change._replace(model=dataclasses.replace(change.model, num_live=change.model.live_count))
+    return checked
 
 
 def check_kept(name: str, found: Any, wanted: Any) -> None:

@@ -61,8 +61,9 @@ class Stage:
     """Learning rates of the Gaussians."""
     iterations: int
     """Views seen, times the batch size."""
-    params_rate: Any = 0.0
-    """Learning rate of the appearance: a number, or the argument of `Appearance.rates`."""
+    params_rate: Any = None
+    """Learning rate of the appearance's parameters: a number, or the argument of `Appearance.rates`; 0: they stay as
+    they are. None: the appearance has none."""
     corrections: tuple[Correction, ...] = ()
     """Corrections of each training view, such as exposures and poses."""
     raises_sh_degree: bool = dataclasses.field(default=False, metadata={"static": True})
@@ -141,6 +142,11 @@ class Stage:
             check_kind(f"{where} {name}", several, (tuple, list), "one of them stands in (…,)")
             for index, one in enumerate(several):
                 _check_part(f"{where} {name}[{index}]", one, PARTS.get(name, ()))
+        if self.params_rate is None and jax.tree.leaves(self.appearance.allocate(jax.random.key(0), no_rows(2, 1))[0]):
+            raise ValueError(
+                f"{where} params_rate must be the learning rate of the parameters of {type(self.appearance).__name__}, "
+                "such as 1e-2, or 0 if they are to stay as they are; got none"
+            )
         if not self.losses:
             raise ValueError(f"{where} losses must have a term, such as Term(function)")
 

@@ -28,7 +28,7 @@ from a2tg_jax.training.batch_gradients import BatchGradients, batch_gradients, d
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import CorrectionState, corrected_camera, initial_corrections, rows_of, updated
 from a2tg_jax.training.jitter import jittered
-from a2tg_jax.training.returned import check_change, check_kept
+from a2tg_jax.training.returned import check_kept, checked_change
 from a2tg_jax.training.stage import Background, Clock, Stage
 
 FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE, EXPLODED = range(5)
@@ -228,7 +228,7 @@ def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array,
     """
     model = state.model
     of_gaussians = stage.rates.of_gaussians(stage.rates.of_means(rate_of_means, model), model.gaussians.sh_degree)
-    of_params = stage.appearance.rates(stage.params_rate, model.params)
+    of_params = stage.appearance.rates(0.0 if stage.params_rate is None else stage.params_rate, model.params)
     rates = stage.rates.cooled((of_gaussians, of_params), progress)
     return adam_update((model.gaussians, model.params), grads, state.moments, rates)
 
@@ -259,8 +259,8 @@ def _applied(
     stage_name: str, event: StepEvent, now: Now, model: Model, moments: AdamState, state: Any
 ) -> tuple[Model, AdamState, Any, EventInfo]:
     """Return the change by an event, which must keep all shapes."""
-    change, name = event.apply(now, model, moments, state), f"stage {stage_name!r}: {type(event).__name__}.apply"
-    check_change(name, change)
+    name = f"stage {stage_name!r}: {type(event).__name__}.apply"
+    change = checked_change(name, event.apply(now, model, moments, state))
     check_kept(f"{name}: model", change.model, model)
     check_kept(f"{name}: state", change.state, state)
     info = EventInfo(jnp.asarray(change.info.is_possible), jnp.asarray(change.info.num_refused, jnp.int32))

@@ -1,0 +1,203 @@
+"""Events of one's own on the host: rows that they remove, programs that they cause, and what made no difference."""
+
+import dataclasses
+import re
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_model_rows import NUM, rows_of, some_model
+from toy_system import Rings
+
+import a2tg_jax as a2tg
+from a2tg_jax.core.optim import adam_init
+from a2tg_jax.results.forecast import forecast_run
+from a2tg_jax.results.plan import plan_run
+from a2tg_jax.training.effects import StageEffects
+from a2tg_jax.training.step import initial_state, jitted_step
+from a2tg_jax.training.terms import l1
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=50)
+
+
+@a2tg.event
+class PruneFaint(a2tg.HostEvent):
+    """Removes the faintest five of the Gaussians every fourth iteration, in one of several ways."""
+
+    how: str = a2tg.static(default="rows")
+    last: int = a2tg.static(default=20)
+
+    def iterations(self, num_iterations):
+        return tuple(range(4, self.last + 1, 4))
+
+    def apply(self, due, model, moments, state):
+        opacities = np.asarray(model.gaussians.opacities)[: model.num]
+        is_kept = opacities > np.sort(opacities)[4]
+        if self.how == "rows":
+            return a2tg.keep_rows(model, moments, state, is_kept)
+        if self.how == "all":
+            return a2tg.keep_rows(model, moments, state, is_kept | True)
+        fewer = model[is_kept]
+        if self.how == "model":
+            return a2tg.Change(fewer, moments, state)
+        chosen = jax.tree.map(lambda x: x[: model.num][is_kept] if x.ndim else x, moments)
+        return a2tg.Change(fewer, chosen, state)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Own(a2tg.System):
+    """One stage with the events given."""
+
+    events: Any = ()
+    iterations: int = 20
+    appearance: Any = a2tg.Plain()  # noqa: RUF009 - frozen
+    params_rate: Any = None
+
+    def stages(self):
+        losses = (a2tg.Term(l1),)
+        return (a2tg.Stage("own", self.appearance, self.events, losses, self.rates, self.iterations, self.params_rate),)
+
+
+def fitted(scene, *events, **options):
+    return a2tg.fit(scene, Own(events=events, sh_degree=0, **options), progress=False)
+
+
+def test_rows_that_stay_come_first_at_the_same_shapes():
+    """Gaussians, appearance and moments; the mask may have a place for each row, even for those that do not exist."""
+    model = some_model("shaped")
+    moments = adam_init((model.gaussians, model.params))
+    moments = dataclasses.replace(moments, mu=(model.gaussians, model.params))
+    is_kept = np.arange(NUM) % 3 != 1
+    change = a2tg.keep_rows(model, moments, (), is_kept)
+    wanted = [row for row, kept in zip(rows_of(model), is_kept, strict=True) if kept]
+    assert change.model.num == len(wanted) == 8
+    assert jax.tree.map(jnp.shape, change.model) == jax.tree.map(jnp.shape, model)
+    np.testing.assert_array_equal(rows_of(change.model), wanted)
+    gaussians, params = change.moments.mu
+    moved = dataclasses.replace(change.model, gaussians=gaussians, params=params)
+    np.testing.assert_array_equal(rows_of(moved), wanted)
+    padded = a2tg.keep_rows(model, moments, (), jnp.asarray([*is_kept, True, True]))
+    np.testing.assert_array_equal(padded.rows, change.rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "is_kept", "message"),
+    [
+        ("plain", np.ones(NUM - 1, bool), r"is_kept must be \[12\]; got \[11\]"),
+        ("plain", np.ones(NUM), "is_kept must be bools; got float64"),
+        ("plain", True, r"is_kept must be \[12\]; got \[\]"),
+        ("plain", np.arange(NUM) == 3, "is_kept must keep at least 2 Gaussians; got 1 of 12"),
+        ("banded", np.ones(NUM, bool), "prune before they have"),
+        ("textured", np.arange(NUM) < 5, "textures of 3 sizes cannot change rows: densify and prune before they grow"),
+    ],
+)
+def test_rows_that_cannot_be_removed_are_refused(name, is_kept, message):
+    model = some_model(name)
+    with pytest.raises(ValueError, match=message):
+        a2tg.keep_rows(model, adam_init((model.gaussians, model.params)), (), is_kept)
+
+
+def test_an_event_that_removes_rows_compiles_nothing(scene):
+    """With rows of other shapes each time is a program, which the third time tells; the model is the same."""
+
+    def trained(how):
+        before = jitted_step().num_compiled()
+        result = fitted(scene, PruneFaint(how), iterations=22)
+        assert result.num_regrown == 0
+        return result, jitted_step().num_compiled() - before
+
+    kept, num_kept = trained("rows")
+    assert num_kept == 1 and kept.model.num == 50 - 5 * 5
+    message = (
+        r"stage 'own': PruneFaint has changed shapes 3 times, .* it happens 2 times more: keep shapes, by keep_rows\("
+    )
+    with pytest.warns(UserWarning, match=message) as told:
+        cut, num_cut = trained("moments")
+    assert len(told) == 1 and num_cut == 6
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), kept.model, cut.model)
+
+
+def test_moments_of_other_rows_are_refused_with_what_to_say(scene):
+    with pytest.raises(ValueError, match=r"moments.mu\[0\].means must be \[45, 3\]; got \[50, 3\].*: keep_rows\(model"):
+        fitted(scene, PruneFaint("model"))
+
+
+def test_programs_are_counted_before_and_while_it_trains(scene):
+    """An event is believed to cause a program each time until it has happened, and then what it did."""
+    event = PruneFaint(last=156)
+    system = Own(events=(event,), sh_degree=0, iterations=160)
+    assert forecast_run(scene, plan_run({"a": system})).num_programs == 40
+    stage = system.stages()[0]
+    state = initial_state(stage, dataclasses.replace(some_model("plain"), num_live=jnp.int32(NUM + 2)))
+    arguments = state.model, state.moments, ()
+    for how, ahead in (("rows", 0), ("moments", 38)):
+        effects = StageEffects(stage, system, num_sizes=1)
+        effects.launch(1, 10.0)
+        assert effects.programs_ahead(1) == effects.programs_ahead(4) == 39
+        effects.apply(0, state, PruneFaint(how).apply(a2tg.Due(), *arguments))
+        effects.launch(5, None if how == "rows" else 14.0)
+        assert effects.programs_ahead(5) == ahead
+    assert effects.seconds_a_program == 12.0
+    assert StageEffects(stage, system, num_sizes=3).programs_ahead(1) == 3 * 39
+
+
+@a2tg.event
+class Late(a2tg.StepEvent):
+    def times(self, num_iterations):
+        return a2tg.Times(first=50, last=100, every=10)
+
+    def apply(self, now, model, moments, state):
+        return a2tg.Change(model, moments, state)
+
+
+@a2tg.event
+class Early(PruneFaint):
+    def iterations(self, num_iterations):
+        return (-1, 0)
+
+
+def test_events_without_effect_are_told(scene):
+    """Each once: those that never happen before the stage, those that changed nothing at its end."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fitted(scene, PruneFaint("all"), Late(), Early())
+    assert [str(one.message) for one in caught] == [
+        "stage 'own': Late never happens, for it is first due at iteration 50 of 20",
+        "stage 'own': Early never happens, for it is first due at iteration 0 of 20",
+        "stage 'own': PruneFaint changed nothing, though it happened 5 times",
+    ]
+
+
+@pytest.mark.parametrize("given", [{"k_a": 3.0}, {"anisotropic": False}, {}])
+def test_choices_about_anisotropy_that_make_no_difference_are_told(scene, given):
+    """Splats of the built-in scene are round after so few iterations. Defaults are nobody's choice."""
+    system = a2tg.A2tg(
+        stage2_iterations=8, initial_gaussians=50, texture=a2tg.TextureConfig(upscale_at=(0.5,), **given)
+    )
+    start = a2tg.Model(a2tg.init_from_points(scene.points, scene.colors))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        a2tg.training.fit_stage(scene, system, 1, start, progress=False)
+    told = [f"stage 'textures': texture.{name} made no difference, for no Gaussian whose" for name in given]
+    assert [str(one.message)[: len(told[0])] for one in caught] == told
+
+
+def test_choices_about_anisotropy_that_act_are_not_told():
+    thin, square = a2tg.Upscale(k_a=3.0), np.ones((2, 2), int)
+    assert thin._unused(square, np.array([[0.02, 0.005], [0.02, 0.02]])) is None
+    assert re.match(r"\{k_a\} made no difference", thin._unused(square, np.array([[0.02, 0.01], [0.02, 0.02]])))
+
+
+def test_parameters_learn_by_the_rate_that_is_given(scene):
+    """Without one a stage is refused; 0 leaves them as they are."""
+    with pytest.raises(ValueError, match="params_rate must be the learning rate of the parameters of Rings"):
+        fitted(scene, appearance=Rings())
+    still, learned = (fitted(scene, appearance=Rings(), params_rate=rate, iterations=3).model for rate in (0, 1e-2))
+    np.testing.assert_array_equal(still.params, np.tile([0, 0, 0, 2.0], (50, 1)))
+    assert np.abs(learned.params[:, :3]).max() > 1e-2
