@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
+from a2tg_jax.core.display import counted
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
@@ -170,8 +171,9 @@ def _usable(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud
     is_usable[is_usable] = _are_somewhere(transform.apply(cloud.points[is_usable]))
     if is_usable.all():
         return cloud
-    message = f"{source}: {np.count_nonzero(~is_usable)} points are not finite, or beyond ±{LARGEST_COORDINATE:g}"
-    warnings.warn(f"{message}; they are left out", stacklevel=4)
+    left_out = counted(int(np.count_nonzero(~is_usable)), "point")
+    message = f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}"
+    warnings.warn(message, stacklevel=4)
     return PointCloud(cloud.points[is_usable], cloud.colors[is_usable])
 
 
