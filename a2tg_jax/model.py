@@ -16,7 +16,7 @@ from a2tg_jax.appearance.sh_bands import BandLayout, Bands, dense_sh, split_sh
 from a2tg_jax.appearance.stored import check_given
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import check_kind, short_repr
+from a2tg_jax.core.checks import check_kind, check_unmasked, short_repr
 from a2tg_jax.core.display import counted, html_table, in_bytes, short_tuple_repr
 from a2tg_jax.core.forks import check_process
 from a2tg_jax.core.gaussians import Gaussians
@@ -25,7 +25,7 @@ from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.render import render_appearance, with_features
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.texture import AtlasLayout, Textures, check_textures
 
 SAME_PLACE = 1e-5
 """Largest distance of two models' origins that are taken for one."""
@@ -75,6 +75,8 @@ class Model:
         """Appearance rule for the renderer."""
         check_process()
         check_given(self.appearance, self.params)
+        if isinstance(self.params, Textures):
+            check_textures(self.params, self.layout, self.gaussians.num, "model.params")
         return PlainRule() if self.gaussians.num == 0 else self.appearance.rule(self.params, self.layout)
 
     @property
@@ -267,6 +269,7 @@ def _indices(rows: Any, num: int) -> np.ndarray:
             raise ValueError(f"rows must choose among {num} Gaussians; got {rows}")
         end = f"{rows + 1}" if rows != -1 else ""
         raise ValueError(f"rows must be a mask [{num}], indices or a slice; for one Gaussian say model[{rows}:{end}]")
+    check_unmasked("rows", rows)
     chosen = rows if isinstance(rows, slice) else np.asarray(rows)
     if not isinstance(chosen, slice) and (chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "biu")):
         raise ValueError(f"rows must be a mask [{num}], indices or a slice; got {chosen.dtype} {[*chosen.shape]}")

@@ -7,13 +7,14 @@ which `plan_render` fills in.
 import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, AppearanceRule, Features, PlainRule, appearance_for, check_rule
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_floats, check_kind, check_shape, dtype_of, plain
+from a2tg_jax.core.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.overflow import OverflowWatch
@@ -73,7 +74,7 @@ def render_appearance(
     background = (0,) * rule.num_colors if background is None else background
     check_background(background, rule.num_colors)
     if num_live is not None:
-        check_shape("num_live", num_live, ())
+        check_live(num_live, gaussians.num)
     planned = with_capacity(settings, gaussians, camera, rule, num_live)
     background = jnp.asarray(background, gaussians.means.dtype)
     output, _ = _jitted_render()(gaussians, camera, rule, background, planned, num_live=num_live)
@@ -109,8 +110,17 @@ def with_features(rule: AppearanceRule, features: Any, gaussians: Gaussians) -> 
     return Features(rule, jnp.asarray(features))
 
 
+def check_live(num_live: Any, num: int) -> None:
+    """Raise ValueError unless a number of live rows is an integer, up to `num` where it has a value."""
+    check_shape("num_live", num_live, ())
+    is_known = not isinstance(num_live, jax.core.Tracer)
+    if not jnp.issubdtype(dtype_of(num_live), jnp.integer) or (is_known and not 0 <= int(num_live) <= num):
+        raise ValueError(f"num_live must be an integer, 0 to {num}; got {num_live}")
+
+
 def check_background(background: Any, num_colors: int = 3) -> None:
     """Raise ValueError unless the background is one colour, of `num_colors` numbers."""
+    check_unmasked("background", background)
     if np.ndim(background) == 3:
         raise ValueError(
             f"background must be one colour [3]; got {[*np.shape(background)]}. To put an image behind the splats, "

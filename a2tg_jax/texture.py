@@ -23,6 +23,7 @@ from a2tg_jax.core.checks import (
     check_kind,
     check_number,
     check_shape,
+    check_unmasked,
     make_plain,
     plain,
     short_repr,
@@ -46,7 +47,10 @@ class Textures:
     def __post_init__(self) -> None:
         """Convert lists and NumPy's special arrays to plain arrays."""
         if type(self.buckets) in (list, tuple):  # JAX puts other leaves here, such as PartitionSpec.
-            buckets = (plain(f"textures.buckets[{index}]", bucket) for index, bucket in enumerate(self.buckets))
+            buckets = (
+                bucket if isinstance(bucket, tuple) else plain(f"textures.buckets[{index}]", bucket)
+                for index, bucket in enumerate(self.buckets)
+            )
             object.__setattr__(self, "buckets", tuple(buckets))
 
     def __repr__(self) -> str:
@@ -115,10 +119,13 @@ def check_textures(textures: Textures, layout: AtlasLayout, num: int | None = No
         counts = f"{len(textures.buckets)} buckets, and the layout {len(layout.resolutions)} sizes"
         raise ValueError(f"{name} must have one bucket for each size of the layout; they have {counts}")
     for index, (bucket, size) in enumerate(zip(textures.buckets, layout.resolutions, strict=True)):
+        check_array(f"{name}.buckets[{index}]", bucket)
         check_floats(f"{name}.buckets[{index}]", bucket, ("capacity", *size, 4))
     for field in ("bucket", "row"):
         if not jnp.issubdtype(getattr(layout, field).dtype, jnp.integer):
             raise ValueError(f"layout.{field} must be integers; got {getattr(layout, field).dtype}")
+    if layout.num and not any(len(bucket) for bucket in textures.buckets):
+        raise ValueError(f"{name} must have a row for each of {layout.num} Gaussians; all buckets are empty")
     if layout.num and not any(isinstance(leaf, jax.core.Tracer) for leaf in (layout.bucket, layout.row)):
         _check_ranges(textures, layout)
 
@@ -138,6 +145,22 @@ def _check_ranges(textures: Textures, layout: AtlasLayout) -> None:
             f"{bucket[first]}; got {row[first]} for Gaussian {first} (of {outside.size} rows out of range): "
             "is this the layout of other textures?"
         )
+
+
+def nearest_places(textures: Textures, layout: AtlasLayout) -> AtlasLayout:
+    """Return the layout with int32 buckets and rows, each moved to the nearest one that exists; traced.
+
+    `check_textures` refuses such layouts where it can read them. A traced one has no values to check.
+    """
+    bucket = jnp.clip(_as_int32(layout.bucket), 0, len(textures.buckets) - 1)
+    last_rows = jnp.asarray([max(len(texels) - 1, 0) for texels in textures.buckets], jnp.int32)
+    return dataclasses.replace(layout, bucket=bucket, row=jnp.clip(_as_int32(layout.row), 0, last_rows[bucket]))
+
+
+def _as_int32(index: Array) -> Array:
+    """Return integers of any type as int32, clipped to its range."""
+    wanted, own = np.iinfo(np.int32), np.iinfo(index.dtype)
+    return jnp.clip(index, max(wanted.min, own.min), min(wanted.max, own.max)).astype(jnp.int32)
 
 
 def check_places(textures: Textures, layout: AtlasLayout) -> None:
@@ -217,6 +240,7 @@ def checked_sizes(sizes: ArrayLike, name: str = "sizes") -> np.ndarray:
     """
     if isinstance(sizes, Textures | AtlasLayout):
         raise ValueError(f"{name} must be integers [N, 2]; got {type(sizes).__name__}: say layout.sizes")
+    check_unmasked(name, sizes)
     sizes = np.asarray(sizes)
     if sizes.ndim != 2 or sizes.shape[1] != 2 or not np.issubdtype(sizes.dtype, np.integer):
         raise ValueError(f"{name} must be integers [N, 2] as (Tv, Tu); got {sizes.dtype} {sizes.shape}")
@@ -271,7 +295,7 @@ def textures_from_arrays(arrays: Sequence[ArrayLike]) -> tuple[Textures, AtlasLa
     Raises:
       ValueError: if an array is not floats [Tv, Tu, 4] with sides of 1 to 16, naming it.
     """
-    given = [np.asarray(array) for array in arrays]
+    given = [np.asarray(plain(f"texture {index}", array)) for index, array in enumerate(arrays)]
     for index, array in enumerate(given):
         if array.ndim != 3 or array.shape[2] != 4:
             raise ValueError(f"texture {index} must be [Tv, Tu, 4]; got {array.shape}")

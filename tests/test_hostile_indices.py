@@ -13,7 +13,7 @@ import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import TextureOptions, textured_rule
+from a2tg_jax.appearance import Billboards, TextureOptions, textured_rule
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.rasterize import compositor as compositors
 from a2tg_jax.rasterize.kernels.native import composite as native
@@ -173,3 +173,54 @@ def test_regions_need_a_row_for_each_gaussian():
     gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
     with pytest.raises(ValueError, match=r"regions\.first \[N\] of N = 50 gaussians; TexturedRule gave \(9,\)"):
         a2tg.render_appearance(gaussians, camera, short)
+
+
+def test_pictures_with_rows_out_of_range():
+    """Refused eagerly, the nearest picture under jit, as with textures."""
+    gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
+    appearance = Billboards(side=4)
+    params, layout = appearance.allocate(jax.random.key(0), gaussians)
+    noise = jnp.asarray(np.random.default_rng(0).uniform(size=(len(params.buckets[0]), 4, 4, 4)), jnp.float32)
+    params = a2tg.Textures((noise,))
+    stray = dataclasses.replace(layout, row=jnp.full(NUM, 2**30, jnp.int32))
+    with pytest.raises(ValueError, match=r"layout\.row must be below the number"):
+        a2tg.Model(gaussians, params, stray, appearance=appearance).render(camera)
+
+    def drawn(compositor, layout):
+        settings = a2tg.RenderSettings(compositor=compositor, capacity=4096)
+        model = a2tg.Model(gaussians, params, layout, appearance=appearance)
+        return jax.jit(lambda model: model.render(camera, settings=settings).color)(model)
+
+    last = dataclasses.replace(layout, row=jnp.full(NUM, len(noise) - 1, jnp.int32))
+    np.testing.assert_array_equal(drawn("native", stray), drawn("native", last))
+    np.testing.assert_allclose(drawn("native", stray), drawn("xla", stray), atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.uint8, np.int16, np.uint32])
+def test_layouts_of_any_integers(dtype, by_xla):
+    render, most = rendered("native"), np.iinfo(dtype).max
+    row = jnp.asarray(np.where(np.arange(NUM) % 2, np.asarray(LAYOUT.row), most).astype(dtype))
+    value, _ = render(TEXTURES, dataclasses.replace(LAYOUT, row=row))
+    as_int32 = np.where(np.arange(NUM) % 2, np.asarray(LAYOUT.row), min(most, LIMITS.max)).astype(np.int32)
+    np.testing.assert_array_equal(value, render(TEXTURES, dataclasses.replace(LAYOUT, row=jnp.asarray(as_int32)))[0])
+    np.testing.assert_allclose(value, by_xla(TEXTURES, dataclasses.replace(LAYOUT, row=row))[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_compositors_agree_on_regions_of_any_integers(seed):
+    rng = np.random.default_rng(seed)
+    _, _, rule, _, lists = view_of("native")
+    regions = TextureRegion(*(stray_numbers(rng, np.asarray(numbers)) for numbers in rule.regions))
+    found, wanted = (composited(name, regions, lists) for name in ("native", "xla"))
+    np.testing.assert_allclose(found[0], wanted[0], rtol=1e-3)
+    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        # Textures of a thousand texels along an axis have slopes that turn rounding into another pixel at 1/255.
+        is_same = np.isclose(own, other, rtol=1e-3, atol=1e-3 * float(jnp.abs(other).max(initial=0)))
+        assert not is_same.size or is_same.mean() > 0.97
+
+
+@pytest.mark.parametrize("num_live", [-1, NUM + 1, 2.5])
+def test_a_number_of_live_rows_that_there_are_not(num_live):
+    model = a2tg.Model(as_gaussians(SCENE, "float32"), num_live=num_live)
+    with pytest.raises(ValueError, match=f"num_live must be an integer, 0 to {NUM}; got {num_live}"):
+        model.render(as_camera(SCENE, "float32"))

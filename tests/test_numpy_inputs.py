@@ -10,6 +10,17 @@ from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 import a2tg_jax as a2tg
 
+
+class Tensor:
+    """An array of another library."""
+
+    def __init__(self, values):
+        self.values, self.shape, self.dtype = values, values.shape, str(values.dtype)
+
+    def __array__(self, dtype=None, copy=None):
+        return np.asarray(self.values, dtype)
+
+
 SCENE = draw_scene(1, num=20)
 GAUSSIANS, CAMERA = (jax.tree.map(np.asarray, make(SCENE, "float32")) for make in (as_gaussians, as_camera))
 TEXTURES, LAYOUT = jax.tree.map(np.asarray, as_textures(SCENE, "float32"))
@@ -20,6 +31,7 @@ KINDS = {
     "big-endian": lambda x: x.astype(x.dtype.newbyteorder(">")),
     "Fortran": np.asfortranarray,
     "read-only": lambda x: np.broadcast_to(x, x.shape),
+    "other library": lambda x: Tensor(x),
 }
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
@@ -82,6 +94,12 @@ def masked(x):
         ("image has masked entries: ", lambda: a2tg.photometric_loss(masked(IMAGE), IMAGE)),
         ("target has masked entries: ", lambda: a2tg.psnr(IMAGE, masked(IMAGE))),
         ("points has masked entries: ", lambda: a2tg.init_from_points(masked(IMAGE[0]), IMAGE[0])),
+        ("mask has masked entries: ", lambda: a2tg.psnr(IMAGE, IMAGE, masked(IMAGE[..., 0] > 0.5))),
+        ("background has masked entries: ", lambda: image(background=masked(IMAGE[0, 0]))),
+        ("texture 0 has masked entries: ", lambda: a2tg.textures_from_arrays([masked(IMAGE[:2, :4])])),
+        ("rows has masked entries: ", lambda: a2tg.Model(GAUSSIANS)[masked(np.arange(3))]),
+        ("points has masked entries: ", lambda: a2tg.scene_from_arrays(
+            [np.zeros((30, 40, 3), np.uint8)] * 3, np.tile(np.eye(4), (3, 1, 1)), np.eye(3), masked(IMAGE[0]))),
         ("gaussians.means must be an array; got a list whose rows", lambda: a2tg.Gaussians([[0, 0], [1]], *[0] * 4)),
         ("gaussians.quats must be an array; got tuple: use jnp.asarray", lambda: image(
             dataclasses.replace(GAUSSIANS, quats=tuple(map(tuple, GAUSSIANS.quats))))),

@@ -23,7 +23,7 @@ from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_divide
-from a2tg_jax.texture import MAX_SIDE, AtlasLayout, Textures, allocate_textures
+from a2tg_jax.texture import MAX_SIDE, AtlasLayout, Textures, allocate_textures, nearest_places
 
 INITIAL_PEAK, INITIAL_SIGMA = 0.5, 0.3
 """Peak and σ, in units of u, of the initial alpha picture; it falls to an invisible 0.002 at the border."""
@@ -115,6 +115,7 @@ class Billboards(Bucketed):
 
     def rule(self, params: Textures, layout: AtlasLayout) -> BillboardRule:
         (bucket,) = self.only(params)
+        layout = nearest_places(params, layout)
         shown = jnp.concatenate([jax.nn.sigmoid(bucket[..., :3]), bucket[..., 3:]], axis=-1)
         peaks = jax.lax.stop_gradient(jnp.max(bucket[..., 3], axis=(1, 2)))[layout.row]
         first = layout.row * jnp.int32(self.side**2)

@@ -19,7 +19,7 @@ from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual, gaussian_
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import within
-from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, allocate_textures
+from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, allocate_textures, nearest_places
 
 EXTENT = 3.0
 """Half the side of a texture, in standard deviations."""
@@ -69,7 +69,7 @@ def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptio
 
     An empty texture has a region of no texels and changes nothing. Buckets and rows out of range are clamped.
     """
-    layout = _clamped(layout, textures)
+    layout = nearest_places(textures, layout)
     textures = shown_textures(textures, layout, options)
     resolutions = [bucket.shape[1:3] for bucket in textures.buckets]
     areas = [height * width for height, width in resolutions]
@@ -88,16 +88,6 @@ def textured_rule(textures: Textures, layout: AtlasLayout, options: TextureOptio
         peaks=jnp.maximum(peaks, 1.0) if options.outside == "identity" else peaks,
         options=options,
     )
-
-
-def _clamped(layout: AtlasLayout, textures: Textures) -> AtlasLayout:
-    """Return the layout with each bucket and row moved to the nearest one that exists.
-
-    `check_textures` refuses such layouts where it can read them. A traced one has no values to check.
-    """
-    bucket = jnp.clip(layout.bucket, 0, len(textures.buckets) - 1)
-    last_rows = jnp.asarray([max(len(texels) - 1, 0) for texels in textures.buckets], jnp.int32)
-    return dataclasses.replace(layout, bucket=bucket, row=jnp.clip(layout.row, 0, last_rows[bucket]))
 
 
 def shown_textures(textures: Textures, layout: AtlasLayout, options: TextureOptions) -> Textures:

@@ -26,6 +26,14 @@ class TextureRegion(NamedTuple):
     """Width in texels; 0 without a texture."""
 
 
+def within_texels(regions: TextureRegion, num_texels: int) -> TextureRegion:
+    """Return regions moved and cut so that all their texels are among `num_texels`; kernels do not check them."""
+    height = jnp.where(regions.width > 0, jnp.clip(regions.height, 0, num_texels), 0)
+    width = jnp.where(height > 0, jnp.clip(regions.width, 0, num_texels // jnp.maximum(height, 1)), 0)
+    first = jnp.clip(regions.first, 0, num_texels - height * width)
+    return TextureRegion(*(numbers.astype(jnp.int32) for numbers in (first, height, width)))
+
+
 class Corner(NamedTuple):
     """One of the four texels around (x, y)."""
 

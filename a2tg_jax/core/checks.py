@@ -111,18 +111,25 @@ def plain(name: str, value: Any, dtype: Any = None) -> Any:
     Raises:
       ValueError: if an entry is masked, or the rows of a list differ in length.
     """
+    check_unmasked(name, value)
     if isinstance(value, np.ma.MaskedArray):
-        if np.ma.is_masked(value):
-            raise ValueError(f"{name} has masked entries: replace them, as in array.filled(0), or drop their rows")
         value = np.ma.getdata(value)
-    if type(value) is list and _holds_numbers(value):
+    if type(value) in (list, tuple) and _holds_numbers(value):
         try:
             value = np.asarray(value, jnp.result_type(float) if dtype is None else dtype)
         except ValueError:
             raise ValueError(f"{name} must be an array; got a list whose rows differ in length") from None
+    if hasattr(value, "__array__") and not isinstance(value, np.ndarray | np.generic | jax.Array):
+        value = np.asarray(value)  # an array of another library
     if isinstance(value, np.ndarray) and not value.dtype.isnative:
         value = value.astype(value.dtype.newbyteorder("="))
     return value
+
+
+def check_unmasked(name: str, value: Any) -> None:
+    """Raise ValueError if a value is a masked array with masked entries, which would be read as if they were not."""
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+        raise ValueError(f"{name} has masked entries: replace them, as in array.filled(0), or drop their rows")
 
 
 def make_plain(instance: Any, name: str, *fields: str, dtype: Any = None) -> None:
@@ -130,6 +137,8 @@ def make_plain(instance: Any, name: str, *fields: str, dtype: Any = None) -> Non
     values = {field: getattr(instance, field) for field in fields}
     dtypes = [value.dtype for value in values.values() if hasattr(value, "dtype")]
     for field, value in values.items():
+        if type(value) is tuple:  # Trees of shapes have tuples in place of arrays.
+            continue
         changed = plain(f"{name}.{field}", value, dtype or next(iter(dtypes), None))
         if changed is not value:
             object.__setattr__(instance, field, changed)

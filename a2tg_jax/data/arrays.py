@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.core.capture import nearest_point
-from a2tg_jax.core.checks import check_kind, check_shape
+from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
 from a2tg_jax.data.depths import DepthMap
@@ -69,6 +69,7 @@ def scene_from_arrays(
     viewmats = _matrices("viewmats", viewmats, (num, 4, 4))
     if not np.allclose(viewmats[:, 3], [0, 0, 0, 1]):
         raise ValueError("viewmats must end with the row 0, 0, 0, 1: transpose matrices that multiply row vectors")
+    check_unmasked("Ks", Ks)
     Ks = np.asarray(Ks)
     Ks = _matrices("Ks", np.broadcast_to(Ks, (num, 3, 3)) if Ks.shape == (3, 3) else Ks, (num, 3, 3))
     given = {"names": names, "masks": masks, "depths": depths, "observed": observed}
@@ -91,7 +92,7 @@ def scene_from_arrays(
             points = observed_points(projected(ahead, Ks[index]), ahead[:, 2], picture.size)
         mask, depth = (
             None if values is None or values[index] is None
-            else _converted(f"{argument}[{index}]", kind, np.asarray(values[index]), picture.size)
+            else _converted(f"{argument}[{index}]", kind, values[index], picture.size)
             for argument, values, kind in (("masks", masks, Mask.of), ("depths", depths, DepthMap.of))
         )  # fmt: skip
         return Shot(own, viewmat, Ks[index], picture, mask, depth=depth, points=points)
@@ -188,13 +189,15 @@ def _share_that_meet(viewmats: np.ndarray, precision: float) -> float:
 def _matrices(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return matrices as float64 after checking their shape."""
     check_shape(name, values, shape)
+    check_unmasked(name, values)
     return np.asarray(values, np.float64)
 
 
 def _converted(name: str, kind: Callable[[Any], Any], values: Any, size: tuple[int, int] | None = None) -> Any:
     """Return what a view has for an array, or raise ValueError, naming it, if it has another kind or size (H, W)."""
+    check_unmasked(name, values)
     try:
-        made = kind(values)
+        made = kind(values if size is None else np.asarray(values))
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
     if size is not None and made.shape != size:
@@ -204,6 +207,8 @@ def _converted(name: str, kind: Callable[[Any], Any], values: Any, size: tuple[i
 
 def _cloud(points: Any, colors: Any) -> PointCloud:
     """Return points and their colours, grey without."""
+    check_unmasked("points", points)
+    check_unmasked("colors", colors)
     points = np.asarray(points, np.float64)
     check_shape("points", points, ("P", 3))
     colors = np.full(points.shape, 128, np.uint8) if colors is None else np.asarray(colors)
@@ -215,6 +220,7 @@ def _cloud(points: Any, colors: Any) -> PointCloud:
 
 def _chosen(points: np.ndarray, indices: Any, what: str) -> np.ndarray:
     """Return some of the points."""
+    check_unmasked(what, indices)
     indices = np.asarray(indices)
     is_index = indices.ndim == 1 and (np.issubdtype(indices.dtype, np.integer) or not indices.size)
     if not is_index or (indices.size and not 0 <= indices.min() <= indices.max() < len(points)):

@@ -136,6 +136,7 @@ def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[
     image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
     if mask is None:
         return image, target
+    mask = plain("mask", mask)
     check_shape("mask", mask, image.shape[:2])
     counts = jnp.asarray(mask)[..., None]
     return jnp.where(counts, image, 0.0), jnp.where(counts, target, 0.0)

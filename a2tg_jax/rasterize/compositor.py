@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance import AppearanceRule, StaticRule
-from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.core.bilinear import TextureRegion, within_texels
 from a2tg_jax.rasterize.kernels import autodiff
 from a2tg_jax.rasterize.kernels.manual_axes import cotangent_of
 from a2tg_jax.rasterize.reverse_only import once, reverse_only
@@ -61,6 +61,7 @@ def composite_arrays(
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return what `composite` does, with texels and regions in place of the rule's own."""
     static = StaticRule.of(rule)
+    regions = None if regions is None else within_texels(regions, texels.shape[0])
     if settings.compositor == "autodiff":
         if settings.statistic:
             raise ValueError("the statistic of densification needs another compositor than 'autodiff'")

@@ -17,9 +17,9 @@ def pack_inputs(
 ) -> tuple[Array, ...]:  # fmt: skip
     """Pack what kernels read: ids, starts, splats with the cutoff, regions, texels, and (columns, width, height).
 
-    Kernels follow these indices without checking them. Here each is clamped to the array that it points into, so that
-    no list and no region, whatever it holds, makes them read or write elsewhere. Rays of pixels are packed apart
-    (`native.composite`).
+    Kernels follow these indices without checking them. Ids and starts are clamped here, and regions by the compositor
+    (`bilinear.within_texels`), so that no list and no region, whatever it holds, makes them read or write elsewhere.
+    Rays of pixels are packed apart (`native.composite`).
     """
     num, capacity = splats.M.shape[0], lists.ids.shape[0]
     packed = pack_splats(splats, settings.has_geometry, cutoff).astype(splats.M.dtype)
@@ -27,7 +27,7 @@ def pack_inputs(
     # Threads divide the tiles by their starts, which must ascend. Without splats no id is valid: all lists are empty.
     starts = jax.lax.cummax(jnp.clip(lists.starts, 0, capacity if num else 0))
     ids = jnp.clip(lists.ids, 0, max(num - 1, 0))
-    return ids, starts, packed, pack_regions(regions, texels.shape[0]), texels.astype(splats.M.dtype), size
+    return ids, starts, packed, pack_regions(regions), texels.astype(splats.M.dtype), size
 
 
 def num_numbers(has_geometry: bool, num_colors: int) -> int:
@@ -71,11 +71,8 @@ def unpack_gradients(
     return d_splats, d_texels.astype(texels.dtype), d_probe
 
 
-def pack_regions(regions: TextureRegion | None, num_texels: int) -> Array:
-    """Pack the `TextureRegion` of every splat, clamped to the texels, as int32 [N, 3]; without textures [1, 0]."""
+def pack_regions(regions: TextureRegion | None) -> Array:
+    """Pack the `TextureRegion` of every splat as int32 [N, 3]; without textures [1, 0]."""
     if regions is None:
         return jnp.zeros((1, 0), jnp.int32)
-    height = jnp.where(regions.width > 0, jnp.clip(regions.height, 0, num_texels), 0)
-    width = jnp.where(height > 0, jnp.clip(regions.width, 0, num_texels // jnp.maximum(height, 1)), 0)
-    first = jnp.clip(regions.first, 0, num_texels - height * width)
-    return jnp.stack([first, height, width], axis=1).astype(jnp.int32)
+    return jnp.stack(regions, axis=1).astype(jnp.int32)
