@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from a2tg_jax.results.folder import RunFolder, iteration_of
+from a2tg_jax.results.history import read_history
 from a2tg_jax.results.record import read_record
 
 SMOKE = ("--preset", "smoke", "--downscale", "4", "--compare", "gaussians-2d-mcmc")
@@ -134,7 +135,8 @@ def differences(run: RunFolder, whole: RunFolder) -> list[str]:
     for name in read_record(whole).plan.names:
         with np.load(run.model(name)) as a, np.load(whole.model(name)) as b:
             found += [f"{name}: {key}" for key in b.files if not np.array_equal(a[key], b[key])]
-        rows = [[line.split(",")[:-1] for line in r.history(name).read_text().splitlines()] for r in (run, whole)]
+        columns = [read_history(r.history(name)).to_dict() for r in (run, whole)]
+        rows = [repr({key: values.tolist() for key, values in c.items() if key != "seconds"}) for c in columns]
         found += [f"history of {name}"] if rows[0] != rows[1] else []
     if run.per_view.read_text() != whole.per_view.read_text():
         found.append(run.per_view.name)

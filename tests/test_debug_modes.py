@@ -30,6 +30,7 @@ def scene():
     return a2tg.synthetic_scene(num_views=4, width=16, height=12, num_points=30)
 
 
+@pytest.mark.filterwarnings("ignore:.*changed nothing")
 @pytest.mark.parametrize(("mode", "name"), CASES)
 def test_a_system_trains(mode, name, scene):
     """A few steps of each stage, and an event that moves and adds Gaussians."""

@@ -164,7 +164,7 @@ def growing_stage(
         losses=system.loss.terms(),
         rates=dataclasses.replace(system.rates, cooldown=0.0),
         iterations=iterations,
-        params_rate=params_rate,
+        params_rate=_rate_for(appearance, params_rate),
         corrections=system.corrections_of(0),
         jitter=system.jitter,
         raises_sh_degree=True,
@@ -187,9 +187,14 @@ def later_stage(
         losses=system.loss.terms(is_first=False),
         rates=system.rates,
         iterations=iterations,
-        params_rate=params_rate,
+        params_rate=_rate_for(appearance, params_rate),
         corrections=system.corrections_of(1),
     )
+
+
+def _rate_for(appearance: Appearance, rate: Any) -> Any:
+    """Return the rate of parameters; 0 of plain splats, which have none, as records of earlier runs say."""
+    return 0.0 if rate is None and type(appearance) is Plain else rate
 
 
 def continued(system: System, first: Stage, iterations: int) -> tuple[Stage, ...]:

@@ -120,8 +120,9 @@ class HistoryLog:
             size = 2 * self._num + FIRST_ROWS
             self._columns = {name: np.resize(column, size) for name, column in self._columns.items()}
         row = History.row(point, terms)
-        for name in row.keys() - self._columns.keys():
-            self._columns[name] = np.full(size, np.nan)
+        for name in row:  # In their order, which that of a set would not be.
+            if name not in self._columns:
+                self._columns[name] = np.full(size, np.nan)
         for name, column in self._columns.items():
             column[self._num] = row.get(name, np.nan)
         self._num += 1
