@@ -181,9 +181,11 @@ class Upscale(UpscaleChoices, HostEvent):
     def _unused(self, sizes: np.ndarray, scales: np.ndarray) -> str | None:
         """Return which choices about anisotropy that are not the defaults made no difference to textures that grow."""
         names = [name for name in ("anisotropic", "k_a", "k_s") if getattr(self, name) != getattr(UpscaleChoices, name)]
+        if not names:
+            return None
         thin = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, axes=self.axes)
         round_ = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, anisotropic=False)
-        if not names or (thin != round_).any():
+        if (thin != round_).any():
             return None
         told = " and ".join(f"{{{name}}}" for name in names)
         return f"{told} made no difference, for no Gaussian whose texture grew was elongated and thin"

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from a2tg_jax.data.colmap_records import KINDS, POINT, FrameRecord, ImageRecord,
 from a2tg_jax.data.colmap_text import count_text_images, read_text
 from a2tg_jax.data.depth_files import find_depths
 from a2tg_jax.data.division import Division
-from a2tg_jax.data.images import inside, locate_image, map_in_threads, num_readers, on_disk, warn_of_unposed
+from a2tg_jax.data.images import find_image, inside, map_in_threads, num_readers, on_disk, warn_of_unposed
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, mask_to_read
 from a2tg_jax.data.observations import ObservedPoints, before_camera, observed_points
@@ -194,13 +193,7 @@ def _located(folder: Path, images: Sequence[ImageRecord], model: Path) -> list[P
     Raises:
       FileNotFoundError: if some are missing, with their number and what to do.
     """
-
-    def locate(image: ImageRecord) -> Path | None:
-        with suppress(FileNotFoundError):
-            return locate_image(folder, image.name)
-        return None
-
-    found = map_in_threads(locate, images, num_readers(folder))
+    found = map_in_threads(lambda image: find_image(folder, image.name), images, num_readers(folder))
     missing = [image.name for image, file in zip(images, found, strict=True) if file is None]
     if missing:
         more = f", and {len(missing) - 1} more of its {len(images)} are missing" if len(missing) > 1 else ""

@@ -5,6 +5,7 @@ import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import TypeVar
 
@@ -50,6 +51,13 @@ def locate_image(folder: Path, name: str) -> Path:
         f"{folder / name}: no such image, but the scene has a camera for it; "
         f"put the image there, or remove its frame from the file that names it"
     )
+
+
+def find_image(folder: Path, name: str) -> Path | None:
+    """Return the file that `locate_image` returns, or None if it is not there."""
+    with suppress(FileNotFoundError):
+        return locate_image(folder, name)
+    return None
 
 
 def named_image(folder: Path, name: str) -> Path | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from a2tg_jax.data.decoding import picture_size
-from a2tg_jax.data.images import locate_image, map_in_threads, num_readers
+from a2tg_jax.data.images import find_image, map_in_threads, num_readers
 from a2tg_jax.host.regular_files import is_folder
 from a2tg_jax.host.remote_files import is_remote
 
@@ -62,7 +62,7 @@ def find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) -
 
 def _difference(folder: Path, smaller: Path, downscale: int, name: str) -> str:
     """Return how the copy of a file differs from one of 1/downscale of its size; "" if it does not."""
-    full, copy = (_located(place, name) for place in (folder, smaller))
+    full, copy = (find_image(place, name) for place in (folder, smaller))
     if full is None:
         return ""
     if copy is None:
@@ -74,9 +74,3 @@ def _difference(folder: Path, smaller: Path, downscale: int, name: str) -> str:
         if any(abs(side - whole / downscale) > ROUNDING for side, whole in zip(copied, size, strict=True)):
             return f"{name}, which is {copied[0]}x{copied[1]} for {size[0]}x{size[1]}"
     return ""
-
-
-def _located(folder: Path, name: str) -> Path | None:
-    with suppress(FileNotFoundError):
-        return locate_image(folder, name)
-    return None
