@@ -187,8 +187,8 @@ class Upscale(UpscaleChoices, HostEvent):
         round_ = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, anisotropic=False)
         if (thin != round_).any():
             return None
-        told = " and ".join(f"{{{name}}}" for name in names)
-        return f"{told} made no difference, for no Gaussian whose texture grew was elongated and thin"
+        choices = " and ".join(f"{{{name}}}" for name in names)
+        return f"{choices} made no difference, for no Gaussian whose texture grew was elongated and thin"
 
     def _with_the_rest(self, averages: np.ndarray, sizes: np.ndarray, scales: np.ndarray, left: float) -> np.ndarray:
         """Return the sizes after further upscalings if bytes are left after all textures took what they proposed.

@@ -137,7 +137,7 @@ def make_plain(instance: Any, name: str, *fields: str, dtype: Any = None) -> Non
     values = {field: getattr(instance, field) for field in fields}
     dtypes = [value.dtype for value in values.values() if hasattr(value, "dtype")]
     for field, value in values.items():
-        if type(value) is tuple:  # Trees of shapes have tuples in place of arrays.
+        if type(value) is tuple:  # Trees of shapes have tuples where arrays were.
             continue
         changed = plain(f"{name}.{field}", value, dtype or next(iter(dtypes), None))
         if changed is not value:
@@ -145,7 +145,7 @@ def make_plain(instance: Any, name: str, *fields: str, dtype: Any = None) -> Non
 
 
 def _holds_numbers(values: Any) -> bool:
-    """Return whether the first entry of nested sequences is a number, as it is in none that JAX puts into a pytree."""
+    """Return whether the first entry of nested sequences is a number; JAX puts no such sequence into a pytree."""
     while isinstance(values, list | tuple) and values:
         values = values[0]
     return isinstance(values, numbers.Number) and not isinstance(values, bool)

@@ -109,7 +109,7 @@ def scene_from_arrays(
 
 
 def _told_of_values(images: Sequence[Any], colors: Any) -> Iterator[str]:
-    """Yield what to say of colours that are only 0 and 1 of 255: those of [0, 1] without their factor."""
+    """Yield a warning if colours are only 0 and 1 of 255: colours of [0, 1] whose factor of 255 is missing."""
     given = {"images": [image for image in images if not isinstance(image, Picture)]}
     given |= {} if colors is None else {"colors": [colors]}
     for name, arrays in given.items():
@@ -123,7 +123,7 @@ def _told_of_values(images: Sequence[Any], colors: Any) -> Iterator[str]:
 
 
 def _told_of_sizes(shots: Sequence[Shot]) -> str:
-    """Return what to say if principal points are those of images of another size, which differs on both axes."""
+    """Return a warning if principal points fit images of another size, which differs on both axes."""
     sizes = np.array([shot.pixels.shape[1::-1] for shot in shots], float)
     twice = np.array([2 * shot.K[:2, 2] for shot in shots])
     is_off = (np.maximum(twice, sizes) > OFF_CENTER * np.minimum(twice, sizes)).all(axis=1)
