@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from a2tg_jax.core.paths import look_at as look_at
     from a2tg_jax.core.paths import path_through as path_through
     from a2tg_jax.core.paths import smooth_path as smooth_path
+    from a2tg_jax.core.pytree import pytree as pytree
+    from a2tg_jax.core.pytree import static as static
     from a2tg_jax.core.similarity import Similarity as Similarity
     from a2tg_jax.core.transform import transform_gaussians as transform_gaussians
     from a2tg_jax.data import Mask as Mask
@@ -60,9 +62,7 @@ if TYPE_CHECKING:
     from a2tg_jax.events import HostEvent as HostEvent
     from a2tg_jax.events import StepEvent as StepEvent
     from a2tg_jax.events import Times as Times
-    from a2tg_jax.events import event as event
     from a2tg_jax.events import keep_rows as keep_rows
-    from a2tg_jax.events import static as static
     from a2tg_jax.finish.compaction import loss_beside_renders as loss_beside_renders
     from a2tg_jax.finish.compaction import loss_on_views as loss_on_views
     from a2tg_jax.finish.compaction import measure_choices as measure_choices
@@ -181,6 +181,7 @@ _NAMES = {
     "a2tg_jax.core.origin": ("Origin",),
     "a2tg_jax.core.overflow": ("CapacityWarning",),
     "a2tg_jax.core.paths": ("look_at", "path_through", "smooth_path"),
+    "a2tg_jax.core.pytree": ("pytree", "static"),
     "a2tg_jax.core.similarity": ("Similarity",),
     "a2tg_jax.core.transform": ("transform_gaussians",),
     "a2tg_jax.data": (
@@ -210,9 +211,7 @@ _NAMES = {
         "HostEvent",
         "StepEvent",
         "Times",
-        "event",
         "keep_rows",
-        "static",
     ),
     "a2tg_jax.finish.compaction": ("loss_beside_renders", "loss_on_views", "measure_choices", "smallest_within"),
     "a2tg_jax.finish.polishing": ("polish",),

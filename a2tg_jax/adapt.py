@@ -18,8 +18,9 @@ from a2tg_jax.core.budget import MOST_ROOM, bytes_of, event_budget, within_budge
 from a2tg_jax.core.checks import check_int, check_literal, check_mask, check_number, check_shape
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.spread_arrays import on_host, placed_like
-from a2tg_jax.events import Change, Due, FieldError, HostEvent, Seen, Statistic, event, iterations_at, static
+from a2tg_jax.events import Change, Due, FieldError, HostEvent, Seen, Statistic, iterations_at
 from a2tg_jax.model import Model
 from a2tg_jax.texture import (
     BYTES_PER_TEXEL,
@@ -78,7 +79,7 @@ class UpscaleChoices:
     """Largest texture side in texels (at most 16)."""
 
 
-@event
+@pytree
 class Upscale(UpscaleChoices, HostEvent):
     """Gradient-driven selection, then anisotropic upscaling, of `appearance.Textured` (A²TG)."""
 

@@ -9,7 +9,7 @@ on the host, where shapes may change (`HostEvent`). Either may gather a statisti
 import dataclasses
 import re
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple, TypeVar, dataclass_transform
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -292,27 +292,6 @@ def iterations_at(
         wrong = f"must be ascending fractions between 0 and 1; got {shortened(fractions)}"
         raise ValueError(f"{name} {wrong}") if of is None else FieldError(of, f"{{{name}}} {wrong}")
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
-
-
-def static(*, default: Any = dataclasses.MISSING, is_addition: bool = False) -> Any:
-    """Return a field of an event (or loss term) that chooses shapes or code, and is not traced.
-
-    Args:
-      default: of the field.
-      is_addition: whether trainings of earlier versions, which did not know the field, are those with its default.
-    """
-    return dataclasses.field(default=default, metadata={"static": True, "is_addition": is_addition})
-
-
-def is_addition(field: dataclasses.Field[Any]) -> bool:
-    """Return whether trainings of earlier versions, which did not know a field, are those with its default."""
-    return bool(field.metadata.get("is_addition", False))
-
-
-@dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
-def event(cls: type[T]) -> type[T]:
-    """Decorate a class: make it a frozen dataclass that is a pytree of its numbers."""
-    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
 
 
 def from_options(kind: type[T], options: Any, **others: Any) -> T:

@@ -20,18 +20,8 @@ from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians, rotation_matrices
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.events import (
-    Change,
-    EventInfo,
-    FieldError,
-    Now,
-    StepEvent,
-    Times,
-    clear_moments,
-    event,
-    gather_rows,
-    static,
-)
+from a2tg_jax.core.pytree import pytree, static
+from a2tg_jax.events import Change, EventInfo, FieldError, Now, StepEvent, Times, clear_moments, gather_rows
 from a2tg_jax.model import Model
 from a2tg_jax.texture import bucket_capacity
 
@@ -286,7 +276,7 @@ def densify_times(num_iterations: int, last: float = 5 / 6) -> Times:
     return Times(round(num_iterations / 60), int(last * num_iterations + 1e-9), every)
 
 
-@event
+@pytree
 class Noise(StepEvent):
     """Exploration noise on the means, after every iteration (`perturb`)."""
 
@@ -297,7 +287,7 @@ class Noise(StepEvent):
         return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
 
 
-@event
+@pytree
 class Mcmc(StepEvent):
     """Relocation of dead Gaussians and growth to a cap (`relocate`, `grow`), for any appearance."""
 
@@ -350,7 +340,7 @@ class Mcmc(StepEvent):
         return gather_rows(shared, moves.rows), clear_moments(model, moments, moves.is_reset), moves.info
 
 
-@event
+@pytree
 class FillingMcmc(Mcmc):
     """Variant of `Mcmc` that grows by more than 5 % if it takes that to reach the cap by its last event."""
 

@@ -21,6 +21,7 @@ from a2tg_jax.core.display import counted, html_table, in_bytes, short_tuple_rep
 from a2tg_jax.core.forks import check_process
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK, Origin
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
@@ -43,8 +44,7 @@ class Parameters(NamedTuple):
         return short_tuple_repr(self)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Model:
     """Gaussians, their appearance with its parameters, and their origin.
 

@@ -16,7 +16,6 @@ from a2tg_jax.appearance import Appearance, AppearanceRule, Features, PlainRule,
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.overflow import OverflowWatch
 from a2tg_jax.rasterize.capacity import with_capacity
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
@@ -85,8 +84,8 @@ def render_appearance(
 
 
 @functools.cache
-def _jitted_render() -> Jitted[..., tuple[RenderOutput, Array]]:
-    return Jitted(render_traced, static_argnums=(4,))
+def _jitted_render() -> jax.stages.Wrapped:
+    return jax.jit(render_traced, static_argnums=(4,))
 
 
 @functools.cache

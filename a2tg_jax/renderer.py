@@ -5,6 +5,7 @@ import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -13,7 +14,6 @@ from a2tg_jax.core.cameras import Camera, check_camera, checked_cameras, resize_
 from a2tg_jax.core.checks import check_kind, check_number
 from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import HEAD_ROOM, capacity_for, pairs_of_view, pairs_to_draw
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
@@ -169,7 +169,7 @@ class Renderer:
 
 
 @functools.cache
-def _jitted_draw() -> Jitted[..., tuple[RenderOutput, Array]]:
+def _jitted_draw() -> jax.stages.Wrapped:
     """Return the jitted drawing function; its cache counts the compilations."""
 
     def draw(
@@ -185,4 +185,4 @@ def _jitted_draw() -> Jitted[..., tuple[RenderOutput, Array]]:
             gaussians, camera, rule, background, settings, has_geometry=has_geometry, num_live=num_live
         )
 
-    return Jitted(draw, static_argnums=(5, 6))
+    return jax.jit(draw, static_argnums=(5, 6))

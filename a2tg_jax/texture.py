@@ -28,6 +28,7 @@ from a2tg_jax.core.checks import (
     plain,
     short_repr,
 )
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.spread_arrays import on_host, placed_like
 
 MAX_SIDE = 16
@@ -36,8 +37,7 @@ NEUTRAL_TEXEL = (0.0, 0.0, 0.0, 1.0)
 KNOWN_SLACK = 1.25
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Textures:
     """The texels of all Gaussians, bucketed by resolution."""
 
@@ -57,8 +57,7 @@ class Textures:
         return short_repr(self)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class AtlasLayout:
     """Place of each Gaussian's texture. Integers only: not differentiable, kept apart from `Textures`."""
 

@@ -26,7 +26,7 @@ from a2tg_jax.adapt import reallocate
 from a2tg_jax.appearance import Plain, TexelRates, Textured
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.data import view_image
-from a2tg_jax.events import Change, Due, HostEvent, event
+from a2tg_jax.events import Change, Due, HostEvent
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
@@ -55,7 +55,7 @@ CRITERIA = {
 }
 
 
-@event
+@a2tg.pytree
 class GrowRows(HostEvent):
     """Event that gives some Gaussians textures of one size after the first iteration."""
 

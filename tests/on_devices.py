@@ -20,10 +20,9 @@ from scenes_random import fisheye
 import a2tg_jax as a2tg
 from a2tg_jax.core import spread_arrays
 from a2tg_jax.core.geometry import homographies, screen_bounds
-from a2tg_jax.core.jit import classes_of
 from a2tg_jax.core.spread_arrays import on_host, placed_like, rows_moved
 from a2tg_jax.densify.splitting import SplitByGradient
-from a2tg_jax.events import Change, Due, HostEvent, StepEvent, event
+from a2tg_jax.events import Change, Due, HostEvent, StepEvent
 from a2tg_jax.rasterize.capacity import pairs_of_view
 from a2tg_jax.rasterize.exchange import AXIS, ROOM_OF_A_BAND, exchange_among, spread
 from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
@@ -476,7 +475,7 @@ def same_bits(expected, found):
         np.testing.assert_array_equal(a.reshape(-1).view(np.uint8), b.reshape(-1).view(np.uint8))
 
 
-@event
+@a2tg.pytree
 class Reverse(HostEvent):
     """An event of somebody else: it turns the order of the rows, of arrays that it can read."""
 
@@ -491,7 +490,7 @@ class Reverse(HostEvent):
         return Change(dataclasses.replace(model, gaussians=gaussians), moments, state, rows=rows)
 
 
-@event
+@a2tg.pytree
 class Remember(StepEvent):
     """An event of somebody else, whose state is made of values of the model and follows rows in a way of its own."""
 
@@ -561,7 +560,7 @@ def memory(folder):
         own = system(Gaussians2dMcmc, densify={"cap": 400}, initial_gaussians=400, batch_size=size)
         run = StageRun(found, own, 0, initial_model(found, own), session=Session(devices=jax.devices()))
         arguments = run.arguments(1)
-        lowered = jitted_step()._jitted.lower(classes_of((arguments, {})), *arguments)
+        lowered = jitted_step().lower(*arguments)
         said = jax.device_count() * lowered.compile().memory_analysis().temp_size_in_bytes
         expected = stage_bytes(found, own, run.stage, 400, run.model.num_bytes, jax.device_count())
         assert 0.75 < (expected.gradients + expected.pixels) / said < 1.33, (size, expected, said)

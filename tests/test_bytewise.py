@@ -14,6 +14,7 @@ from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Banded, Shaped, Textured
 from a2tg_jax.appearance.shaped import exponents_of
 from a2tg_jax.core.budget import bytes_of, event_budget
+from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.densify.exponents import LimitExponents
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import HostEvent
@@ -91,9 +92,9 @@ def test_details_have_their_room_before_they_come(scene, before_details, monkeyp
     system, first = before_details
 
     def details():
-        before = jitted_step().num_compiled()
+        before = num_compiled(jitted_step())
         result = a2tg.fit_stage(scene, system, 1, first, progress=False)
-        return result.model, jitted_step().num_compiled() - before - result.num_regrown
+        return result.model, num_compiled(jitted_step()) - before - result.num_regrown
 
     model, num_compiled = details()
     assert num_compiled == 1
@@ -116,9 +117,9 @@ def test_what_goes_on_has_its_room_again(scene, before_details, tmp_path):
 
     whole = a2tg.fit_stage(scene, system, 1, first, progress=False, on_checkpoint=keep, checkpoint_every=4)
     for stop in stops[:3]:
-        before = jitted_step().num_compiled()
+        before = num_compiled(jitted_step())
         rest = a2tg.fit_stage(scene, system, 1, resume=stop, progress=False)
-        assert jitted_step().num_compiled() - before - rest.num_regrown <= 1, stop.iteration
+        assert num_compiled(jitted_step()) - before - rest.num_regrown <= 1, stop.iteration
         assert_same(rest.model, whole.model)
 
 

@@ -14,7 +14,6 @@ from a2tg_jax import (
     DivergedError,
     Interrupted,
     StepEvent,
-    event,
     fit,
     init_from_points,
     load_checkpoint,
@@ -22,6 +21,7 @@ from a2tg_jax import (
     synthetic_scene,
 )
 from a2tg_jax.appearance import Banded
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.systems.a2tg import TextureConfig
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.systems.stage1 import McmcConfig
@@ -40,7 +40,7 @@ def scene():
     return synthetic_scene(num_views=8, width=40, height=30, num_points=150)
 
 
-@event
+@pytree
 class Poison(StepEvent):
     """After one iteration, a row becomes NaN."""
 
@@ -53,7 +53,7 @@ class Poison(StepEvent):
         return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
 
 
-@event
+@pytree
 class Brighten(StepEvent):
     """After every iteration, colours double."""
 
@@ -99,7 +99,7 @@ def test_tables_without_rows_are_finite():
     assert not jax.tree.leaves(tables)[0].size and not list(_not_finite((gaussians, tables, ())))
 
 
-@event
+@pytree
 class Nothing(StepEvent):
     """Changes one parameter, to what it was."""
 

@@ -14,6 +14,7 @@ from toy_system import Rings
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
+from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.results.forecast import forecast_run
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.training.effects import StageEffects
@@ -26,7 +27,7 @@ def scene():
     return a2tg.synthetic_scene(num_views=3, width=16, height=16, num_points=50)
 
 
-@a2tg.event
+@a2tg.pytree
 class PruneFaint(a2tg.HostEvent):
     """Removes the faintest five of the Gaussians every fourth iteration, in one of several ways."""
 
@@ -107,10 +108,10 @@ def test_an_event_that_removes_rows_compiles_nothing(scene):
     """With rows of other shapes each time is a program, which the third time tells; the model is the same."""
 
     def trained(how):
-        before = jitted_step().num_compiled()
+        before = num_compiled(jitted_step())
         result = fitted(scene, PruneFaint(how), iterations=22)
         assert result.num_regrown == 0
-        return result, jitted_step().num_compiled() - before
+        return result, num_compiled(jitted_step()) - before
 
     kept, num_kept = trained("rows")
     assert num_kept == 1 and kept.model.num == 50 - 5 * 5
@@ -147,7 +148,7 @@ def test_programs_are_counted_before_and_while_it_trains(scene):
     assert StageEffects(stage, system, num_sizes=3).programs_ahead(1) == 3 * 39
 
 
-@a2tg.event
+@a2tg.pytree
 class Late(a2tg.StepEvent):
     def times(self, num_iterations):
         return a2tg.Times(first=50, last=100, every=10)
@@ -156,7 +157,7 @@ class Late(a2tg.StepEvent):
         return a2tg.Change(model, moments, state)
 
 
-@a2tg.event
+@a2tg.pytree
 class Early(PruneFaint):
     def iterations(self, num_iterations):
         return (-1, 0)

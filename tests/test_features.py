@@ -1,6 +1,5 @@
 """Images of features: any number of channels, of either sign, with the weights of the picture and exact gradients."""
 
-import dataclasses
 import functools
 
 import jax
@@ -12,6 +11,7 @@ from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, draw
 
 from a2tg_jax import Model, RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import PlainRule
+from a2tg_jax.core.pytree import pytree
 
 SCENE = draw_scene(4, num=8, width=11, height=9)
 SMOOTH = draw_smooth_scene(53, width=8, height=8)
@@ -107,8 +107,7 @@ def test_features_of_a_model():
     np.testing.assert_array_equal(none.color, np.broadcast_to(np.arange(4), (9, 11, 4)))
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Two(PlainRule):
     """A rule of one's own with two channels."""
 

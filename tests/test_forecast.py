@@ -16,7 +16,6 @@ import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.cameras import resize_camera
-from a2tg_jax.core.jit import classes_of
 from a2tg_jax.data import Picture
 from a2tg_jax.host import bars, memory
 from a2tg_jax.mcmc import Mcmc
@@ -82,7 +81,7 @@ def test_a_step_needs_what_xla_says(width, height, num):
     photographs, views = run.photographs.batch(1)
     settings = StepSettings(run.render_settings((height, width)), system.background)
     args = (settings, run.stage, run.clock, run.state, photographs, views, run.scene_scale, run.key)
-    lowered = jitted_step()._jitted.lower(classes_of((args, {})), *args)
+    lowered = jitted_step().lower(*args)
     said = lowered.compile().memory_analysis()
     expected = stage_bytes(scene, system, run.stage, num, run.model.num_bytes)
     step = expected.gradients + expected.pixels
@@ -272,7 +271,7 @@ def test_on_an_accelerator_its_own_memory_counts(monkeypatch):
     assert found.peak[1].program == 0 and found.seconds == 0
 
 
-@a2tg.event
+@a2tg.pytree
 class Read(a2tg.HostEvent):
     """An event of somebody else, which reads the whole state."""
 

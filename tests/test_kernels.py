@@ -16,6 +16,7 @@ from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, gaussian_cutoff, textured_rule
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import homographies
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.kernels.native import threads
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
@@ -79,8 +80,7 @@ def test_parts_cover_all_tiles():
     assert all(one[1] == other[0] for one, other in itertools.pairwise(parts))
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class HalvesRule(AppearanceRule):
     """A rule of another kind: two colours and one opacity a splat, [2N, 3], by the sign of u, and another falloff."""
 
@@ -125,8 +125,7 @@ def test_any_appearance_rule_is_compiled():
         np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-10 * float(jnp.abs(a).max()))
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class UntranslatableRule(PlainRule):
     def falloff(self, numbers, rho):
         return jnp.exp(-0.5 * rho) + 0 * jax.lax.digamma(1 + rho)
@@ -237,8 +236,7 @@ def test_a_rule_defined_anew_is_compiled_anew():
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
 
     def image(residual):
-        @jax.tree_util.register_dataclass
-        @dataclasses.dataclass(frozen=True)
+        @pytree
         class Anew(PlainRule):
             def shade(self, numbers, values, u, v):
                 return (residual * jnp.ones_like(u),) * 3, None

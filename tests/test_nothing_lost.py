@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax import Change, StepEvent, event
+from a2tg_jax import Change, StepEvent
 from a2tg_jax.cli import main as cli
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host import atomic, signals
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.errors import error_text
@@ -395,7 +396,7 @@ def test_lpips_is_kept_while_the_models_are_the_same(scene, stopped, tmp_path, m
 # Divergence
 
 
-@event
+@pytree
 class Trap(StepEvent):
     """After iteration 12, everything is NaN, if the view of the first order was seen."""
 
@@ -431,7 +432,7 @@ class Trapped(Gaussians2dMcmc):
         return (dataclasses.replace(stage, events=(*stage.events, Always() if self.always else Trap(self.x))),)
 
 
-@event
+@pytree
 class Always(StepEvent):
     """After iteration 12, everything is NaN."""
 

@@ -9,6 +9,7 @@ import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 
 from a2tg_jax.appearance import Arguments, PlainRule, StaticRule, elementwise_rule, takes_arrays
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.rasterize.kernels import choice
 from a2tg_jax.render import RenderSettings, render_appearance
 
@@ -17,17 +18,13 @@ GAUSSIANS, CAMERA = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
 MATRIX = np.asarray([[0.2, -0.1], [0.3, 0.1], [-0.2, 0.1]], np.float32)
 
 
-def register(cls):
-    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(cls))
-
-
 def drawn(rule, compositor="xla", **settings):
     settings = RenderSettings(compositor=compositor, **settings)
     return render_appearance(GAUSSIANS, CAMERA, rule, settings=settings).color
 
 
 def with_shade(shade):
-    return register(type("MyRule", (PlainRule,), {"shade": lambda self, numbers, values, u, v: shade(u, v)}))()
+    return pytree(type("MyRule", (PlainRule,), {"shade": lambda self, numbers, values, u, v: shade(u, v)}))()
 
 
 RETURNS = {
@@ -49,10 +46,10 @@ def test_what_shade_returns_is_named(told):
 
 
 def test_other_results_are_named():
-    falloff = register(type("Wide", (PlainRule,), {"falloff": lambda self, numbers, rho: (rho, rho)}))()
+    falloff = pytree(type("Wide", (PlainRule,), {"falloff": lambda self, numbers, rho: (rho, rho)}))()
     with pytest.raises(ValueError, match=r"Wide.falloff must return one number.*it returned \(float32\[\], float32"):
         drawn(falloff)
-    grey = register(type("Grey", (PlainRule,), {"own_colors": lambda self, gaussians, *_: gaussians.opacities}))()
+    grey = pytree(type("Grey", (PlainRule,), {"own_colors": lambda self, gaussians, *_: gaussians.opacities}))()
     with pytest.raises(
         ValueError, match=r"own_colors \[N, 3\] of N = 10 gaussians, by its num_colors; Grey gave \(10,\)"
     ):
@@ -66,7 +63,7 @@ def test_an_error_in_shade_keeps_its_class_and_names_the_rule():
     assert "MyRule.shade" in note and "K = 0 numbers, and C = 0 texture values" in note
 
 
-@register
+@pytree
 class Glow(PlainRule):
     strength: jax.Array
 
@@ -91,13 +88,13 @@ def test_an_array_field_in_shade_is_named(which):
         drawn(Glow(jnp.ones(10), which=which))
 
 
-@register
+@pytree
 class Mixed(PlainRule):
     def shade(self, numbers, values, u, v):
         return tuple(jnp.asarray(MATRIX) @ jnp.stack([u, v])), None
 
 
-@register
+@pytree
 class MixedByHand(PlainRule):
     def shade(self, numbers, values, u, v):
         return tuple(float(row[0]) * u + float(row[1]) * v for row in MATRIX), None
@@ -138,7 +135,7 @@ def test_what_takes_scalars_only_is_applied_pixel_by_pixel(whole, by_hand):
 
 def test_a_rule_that_is_no_pytree_is_named():
     loose = dataclasses.dataclass(frozen=True)(type("Loose", (PlainRule,), {}))
-    with pytest.raises(ValueError, match="Loose is not a pytree: decorate it with @jax"):
+    with pytest.raises(ValueError, match=r"rule must be a pytree: decorate the class Loose with @a2tg_jax\.pytree"):
         drawn(loose())
 
 

@@ -21,6 +21,7 @@ from a2tg_jax import Camera, RenderSettings, Textures, render_appearance
 from a2tg_jax.appearance import AppearanceRule, Billboards, MovableKernelParams, MovableKernels, PlainRule, Shaped
 from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams
 from a2tg_jax.core.numerics import normalize
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.texture import plan_layout
 
@@ -28,8 +29,7 @@ SIDE = 4
 """Of the billboards."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@pytree(kw_only=True)
 class GlossyRule(PlainRule):
     """A highlight about an axis of each splat's own, and the falloff (1 + ρ/2k)^(−k) with a k of its own."""
 
@@ -252,8 +252,7 @@ def test_the_statistic_takes_the_way_of_the_falloff(compositor):
     np.testing.assert_array_equal(statistic[:, :3], 0)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@pytree(kw_only=True)
 class TintedRule(PlainRule):
     """It uses an array where it may not."""
 
@@ -274,11 +273,11 @@ def test_numbers_of_another_shape_are_refused():
     scene = draw_scene(4, num=3, width=8, height=8)
     params = glossy_params(3, "float32")
 
+    @pytree(kw_only=True)
     class Wrong(GlossyRule):
         def numbers(self, gaussians, camera):
             return jnp.zeros(5)
 
-    jax.tree_util.register_dataclass(Wrong)
     with pytest.raises(ValueError, match=r"numbers \[N, K\] of N = 3.*\(5,\)"):
         rendered(scene, Wrong(**jax.tree.map(jnp.asarray, params)), dtype="float32")
 

@@ -48,18 +48,18 @@ class Undecorated(a2tg.StepEvent):
     pass
 
 
-@a2tg.event
+@a2tg.pytree
 class Named(a2tg.StepEvent):
     title: str = "a"
 
 
-@a2tg.event
+@a2tg.pytree
 class Never(a2tg.HostEvent):
     def iterations(self, num_iterations):
         return (0.5,)
 
 
-@a2tg.event
+@a2tg.pytree
 class Returning(a2tg.StepEvent):
     """Returns one of several things."""
 
@@ -76,7 +76,7 @@ class Returning(a2tg.StepEvent):
         return results[self.what]
 
 
-@a2tg.event
+@a2tg.pytree
 class OnHost(a2tg.HostEvent):
     def iterations(self, num_iterations):
         return (1,)
@@ -85,7 +85,7 @@ class OnHost(a2tg.HostEvent):
         return model
 
 
-@a2tg.event
+@a2tg.pytree
 class Observing(a2tg.StepEvent):
     observes = True
 
@@ -105,7 +105,7 @@ WRONG = {
 }
 
 
-@a2tg.event
+@a2tg.pytree
 class Correcting(Exposure):
     """A correction of which one method returns something wrong."""
 
@@ -130,7 +130,7 @@ GIVEN = {
     "stage 'own': events[1] must be a StepEvent or a HostEvent; got the class Noise: say Noise(…)": {
         "events": (a2tg.Noise(), a2tg.Noise)
     },
-    "stage 'own': events[0] must be a pytree; got Undecorated: decorate": {"events": (Undecorated(),)},
+    "stage 'own': events[0] must be a pytree: decorate the class Undecorated": {"events": (Undecorated(),)},
     "stage 'own': events[0] must hold numbers; got 'a': make fields of Named": {"events": (Named(),)},
     "stage 'own': Never.iterations must return ascending integers in a tuple; got (0.5,)": {"events": (Never(),)},
     "stage 'own': losses must be a tuple or a list; got function": {"losses": roughness},

@@ -13,6 +13,7 @@ from own_fusions import passes_in_its_own_process
 from toy_system import Toy
 
 import a2tg_jax as a2tg
+from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.training import fit_stage, loop
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.loop import StageRun
@@ -220,13 +221,13 @@ def test_a_sweep_compiles_each_step_once(scene, sweep, name, thresholds):
         variants = SWEEPS[sweep]
     counts = []
     for changes in variants:
-        before, rooms = jitted_step().num_compiled(), copy.deepcopy(session.capacities)
+        before, rooms = num_compiled(jitted_step()), copy.deepcopy(session.capacities)
         merged = dict(changes)
         if name == "a2tg":
             merged["texture"] = {"upscale_at": [0.5], **changes.get("texture", {})}
         result = a2tg.fit(scene, tiny(name, **merged), progress=False, session=session)
         # Lists that grow in the middle of a run are compiled anew; a run tells how often that was.
-        count = max(0, jitted_step().num_compiled() - before - result.num_regrown)
+        count = max(0, num_compiled(jitted_step()) - before - result.num_regrown)
         counts.append((count, session.capacities == rooms))
     # So are lists that must be longer from the start, as where a seed puts more splats on the screen.
     again = [count for count, had_room in counts[1:] if had_room]

@@ -17,7 +17,6 @@ from a2tg_jax import (
     RenderSettings,
     StepEvent,
     Term,
-    event,
     fit,
     load_checkpoint,
     save_checkpoint,
@@ -26,6 +25,7 @@ from a2tg_jax import (
     view_image,
 )
 from a2tg_jax.appearance import Textured
+from a2tg_jax.core.pytree import num_compiled, pytree
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.a2tg import TextureConfig
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
@@ -57,9 +57,9 @@ def scene():
 @pytest.fixture(scope="module")
 def trained(scene):
     """A whole run, its checkpoints, and how many traces it took."""
-    before = jitted_step().num_compiled()
+    before = num_compiled(jitted_step())
     result, checkpoints = fit_keeping_checkpoints(scene, CONFIG)
-    return result, checkpoints, jitted_step().num_compiled() - before
+    return result, checkpoints, num_compiled(jitted_step()) - before
 
 
 def assert_same(a, b):
@@ -119,7 +119,7 @@ def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
     assert_same(fit(scene, CONFIG, resume=load_checkpoint(path), **told), trained[0])
 
 
-@event
+@pytree
 class Places(StepEvent):
     """Gathers a number of every row, made of Gaussians and layout."""
 
@@ -193,10 +193,10 @@ def test_events_that_the_host_decides_are_those_of_the_step(scene, trained, monk
 
     decided_inside = [jax.tree.map(np.array, model) for model in states()]
     monkeypatch.setattr(loop, "are_events_decided_by_host", lambda: True)
-    before = jitted_step().num_compiled()
+    before = num_compiled(jitted_step())
     for own, other in zip(states(), decided_inside, strict=True):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), own, other)
-    assert jitted_step().num_compiled() - before == 2
+    assert num_compiled(jitted_step()) - before == 2
     numbers = [int(model.live_count) for model in decided_inside]
     assert len(set(numbers)) == 2 and numbers[-1] == numbers[-2] > numbers[-3]
 

@@ -16,7 +16,6 @@ from a2tg_jax.appearance import Shaped
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.data import Scene
 from a2tg_jax.data.scene import origin_of_scene
-from a2tg_jax.events import event
 from a2tg_jax.finish import tuning
 from a2tg_jax.finish.compaction import Trial, loss_on_views
 from a2tg_jax.finish.rounding import GradualRounding, GridRounding, partly_rounded
@@ -180,7 +179,7 @@ class CorrectedStage(a2tg.training.System):
         return (self.stage,)
 
 
-@event
+@a2tg.pytree
 class OwnExposure(Correction):
     """An exposure whose rate is no field."""
 

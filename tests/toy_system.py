@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import a2tg_jax as a2tg
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@a2tg.pytree
 class RingsRule(a2tg.PlainRule):
     """What the renderer is given: rings around the centre of each splat, beside its own colour."""
 
@@ -39,7 +38,7 @@ class Rings(a2tg.Appearance):
         return RingsRule(rings=params)
 
 
-@a2tg.event
+@a2tg.pytree
 class Shrink(a2tg.StepEvent):
     """After every fifth iteration, scales above the average become smaller."""
 

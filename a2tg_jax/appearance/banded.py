@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -26,6 +25,7 @@ from a2tg_jax.appearance.sh_bands import (
 )
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.pytree import pytree
 
 
 class BandedParams(NamedTuple):
@@ -54,8 +54,7 @@ class BandedRates(NamedTuple):
     inner: Any = 0.0
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class BandedRule(RuleAround):
     """Another rule, with more spherical harmonics for some Gaussians."""
 

@@ -23,6 +23,7 @@ from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_divide
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.texture import MAX_SIDE, AtlasLayout, Textures, allocate_textures, nearest_places
 
 INITIAL_PEAK, INITIAL_SIGMA = 0.5, 0.3
@@ -30,8 +31,7 @@ INITIAL_PEAK, INITIAL_SIGMA = 0.5, 0.3
 LEAST_PEAK = 0.999 / 255
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class BillboardRule(AppearanceRule):
     """Appearance rule: RGB residual and alpha from each splat's own picture."""
 

@@ -21,6 +21,7 @@ from a2tg_jax.appearance.copies import LARGEST_OPACITY, share
 from a2tg_jax.appearance.rule import Factor, PlainRule, Residual, gaussian_cutoff
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, logit
+from a2tg_jax.core.pytree import pytree
 
 NUM_KERNELS = 4
 LEAST_WEIGHT = 1e-4
@@ -32,8 +33,7 @@ PUBLISHED_FLOATS = 16
 """Floats of a splat's kernels by the authors' memory figures, which imply 74 floats per splat."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class MovableKernelParams:
     """Kernels of N splats."""
 
@@ -52,8 +52,7 @@ class MovableKernelParams:
         return jax.nn.sigmoid(self.logit_opacities)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@pytree(kw_only=True)
 class MovableKernelsRule(PlainRule):
     """Appearance rule: colour residual and opacity from four kernels."""
 

@@ -22,8 +22,8 @@ from jax import Array
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.jit import classes_of
 from a2tg_jax.core.numerics import at_least
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import sh_sum
 
 Residual = tuple[Array, ...] | None
@@ -96,8 +96,7 @@ class AppearanceRule:
         return gaussian_cutoff(opacities)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class PlainRule(AppearanceRule):
     """Rule of plain 2DGS, and base class of rules without textures."""
 
@@ -112,8 +111,7 @@ class PlainRule(AppearanceRule):
         return None
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class RuleAround(AppearanceRule):
     """Base class of rules that change a part of another rule and forward the rest."""
 
@@ -174,8 +172,7 @@ def has_gaussian_falloff(rule: AppearanceRule) -> bool:
     return type(rule).falloff is AppearanceRule.falloff
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class GivenColors(RuleAround):
     """Another rule with given colours of the Gaussians."""
 
@@ -186,8 +183,7 @@ class GivenColors(RuleAround):
         return self.given
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Features(RuleAround):
     """D features of each splat in place of its colour, with the weights that another rule gives its splats.
 
@@ -216,12 +212,10 @@ class StaticRule:
 
     structure: Any
     """Tree structure of the rule, with the static fields."""
-    classes: tuple[type, ...]
-    """Classes of the rule and its inner nodes, which equality of tree structures ignores (`core.jit`)."""
 
     @staticmethod
     def of(rule: AppearanceRule) -> "StaticRule":
-        return StaticRule(jax.tree.structure(rule), classes_of(rule))
+        return StaticRule(jax.tree.structure(rule))
 
     @property
     def rule(self) -> Any:
@@ -235,7 +229,7 @@ class StaticRule:
     @property
     def name(self) -> str:
         """Name of the rule's class."""
-        return self.classes[0].__name__
+        return self.structure.node_data()[0].__name__
 
 
 class _LeftOut:

@@ -17,6 +17,7 @@ from jax import Array
 from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual, RuleAround, StaticRule
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.checks import check_kind, described
+from a2tg_jax.core.pytree import check_pytree, pytree
 
 ODD_SHAPE = (5, 7)
 """Shape of arrays that fits no matrix in a rule by chance."""
@@ -25,12 +26,7 @@ ODD_SHAPE = (5, 7)
 def check_rule(rule: AppearanceRule) -> None:
     """Raise ValueError unless a value is a rule, and it and the rules in it are pytrees."""
     check_kind("rule", rule, AppearanceRule)
-    for leaf in jax.tree.leaves(rule):
-        if isinstance(leaf, AppearanceRule):
-            raise ValueError(
-                f"{type(leaf).__name__} is not a pytree: decorate it with @jax.tree_util.register_dataclass, above "
-                "@dataclasses.dataclass(frozen=True)"
-            )
+    check_pytree("rule", rule)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,8 +132,7 @@ def elementwise_rule(static: StaticRule, arguments: Arguments) -> Any:
     return static.rule if takes_arrays(static, arguments) else OneByOne(static.rule)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class OneByOne(RuleAround):
     """Rule whose element-wise functions take arrays, though those of `inner` take scalars only."""
 

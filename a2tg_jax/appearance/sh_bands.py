@@ -17,6 +17,7 @@ from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.checks import check_shape, short_repr
 from a2tg_jax.core.numerics import normalize
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import NUM_BASES, sh_basis
 from a2tg_jax.core.spread_arrays import on_host, placed_like
 from a2tg_jax.texture import bucket_capacity
@@ -24,8 +25,7 @@ from a2tg_jax.texture import bucket_capacity
 MAX_DEGREE = 3
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Bands:
     """Coefficients beyond those that all Gaussians have."""
 
@@ -36,8 +36,7 @@ class Bands:
         return short_repr(self)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class BandLayout:
     """Owners of the rows of the tables. Integers only: not differentiable, kept apart from `Bands`."""
 

@@ -13,7 +13,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -25,6 +24,7 @@ from a2tg_jax.appearance.plain import Plain
 from a2tg_jax.appearance.rule import Factor, Residual, RuleAround, has_gaussian_falloff
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.spread_arrays import rows_moved
 
 SHAPES = "shapes"
@@ -116,8 +116,7 @@ def falloff_of(curve: Curve, rho: Array) -> Array:
     return jnp.exp(-curve.scales * (jnp.exp(curve.exponents * jnp.log(rho + OFFSET)) - curve.starts))
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class ShapedRule(RuleAround):
     """Another rule, with a kernel of its own shape for each splat."""
 

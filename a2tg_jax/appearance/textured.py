@@ -19,14 +19,14 @@ from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual, gaussian_
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import within
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures, allocate_textures, nearest_places
 
 EXTENT = 3.0
 """Half the side of a texture, in standard deviations."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class TexturedRule(AppearanceRule):
     """Appearance rule: RGB residual and alpha factor from each splat's own texture."""
 

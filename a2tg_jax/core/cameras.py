@@ -18,6 +18,7 @@ from a2tg_jax.core.checks import (
     make_plain,
     short_repr,
 )
+from a2tg_jax.core.pytree import pytree
 
 LONGEST_SIDE = 100_000
 """Largest longer side of an image, in pixels."""
@@ -33,8 +34,7 @@ LARGEST_COORDINATE = LARGEST_NUMBER
 """Largest coordinate of a camera or a point, in any world."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Camera:
     """One view: a pinhole camera in OpenCV's frame, x right, y down, z forward; pixel centres lie at +0.5.
 

@@ -28,6 +28,7 @@ from a2tg_jax.core.checks import (
 )
 from a2tg_jax.core.forks import check_process
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import NUM_BASES
 
 INITIAL_OPACITY = 0.1
@@ -40,8 +41,7 @@ LEAST_INITIAL_COLOR = 0.05
 """Least initial colour. At and below 0 the renderer's max(colour, 0) has no gradient that would raise it."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Gaussians:
     """N flat Gaussians as unconstrained arrays, all of one dtype: float32, or float64."""
 

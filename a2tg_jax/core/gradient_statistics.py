@@ -4,15 +4,13 @@ A²TG averages ‖Σ_pixels |∂L/∂mean|‖ to choose what gets texels; adapti
 gradient of the projected mean to choose what is cloned or split.
 """
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import DTypeLike
 
 from a2tg_jax.core.checks import check_floats, check_shape
 from a2tg_jax.core.numerics import safe_divide, safe_norm
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.spread_arrays import zeros_beside
 
 
@@ -35,8 +33,7 @@ def read_probe(found: Array, statistic: str, width: int, height: int) -> tuple[A
     return gradients, found[..., 3] > 0
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class GradientStatistics:
     """Sums from which each Gaussian's average gradient norm over views is computed."""
 

@@ -3,7 +3,6 @@
 jaxopt has no Adam of its own. No other module imports jaxopt.
 """
 
-import dataclasses
 import math
 import warnings
 from typing import Any
@@ -14,6 +13,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_number, check_numeric, check_shape
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host.text import shortened
 
 with warnings.catch_warnings():
@@ -23,8 +23,7 @@ with warnings.catch_warnings():
     from jaxopt.linear_solve import solve_cg as solve_cg  # type: ignore[import-untyped]
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class AdamState:
     """State of Adam; `mu` and `nu` have the structure, shapes and dtypes of the parameters."""
 

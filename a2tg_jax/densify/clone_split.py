@@ -17,6 +17,7 @@ from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.gaussians import Gaussians, logit, rotation_matrices
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.events import (
     Change,
     EventInfo,
@@ -27,10 +28,8 @@ from a2tg_jax.events import (
     StepEvent,
     Times,
     clear_moments,
-    event,
     gather_moments,
     gather_rows,
-    static,
 )
 from a2tg_jax.model import Model
 
@@ -49,7 +48,7 @@ class Edit(NamedTuple):
     is_split: Array
 
 
-@event
+@pytree
 class CloneSplitPrune(StepEvent):
     """Event that clones small Gaussians and splits large ones with large gradients, and prunes faint or too large ones.
 
@@ -127,7 +126,7 @@ class CloneSplitPrune(StepEvent):
         return Edit(is_kept, is_doubled & ~is_large, is_doubled & is_large)
 
 
-@event
+@pytree
 class FillingDensity(CloneSplitPrune):
     """Variant of `CloneSplitPrune` whose growth in each event is chosen to end at the cap.
 
@@ -226,7 +225,7 @@ def reset_interval(num_iterations: Any) -> Array:
     return jnp.maximum(num_iterations // 10, LEAST_BETWEEN_RESETS)
 
 
-@event
+@pytree
 class OpacityReset(StepEvent):
     """Event that resets opacities above `most` to `most`: every max(500, n/10) of n iterations, until n/2."""
 

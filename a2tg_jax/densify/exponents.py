@@ -6,11 +6,12 @@ import jax.numpy as jnp
 
 from a2tg_jax.appearance.shaped import LARGEST_LOG_EXPONENT, MOST_SHARE
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.events import Change, Now, StepEvent, event
+from a2tg_jax.core.pytree import pytree
+from a2tg_jax.events import Change, Now, StepEvent
 from a2tg_jax.model import Model
 
 
-@event
+@pytree
 class LimitExponents(StepEvent):
     """Lower limit of the exponents of kernels (`Shaped`), after every iteration."""
 

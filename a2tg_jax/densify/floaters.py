@@ -8,10 +8,11 @@ import numpy as np
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.data import View
 from a2tg_jax.densify.pruning import pruning_times, shown_in
-from a2tg_jax.events import LEAST_LEFT, Change, Due, FieldError, HostEvent, event, keep_rows, static
+from a2tg_jax.events import LEAST_LEFT, Change, Due, FieldError, HostEvent, keep_rows
 from a2tg_jax.model import Model
 
 NEAREST = 0.02
@@ -20,7 +21,7 @@ SURE_VIEWS = 3
 """Number of training views in which a Gaussian must show to count as a part of the scene."""
 
 
-@event
+@pytree
 class PruneFloaters(HostEvent):
     """Event that prunes the Gaussians that show in fewer training views than asked for, or stand close before one.
 

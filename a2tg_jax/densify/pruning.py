@@ -19,11 +19,11 @@ from jax import Array
 from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.display import counted
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.data import View, counted_pixels, views_by_kind
-from a2tg_jax.events import LEAST_LEFT, Change, Due, FieldError, HostEvent, Times, event, keep_rows, static
+from a2tg_jax.events import LEAST_LEFT, Change, Due, FieldError, HostEvent, Times, keep_rows
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import room_of_view
@@ -34,7 +34,7 @@ from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 
 
-@event
+@pytree
 class Prune(HostEvent):
     """Event that prunes the Gaussians with the smallest blending weights, summed over the training views.
 
@@ -172,8 +172,8 @@ def _rounded_up(number: int) -> int:
 
 
 @functools.cache
-def _jitted() -> Jitted[..., tuple[Array, Array]]:
-    return Jitted(_weights, static_argnums=(5,))
+def _jitted() -> jax.stages.Wrapped:
+    return jax.jit(_weights, static_argnums=(5,))
 
 
 def _weights(

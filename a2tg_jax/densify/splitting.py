@@ -25,9 +25,10 @@ from a2tg_jax.core.gaussians import logit
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.spread_arrays import zeros_beside
 from a2tg_jax.densify.clone_split import SPLIT_SHRINK, halved
-from a2tg_jax.events import Change, EventInfo, Now, Seen, Statistic, clear_moments, event, gather_rows
+from a2tg_jax.events import Change, EventInfo, Now, Seen, Statistic, clear_moments, gather_rows
 from a2tg_jax.mcmc import FillingMcmc, Moves, plan_growth, plan_relocation
 from a2tg_jax.model import Model
 
@@ -35,8 +36,7 @@ LEAST_WEIGHT = 1e-12
 """Weight of a host that no view has seen."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class SplitStatistics:
     """Statistics of N Gaussians over the steps since their last split."""
 
@@ -45,7 +45,7 @@ class SplitStatistics:
     """[N] largest of the smaller standard deviations on the screen, in pixels; 0 if no view has composited it."""
 
 
-@event
+@pytree
 class SplitByGradient(FillingMcmc):
     """Event that moves dead Gaussians and adds new ones up to the cap, where the average gradient times the size is
     largest."""

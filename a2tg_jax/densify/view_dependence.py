@@ -4,7 +4,6 @@ The image is linear in the coefficients. So the gradient of a coefficient that a
 over views of ∂L/∂colour · Y(direction). Residuals that many views share add up in it, others cancel.
 """
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -16,14 +15,14 @@ from a2tg_jax.appearance.sh_bands import MAX_DEGREE, BandLayout, Bands, floats_o
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, MOST_ROOM, bytes_of, event_budget, within_budget
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, sh_basis
 from a2tg_jax.core.spread_arrays import on_host, zeros_beside
-from a2tg_jax.events import Change, Due, HostEvent, Seen, event, iterations_at, static
+from a2tg_jax.events import Change, Due, HostEvent, Seen, iterations_at
 from a2tg_jax.model import Model
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class ViewDependence:
     """Sums over views of the gradient at all 16 coefficients of each Gaussian, whether it has them or not."""
 
@@ -61,7 +60,7 @@ class ViewDependence:
 BAND_SLICES = tuple(slice(NUM_BASES[degree - 1], NUM_BASES[degree]) for degree in (1, 2, 3))
 
 
-@event
+@pytree
 class AdaptDegrees(HostEvent):
     """Event that lowers idle degrees and raises others by one where the gradient per byte is largest, within a budget.
 

@@ -21,7 +21,6 @@ from a2tg_jax.appearance import GivenColors
 from a2tg_jax.appearance.layers import layer_without
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import solve_cg
 from a2tg_jax.data import View, counted_pixels, view_image, views_by_kind
 from a2tg_jax.data.scene import check_are_views
@@ -84,8 +83,8 @@ def polish(
 
 
 @functools.cache
-def _jitted() -> Jitted[..., Colors]:
-    return Jitted(_solve, static_argnums=(3, 4))
+def _jitted() -> jax.stages.Wrapped:
+    return jax.jit(_solve, static_argnums=(3, 4))
 
 
 def _solve(

@@ -20,8 +20,9 @@ from a2tg_jax.appearance.shaped import LARGEST_LOG_EXPONENT, MOST_SHARE
 from a2tg_jax.core.gaussians import Gaussians, logit
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.events import Change, Now, StepEvent, event
+from a2tg_jax.events import Change, Now, StepEvent
 from a2tg_jax.io.compact import LEAST_OPACITY, CompactChoices, Grids
 from a2tg_jax.model import Model, Parameters
 from a2tg_jax.texture import Textures
@@ -67,8 +68,7 @@ class ContractedSteps(NamedTuple):
         return nearest
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class GridRounding:
     """Rounding to the grids of a compact file, for models as `half_turned` gives them: no splat is half-turned anew."""
 
@@ -158,7 +158,7 @@ def _with_w(xyz: Array) -> Array:
     return normalize(jnp.concatenate([w, xyz], axis=1))
 
 
-@event
+@pytree
 class GradualRounding(StepEvent):
     """Rounding of more and more numbers, each from a random time on, until all of them are rounded.
 

@@ -22,7 +22,6 @@ from a2tg_jax.appearance import Appearance
 from a2tg_jax.appearance.layers import layer_without
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.data import View
 from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.finish.compaction import loss_on_views
@@ -243,8 +242,8 @@ def texel_weights_of(model: Model, cameras: Sequence[Camera], background: Any) -
 
 
 @functools.cache
-def _jitted() -> Jitted[..., Textures]:
-    return Jitted(_weights_in, static_argnums=(4,))
+def _jitted() -> jax.stages.Wrapped:
+    return jax.jit(_weights_in, static_argnums=(4,))
 
 
 def _weights_in(model: Model, camera: Camera, background: Array, key: Array, settings: RenderSettings) -> Textures:

@@ -16,8 +16,8 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.events import event
 from a2tg_jax.finish.compaction import LADDER, Ladder, Loss, TooMuchLostError, Trial, smallest_within
 from a2tg_jax.finish.rounding import GradualRounding, GridRounding
 from a2tg_jax.io.compact import CompactChoices, Grids, decode_model, encode_model, grids_of, half_turned
@@ -132,7 +132,7 @@ def _tuning(system: System, stage: Stage) -> _Tuning:
     return _Tuning(**shared | {"memory_budget": None}, stage=stage)
 
 
-@event
+@pytree
 class _Constant(Correction):
     """A correction that no longer learns."""
 

@@ -18,7 +18,6 @@ from a2tg_jax.appearance import AppearanceRule
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_mask, check_shape
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.data import View, view_image
@@ -121,8 +120,8 @@ def _aligned(view: View, model: Model, background: Array, settings: RenderSettin
 
 
 @functools.cache
-def _jitted_descent() -> Jitted[..., _Best]:
-    return Jitted(_descent, static_argnums=(6, 7))
+def _jitted_descent() -> jax.stages.Wrapped:
+    return jax.jit(_descent, static_argnums=(6, 7))
 
 
 def _descent(

@@ -5,11 +5,11 @@ import functools
 import time
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.display import counted
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.host.bars import progress_over
 from a2tg_jax.mesh.blocks import BlockGrid, GridFullError
 from a2tg_jax.mesh.depth_maps import DepthMap, depth_map
@@ -198,5 +198,5 @@ def _sphere(
 
 
 @functools.cache
-def _jitted_depths() -> Jitted[..., DepthMap]:
-    return Jitted(depth_map)
+def _jitted_depths() -> jax.stages.Wrapped:
+    return jax.jit(depth_map)

@@ -6,12 +6,12 @@ its depths are sure: its weight falls with the spread of a depth.
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.mesh.blocks import LOCAL, SIDE, VOXELS, BlockGrid, unique_blocks
 from a2tg_jax.mesh.depth_maps import DepthMap
 from a2tg_jax.mesh.space import TRUNCATION, Space
@@ -53,8 +53,8 @@ def blocks_near(depths: DepthMap, space: Space) -> np.ndarray:
 
 
 @functools.cache
-def _jitted_near() -> Jitted[..., Array]:
-    return Jitted(_near)
+def _jitted_near() -> jax.stages.Wrapped:
+    return jax.jit(_near)
 
 
 def _near(depths: DepthMap, space: Space) -> Array:
@@ -70,8 +70,8 @@ def _near(depths: DepthMap, space: Space) -> Array:
 
 
 @functools.cache
-def _jitted_fuse() -> Jitted[..., Voxels]:
-    return Jitted(_fused)
+def _jitted_fuse() -> jax.stages.Wrapped:
+    return jax.jit(_fused)
 
 
 def _fused(voxels: Voxels, blocks: Array, depths: DepthMap, space: Space) -> Voxels:

@@ -7,12 +7,12 @@ Voxel i [3] lies at y = voxel·i, relative to the centre. Within the radius R, x
 import dataclasses
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from a2tg_jax.core.capture import nearest_point
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.similarity import camera_centers
 
 TRUNCATION = 5.0
@@ -23,8 +23,7 @@ RADII = 2.0
 """Default radius, in median distances of the cameras from the centre."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Space:
     """Centre, radius and voxels."""
 

@@ -15,7 +15,6 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.geometry import homographies, screen_bounds
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.rasterize.exchange import Travel, share_of_a_band, travel
 from a2tg_jax.rasterize.image_bands import BorderRoom
 from a2tg_jax.rasterize.render_types import RenderSettings
@@ -111,8 +110,8 @@ def room_of_view(
 
 
 @functools.cache
-def _jitted_count() -> Jitted[..., Array]:
-    return Jitted(_count_pairs, static_argnums=(3, 4))
+def _jitted_count() -> jax.stages.Wrapped:
+    return jax.jit(_count_pairs, static_argnums=(3, 4))
 
 
 def _count_pairs(
@@ -125,8 +124,8 @@ def _count_pairs(
 
 
 @functools.cache
-def _jitted_travel() -> Jitted[..., Travel]:
-    return Jitted(_travel, static_argnums=(3,))
+def _jitted_travel() -> jax.stages.Wrapped:
+    return jax.jit(_travel, static_argnums=(3,))
 
 
 def _travel(

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.events import event, static
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.training.corrections import Correction
 
 LUMINANCE = (0.299, 0.587, 0.114)
 """Weights of red, green and blue (BT.601)."""
 
 
-@event
+@pytree
 class BilateralGrid(Correction):
     """An affine map of colours per view, position and luminance, [L, Gy, Gx, 3, 4]; see `sliced`.
 

@@ -17,8 +17,8 @@ from jax import Array
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.rigid import moved_viewmat
-from a2tg_jax.events import event
 from a2tg_jax.training.returned import check_kept, check_scalar
 
 MOST_READABLE = 100
@@ -59,7 +59,7 @@ class Correction:
         return rows
 
 
-@event
+@pytree
 class Exposure(Correction):
     """An affine map of colours per view, [3, 4], c ↦ A·c + b; on average over the views it changes nothing.
 
@@ -86,7 +86,7 @@ class Exposure(Correction):
         return rows - jnp.mean(rows, axis=0, keepdims=True) + jnp.asarray(self.neutral, rows.dtype)[None]
 
 
-@event
+@pytree
 class PoseRefinement(Correction):
     """A small rigid motion per view, a twist [6] in the camera's frame (`core.rigid.moved_viewmat`)."""
 
@@ -108,8 +108,7 @@ class PoseRefinement(Correction):
         return dataclasses.replace(camera, viewmat=moved_viewmat(row, camera.viewmat))
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class CorrectionState:
     """State of one correction."""
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.numerics import safe_divide
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.data.observations import ObservedPoints
-from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.terms import Target
@@ -23,7 +23,7 @@ LEAST_ALPHA = 0.5
 """Least rendered alpha of pixels that are compared."""
 
 
-@event
+@pytree
 class DepthPrior:
     """Mean absolute difference of inverse depths after scale and shift of least squares (`depth_loss`)."""
 
@@ -42,7 +42,7 @@ class DepthPrior:
         return self.weight * depth_loss(output.depth, output.alpha, prior, counts, has_shift=self.kind == "inverse")
 
 
-@event
+@pytree
 class PointDepths:
     """Mean absolute difference of inverse depths at the points that the photograph observed (`points_loss`)."""
 

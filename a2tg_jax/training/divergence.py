@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.rasterize.exchange import spread
 from a2tg_jax.rasterize.placement import readable
 from a2tg_jax.training.checkpoint import Checkpoint, History
@@ -41,9 +40,9 @@ def largest_loss(history: History) -> float:
 
 
 @functools.cache
-def jitted_attempt() -> Jitted[..., Attempt]:
+def jitted_attempt() -> jax.stages.Wrapped:
     """Return `attempt`, jitted, with its results spread over the devices of the settings."""
-    return Jitted(_spread_attempt, static_argnums=(0,))
+    return jax.jit(_spread_attempt, static_argnums=(0,))
 
 
 def _spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.core.spread_arrays import mesh_of, on_host
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Change, Due, Event, HostEvent, StepEvent
@@ -316,10 +317,10 @@ class StageRun:
 
     def _launch(self, iteration: int) -> StepInfo:
         arguments, step = self.arguments(iteration), jitted_step()
-        num_compiled, started = step.num_compiled(), time.perf_counter()
+        before, started = num_compiled(step), time.perf_counter()
         info: StepInfo
         self.state, info = step(*arguments)
-        is_compiled = step.num_compiled() > num_compiled
+        is_compiled = num_compiled(step) > before
         self.effects.launch(iteration, time.perf_counter() - started if is_compiled else None)
         if is_compiled:
             self.num_compiled += 1

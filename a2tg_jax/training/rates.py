@@ -1,6 +1,5 @@
 """Adam's learning rates of the Gaussians, and how they differ between Gaussians and change during a stage."""
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -8,8 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.events import static
 from a2tg_jax.model import Model
 
 COOLED = 0.1
@@ -18,8 +17,7 @@ LARGEST_RATIO = 5.0
 """Largest ratio of a Gaussian's size to the mean of all that its learning rate follows."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class LearningRates:
     """Adam's learning rates of the Gaussians."""
 

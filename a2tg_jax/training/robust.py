@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.events import event, static
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import photometric_parts
@@ -23,7 +23,7 @@ REACH = 1
 """Number of patches around one over which the residual is averaged."""
 
 
-@event
+@pytree
 class RobustPhotometric:
     """The photometric loss over inliers: patches without an outlying residual (`inliers`)."""
 

@@ -16,8 +16,9 @@ from jax import Array
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.checks import check_kind, kind_of
 from a2tg_jax.core.gaussians import no_rows
+from a2tg_jax.core.pytree import check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times, static
+from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
@@ -44,8 +45,7 @@ class LossTerm(Protocol):
         ...
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class Stage:
     """A part of training with one appearance, one loss and one schedule. A pytree: its numbers are traced."""
 
@@ -193,9 +193,8 @@ def _check_part(name: str, part: Any, kinds: tuple[type, ...]) -> None:
     elif isinstance(part, type) or is_function or not callable(part):
         hint = f": say Term({part.__name__})" if is_function else ""
         raise ValueError(f"{name} must be a loss term, such as Term(function); got {kind_of(part)}{hint}")
+    check_pytree(name, part)
     for leaf in jax.tree.leaves(part):
-        if leaf is part:
-            raise ValueError(f"{name} must be a pytree; got {kind_of(part)}: decorate this class by @a2tg_jax.event")
         if not isinstance(leaf, numbers.Number | np.ndarray | np.generic | jax.Array):
             kind = type(part).__name__
             raise ValueError(f"{name} must hold numbers; got {leaf!r}: make fields of {kind} that hold other static()")

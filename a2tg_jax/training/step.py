@@ -16,9 +16,9 @@ from jax import Array
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
-from a2tg_jax.core.jit import Jitted
 from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.events import Event, EventInfo, Now, Seen, StepEvent, Times
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.exchange import exchange_of, spread
@@ -35,8 +35,7 @@ FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE, EXPLODED = range(5)
 """Status of a state: the reason why the last step was not taken."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@pytree
 class TrainState:
     """All values that training changes. Everything else follows from the system and the iteration."""
 
@@ -120,9 +119,9 @@ class Attempt(NamedTuple):
 
 
 @functools.cache
-def jitted_step() -> Jitted[..., tuple[TrainState, StepInfo]]:
+def jitted_step() -> jax.stages.Wrapped:
     """Return `train_step`, jitted, with the state's buffers donated; its cache counts the traces."""
-    return Jitted(train_step, static_argnums=(0,), donate_argnums=(3,))
+    return jax.jit(train_step, static_argnums=(0,), donate_argnums=(3,))
 
 
 def train_step(

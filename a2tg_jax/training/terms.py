@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.data.observations import ObservedPoints
-from a2tg_jax.events import event, static
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss, photometric_parts
@@ -57,7 +57,7 @@ class Target(NamedTuple):
 LossFunction = Callable[[Model, Target, RenderOutput], Array]
 
 
-@event
+@pytree
 class Term:
     """Function of model, target and render, times a weight.
 
@@ -89,7 +89,7 @@ class Term:
         return getattr(self.function, "__name__", type(self.function).__name__).strip("<>")
 
 
-@event
+@pytree
 class Photometric:
     """(1 − w)·L1 + w·(1 − SSIM), the loss of 3DGS."""
 

@@ -1,0 +1,103 @@
+"""Frozen dataclasses that are pytrees: `pytree` decorates a class, `static` marks a field that is not traced.
+
+`jax.tree_util.register_dataclass` is not used: JAX 0.10 to 0.12 considers the structures of two such classes equal if
+only the classes differ, so that `jax.jit` may run the program of a class for its subclass. Classes registered with
+their own functions are told apart.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar, dataclass_transform, overload
+
+import jax
+
+T = TypeVar("T")
+MARK = "_registered_pytree"
+
+
+def static(*, default: Any = dataclasses.MISSING, is_addition: bool = False) -> Any:
+    """Return a field that chooses shapes or code, and is not traced. Its values must be hashable.
+
+    Args:
+      default: default of the field.
+      is_addition: whether trainings of earlier versions, which lack the field, equal those with its default.
+    """
+    return dataclasses.field(default=default, metadata={"static": True, "is_addition": is_addition})
+
+
+def beside(*, default: Any = None) -> Any:
+    """Return a field that is no part of the pytree: whatever a transformation returns has the default instead."""
+    return dataclasses.field(default=default, metadata={"beside": True})
+
+
+def is_addition(field: dataclasses.Field[Any]) -> bool:
+    """Return whether trainings of earlier versions, which lack a field, equal those with its default."""
+    return bool(field.metadata.get("is_addition", False))
+
+
+@overload
+def pytree(cls: type[T], /) -> type[T]: ...
+@overload
+def pytree(*, kw_only: bool = False, repr: bool = True) -> Callable[[type[T]], type[T]]: ...
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(static, beside, dataclasses.field))
+def pytree(cls: Any = None, /, **options: Any) -> Any:
+    """Decorate a class: make it a frozen dataclass and a pytree of its fields, but for static ones.
+
+    Transformations of JAX build instances without calling `__init__` and `__post_init__`, so that these may check and
+    convert what a caller gives.
+
+    Args:
+      cls: the class; its bases may be decorated, too.
+      **options: options of `dataclasses.dataclass`, as in `@pytree(kw_only=True)`.
+    """
+    if cls is None:
+        return lambda own: pytree(own, **options)
+    made = dataclasses.dataclass(frozen=True, **options)(cls)
+    kinds: dict[str, list[str]] = {"static": [], "beside": [], "dynamic": []}
+    for field in dataclasses.fields(made):
+        kind = next((kind for kind in ("static", "beside") if field.metadata.get(kind)), "dynamic")
+        kinds[kind].append(field.name)
+    dynamic, fixed = tuple(kinds["dynamic"]), tuple(kinds["static"])
+    keys = tuple(jax.tree_util.GetAttrKey(name) for name in dynamic)
+    left_out = {field.name: field.default for field in dataclasses.fields(made) if field.name in kinds["beside"]}
+
+    def flatten(node: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        own = node.__dict__
+        return tuple(own[name] for name in dynamic), tuple(own[name] for name in fixed)
+
+    def flatten_with_keys(node: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        children, values = flatten(node)
+        return tuple(zip(keys, children, strict=True)), values
+
+    def unflatten(values: tuple[Any, ...], children: tuple[Any, ...]) -> Any:
+        node = object.__new__(made)
+        node.__dict__.update(zip(dynamic, children, strict=True))
+        node.__dict__.update(zip(fixed, values, strict=True))
+        node.__dict__.update(left_out)
+        return node
+
+    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
+    setattr(made, MARK, made)
+    return made
+
+
+def check_pytree(name: str, value: Any) -> None:
+    """Raise ValueError unless `pytree` decorates the class of a value and of each dataclass in it."""
+    ahead = [jax.tree.structure(value)]
+    kinds = {type(leaf) for leaf in jax.tree.leaves(value) if leaf is value or dataclasses.is_dataclass(leaf)}
+    while ahead:
+        node = ahead.pop()
+        if data := node.node_data():
+            kinds.add(data[0])
+            ahead += node.children()
+    for kind in kinds:
+        is_other = dataclasses.is_dataclass(kind) or (kind is type(value) and not issubclass(kind, tuple | list | dict))
+        if is_other and kind.__dict__.get(MARK) is not kind:
+            raise ValueError(f"{name} must be a pytree: decorate the class {kind.__name__} with @a2tg_jax.pytree")
+
+
+def num_compiled(jitted: Any) -> int:
+    """Return the number of compiled programs of a function of `jax.jit` in this process."""
+    return int(jitted._cache_size())
