@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from a2tg_jax.adapt import reallocate as reallocate
     from a2tg_jax.adapt import select as select
     from a2tg_jax.appearance import Appearance as Appearance
-    from a2tg_jax.appearance import AppearanceRule as AppearanceRule
-    from a2tg_jax.appearance import Plain as Plain
-    from a2tg_jax.appearance import PlainRule as PlainRule
-    from a2tg_jax.appearance import Textured as Textured
-    from a2tg_jax.appearance import TexturedRule as TexturedRule
+    from a2tg_jax.appearance import Bands as Bands
+    from a2tg_jax.appearance import Exponents as Exponents
+    from a2tg_jax.appearance import TexelRates as TexelRates
+    from a2tg_jax.appearance import Texture as Texture
     from a2tg_jax.appearance import TextureOptions as TextureOptions
+    from a2tg_jax.appearance import allocate_appearance as allocate_appearance
     from a2tg_jax.core.bilinear import TextureRegion as TextureRegion
     from a2tg_jax.core.cameras import Camera as Camera
     from a2tg_jax.core.cameras import resize_camera as resize_camera
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from a2tg_jax.core.optim import exponential_decay as exponential_decay
     from a2tg_jax.core.origin import Origin as Origin
     from a2tg_jax.core.overflow import CapacityWarning as CapacityWarning
+    from a2tg_jax.core.partition import combine as combine
+    from a2tg_jax.core.partition import partition as partition
     from a2tg_jax.core.paths import look_at as look_at
     from a2tg_jax.core.paths import path_through as path_through
     from a2tg_jax.core.paths import smooth_path as smooth_path
@@ -110,7 +112,6 @@ if TYPE_CHECKING:
     from a2tg_jax.mesh.texturing import texture_mesh as texture_mesh
     from a2tg_jax.mesh.triangles import Mesh as Mesh
     from a2tg_jax.model import Model as Model
-    from a2tg_jax.model import Parameters as Parameters
     from a2tg_jax.model import concatenate as concatenate
     from a2tg_jax.rasterize.render_types import RenderOutput as RenderOutput
     from a2tg_jax.rasterize.render_types import RenderSettings as RenderSettings
@@ -119,16 +120,12 @@ if TYPE_CHECKING:
     from a2tg_jax.renderer import Renderer as Renderer
     from a2tg_jax.renderer import plan_render as plan_render
     from a2tg_jax.systems.a2tg import A2tg as A2tg
-    from a2tg_jax.systems.a2tg import TextureConfig as TextureConfig
     from a2tg_jax.systems.bbsplat import BBSplat as BBSplat
     from a2tg_jax.systems.bytewise import Bytewise as Bytewise
     from a2tg_jax.systems.gaussians_2d import Gaussians2d as Gaussians2d
     from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc as Gaussians2dMcmc
-    from a2tg_jax.systems.stage1 import DensityConfig as DensityConfig
-    from a2tg_jax.systems.stage1 import McmcConfig as McmcConfig
     from a2tg_jax.systems.supergaussians import SuperGaussians as SuperGaussians
     from a2tg_jax.systems.textured_gaussians import TexturedGaussians as TexturedGaussians
-    from a2tg_jax.texture import AtlasLayout as AtlasLayout
     from a2tg_jax.texture import Textures as Textures
     from a2tg_jax.texture import allocate_textures as allocate_textures
     from a2tg_jax.texture import texture_arrays as texture_arrays
@@ -166,11 +163,11 @@ _NAMES = {
     "a2tg_jax.adapt": ("Upscale", "next_sizes", "reallocate", "select"),
     "a2tg_jax.appearance": (
         "Appearance",
-        "AppearanceRule",
-        "Plain",
-        "PlainRule",
-        "Textured",
-        "TexturedRule",
+        "Bands",
+        "Exponents",
+        "TexelRates",
+        "Texture",
+        "allocate_appearance",
         "TextureOptions",
     ),
     "a2tg_jax.core.bilinear": ("TextureRegion",),
@@ -180,6 +177,7 @@ _NAMES = {
     "a2tg_jax.core.optim": ("adam_init", "adam_update", "exponential_decay"),
     "a2tg_jax.core.origin": ("Origin",),
     "a2tg_jax.core.overflow": ("CapacityWarning",),
+    "a2tg_jax.core.partition": ("combine", "partition"),
     "a2tg_jax.core.paths": ("look_at", "path_through", "smooth_path"),
     "a2tg_jax.core.pytree": ("pytree", "static"),
     "a2tg_jax.core.similarity": ("Similarity",),
@@ -235,19 +233,18 @@ _NAMES = {
     "a2tg_jax.mesh.simplify": ("simplify_mesh",),
     "a2tg_jax.mesh.texturing": ("texture_mesh",),
     "a2tg_jax.mesh.triangles": ("Mesh",),
-    "a2tg_jax.model": ("Model", "Parameters", "concatenate"),
+    "a2tg_jax.model": ("Model", "concatenate"),
     "a2tg_jax.rasterize.render_types": ("RenderOutput", "RenderSettings"),
     "a2tg_jax.render": ("render_appearance", "render_image"),
     "a2tg_jax.renderer": ("Renderer", "plan_render"),
-    "a2tg_jax.systems.a2tg": ("A2tg", "TextureConfig"),
+    "a2tg_jax.systems.a2tg": ("A2tg",),
     "a2tg_jax.systems.bbsplat": ("BBSplat",),
     "a2tg_jax.systems.bytewise": ("Bytewise",),
     "a2tg_jax.systems.gaussians_2d": ("Gaussians2d",),
     "a2tg_jax.systems.gaussians_2d_mcmc": ("Gaussians2dMcmc",),
-    "a2tg_jax.systems.stage1": ("DensityConfig", "McmcConfig"),
     "a2tg_jax.systems.supergaussians": ("SuperGaussians",),
     "a2tg_jax.systems.textured_gaussians": ("TexturedGaussians",),
-    "a2tg_jax.texture": ("AtlasLayout", "Textures", "allocate_textures", "texture_arrays", "textures_from_arrays"),
+    "a2tg_jax.texture": ("Textures", "allocate_textures", "texture_arrays", "textures_from_arrays"),
     "a2tg_jax.training": (
         "Checkpoint",
         "DivergedError",

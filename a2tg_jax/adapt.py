@@ -4,37 +4,24 @@ The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select`
 `reallocate`. All but the statistic runs on the host, on one array at a time.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
-import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from a2tg_jax.appearance.texel_moves import Move, moved_texels, plan_moves
+from a2tg_jax.appearance import in_words
 from a2tg_jax.core.budget import MOST_ROOM, bytes_of, event_budget, within_budget
-from a2tg_jax.core.checks import check_int, check_literal, check_mask, check_number, check_shape
+from a2tg_jax.core.checks import check_int, check_literal, check_number, check_shape
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.core.spread_arrays import on_host, placed_like
-from a2tg_jax.events import Change, Due, FieldError, HostEvent, Seen, Statistic, iterations_at
+from a2tg_jax.core.table import Shape, bucket_capacity, resize
+from a2tg_jax.events import Change, Due, HostEvent, Seen, Statistic, iterations_at
 from a2tg_jax.model import Model
-from a2tg_jax.texture import (
-    BYTES_PER_TEXEL,
-    MAX_SIDE,
-    NEUTRAL_TEXEL,
-    AtlasLayout,
-    Shape,
-    Textures,
-    bucket_capacity,
-    check_textures,
-    checked_sizes,
-    plan_layout,
-    shape_of,
-)
+from a2tg_jax.parallel.rows import on_host
+from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures, checked_sizes
 
 Axes = Literal["paper", "authors"]
 """Whose choice of the axis that a thin Gaussian doubles."""
@@ -42,6 +29,8 @@ PAPER_ITERATIONS = 30_000
 PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
 """Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and a longer one for short stages, in
 which the statistic needs more time to settle."""
+PAPER_THRESHOLD = 2e-5
+"""k_G, in the unit of the authors' own statistic."""
 USUAL_SHARE = 0.25
 """Default share of the Gaussians that grow, for forecasts."""
 
@@ -50,26 +39,26 @@ class ReallocateResult(NamedTuple):
     """Result of `reallocate`."""
 
     textures: Textures
-    layout: AtlasLayout
     moments: Any
     """Moments as given, their textures rebuilt as the texels were."""
 
 
-@dataclasses.dataclass(frozen=True)
-class UpscaleChoices:
-    """Choices that `Upscale` and the options of a system share."""
+@pytree
+class Upscale(HostEvent):
+    """Gradient-driven selection, then anisotropic upscaling, of textures (A²TG)."""
 
     select: Literal["fraction", "threshold", "budget"] = static(default="fraction")
-    """Rule that chooses the Gaussians to upscale."""
+    """Rule that chooses the Gaussians to upscale; a memory_budget sets "budget"."""
     fraction: float = 0.25
     """Share of the Gaussians upscaled at each event."""
     threshold: float | None = None
     """Smallest average gradient that is upscaled (k_G); needed by select="threshold"."""
     budget_mb: float | None = None
-    """Largest reported memory in MB (10^6 bytes); needed by select="budget"."""
+    """Largest reported memory in MB (10^6 bytes); for select="budget" only, which needs it. It bounds the textures
+    alone, beside the Gaussians; a memory_budget chooses both."""
     anisotropic: bool = static(default=True)
     """Whether thin Gaussians double one axis only; off: always both."""
-    axes: Axes = static(default="paper")  # noqa: RUF009 - an alias of Literal
+    axes: Axes = static(default="paper")
     """Axis that a thin Gaussian doubles: the long one, or the short one as in the authors' program."""
     k_a: float = 4.0
     """Aspect ratio above which a Gaussian counts as elongated."""
@@ -77,12 +66,6 @@ class UpscaleChoices:
     """Shorter scale, in units of the normalised world, below which an elongated Gaussian counts as thin."""
     cap: int = static(default=4)
     """Largest texture side in texels (at most 16)."""
-
-
-@pytree
-class Upscale(UpscaleChoices, HostEvent):
-    """Gradient-driven selection, then anisotropic upscaling, of `appearance.Textured` (A²TG)."""
-
     at: tuple[float, ...] | None = static(default=None)
     """Fractions of the stage after which textures grow; None: as often as it takes to reach the cap, every 1/60 of the
     stage as in the paper, every 0.15 in stages under 30,000 iterations."""
@@ -93,35 +76,50 @@ class Upscale(UpscaleChoices, HostEvent):
     """Adam's moments of a texture that has grown: zero, so that its texels part quickly, or copied from its old
     texels."""
 
-    reads_whole = False
+    @staticmethod
+    def official() -> "Upscale":
+        """Return the choices of the authors' own program."""
+        return Upscale(
+            select="threshold", threshold=PAPER_THRESHOLD, axes="authors", gradient="screen", moments="copied"
+        )
 
     @property
     def statistic(self) -> Statistic:
         return self.gradient
 
+    def check_options(self) -> None:
+        check_number("cap", self.cap, least=1, most=MAX_SIDE)
+        check_number("fraction", self.fraction, least=0, most=1)
+        check_number("k_a", self.k_a, least=1)
+        check_number("k_s", self.k_s, least=0)
+        if self.threshold is not None:
+            check_number("threshold", self.threshold, least=0)
+        if self.budget_mb is not None:
+            check_number("budget_mb", self.budget_mb, least=1e-6)
+        if self.select == "budget" and self.budget_mb is None:
+            raise ValueError("select is 'budget', so budget_mb must say how many MB (10^6 bytes)")
+        if self.select == "threshold" and self.threshold is None:
+            raise ValueError("select is 'threshold', so threshold must say which average gradient")
+        # The threshold of the authors' program may stay when another rule is chosen.
+        for rule, name, usual in (("budget", "budget_mb", None), ("threshold", "threshold", PAPER_THRESHOLD)):
+            number = getattr(self, name)
+            if self.select != rule and number not in (None, usual):
+                raise ValueError(
+                    f"{name} is {number}, but select is {self.select!r}: set select to {rule!r}, or leave {name} out"
+                )
+        self.iterations(PAPER_ITERATIONS)
+
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        self._check_choices()
         fractions = self.at
         if fractions is None:
             interval = SHORT_INTERVAL if num_iterations < PAPER_ITERATIONS else PAPER_INTERVAL
             rounds = math.ceil(math.log2(self.cap))
             fractions = tuple(interval * (index + 1) for index in range(rounds))
-        return iterations_at(fractions, num_iterations, of=self)
-
-    def _check_choices(self) -> None:
-        """Raise FieldError if a number is out of range, or missing for the rule."""
-        if not 1 <= self.cap <= MAX_SIDE:
-            raise FieldError(self, f"{{cap}} must lie in 1..{MAX_SIDE}; got {self.cap}")
-        if not 0 <= self.fraction <= 1:
-            raise FieldError(self, f"{{fraction}} must lie in [0, 1]; got {self.fraction}")
-        if self.select == "budget" and self.budget_mb is None:
-            raise FieldError(self, "{select} is 'budget', so {budget_mb} must say how many MB (10^6 bytes)")
-        if self.select == "threshold" and self.threshold is None:
-            raise FieldError(self, "{select} is 'threshold', so {threshold} must say which average gradient")
+        return iterations_at(fractions, num_iterations)
 
     @property
     def _budget_bytes(self) -> int:
-        assert self.budget_mb is not None, "refused by `iterations`"
+        assert self.budget_mb is not None, "refused by `check_options`"
         return bytes_of(self.budget_mb)
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
@@ -137,14 +135,14 @@ class Upscale(UpscaleChoices, HostEvent):
     ) -> tuple[Model, AdamState]:
         if model.textures is None or self.select != "budget":
             return model, moments
-        textures, layout = model.textures
-        present = BYTES_PER_TEXEL * layout.count_texels(model.num)
+        textures = model.textures
+        present = BYTES_PER_TEXEL * textures.count_elements(model.num)
         left = self._budget_bytes - num_bytes + present
-        room = most_textures(layout.sizes, left, self.cap)
-        if BYTES_PER_TEXEL * room.num_texels > MOST_ROOM * self._budget_bytes:
+        room = most_textures(textures.sizes, left, self.cap)
+        if BYTES_PER_TEXEL * room.num_elements > MOST_ROOM * self._budget_bytes:
             return model, moments
-        rebuilt = reallocate(textures, layout, layout.sizes, moments, room=room)
-        return model.with_textures(rebuilt.textures, rebuilt.layout), rebuilt.moments
+        rebuilt = reallocate(textures, textures.sizes, moments, room=room)
+        return model.with_textures(rebuilt.textures), rebuilt.moments
 
     def init(self, model: Model) -> GradientStatistics:
         return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
@@ -154,12 +152,13 @@ class Upscale(UpscaleChoices, HostEvent):
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
         if model.textures is None:
-            raise ValueError(f"{type(model.appearance).__name__} has no textures that could grow; Textured has")
-        textures, layout = model.textures
-        num = model.num
-        new_sizes, scales, averages = layout.sizes, on_host(model.gaussians.scales), on_host(state.average())
+            raise ValueError(
+                f"{in_words(model.appearance)} cannot grow textures: the stage needs Appearance(texture=Texture())"
+            )
+        textures, num = model.textures, model.num
+        old_sizes, scales, averages = textures.sizes, on_host(model.gaussians.scales), on_host(state.average())
         # Rows that do not exist yet count for nothing, and get nothing.
-        sizes = new_sizes[:num]
+        sizes, new_sizes = old_sizes[:num], old_sizes.copy()
         proposed = next_sizes(
             sizes, scales[:num], k_a=self.k_a, k_s=self.k_s, cap=self.cap,
             anisotropic=self.anisotropic, axes=self.axes,
@@ -172,24 +171,22 @@ class Upscale(UpscaleChoices, HostEvent):
             left = how["budget_bytes"] - _bytes_between(sizes, grown)
             grown = self._with_the_rest(averages[:num], grown, scales[:num], left)
         new_sizes[:num] = grown
-        kept = None if self.moments == "copied" else (new_sizes == layout.sizes).all(axis=1)
-        present = shape_of(textures, layout)
-        rebuilt = reallocate(textures, layout, new_sizes, moments, tuple(due.shapes), kept, present)
-        due.shapes.add(shape_of(rebuilt.textures, rebuilt.layout))
-        model = model.with_textures(rebuilt.textures, rebuilt.layout)
+        kept = None if self.moments == "copied" else (new_sizes == old_sizes).all(axis=1)
+        rebuilt = reallocate(textures, new_sizes, moments, tuple(due.shapes), kept, textures.shape)
+        due.shapes.add(rebuilt.textures.shape)
+        model = model.with_textures(rebuilt.textures)
         return Change(model, rebuilt.moments, self.init(model), unused=unused)
 
     def _unused(self, sizes: np.ndarray, scales: np.ndarray) -> str | None:
         """Return which choices about anisotropy that are not the defaults made no difference to textures that grow."""
-        names = [name for name in ("anisotropic", "k_a", "k_s") if getattr(self, name) != getattr(UpscaleChoices, name)]
+        names = [name for name in ("anisotropic", "k_a", "k_s") if getattr(self, name) != getattr(Upscale, name)]
         if not names:
             return None
         thin = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, axes=self.axes)
         round_ = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, anisotropic=False)
         if (thin != round_).any():
             return None
-        choices = " and ".join(f"{{{name}}}" for name in names)
-        return f"{choices} made no difference, for no Gaussian whose texture grew was elongated and thin"
+        return f"{' and '.join(names)} made no difference, for no Gaussian whose texture grew was elongated and thin"
 
     def _with_the_rest(self, averages: np.ndarray, sizes: np.ndarray, scales: np.ndarray, left: float) -> np.ndarray:
         """Return the sizes after further upscalings if bytes are left after all textures took what they proposed.
@@ -342,7 +339,6 @@ def select(
 
 def reallocate(
     textures: Textures,
-    layout: AtlasLayout,
     new_sizes: ArrayLike,
     moments: Any = None,
     known: Sequence[Shape] = (),
@@ -355,39 +351,22 @@ def reallocate(
     what grows from an empty texture, is (0, 0, 0, 1) in textures and 0 in moments.
 
     Args:
-      textures: the present texels.
-      layout: their layout, of N Gaussians.
+      textures: the present textures, of N Gaussians.
       new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0.
-      moments: any pytree, such as the state of Adam: all `Textures` in it are rebuilt, other leaves stay as they are.
-      known: shapes of buckets to prefer (`texture.plan_layout`).
+      moments: any pytree, such as the state of Adam: all `Textures` in it are rebuilt, other leaves stay
+        unchanged.
+      known: shapes of buckets to prefer (`core.table.plan_places`).
       kept: [N] bool, whose moments are kept, the others' being 0; None: all.
       room: shape of the buckets, if the textures fit; None: as small as possible, or one of `known`.
 
     Raises:
-      ValueError: if `new_sizes` does not fit the layout or holds a side out of range.
+      ValueError: if `new_sizes` does not fit the textures or holds a side out of range.
     """
-    check_textures(textures, layout)
+    check_textures(textures)
     new_sizes = checked_sizes(new_sizes, "new_sizes")
-    check_shape("new_sizes", new_sizes, (layout.num, 2))
-    new_layout, capacities = plan_layout(new_sizes, known, like=layout.bucket, room=room)
-    texel_moves = moment_moves = plan_moves(layout, new_layout)
-    if kept is not None:
-        check_mask("kept", kept, (layout.num,))
-        moment_moves = plan_moves(layout, new_layout, np.asarray(kept))
-    shapes = [(capacity, *size, 4) for capacity, size in zip(capacities, new_layout.resolutions, strict=True)]
-
-    def rebuild(tree: Textures, moves: list[Move], padding: tuple[float, ...]) -> Textures:
-        buckets = moved_texels(tree, shapes, moves, padding)
-        return Textures(tuple(placed_like(bucket, layout.bucket) for bucket in buckets))
-
-    def rebuild_moments(leaf: Any) -> Any:
-        if not isinstance(leaf, Textures):
-            return leaf
-        check_textures(leaf, layout, layout.num, "moments")
-        return rebuild(leaf, moment_moves, (0.0, 0.0, 0.0, 0.0))
-
-    moments = jax.tree.map(rebuild_moments, moments, is_leaf=lambda x: isinstance(x, Textures))
-    return ReallocateResult(rebuild(textures, texel_moves, NEUTRAL_TEXEL), new_layout, moments)
+    check_shape("new_sizes", new_sizes, (textures.num, 2))
+    rebuilt, moments = resize(textures, new_sizes, moments, known, None if kept is None else np.asarray(kept), room)
+    return ReallocateResult(rebuilt, moments)
 
 
 def _select_fraction(statistic: np.ndarray, can_grow: np.ndarray, fraction: float) -> np.ndarray:

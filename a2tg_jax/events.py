@@ -7,32 +7,27 @@ on the host, where shapes may change (`HostEvent`). Either may gather a statisti
 """
 
 import dataclasses
-import re
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.appearance.base import clear_rows
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_mask
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.spread_arrays import mesh_of, on_host, placed_like, rows_moved
+from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.core.table import Shape, Table
 from a2tg_jax.data import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
+from a2tg_jax.parallel.rows import on_host, placed_like, rows_moved
 from a2tg_jax.rasterize.pixel import Statistic as Statistic
-from a2tg_jax.texture import Shape
 
-T = TypeVar("T")
 LEAST_LEFT = 2
 """Smallest number of Gaussians that training needs."""
-
-
-def _as_it_is(tree: Any) -> Any:
-    return tree
 
 
 class Times(NamedTuple):
@@ -63,6 +58,7 @@ class Times(NamedTuple):
 
 
 EVERY_ITERATION = Times(1, 2**31 - 1, 1)
+NEVER = Times(1, 0, 1)
 
 
 class Seen(NamedTuple):
@@ -108,9 +104,6 @@ class Due:
     """Training views, with the cameras that the scene gives."""
     shapes: set[Shape] = dataclasses.field(default_factory=set)
     """Shapes of textures that steps are compiled for; an event adds the shapes that it makes."""
-    agreed: Callable[[Any], Any] = _as_it_is
-    """Function that returns the arrays that the first of several processes has. Sums of renders need it, because GPUs
-    may round them differently each time; all processes call it."""
 
 
 class EventInfo(NamedTuple):
@@ -127,42 +120,36 @@ class Change(NamedTuple):
 
     model: Model
     moments: AdamState
-    """Moments of (gaussians, params)."""
+    """Adam's moments of the model's floats."""
     state: Any
     info: EventInfo = EventInfo()
     rows: np.ndarray | None = None
     """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved.
     Model, moments and state are those of the new order; what other events have gathered then follows."""
     unused: str | None = None
-    """Options of an event on the host that made no difference this time, as a sentence with the event's fields in
-    braces; None: all did. If they made none in the whole stage, a warning says so."""
-
-
-def with_names(message: str, name_of: Callable[[str], str]) -> str:
-    """Return a message in which `name_of` names each field that stands in braces, such as "{cap}"."""
-    return re.sub(r"\{(\w+)\}", lambda match: name_of(match[1]), message)
-
-
-class FieldError(ValueError):
-    """Mistake in a field of an event. `System.naming_options` replaces the field's name by that of its option."""
-
-    def __init__(self, event: "Event", message: str):
-        """Args:
-        event: whose fields they are.
-        message: one line with the fields' names in braces.
-        """
-        super().__init__(with_names(message, lambda name: name))
-        self.event, self.message = event, message
+    """Sentence that begins with a field of an event on the host and says that it made no difference this time; None:
+    all did. If it made none in the whole stage, a warning says so."""
 
 
 class Event:
-    """Base class of both kinds of event."""
+    """Base class of both kinds of event.
 
-    reads_whole: ClassVar[bool] = True
-    """Whether `init` and `gather`, and `apply` of an event on the host, get arrays whole, on one device, where several
-    devices train together. That device needs room for the whole state twice. If False, they get the arrays as they
-    lie, with their rows spread over the devices, read them by `on_host` and place new ones by `placed_like`, one at a
-    time (`core.spread_arrays`)."""
+    Where several devices train together, arrays come as they are, with their rows spread over the devices; whatever
+    `init`, `gather` and an event on the host return is spread again. On the host, read arrays by `on_host`, and place
+    new ones by `placed_like`, which never puts all rows on one device (`parallel.rows`).
+    """
+
+    prunes_large: ClassVar[bool] = False
+    """Whether it prunes Gaussians for their size, so that no sky can be trained."""
+    limited_by: ClassVar[str] = ""
+    """Field that bounds the number of Gaussians, such as "cap"; advice names it."""
+
+    def check_options(self) -> None:
+        """Check the ranges of the fields (host). A stage calls it, and a system whose option the event is.
+
+        Raises:
+          ValueError: beginning with the name of the field, such as "cap must be at least 2; got 1".
+        """
 
     @property
     def statistic(self) -> Statistic | None:
@@ -179,7 +166,7 @@ class Event:
 
         It does not follow rows that another event moves inside the step: what gathers per row wants a stage in which
         none does. `gather` follows those that move on the host. If several devices train together, they share the rows
-        of these arrays; those made by `core.spread_arrays.zeros_beside` never lie on one device.
+        of these arrays; those made by `parallel.rows.zeros_beside` are never on one device.
         """
         return ()
 
@@ -228,9 +215,7 @@ class StepEvent(Event):
     num_keys: ClassVar[int] = 1
     """Random keys that `apply` uses."""
     impossible: ClassVar[str] = ""
-    """Reason why training cannot go on if `EventInfo.is_possible` is False; the event's fields stand in braces."""
-    refused: ClassVar[str] = ""
-    """Advice if `EventInfo.num_refused` is not 0, such as "raise {cap}"; the event's fields stand in braces."""
+    """Reason why training cannot go on if `EventInfo.is_possible` is False, in terms of the event's fields."""
 
     def times(self, num_iterations: int) -> Times:
         """Return the times of the event in a stage of so many iterations (host)."""
@@ -274,37 +259,22 @@ class HostEvent(Event):
         raise NotImplementedError(f"{type(self).__name__} must say what it does")
 
 
-def iterations_at(
-    fractions: tuple[float, ...], num_iterations: int, name: str = "at", of: Event | None = None
-) -> tuple[int, ...]:
+def iterations_at(fractions: tuple[float, ...], num_iterations: int, *, with_end: bool = False) -> tuple[int, ...]:
     """Return the iterations at fractions of a stage, ascending; in a short stage two of them may be one (host).
 
     Args:
-      fractions: ascending, between 0 and 1.
+      fractions: the event's field `at`, ascending, between 0 and 1.
       num_iterations: length of the stage.
-      name: name of the fractions in the error.
-      of: event that has the fractions as its field `name`; None if `name` is an option.
+      with_end: whether the last fraction may be 1, the end of the stage.
 
     Raises:
-      ValueError: if the fractions are not ascending or not between 0 and 1; a `FieldError` if `of` is given.
+      ValueError: if the fractions are not ascending or out of range.
     """
-    if any(not 0 < fraction < 1 for fraction in fractions) or list(fractions) != sorted(set(fractions)):
-        wrong = f"must be ascending fractions between 0 and 1; got {shortened(fractions)}"
-        raise ValueError(f"{name} {wrong}") if of is None else FieldError(of, f"{{{name}}} {wrong}")
+    is_inside = all(0 < fraction < 1 or (with_end and fraction == 1) for fraction in fractions)
+    if not is_inside or list(fractions) != sorted(set(fractions)):
+        wanted = "fractions above 0, up to 1" if with_end else "fractions between 0 and 1"
+        raise ValueError(f"at must be ascending {wanted}; got {shortened(fractions)}")
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
-
-
-def from_options(kind: type[T], options: Any, **others: Any) -> T:
-    """Build an event from options.
-
-    Args:
-      kind: class of the event.
-      options: dataclass; its fields of the same names set fields of the event.
-      others: further fields of the event, which take precedence.
-    """
-    fields = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    shared = fields & {field.name for field in dataclasses.fields(options)} - set(others)
-    return kind(**{name: getattr(options, name) for name in shared}, **others)
 
 
 def keep_rows(model: Model, moments: AdamState, state: Any, is_kept: Any) -> Change:
@@ -320,11 +290,9 @@ def keep_rows(model: Model, moments: AdamState, state: Any, is_kept: Any) -> Cha
         as `model.gaussians.opacities > 0.01`.
 
     Raises:
-      ValueError: if it is no such mask or keeps fewer than 2, or if Gaussians have degrees of their own or textures of
-        several sizes.
+      ValueError: if it is no such mask or keeps fewer than 2, or if textures or view dependence have blocks of several
+        sizes.
     """
-    if model.appearance.has_degrees:
-        raise ValueError("Gaussians that have degrees of their own cannot change rows: prune before they have")
     num, rows = model.num, np.arange(model.gaussians.num, dtype=np.int32)
     is_kept = on_host(is_kept)
     check_mask("is_kept", is_kept, (len(rows) if is_kept.shape == rows.shape else num,))
@@ -332,42 +300,40 @@ def keep_rows(model: Model, moments: AdamState, state: Any, is_kept: Any) -> Cha
     if (num_kept := int(is_kept.sum())) < LEAST_LEFT:
         raise ValueError(f"is_kept must keep at least {LEAST_LEFT} Gaussians; got {num_kept} of {num:,}")
     rows[:num] = np.concatenate([np.flatnonzero(is_kept), np.flatnonzero(~is_kept)])
-    means = model.gaussians.means
-    moved: Any = jnp.asarray(rows) if mesh_of(means) is None else rows  # To the device once, or moved on the host.
-    moments = gather_moments(model, moments, moved)
-    left = placed_like(np.asarray(num_kept, np.int32), means)
-    model = dataclasses.replace(gather_rows(model, moved), num_live=left)
+    moments = gather_moments(moments, rows)
+    left = placed_like(np.asarray(num_kept, np.int32), model.gaussians.means)
+    model = dataclasses.replace(gather_rows(model, rows), num_live=left)
     return Change(model, moments, state, rows=rows)
 
 
 def gather_rows(model: Model, rows: Any) -> Model:
     """Return the model whose row i is the former row rows[i], of all N."""
-    params = model.appearance.gather(model.params, model.layout, rows)
-    return dataclasses.replace(model, gaussians=_moved(model.gaussians, rows), params=params)
+    gaussians, appearance = _moved((model.gaussians, model.appearance), rows)
+    return dataclasses.replace(model, gaussians=gaussians, appearance=appearance)
 
 
-def gather_moments(model: Model, moments: AdamState, rows: Any) -> AdamState:
+def gather_moments(moments: AdamState, rows: Any) -> AdamState:
     """Return the moments whose row i is the former row rows[i], of all N."""
-    return _of_pairs(moments, lambda g, p: (_moved(g, rows), model.appearance.gather(p, model.layout, rows)))
+    return dataclasses.replace(moments, mu=gather_rows(moments.mu, rows), nu=gather_rows(moments.nu, rows))
 
 
 def _moved(tree: Any, rows: Any) -> Any:
-    """Return arrays whose row i is the former row rows[i]."""
-    return jax.tree.map(lambda x: rows_moved(x, rows), tree)
+    """Return arrays and tables whose row i is the former row rows[i]."""
+    return jax.tree.map(
+        lambda leaf: leaf.gather(rows) if isinstance(leaf, Table) else rows_moved(leaf, rows),
+        tree,
+        is_leaf=lambda leaf: isinstance(leaf, Table),
+    )
 
 
 def clear_moments(model: Model, moments: AdamState, is_cleared: Array) -> AdamState:
     """Return the moments with the marked rows [N] at zero."""
+    _, rest = partition(model)
 
-    def clear(leaf: Array) -> Array:
-        return jnp.where(is_cleared.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.zeros_like(leaf), leaf)
+    def cleared(moment: Model) -> Model:
+        whole = combine(moment, rest)
+        gaussians, appearance = clear_rows((whole.gaussians, whole.appearance), is_cleared)
+        floats, _ = partition(dataclasses.replace(whole, gaussians=gaussians, appearance=appearance))
+        return floats
 
-    def cleared(gaussians: Any, params: Any) -> tuple[Any, Any]:
-        return jax.tree.map(clear, gaussians), model.appearance.clear(params, model.layout, is_cleared)
-
-    return _of_pairs(moments, cleared)
-
-
-def _of_pairs(moments: AdamState, function: Callable[[Any, Any], Any]) -> AdamState:
-    """`function` of the Gaussians' and the parameters' part of both moments."""
-    return dataclasses.replace(moments, mu=function(*moments.mu), nu=function(*moments.nu))
+    return dataclasses.replace(moments, mu=cleared(moments.mu), nu=cleared(moments.nu))

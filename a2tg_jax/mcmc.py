@@ -17,13 +17,13 @@ from jax import Array
 
 from a2tg_jax.appearance.copies import DEAD_OPACITY, MAX_SHARES, share
 from a2tg_jax.core.budget import number_to_reach
-from a2tg_jax.core.checks import check_shape
+from a2tg_jax.core.checks import check_number, check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians, rotation_matrices
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.events import Change, EventInfo, FieldError, Now, StepEvent, Times, clear_moments, gather_rows
+from a2tg_jax.core.table import bucket_capacity
+from a2tg_jax.events import NEVER, Change, EventInfo, Now, StepEvent, Times, clear_moments, gather_rows
 from a2tg_jax.model import Model
-from a2tg_jax.texture import bucket_capacity
 
 NOISE_SCALE = 5e5
 NOISE_STEEPNESS = 100.0
@@ -262,7 +262,7 @@ def _zero_rows(tree: Any, is_zeroed: Array) -> Any:
     return jax.tree.map(lambda x: jnp.where(is_zeroed.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x), tree)
 
 
-def _check_moments(gaussians: Gaussians, moments: Any) -> None:
+def _check_moments(gaussians: Gaussians, moments: object) -> None:
     """Raise ValueError unless the Gaussians are well formed and every leaf has one row for each of them."""
     check_gaussians(gaussians)
     for leaf in jax.tree.leaves(moments):
@@ -280,8 +280,6 @@ def densify_times(num_iterations: int, last: float = 5 / 6) -> Times:
 class Noise(StepEvent):
     """Exploration noise on the means, after every iteration (`perturb`)."""
 
-    reads_whole = False
-
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
         gaussians = perturb(now.keys[0], model.gaussians, model.live_count, now.rate_of_means)
         return Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
@@ -292,18 +290,22 @@ class Mcmc(StepEvent):
     """Relocation of dead Gaussians and growth to a cap (`relocate`, `grow`), for any appearance."""
 
     cap: int = static(default=500_000)
-    """Largest number of Gaussians."""
+    """Largest number of Gaussians; 0: none relocate, and their number stays. A memory_budget takes its place."""
 
-    reads_whole = False
+    limited_by = "cap"
     num_keys: ClassVar[int] = 2
     impossible: ClassVar[str] = "no Gaussian above the death opacity is left"
 
+    def check_options(self) -> None:
+        if self.cap:
+            check_number("cap", self.cap, least=2)
+
     def times(self, num_iterations: int) -> Times:
-        return densify_times(num_iterations)
+        return densify_times(num_iterations) if self.cap else NEVER
 
     @property
-    def most_gaussians(self) -> int:
-        return self.cap
+    def most_gaussians(self) -> int | None:
+        return self.cap or None
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         """Return the cap, or, if growth reaches less than half of it, what it reaches, rounded up to few shapes."""
@@ -331,12 +333,11 @@ class Mcmc(StepEvent):
 
     @staticmethod
     def _move(model: Model, moments: AdamState, plan: Callable[..., Moves]) -> tuple[Model, AdamState, MoveInfo]:
-        appearance, layout = model.appearance, model.layout
         num_live = model.live_count
-        moves = plan(appearance.opacities(model.gaussians, model.params, layout), num_live)
-        gaussians, params = appearance.share(model.gaussians, model.params, layout, moves.num_shares)
+        moves = plan(model.appearance.opacities(model.gaussians), num_live)
+        gaussians, appearance = model.appearance.share(model.gaussians, moves.num_shares)
         num_live = num_live + moves.info.num_added
-        shared = dataclasses.replace(model, gaussians=gaussians, params=params, num_live=num_live)
+        shared = dataclasses.replace(model, gaussians=gaussians, appearance=appearance, num_live=num_live)
         return gather_rows(shared, moves.rows), clear_moments(model, moments, moves.is_reset), moves.info
 
 
@@ -344,12 +345,14 @@ class Mcmc(StepEvent):
 class FillingMcmc(Mcmc):
     """Variant of `Mcmc` that grows by more than 5 % if it takes that to reach the cap by its last event."""
 
+    def check_options(self) -> None:
+        check_number("cap", self.cap, least=2)
+
     def num_rows(self, num: int, num_iterations: int) -> int:
         if num < self.cap and not self.times(num_iterations).num_times:
-            raise FieldError(
-                self,
-                f"{{cap}} has room for {self.cap:,} Gaussians, but in {num_iterations} iterations there is no growth "
-                f"from {num:,}",
+            raise ValueError(
+                f"cap has room for {self.cap:,} Gaussians, but in {num_iterations} iterations there is no growth from "
+                f"{num:,}"
             )
         return max(num, self.cap)
 

@@ -3,92 +3,70 @@
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance, AppearanceRule, Plain, PlainRule
-from a2tg_jax.appearance.layers import layers_in_words
-from a2tg_jax.appearance.sh_bands import BandLayout, Bands, dense_sh, split_sh
-from a2tg_jax.appearance.stored import check_given
+from a2tg_jax.appearance import Appearance, count_floats, in_words, template_of
+from a2tg_jax.appearance.bands import MAX_DEGREE, bands_of_dense, degrees_of_sizes, dense_bands
+from a2tg_jax.appearance.base import check_arrays_given, join_rows, take_rows
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind, check_unmasked, short_repr
-from a2tg_jax.core.display import counted, html_table, in_bytes, short_tuple_repr
-from a2tg_jax.core.forks import check_process
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.origin import BLACK, Origin
-from a2tg_jax.core.pytree import pytree
+from a2tg_jax.core.notebook_display import html_table
+from a2tg_jax.core.origin import BLACK, Color, Origin
+from a2tg_jax.core.partition import partition
+from a2tg_jax.core.pytree import beside, pytree, static
+from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.transform import transform_gaussians
+from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.render import render_appearance, with_features
-from a2tg_jax.texture import AtlasLayout, Textures, check_textures
+from a2tg_jax.texture import Textures
 
 SAME_PLACE = 1e-5
 """Largest distance of two models' origins that are taken for one."""
 
 
-class Parameters(NamedTuple):
-    """The floats of a model, or gradients of them."""
-
-    gaussians: Gaussians
-    """Floats of the Gaussians."""
-    params: Any
-    """Floats of the appearance."""
-
-    def __repr__(self) -> str:
-        return short_tuple_repr(self)
-
-
 @pytree
 class Model:
-    """Gaussians, their appearance with its parameters, and their origin.
+    """Gaussians and their appearance, N rows each.
 
     Methods marked "(host)" read numbers of the device, and cannot be called under jit.
     """
 
     gaussians: Gaussians
     """Allocated rows, of which the first `num_live` exist."""
-    params: Any = ()
-    """Parameters of the appearance."""
-    layout: Any = ()
-    """Integers of the appearance beside its parameters, not differentiable."""
+    appearance: Appearance = Appearance()
+    """What the Gaussians show; plain Gaussians by default."""
     num_live: Array | None = None
     """int32 number of rows that exist; None if all do."""
-    appearance: Appearance = dataclasses.field(default_factory=Plain, metadata={"static": True})
-    """Kind of appearance, with its options."""
-    origin: Origin | None = dataclasses.field(default=None, metadata={"static": True})
-    """Training cameras and world; None if unknown."""
+    background: Color = static(default=BLACK)
+    """RGB behind all splats."""
+    origin: Origin | None = beside(default=None)
+    """Training cameras and world; None if unknown. No part of the pytree: what jit or `jax.tree.map` returns has none,
+    and models that differ in it only share compiled programs."""
 
     def __post_init__(self) -> None:
-        """Refuse other values of this library in place of Gaussians; transformations put values of their own there."""
+        """Refuse other values of this library instead of Gaussians and appearance; rates and the like pass."""
         is_ours = type(self.gaussians).__module__.startswith("a2tg_jax.")
         if is_ours or isinstance(self.gaussians, str):
             check_kind("gaussians", self.gaussians, Gaussians)
-
-    @property
-    def rule(self) -> AppearanceRule:
-        """Appearance rule for the renderer."""
-        check_process()
-        check_given(self.appearance, self.params)
-        if isinstance(self.params, Textures):
-            check_textures(self.params, self.layout, self.gaussians.num, "model.params")
-        return PlainRule() if self.gaussians.num == 0 else self.appearance.rule(self.params, self.layout)
+        if type(self.appearance).__module__.startswith("a2tg_jax."):
+            check_kind("appearance", self.appearance, Appearance, "such as Appearance(texture=Texture(textures))")
 
     @property
     def live(self) -> "Model":
         """Model of only the rows that exist (host)."""
-        check_given(self.appearance, self.params)
+        check_arrays_given(self.appearance)
         if self.num_live is None:
             return self
-        params, layout = self.appearance.first_rows(self.params, self.layout, self.num)
-        return dataclasses.replace(
-            self, gaussians=self.gaussians[: self.num], params=params, layout=layout, num_live=None
-        )
+        return dataclasses.replace(self._taken(np.arange(self.num)), num_live=None)
 
     def __getitem__(self, rows: Any) -> "Model":
         """Return the model of some of the Gaussians that exist (host).
@@ -100,20 +78,11 @@ class Model:
           ValueError: if it is none of these, or an index is out of range.
         """
         model = self.live
-        indices = _indices(rows, model.num)
-        params, layout = model.appearance.take_rows(model.params, model.layout, indices)
-        return dataclasses.replace(model, gaussians=model.gaussians[indices], params=params, layout=layout)
+        return model._taken(_indices(rows, model.num))
 
-    @property
-    def parameters(self) -> Parameters:
-        """All floats of the model, which training differentiates and changes."""
-        return Parameters(self.gaussians, self.params)
-
-    def with_parameters(self, parameters: Parameters) -> "Model":
-        """Return the same model with other floats, of the same shapes."""
-        hint = "say model.parameters._replace(gaussians=gaussians)" if isinstance(parameters, Gaussians) else ""
-        check_kind("parameters", parameters, Parameters, hint)
-        return dataclasses.replace(self, gaussians=parameters.gaussians, params=parameters.params)
+    def _taken(self, rows: np.ndarray) -> "Model":
+        gaussians, appearance = take_rows((self.gaussians, self.appearance), rows)
+        return dataclasses.replace(self, gaussians=gaussians, appearance=appearance)
 
     @property
     def num(self) -> int:
@@ -134,69 +103,61 @@ class Model:
     def num_published_bytes(self) -> int:
         """Bytes as the method's authors count them (host)."""
         own = self.gaussians.floats_per_row * self.num
-        return BYTES_PER_FLOAT * (own + self.appearance.num_published_floats(self.layout, self.num))
+        return BYTES_PER_FLOAT * (own + self.appearance.num_published_floats(self.num))
 
     def bytes_of(self, num: int) -> int:
         """Return the bytes of the trained floats of the first `num` Gaussians and their appearance (host)."""
-        check_given(self.appearance, self.params)
-        return BYTES_PER_FLOAT * (self.gaussians.floats_per_row * num + self.appearance.num_floats(self.layout, num))
+        check_arrays_given(self.appearance)
+        return BYTES_PER_FLOAT * (self.gaussians.floats_per_row * num + count_floats(self.appearance, num))
 
     @property
     def num_padding_bytes(self) -> int:
         """Bytes of padding in the buffers (host)."""
-        allocated = sum(np.asarray(leaf.shape).prod() * leaf.dtype.itemsize for leaf in jax.tree.leaves(self.params))
+        floats, _ = partition(self.appearance)
+        allocated = sum(np.asarray(leaf.shape).prod() * leaf.dtype.itemsize for leaf in jax.tree.leaves(floats))
         return int(allocated) + BYTES_PER_FLOAT * self.gaussians.floats_per_row * self.num - self.num_bytes
 
     @property
-    def textures(self) -> tuple[Textures, AtlasLayout] | None:
-        """Textures and their layout; None without textures."""
-        return self.appearance.textures(self.params, self.layout)
+    def textures(self) -> Textures | None:
+        """Textures of the splats; None without textures."""
+        return self.appearance.textures
 
-    def with_textures(self, textures: Textures, layout: AtlasLayout) -> "Model":
+    def with_textures(self, textures: Textures) -> "Model":
         """Return the same model with other textures.
 
         Raises:
           ValueError: if the model has none; the message says how to build one that has.
         """
-        check_given(self.appearance, self.params)
-        params, layout = self.appearance.with_textures(self.params, self.layout, textures, layout)
-        return dataclasses.replace(self, params=params, layout=layout)
+        return dataclasses.replace(self, appearance=self.appearance.with_textures(textures))
 
     @property
-    def bands(self) -> tuple[Bands, BandLayout] | None:
-        """Spherical harmonics beyond those of the Gaussians, and their owners; None without degrees per Gaussian."""
-        return self.appearance.bands(self.params, self.layout)
-
-    def with_bands(self, bands: Bands, owners: BandLayout) -> "Model":
-        """Return the same model with other spherical harmonics beyond those of the Gaussians.
-
-        Raises:
-          ValueError: if the model has no degrees per Gaussian; the message says how to build one that has.
-        """
-        check_given(self.appearance, self.params)
-        params, layout = self.appearance.with_bands(self.params, self.layout, bands, owners)
-        return dataclasses.replace(self, params=params, layout=layout)
+    def degrees(self) -> np.ndarray:
+        """[N] degrees of the spherical harmonics of each allocated Gaussian (host)."""
+        base, coefficients = self.gaussians.sh_degree, self.appearance.coefficients
+        if coefficients is None:
+            return np.full(self.gaussians.num, base)
+        return degrees_of_sizes(coefficients.sizes, base)
 
     @property
     def sh(self) -> np.ndarray:
-        """[N, K, 3] all spherical harmonics, with zeros above the degree of a Gaussian (host)."""
-        own = np.asarray(self.gaussians.sh)
-        return own if self.bands is None else dense_sh(own, *self.bands)
+        """[N, K, 3] all spherical harmonics, with zeros above the degree of a Gaussian; K is that of the highest degree
+        (host)."""
+        own, coefficients = np.asarray(self.gaussians.sh), self.appearance.coefficients
+        if coefficients is None:
+            return own
+        highest = int(self.degrees.max(initial=self.gaussians.sh_degree))
+        dense = dense_bands(coefficients, self.gaussians.sh_degree)
+        return np.concatenate([own, dense], axis=1, dtype=own.dtype)[:, : NUM_BASES[highest]]
 
     def with_sh(self, sh: np.ndarray) -> "Model":
         """Return the same model with other spherical harmonics, as `sh` gives them; degrees stay (host)."""
-        own = jnp.asarray(sh[:, : self.gaussians.sh.shape[1]], self.gaussians.sh.dtype)
+        base = self.gaussians.sh_degree
+        own = jnp.asarray(sh[:, : NUM_BASES[base]], self.gaussians.sh.dtype)
         model = dataclasses.replace(self, gaussians=dataclasses.replace(self.gaussians, sh=own))
-        if self.bands is None:
+        if self.appearance.coefficients is None:
             return model
-        _, owners = self.bands
-        bands, _ = split_sh(sh, owners.degrees, owners.base_degree)
-        return model.with_bands(bands, owners)
-
-    @property
-    def background(self) -> tuple[float, float, float]:
-        """RGB behind all splats: that of the origin, or black."""
-        return BLACK if self.origin is None else self.origin.background
+        coefficients = bands_of_dense(sh[:, NUM_BASES[base] :], self.degrees, base)
+        return dataclasses.replace(model, appearance=self.appearance.with_coefficients(coefficients))
 
     def render(
         self,
@@ -210,21 +171,21 @@ class Model:
 
         Args:
           camera: the view.
-          features: [N, D] numbers to show in place of colours (`render_image`), one row for each allocated Gaussian.
+          features: [N, D] numbers to show instead of colours (`render_image`), one row for each allocated Gaussian.
           background: [3] colour, or [D] features; None is the model's own, or 0 behind features.
           settings: static options; `texture` is not used, for the appearance has options of its own. Under jit they
             need a capacity: `plan_render(model, cameras)`.
         """
         background = self.background if background is None and features is None else background
-        rule = with_features(self.rule, features, self.gaussians)
+        appearance = with_features(self.appearance, features, self.gaussians)
         return render_appearance(
-            self.gaussians, camera, rule, background=background, settings=settings, num_live=self.num_live
+            self.gaussians, camera, appearance, background=background, settings=settings, num_live=self.num_live
         )
 
     def transform(self, similarity: Similarity) -> "Model":
         """Return the same model in the world that `similarity` leads to, with its cameras (host).
 
-        View dependence turns with the world; all other parameters of the appearance stay.
+        View dependence turns with the world; everything else of the appearance stays.
 
         Lengths of the settings are in units of the world: `near_plane` is 0.2 of the new units too. Scale it along for
         the same image, which else may lack or show splats close to the camera:
@@ -253,10 +214,11 @@ class Model:
     def _facts(self) -> list[tuple[str, str]]:
         """Return what a reader asks about a model, by name (host)."""
         degree = self.gaussians.sh_degree
+        has_bands = self.appearance.bands is not None
         facts = [
             ("Gaussians", counted(self.num, "Gaussian")),
-            ("view dependence", f"SH degrees {degree} to 3" if self.appearance.has_degrees else f"SH degree {degree}"),
-            ("appearance", layers_in_words(self.appearance.layers)),
+            ("view dependence", f"SH degrees {degree} to {MAX_DEGREE}" if has_bands else f"SH degree {degree}"),
+            ("appearance", in_words(self.appearance)),
             ("memory", in_bytes(self.num_bytes)),
         ]
         return facts if self.origin is None else [*facts, ("origin", repr(self.origin))]
@@ -305,8 +267,8 @@ def concatenate(models: Sequence[Model]) -> Model:
         check_kind(f"models[{index}]", model, Model)
     models = [model.live for model in models]
     first = models[0]
-    if kinds := [type(m.appearance).__name__ for m in models if m.appearance != first.appearance]:
-        own = type(first.appearance).__name__
+    if kinds := [in_words(m.appearance) for m in models if template_of(m.appearance) != template_of(first.appearance)]:
+        own = in_words(first.appearance)
         why = f"{own} and {kinds[0]}" if kinds[0] != own else f"{own} of different options"
         raise ValueError(f"models must have one appearance; got {why}")
     if dtypes := [
@@ -320,12 +282,11 @@ def concatenate(models: Sequence[Model]) -> Model:
                 move = f"models[{index}].origin.transform.inverse().then(models[0].origin.transform)"
                 warnings.warn(f"models[{index}] is relative to another offset; transform it by {move}", stacklevel=2)
     highest = max(model.gaussians.sh.shape[1] for model in models)
-    several = [_with_bases(model.gaussians, 0 if first.appearance.has_degrees else highest) for model in models]
+    several = [_with_bases(model.gaussians, 0 if first.appearance.bands is not None else highest) for model in models]
     if len({gaussians.sh_degree for gaussians in several}) > 1:
         raise ValueError(f"models must have one degree below their bands; got {[g.sh_degree for g in several]}")
-    params, layout = first.appearance.joined([(model.params, model.layout) for model in models])
-    gaussians = jax.tree.map(lambda *x: jnp.concatenate(x), *several)
-    return dataclasses.replace(first, gaussians=gaussians, params=params, layout=layout)
+    gaussians, appearance = join_rows([(own, model.appearance) for own, model in zip(several, models, strict=True)])
+    return dataclasses.replace(first, gaussians=gaussians, appearance=appearance)
 
 
 def _with_bases(gaussians: Gaussians, num: int) -> Gaussians:

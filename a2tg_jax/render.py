@@ -1,36 +1,38 @@
-"""Images of textured 2D Gaussians: `render_image` for Gaussians and textures, `render_appearance` for any rule.
+"""Images of textured 2D Gaussians: `render_image` for Gaussians and textures, `render_appearance` for any appearance.
 
 N splats, H×W pixels. An eager call plans its own capacity. Under jit or vmap, the capacity comes from the settings,
 which `plan_render` fills in.
 """
 
+import dataclasses
 import functools
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
-from a2tg_jax.appearance import Appearance, AppearanceRule, Features, PlainRule, appearance_for, check_rule
+from a2tg_jax.appearance import Appearance, appearance_for, check_is_appearance
+from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain
+from a2tg_jax.core.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain_array
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.overflow import OverflowWatch
 from a2tg_jax.rasterize.capacity import with_capacity
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.texture import AtlasLayout, Textures, check_textures
+from a2tg_jax.texture import Textures, check_textures
 
 
 def render_image(
     gaussians: Gaussians,
     camera: Camera,
     textures: Textures | None = None,
-    layout: AtlasLayout | None = None,
     *,
-    features: Any = None,
-    background: Any = None,
+    features: ArrayLike | None = None,
+    background: ArrayLike | None = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
 ) -> RenderOutput:
     """Render a view: equations (3) to (6) of A²TG. Differentiable in every float, camera and background included.
@@ -38,9 +40,9 @@ def render_image(
     Args:
       gaussians: N Gaussians.
       camera: the view.
-      textures, layout: textures of the Gaussians; without both, the splats are plain 2DGS.
-      features: [N, D] numbers of each Gaussian to show in place of its colour, D >= 1, of either sign. They are
-        weighted as the colour is and not clipped: `color` is [H, W, D]. Of textures they see alpha only.
+      textures: textures of the Gaussians; without them, the splats are plain 2DGS.
+      features: [N, D] numbers of each Gaussian to show instead of its colour, D >= 1, of either sign. They are
+        weighted like the colour and not clipped: `color` is [H, W, D]. Of textures only alpha acts on them.
       background: [3] colour, or [D] features, behind everything; None is 0.
       settings: static options. An eager call, also under `jax.grad`, needs no capacity and never overflows.
 
@@ -49,34 +51,35 @@ def render_image(
       whole image and all gradients are NaN. A NaN texel is NaN in the image where it is visible.
 
     Raises:
-      ValueError: under jit or vmap without a capacity, if only one of textures and layout is given, if the layout
-        has another number of Gaussians, or if an argument has a wrong shape.
+      ValueError: under jit or vmap without a capacity, if there are textures of another number of Gaussians, or if an
+        argument has a wrong shape.
     """
     check_gaussians(gaussians)
-    rule = with_features(rule_of(gaussians, textures, layout, settings), features, gaussians)
-    return render_appearance(gaussians, camera, rule, background=background, settings=settings)
+    appearance = with_features(appearance_of(gaussians, textures, settings), features, gaussians)
+    return render_appearance(gaussians, camera, appearance, background=background, settings=settings)
 
 
 def render_appearance(
     gaussians: Gaussians,
     camera: Camera,
-    rule: AppearanceRule,
+    appearance: Appearance,
     *,
-    background: Any = None,
+    background: ArrayLike | None = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     num_live: Array | int | None = None,
 ) -> RenderOutput:
-    """Render a view as `render_image` does, with an appearance rule; of the first `num_live` rows, if given."""
+    """Render a view as `render_image` does, with any appearance; of the first `num_live` rows, if given."""
     check_gaussians(gaussians)
     check_camera(camera)
-    check_rule(rule)
-    background = (0,) * rule.num_colors if background is None else background
-    check_background(background, rule.num_colors)
+    check_is_appearance(appearance, gaussians)
+    num_colors = num_colors_of(appearance)
+    background = (0,) * num_colors if background is None else background
+    check_background(background, num_colors)
     if num_live is not None:
         check_live(num_live, gaussians.num)
-    planned = with_capacity(settings, gaussians, camera, rule, num_live)
+    planned = with_capacity(settings, gaussians, camera, appearance, num_live)
     background = jnp.asarray(background, gaussians.means.dtype)
-    output, _ = _jitted_render()(gaussians, camera, rule, background, planned, num_live=num_live)
+    output, _ = _jitted_render()(gaussians, camera, appearance, background, planned, num_live=num_live)
     if settings.capacity is not None:
         kind = settings, camera.width, camera.height, gaussians.num
         _overflow_watch().observe(output.overflow, settings.capacity, kind)
@@ -84,7 +87,7 @@ def render_appearance(
 
 
 @functools.cache
-def _jitted_render() -> jax.stages.Wrapped:
+def _jitted_render() -> Callable[..., tuple[RenderOutput, Array]]:
     return jax.jit(render_traced, static_argnums=(4,))
 
 
@@ -93,23 +96,23 @@ def _overflow_watch() -> OverflowWatch:
     return OverflowWatch()
 
 
-def with_features(rule: AppearanceRule, features: Any, gaussians: Gaussians) -> AppearanceRule:
-    """Return the rule that shows features [N, D] in place of colours; the same rule if features is None.
+def with_features(appearance: Appearance, features: ArrayLike | None, gaussians: Gaussians) -> Appearance:
+    """Return the appearance that shows features [N, D] instead of colours; the same one if features is None.
 
     Raises:
       ValueError: if the features are not floats [N, D] of the Gaussians' dtype, D >= 1.
     """
     if features is None:
-        return rule
-    features = plain("features", features, gaussians.means.dtype)
+        return appearance
+    features = plain_array("features", features, gaussians.means.dtype)
     check_floats("features", features, (gaussians.num, "D"))
     if dtype_of(features) != gaussians.means.dtype or not np.shape(features)[1]:
         found = f"{dtype_of(features)}{[*np.shape(features)]}"
         raise ValueError(f"features must be {gaussians.means.dtype} as the means are, D >= 1; got {found}")
-    return Features(rule, jnp.asarray(features))
+    return dataclasses.replace(appearance, features=jnp.asarray(features))
 
 
-def check_live(num_live: Any, num: int) -> None:
+def check_live(num_live: Array | int, num: int) -> None:
     """Raise ValueError unless a number of live rows is an integer, up to `num` where it has a value."""
     check_shape("num_live", num_live, ())
     is_known = not isinstance(num_live, jax.core.Tracer)
@@ -117,7 +120,7 @@ def check_live(num_live: Any, num: int) -> None:
         raise ValueError(f"num_live must be an integer, 0 to {num}; got {num_live}")
 
 
-def check_background(background: Any, num_colors: int = 3) -> None:
+def check_background(background: ArrayLike, num_colors: int = 3) -> None:
     """Raise ValueError unless the background is one colour, of `num_colors` numbers."""
     check_unmasked("background", background)
     if np.ndim(background) == 3:
@@ -130,25 +133,15 @@ def check_background(background: Any, num_colors: int = 3) -> None:
     check_shape("background", background, (num_colors,))
 
 
-def appearance_of(
-    gaussians: Gaussians, textures: Textures | None, layout: AtlasLayout | None, settings: RenderSettings
-) -> Appearance:
-    """Return the appearance of Gaussians and textures given apart, which `settings.texture` decides.
+def appearance_of(gaussians: Gaussians, textures: Textures | None, settings: RenderSettings) -> Appearance:
+    """Return the appearance of Gaussians and their textures, whose options are `settings.texture`.
 
     Raises:
-      ValueError: if only one of textures and layout is given, they do not fit the Gaussians, or there are no settings.
+      ValueError: if the textures do not fit the Gaussians, or there are no settings.
     """
     check_kind("settings", settings, RenderSettings)
-    if (textures is None) != (layout is None):
-        raise ValueError("textures and layout belong together: give both or neither")
-    if textures is not None and layout is not None:
-        check_textures(textures, layout, gaussians.num)
-    return appearance_for(settings.texture, has_textures=textures is not None)
-
-
-def rule_of(
-    gaussians: Gaussians, textures: Textures | None, layout: AtlasLayout | None, settings: RenderSettings
-) -> AppearanceRule:
-    """Return the rule of `appearance_of`; without Gaussians, that of plain 2DGS. Raises as it does."""
-    appearance = appearance_of(gaussians, textures, layout, settings)
-    return appearance.rule(textures, layout) if gaussians.num else PlainRule(max_alpha=settings.texture.max_alpha)
+    appearance = appearance_for(settings.texture, has_textures=textures is not None)
+    if textures is None:
+        return appearance
+    check_textures(textures, gaussians.num)
+    return appearance.with_textures(textures)

@@ -2,24 +2,24 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from numpy.typing import ArrayLike
 
-from a2tg_jax.appearance import AppearanceRule, check_rule
+from a2tg_jax.appearance import Appearance, check_is_appearance
 from a2tg_jax.core.cameras import Camera, check_camera, checked_cameras, resize_camera
 from a2tg_jax.core.checks import check_kind, check_number
-from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import HEAD_ROOM, capacity_for, pairs_of_view, pairs_to_draw
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.render import appearance_of, check_background, rule_of
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.render import appearance_of, check_background
+from a2tg_jax.texture import Textures
 
 FIRST_ROOM = 1.5
 """Head room over the first views."""
@@ -35,9 +35,8 @@ def plan_render(
     gaussians: Model | Gaussians,
     cameras: Camera | Sequence[Camera],
     textures: Textures | None = None,
-    layout: AtlasLayout | None = None,
     *,
-    rule: AppearanceRule | None = None,
+    appearance: Appearance | None = None,
     head_room: float = HEAD_ROOM,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
 ) -> RenderSettings:
@@ -46,14 +45,14 @@ def plan_render(
     Args:
       gaussians: a model, alone; or N Gaussians.
       cameras: one or more.
-      textures, layout: textures of the Gaussians; without both, the splats are plain 2DGS.
-      rule: appearance rule of the Gaussians, instead of textures.
+      textures: textures of the Gaussians; without them, the splats are plain 2DGS.
+      appearance: appearance of the Gaussians, instead of textures.
       head_room: factor, at least 1, on the pairs of the fullest view.
       settings: static options; their capacity is replaced.
 
     Raises:
-      ValueError: if there is no camera, an argument is of another kind or out of range, textures or a rule are given
-        beside a model or each other, or under jit and vmap, where shapes are fixed.
+      ValueError: if there is no camera, an argument is of another kind or out of range, textures or an appearance are
+        given besides a model or each other, or under jit and vmap, where shapes are fixed.
     """
     check_kind("gaussians", gaussians, (Model, Gaussians))
     cameras = checked_cameras(cameras)
@@ -63,16 +62,17 @@ def plan_render(
     check_kind("settings", settings, RenderSettings)
     num_live = None
     if isinstance(gaussians, Model):
-        if not (rule is None and textures is None and layout is None):
-            raise ValueError("a model says itself what its splats show: say plan_render(model, cameras)")
+        if appearance is not None or textures is not None:
+            raise ValueError("a model has an appearance already: say plan_render(model, cameras)")
         model, gaussians = gaussians, gaussians.gaussians
-        rule, num_live = model.rule, model.num_live
+        appearance, num_live = model.appearance, model.num_live
     check_gaussians(gaussians)
-    if rule is None:
-        rule = rule_of(gaussians, textures, layout, settings)
-    elif textures is not None or layout is not None:
-        raise ValueError("rule already says what the splats show: give it, or textures and layout")
-    most = max(pairs_to_draw(gaussians, camera, rule, settings, num_live) for camera in cameras)
+    if appearance is None:
+        appearance = appearance_of(gaussians, textures, settings)
+    elif textures is not None:
+        raise ValueError("give an appearance or textures, not both")
+    check_is_appearance(appearance, gaussians)
+    most = max(pairs_to_draw(gaussians, camera, appearance, settings, num_live) for camera in cameras)
     return dataclasses.replace(settings, capacity=capacity_for(most, head_room))
 
 
@@ -91,11 +91,11 @@ class Renderer:
     def __init__(
         self,
         model: Model | Gaussians,
-        rule: AppearanceRule | None = None,
+        appearance: Appearance | None = None,
         *,
         cameras: Camera | Iterable[Camera] = (),
         capacities: Mapping[Size, int] | None = None,
-        background: Any = None,
+        background: ArrayLike | None = None,
         settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
         has_geometry: bool = True,
     ):
@@ -103,7 +103,7 @@ class Renderer:
 
         Args:
           model: a model, or Gaussians of which all rows exist.
-          rule: appearance rule of Gaussians; None is plain 2DGS. A model has its own.
+          appearance: appearance of Gaussians; None is plain 2DGS. A model has its own.
           cameras: one or more for which the first capacities are planned; others may follow.
           capacities: initial capacities, such as those of the renderer of a similar model.
           background: [3] colour; None is the model's own, or black.
@@ -111,21 +111,22 @@ class Renderer:
           has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
 
         Raises:
-          ValueError: if a rule is given beside a model, or an argument has a wrong shape.
+          ValueError: if an appearance is given besides a model, or an argument has a wrong shape.
         """
         check_kind("model", model, (Model, Gaussians))
         check_kind("settings", settings, RenderSettings)
-        if rule is not None:
-            check_rule(rule)
-        if isinstance(model, Model) and rule is not None:
-            raise ValueError("rule: a model says itself what its splats show; give Gaussians with a rule")
+        if appearance is not None:
+            check_is_appearance(appearance)
+        if isinstance(model, Model) and appearance is not None:
+            raise ValueError("appearance: a model has its own; give Gaussians with an appearance")
         if not isinstance(model, Model):
-            model = Model(model, appearance=appearance_of(model, None, None, settings))
+            model = Model(model, appearance or appearance_of(model, None, settings))
         background = model.background if background is None else background
         check_background(background)
         check_gaussians(model.gaussians)
+        check_is_appearance(model.appearance, model.gaussians)
         self._gaussians, self._num_live = model.gaussians, model.num_live
-        self._rule = model.rule if rule is None else rule
+        self._appearance = model.appearance
         self._background = jnp.asarray(background, model.gaussians.means.dtype)
         self._settings, self._has_geometry = settings, has_geometry
         own = [] if model.origin is None else model.origin.cameras
@@ -160,29 +161,31 @@ class Renderer:
             self.capacities[size] = max(self.capacities.get(size, 0), capacity_for(self._num_pairs(camera)))
 
     def _num_pairs(self, camera: Camera) -> int:
-        return pairs_of_view(self._gaussians, camera, self._rule, self._settings, self._num_live)
+        return pairs_of_view(self._gaussians, camera, self._appearance, self._settings, self._num_live)
 
     def _draw(self, camera: Camera) -> tuple[RenderOutput, Array]:
         settings = dataclasses.replace(self._settings, capacity=self.capacities[camera.width, camera.height])
         draw = _jitted_draw()
-        return draw(self._gaussians, self._num_live, camera, self._rule, self._background, settings, self._has_geometry)
+        return draw(
+            self._gaussians, self._num_live, camera, self._appearance, self._background, settings, self._has_geometry
+        )
 
 
 @functools.cache
-def _jitted_draw() -> jax.stages.Wrapped:
+def _jitted_draw() -> Callable[..., tuple[RenderOutput, Array]]:
     """Return the jitted drawing function; its cache counts the compilations."""
 
     def draw(
         gaussians: Gaussians,
         num_live: Array | None,
         camera: Camera,
-        rule: AppearanceRule,
+        appearance: Appearance,
         background: Array,
         settings: RenderSettings,
         has_geometry: bool,
     ) -> tuple[RenderOutput, Array]:
         return render_traced(
-            gaussians, camera, rule, background, settings, has_geometry=has_geometry, num_live=num_live
+            gaussians, camera, appearance, background, settings, has_geometry=has_geometry, num_live=num_live
         )
 
     return jax.jit(draw, static_argnums=(5, 6))

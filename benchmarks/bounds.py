@@ -20,15 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax
-from a2tg_jax.appearance import AppearanceRule, StaticRule
+from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view
 from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.native import composite as native
-from a2tg_jax.rasterize.kernels.traced import Functions, KernelSpec
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats, project_gaussians
+from a2tg_jax.rasterize.kernels.traced import Functions
+from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats, kernel_of, project_gaussians
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
-from a2tg_jax.render import rule_of
+from a2tg_jax.render import appearance_of
 from benchmarks.workload import random_scene, random_textures
 
 BYTES_PER_SECOND, FLOPS_PER_SECOND = 4.8e12, 67e12
@@ -103,24 +103,25 @@ def main() -> None:
 def count(num: int, kind: str, width: int, height: int) -> tuple[Work, KernelSpec]:
     """Count the work of the random workload's view, and return the specification of its kernels."""
     gaussians, camera = random_scene(num, width, height)
-    textures, layout = random_textures(num, kind)
+    textures = random_textures(num, kind)
     settings = a2tg_jax.RenderSettings(tile_size=TILE_SIZE)
-    rule, grid = rule_of(gaussians, textures, layout, settings), TileGrid(width, height, TILE_SIZE)
-    boxes = pairs_of_view(gaussians, camera, rule, settings)
-    splats, cutoff = jax.jit(lambda g: project_gaussians(g, camera, rule, settings.near_plane, 3))(gaussians)
+    appearance, grid = appearance_of(gaussians, textures, settings), TileGrid(width, height, TILE_SIZE)
+    boxes = pairs_of_view(gaussians, camera, appearance, settings)
+    splats, cutoff = jax.jit(lambda g: project_gaussians(g, camera, appearance, settings.near_plane, 3))(gaussians)
     lists = native.tile_lists(splats.M, cutoff, settings.near_plane, grid, capacity_for(boxes))
-    compositing = CompositingSettings(grid, settings.near_plane, False, "position", "native", 1)
+    spec, texels, regions = kernel_of(
+        appearance, splats, tile_size=TILE_SIZE, near_plane=settings.near_plane, has_geometry=False
+    )
+    counting = dataclasses.replace(spec, statistic="position")
     jacobian = camera.K @ camera.viewmat[:3, :3]
-    view = View(compositing, splats, rule, cutoff, jacobian)
+    view = View(CompositingSettings(counting, grid, "native", 1), splats, texels, regions, cutoff, jacobian)
     counts = np.asarray(view.counts(lists))
-    is_textured = np.zeros(num, bool) if layout is None else np.asarray(layout.sizes).prod(axis=1) > 1
+    areas = np.zeros(num, int) if textures is None else textures.sizes.prod(axis=1)
     work = Work(
         num, width * height, float(boxes), float(lists.starts[-1]), float(view.taken(lists).sum()), float(counts.sum()),
-        float(counts[is_textured].sum()), 0 if layout is None else int(np.asarray(layout.sizes).prod(axis=1).sum()),
+        float(counts[areas > 1].sum()), int(areas.sum()),
     )  # fmt: skip
-    return work, KernelSpec.of(
-        compositing._replace(statistic=None), StaticRule.of(rule), splats, rule.texels, rule.regions
-    )
+    return work, spec
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +130,8 @@ class View:
 
     settings: CompositingSettings
     splats: Splats
-    rule: AppearanceRule
+    texels: jax.Array
+    regions: TextureRegion | None
     cutoff: jax.Array
     jacobian: jax.Array
 
@@ -153,7 +155,8 @@ class View:
         return least
 
     def _composite(self, lists: TileLists, probe: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return composite(self.settings, self.splats, self.rule, self.cutoff, lists, self.jacobian, probe)
+        given = self.splats, self.texels, self.regions, self.cutoff, lists, self.jacobian, probe
+        return composite(self.settings, *given)
 
     def _by_tile(self, image: jax.Array) -> jax.Array:
         """Return an image [H, W] as [tiles, pixels of a tile], padded with zeros."""
@@ -225,8 +228,8 @@ MOVES = {
 def projection_flops() -> tuple[float, float]:
     """Return the operations of projecting a Gaussian, and of the gradient of that, as XLA counts them."""
     gaussians, camera = random_scene(SAMPLE, *FULL_SIZE)
-    rule = rule_of(gaussians, None, None, a2tg_jax.RenderSettings())
-    project = lambda gaussians: project_gaussians(gaussians, camera, rule, 0.2, 3)[0]  # noqa: E731
+    plain = a2tg_jax.Appearance()
+    project = lambda gaussians: project_gaussians(gaussians, camera, plain, 0.2, 3)[0]  # noqa: E731
 
     def pull_back(gaussians):
         splats, pull = jax.vjp(project, gaussians)

@@ -11,7 +11,6 @@ kernel; on a GPU it is a few launches of CUB's. A branch is a place where the st
 
 import argparse
 import collections
-import dataclasses
 import functools
 import os
 import pathlib
@@ -75,10 +74,11 @@ def step(name: str, index: int, num: int):
     rng, (width, height), views = np.random.default_rng(0), STEP_SIZE, STEP_PHOTOGRAPHS
     stage = find_system(name).preset("paper").stages()[index]
     gaussians = init_from_points(rng.normal(size=(num, 3)), np.full((num, 3), 0.5))
-    params, layout = stage.appearance.allocate(jax.random.key(0), gaussians[:1])
-    if jax.tree.leaves(params):
-        params, layout = allocate_textures(np.repeat(rng.choice(SIDES, (num, 1), p=SHARES), 2, axis=1))
-    model = Model(gaussians, params, layout, jnp.asarray(num, jnp.int32), appearance=stage.appearance)
+    appearance = stage.appearance
+    if appearance.texture is not None:
+        sizes = np.repeat(rng.choice(SIDES, (num, 1), p=SHARES), 2, axis=1)
+        appearance = appearance.with_textures(allocate_textures(sizes))
+    model = Model(gaussians, appearance, num_live=jnp.asarray(num, jnp.int32))
     clock = stage.clock()
     due = tuple(times is None for times in clock.times)
     settings = StepSettings(RenderSettings(capacity=10 * num, tile_size=TILE_SIZE, compositor="cuda"), "black", due)
@@ -100,37 +100,37 @@ def programs():
     import jax
     import jax.numpy as jnp
 
-    from a2tg_jax.appearance import PlainRule, StaticRule, TexturedRule, TextureOptions
+    from a2tg_jax.appearance import Appearance, StaticShading, Texture
+    from a2tg_jax.core.bilinear import TextureRegion
     from a2tg_jax.rasterize.compositor import composite
-    from a2tg_jax.rasterize.kernels import choice
-    from a2tg_jax.rasterize.kernels.traced import KernelSpec
-    from a2tg_jax.rasterize.splats import CompositingSettings, Splats
+    from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats
     from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
-    choice.IS_COMPILED_AHEAD = True
     num, grid = NUM_GAUSSIANS, TileGrid(WIDTH, HEIGHT, TILE_SIZE)
     floats = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)  # noqa: E731
     integers = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.int32)  # noqa: E731
     splats = Splats(floats(num, 3, 3), floats(num, 3), floats(num), floats(num, 3), floats(num, 0))
     lists = TileLists(integers(NUM_PAIRS), integers(grid.num + 1), floats(), jax.ShapeDtypeStruct((), jnp.bool_))
-    textured = TexturedRule(floats(4 * num, 4), (integers(num),) * 3, floats(num), TextureOptions())
+    texels, regions = floats(4 * num, 4), TextureRegion(*(integers(num),) * 3)
+    plain, textured = (StaticShading.of(Appearance(texture=texture)) for texture in (None, Texture()))
 
-    for name, rule in (("plain", PlainRule()), ("textured", textured)):
+    for name, static, *places in (("plain", plain, floats(1, 0), None), ("textured", textured, texels, regions)):
         for statistic in (None, "position"):
-            settings = CompositingSettings(grid, 0.2, False, statistic, "cuda", 1)
-            inputs = splats, rule, floats(num), lists, floats(3, 3), floats(num, 4)
-            spec = KernelSpec.of(settings, StaticRule.of(rule), splats, rule.texels, rule.regions)
+            columns = places[0].shape[1]
+            spec = KernelSpec(static, 0, columns, "float32", TILE_SIZE, 0.2, has_geometry=False, statistic=statistic)
+            settings = CompositingSettings(spec, grid, "cuda", 1)
+            inputs = splats, *places, floats(num), lists, floats(3, 3), floats(num, 4)
 
             def forward(*inputs, settings=settings):
                 return composite(settings, *inputs)
 
-            def backward(splats, rule, cutoff, lists, jacobian, probe, settings=settings):
-                def loss(splats, params, probe):
-                    shown = dataclasses.replace(rule, texels=params) if params.shape[1] else rule
-                    channels, transmittance = composite(settings, splats, shown, cutoff, lists, jacobian, probe)
+            def backward(splats, texels, regions, cutoff, lists, jacobian, probe, settings=settings):
+                def loss(splats, texels, probe):
+                    inputs = splats, texels, regions, cutoff, lists, jacobian, probe
+                    channels, transmittance = composite(settings, *inputs)
                     return jnp.sum(channels) + jnp.sum(transmittance)
 
-                return jax.grad(loss, argnums=(0, 1, 2))(splats, rule.texels, probe)
+                return jax.grad(loss, argnums=(0, 1, 2))(splats, texels, probe)
 
             if not statistic:
                 yield f"{name}, forward", "forward", forward, inputs, spec

@@ -9,7 +9,6 @@ import argparse
 import dataclasses
 import pathlib
 
-import jax
 import jax.numpy as jnp
 
 import a2tg_jax as a2tg
@@ -41,14 +40,16 @@ def rounded(model: a2tg.Model, dtype, what: str) -> tuple[a2tg.Model, int]:
     def in_half(leaf):
         return leaf.astype(dtype).astype(leaf.dtype)
 
-    num, gaussians, params, saved = model.num, model.gaussians, model.params, 0
+    saved = 0
     if "texels" in what and model.textures is not None:
-        params = jax.tree.map(in_half, params)
-        saved += 2 * 4 * model.textures[1].num_texels
+        buckets = tuple(map(in_half, model.textures.buckets))
+        model = model.with_textures(dataclasses.replace(model.textures, buckets=buckets))
+        saved += 2 * 4 * model.textures.num_texels
     if "SH" in what:
-        gaussians = dataclasses.replace(gaussians, sh=in_half(gaussians.sh))
-        saved += 2 * num * gaussians.sh[0].size
-    return dataclasses.replace(model, gaussians=gaussians, params=params), saved
+        sh = in_half(model.gaussians.sh)
+        model = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=sh))
+        saved += 2 * model.num * sh[0].size
+    return model, saved
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from a2tg_jax.core.transform import transform_gaussians
 from a2tg_jax.data.synthetic import exact_points, still_life
 from a2tg_jax.host.memory import memory_peak
 from a2tg_jax.mesh.blocks import BlockGrid
-from a2tg_jax.mesh.depth_maps import depth_map
+from a2tg_jax.mesh.depth_maps import rendered_depth
 from a2tg_jax.mesh.extract import GRID_BYTES
 from a2tg_jax.mesh.fusion import fuse
 from a2tg_jax.mesh.marching import surface_of
@@ -90,7 +90,7 @@ def measure(model: a2tg.Model, resolution: int, has_texture: bool):
     cameras = model.origin.cameras
     center, radius = common_sphere(model.origin.viewmats)
     space, grid = Space.of(center, radius, radius / resolution, False), BlockGrid(GRID_BYTES)
-    renderer, depths_of, times = Renderer(model, cameras=cameras), jax.jit(depth_map), []
+    renderer, depths_of, times = Renderer(model, cameras=cameras), jax.jit(rendered_depth), []
     for camera in cameras:
         rendered, depths = seconds(lambda camera=camera: jax.block_until_ready(depths_of(renderer(camera), camera)))
         fused, _ = seconds(lambda depths=depths: fuse(grid, depths, space))

@@ -57,7 +57,7 @@ def measure(where: str, timed: Timed, session: a2tg_jax.Session, iterations: int
     start = time.perf_counter()
     scene = a2tg_jax.load_scene(where, room=0)
     loaded = time.perf_counter() - start
-    system = a2tg_jax.Gaussians2dMcmc(stage1_iterations=WARM_UP + iterations, densify=a2tg_jax.McmcConfig(cap=2000))
+    system = a2tg_jax.Gaussians2dMcmc(stage1_iterations=WARM_UP + iterations, densify=a2tg_jax.Mcmc(cap=2000))
     a2tg_jax.fit(scene, system, progress=False, session=session)
     step = (time.perf_counter() - timed.started) / iterations
     return {"load_seconds": loaded, "step_ms": 1e3 * step, "waited_ms": 1e3 * timed.waited / iterations}

@@ -11,7 +11,7 @@ import numpy as np
 
 import a2tg_jax
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.render import rule_of
+from a2tg_jax.render import appearance_of
 from benchmarks.arrays import random_image
 from benchmarks.timing import timed
 from benchmarks.workload import random_scene, random_textures
@@ -20,9 +20,9 @@ from benchmarks.workload import random_scene, random_textures
 def measure_render(case: dict) -> dict:
     """Measure the random workload."""
     gaussians, camera = random_scene(case["num"], case["width"], case["height"])
-    textures, layout = random_textures(case["num"], case.get("textures", "none"))
+    textures = random_textures(case["num"], case.get("textures", "none"))
     settings = a2tg_jax.RenderSettings(compositor=case.get("compositor", "auto"), tile_size=case.get("tile_size", 8))
-    return measure_view(gaussians, camera, textures, layout, settings)
+    return measure_view(gaussians, camera, textures, settings)
 
 
 def measure_ratios(case: dict) -> dict:
@@ -30,8 +30,8 @@ def measure_ratios(case: dict) -> dict:
     gaussians, camera = random_scene(case["num"], case["width"], case["height"])
     calls, kinds = {}, ("none", "mixed", "4x4")
     for kind in kinds:
-        textures, layout = random_textures(case["num"], kind)
-        made = passes(gaussians, camera, textures, layout, a2tg_jax.RenderSettings())
+        textures = random_textures(case["num"], kind)
+        made = passes(gaussians, camera, textures, a2tg_jax.RenderSettings())
         for which in ("forward", "both"):
             calls[kind, which] = functools.partial(getattr(made, which), gaussians, textures)
     for call in calls.values():
@@ -50,11 +50,10 @@ def measure_view(
     gaussians: a2tg_jax.Gaussians,
     camera: a2tg_jax.Camera,
     textures: a2tg_jax.Textures | None,
-    layout: a2tg_jax.AtlasLayout | None,
     settings: a2tg_jax.RenderSettings,
 ) -> dict:
     """Measure forward, forward with backward, and count the composited pairs."""
-    made = passes(gaussians, camera, textures, layout, settings)
+    made = passes(gaussians, camera, textures, settings)
     counts = made.counts(gaussians, textures, jnp.zeros((gaussians.num, 4)))
     return {
         "forward": timed(made.forward, gaussians, textures, wait=jax.block_until_ready),
@@ -74,17 +73,17 @@ class Passes(NamedTuple):
     """Gradient at the statistic's probe, a further argument (`rasterize.compositor.composite`)."""
 
 
-def passes(gaussians, camera, textures, layout, settings: a2tg_jax.RenderSettings) -> Passes:
+def passes(gaussians, camera, textures, settings: a2tg_jax.RenderSettings) -> Passes:
     """Return the measured functions of a view."""
-    settings = a2tg_jax.plan_render(gaussians, camera, textures, layout, settings=settings)
+    settings = a2tg_jax.plan_render(gaussians, camera, textures, settings=settings)
     target = jnp.asarray(random_image(camera.width, camera.height))
 
     def image(gaussians, textures, probe=None):
-        rule = rule_of(gaussians, textures, layout, settings)
-        return render_traced(gaussians, camera, rule, jnp.zeros(3), settings, has_geometry=False, probe=probe)[0].color
+        shown = appearance_of(gaussians, textures, settings)
+        return render_traced(gaussians, camera, shown, jnp.zeros(3), settings, has_geometry=False, probe=probe)[0].color
 
     def loss(gaussians, textures, probe=None):
         return jnp.mean(jnp.abs(image(gaussians, textures, probe) - target))
 
-    both, counts = jax.grad(loss, argnums=(0, 1)), jax.grad(loss, argnums=2)
+    both, counts = jax.grad(loss, argnums=(0, 1), allow_int=True), jax.grad(loss, argnums=2)
     return Passes(jax.jit(image), jax.jit(both), jax.jit(counts))

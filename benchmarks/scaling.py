@@ -31,15 +31,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax import RenderSettings
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
-from a2tg_jax.core.geometry import homographies, screen_bounds
+from a2tg_jax.core.geometry import screen_bounds
 from a2tg_jax.core.pixel_sizes import NEAR_PLANE
-from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
+from a2tg_jax.parallel.image_bands import BorderRoom, ImageBands
 from a2tg_jax.rasterize.kernels.packing import num_numbers
+from a2tg_jax.rasterize.splats import drawn_splats
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
-from a2tg_jax.render import rule_of
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training.registry import with_changes
 from benchmarks.workload import random_scene
@@ -68,9 +67,8 @@ def boxes_of(num: int, grid: TileGrid, has_sky: bool) -> Rectangles:
     gaussians, camera = random_scene(num, WIDTH, HEIGHT)
 
     def covered(gaussians: a2tg.Gaussians, camera: a2tg.Camera) -> Rectangles:
-        M, _ = homographies(gaussians, camera)
-        rule = rule_of(gaussians, None, None, RenderSettings())
-        return tile_rectangles(screen_bounds(M, rule.cutoff(rule.opacities(gaussians)), NEAR_PLANE), grid)
+        M, cutoff = drawn_splats(gaussians, camera, a2tg.Appearance(), None)
+        return tile_rectangles(screen_bounds(M, cutoff, NEAR_PLANE), grid)
 
     boxes = jax.jit(covered)(gaussians, camera)
     if not has_sky:
@@ -79,19 +77,19 @@ def boxes_of(num: int, grid: TileGrid, has_sky: bool) -> Rectangles:
     return boxes._replace(counts=jnp.where(is_shown, boxes.counts, 0))
 
 
-def fullest(bands: Bands, pairs: jax.Array, borders: jax.Array) -> float:
+def fullest(bands: ImageBands, pairs: jax.Array, borders: jax.Array) -> float:
     """Return the pairs of the fullest band, divided by the mean."""
     own = np.asarray(bands.sums(pairs, borders))
     return float(own.max() / own.mean())
 
 
-def pixel_bytes(bands: Bands) -> int:
+def pixel_bytes(bands: ImageBands) -> int:
     """Return the bytes of the pixels that devices send to each other for a view, and of their gradients."""
     rows = sum(hop.rows * (bands.num - abs(hop.bands)) for hop in bands.hops() if hop.bands)
     return 2 * BYTES_PER_FLOAT * CHANNELS * WIDTH * rows
 
 
-def rows_between(bands: Bands, boxes: Rectangles, borders: jax.Array, devices: int) -> np.ndarray:
+def rows_between(bands: ImageBands, boxes: Rectangles, borders: jax.Array, devices: int) -> np.ndarray:
     """Return [bands, devices] the rows that each device sends to each band."""
     return np.asarray(bands.reached(boxes, borders)).reshape(bands.num, devices, -1).sum(axis=2)
 
@@ -99,11 +97,11 @@ def rows_between(bands: Bands, boxes: Rectangles, borders: jax.Array, devices: i
 def counted(num: int, devices: int, views: int, has_sky: bool) -> dict[str, float | str]:
     """Return the counts of one rendering of `num` Gaussians, beside those of `views` − 1 others that are alike."""
     num = num // devices * devices
-    bands = Bands.of(TileGrid(WIDTH, HEIGHT, 8), devices // views)
+    bands = ImageBands.of(TileGrid(WIDTH, HEIGHT, 8), devices // views)
     boxes = boxes_of(num, bands.whole, has_sky)
     pairs = bands.pairs_of_rows(boxes)
     borders = bands.borders(pairs)
-    bands = Bands.of(bands.whole, bands.num, BorderRoom(*bands.room_for(borders).tolist()))
+    bands = ImageBands.of(bands.whole, bands.num, BorderRoom(*bands.room_for(borders).tolist()))
     per_pair, of_even_bands = (rows_between(bands, boxes, own, devices) for own in (borders, bands.even_borders()))
     least = per_pair.sum() - np.trace(per_pair)
     forward, back = row_bytes()

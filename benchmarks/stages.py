@@ -9,9 +9,9 @@ import a2tg_jax
 from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.native import composite as native
-from a2tg_jax.rasterize.splats import CompositingSettings, project_gaussians
+from a2tg_jax.rasterize.splats import CompositingSettings, kernel_of, project_gaussians
 from a2tg_jax.rasterize.tiles import TileGrid
-from a2tg_jax.render import rule_of
+from a2tg_jax.render import appearance_of
 from benchmarks import timing
 from benchmarks.workload import random_scene, random_textures
 
@@ -22,22 +22,25 @@ def measure_stages(case: dict) -> dict:
     """Measure each stage apart."""
     num, width, height = case["num"], case["width"], case["height"]
     gaussians, camera = random_scene(num, width, height)
-    textures, layout = random_textures(num, case.get("textures", "none"))
-    settings = a2tg_jax.plan_render(gaussians, camera, textures, layout)
+    textures = random_textures(num, case.get("textures", "none"))
+    settings = a2tg_jax.plan_render(gaussians, camera, textures)
     capacity = settings.capacity or 0
-    rule, grid = rule_of(gaussians, textures, layout, settings), TileGrid(width, height, settings.tile_size)
-    project = jax.jit(lambda gaussians: project_gaussians(gaussians, camera, rule, settings.near_plane, 3))
+    appearance, grid = appearance_of(gaussians, textures, settings), TileGrid(width, height, settings.tile_size)
+    project = jax.jit(lambda gaussians: project_gaussians(gaussians, camera, appearance, settings.near_plane, 3))
     splats, cutoff = project(gaussians)
     find_lists = jax.jit(lambda M, cutoff: native.tile_lists(M, cutoff, settings.near_plane, grid, capacity))
     lists = find_lists(splats.M, cutoff)
-    compositing = CompositingSettings(grid, settings.near_plane, False, None, "native", 1)
+    spec, texels, regions = kernel_of(
+        appearance, splats, tile_size=settings.tile_size, near_plane=settings.near_plane, has_geometry=False
+    )
+    compositing = CompositingSettings(spec, grid, "native", 1)
     jacobian, probe = camera.K @ camera.viewmat[:3, :3], jnp.zeros((num, 4))
 
-    def colors(splats, rule):
-        return composite(compositing, splats, rule, cutoff, lists, jacobian, probe)[0]
+    def colors(splats, texels):
+        return composite(compositing, splats, texels, regions, cutoff, lists, jacobian, probe)[0]
 
-    def all_of_it(splats, rule):
-        _, pull_back = jax.vjp(colors, splats, rule)
+    def all_of_it(splats, texels):
+        _, pull_back = jax.vjp(colors, splats, texels)
         return pull_back(jnp.ones((3, height, width)))
 
     def project_gradient(gaussians):
@@ -51,8 +54,8 @@ def measure_stages(case: dict) -> dict:
         "projection": timed(project, gaussians),
         "projection, forward and backward": timed(jax.jit(project_gradient), gaussians),
         "tile lists": timed(find_lists, splats.M, cutoff),
-        "compositing": timed(jax.jit(colors), splats, rule),
-        "compositing, forward and backward": timed(jax.jit(all_of_it), splats, rule),
+        "compositing": timed(jax.jit(colors), splats, texels),
+        "compositing, forward and backward": timed(jax.jit(all_of_it), splats, texels),
         "loss, value and gradient": timed(jax.jit(jax.value_and_grad(a2tg_jax.photometric_loss)), image, target),
         "Adam": timed(adam, gaussians, moments),
         "evaluated_pairs": float(lists.starts[-1]) * settings.tile_size**2,

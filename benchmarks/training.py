@@ -8,8 +8,8 @@ import numpy as np
 import a2tg_jax
 from a2tg_jax import A2tg
 from a2tg_jax.core.cameras import resize_camera
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
-from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import fit_stage, like
 from benchmarks.rendering import measure_view
 
@@ -38,8 +38,8 @@ def measure_trained(case: dict) -> dict:
     renders = []
     for factor in case["factors"]:
         view = resize_camera(camera, factor * camera.width, factor * camera.height)
-        for kind, textures, layout in (("none", None, None), ("trained", model.params, model.layout)):
-            figures = measure_view(model.gaussians, view, textures, layout, settings)
+        for kind, textures in (("none", None), ("trained", model.textures)):
+            figures = measure_view(model.gaussians, view, textures, settings)
             renders.append({"width": view.width, "height": view.height, "textures": kind, **figures})
     return {"scene": scene.name, "num": model.num, "renders": renders}
 
@@ -52,7 +52,7 @@ def load_case(case: dict) -> tuple[a2tg_jax.Scene, A2tg]:
         A2tg.preset("quick"),
         stage1_iterations=stage1,
         stage2_iterations=stage2,
-        densify=McmcConfig(cap=case["num"]),
+        densify=Mcmc(cap=case["num"]),
     )
     return scene, system
 

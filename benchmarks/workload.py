@@ -1,6 +1,7 @@
 """The measured workload: random Gaussians as this library's arrays, and textures for them."""
 
-import jax
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,10 +24,10 @@ def random_scene(num: int, width: int, height: int) -> tuple[a2tg_jax.Gaussians,
     return gaussians, a2tg_jax.Camera(as_float(viewmat), as_float(K), width, height)
 
 
-def random_textures(num: int, kind: str, seed: int = 1):
+def random_textures(num: int, kind: str, seed: int = 1) -> a2tg_jax.Textures | None:
     """Return textures of one kind: none, 70% 1×1 and 30% up to 4×4 ("mixed"), or all of one size."""
     if kind == "none":
-        return None, None
+        return None
     rng = np.random.default_rng(seed)
     sizes = np.ones((num, 2), np.int64)
     if kind == "mixed":
@@ -34,6 +35,6 @@ def random_textures(num: int, kind: str, seed: int = 1):
         sizes[is_larger] = rng.choice([1, 2, 4], size=(is_larger.sum(), 2))
     else:
         sizes[:] = int(kind.split("x")[0])
-    textures, layout = a2tg_jax.allocate_textures(sizes)
+    textures = a2tg_jax.allocate_textures(sizes)
     noise = lambda x: x + jnp.asarray(rng.normal(size=x.shape) * [0.2, 0.2, 0.2, 0], jnp.float32)  # noqa: E731
-    return jax.tree.map(noise, textures), layout
+    return dataclasses.replace(textures, buckets=tuple(map(noise, textures.buckets)))

@@ -36,8 +36,8 @@ SMALL_DOWNSCALE, SMALL_BUDGET = 4, 0.15
 NUM_KEPT, NUM_SCORED, NUM_FOLDS = 24, 12, 5
 FIGURES = "psnr", "train_psnr"
 MOST_SEEDS = 10
-GAUSSIAN_KERNELS = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.23}}
-WITHOUT_DETAILS = {"kernel": {"rate": 0.0}, "view_dependence": {"share": 0.0}, "texture": {"share": 0.0}}
+GAUSSIAN_KERNELS = {"kernel_rate": 0.0, "view_dependence_share": 0.23}
+WITHOUT_DETAILS = {"kernel_rate": 0.0, "view_dependence_share": 0.0, "texture_share": 0.0}
 REFERENCE = "MCMC, degree 0"
 _PLAIN = {"sh_degree": 0, "stage2_iterations": 1_000}
 PLAIN: dict[str, tuple[str, dict[str, Any]]] = {
@@ -61,11 +61,7 @@ PARTS: dict[str, tuple[str, dict[str, Any]]] = {
     "the same without pruning": ("bytewise", {**WITHOUT_DETAILS, "prune": {"share": 0.0}}),
 }
 METHODS = {**PLAIN, **BYTEWISE, **PARTS}
-SMALL_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
-    **PLAIN, **BYTEWISE,
-    "floaters pruned": ("bytewise", {"floaters": {"near_share": 0.7}}),
-    "jitter": ("bytewise", {"jitter": 0.1}),
-}  # fmt: skip
+SMALL_METHODS = {**PLAIN, **BYTEWISE}
 
 
 Capture = tuple[str, a2tg.Scene]

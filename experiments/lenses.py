@@ -29,8 +29,8 @@ import a2tg_jax as a2tg
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.lenses import KeptLens, Lens
 from a2tg_jax.data.lighting import light
-from a2tg_jax.data.surfaces import Surface, trace
-from a2tg_jax.data.synthetic import SAMPLE_OFFSETS, camera_path, look_at, still_life
+from a2tg_jax.data.surfaces import Surface, trace_rays
+from a2tg_jax.data.synthetic import SAMPLE_OFFSETS, camera_path, still_life, viewmat_to_target
 from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.training.registry import with_changes
 
@@ -63,7 +63,7 @@ def photograph(surfaces: Sequence[Surface], viewmat: np.ndarray, lens: KeptLens)
     for offset in SAMPLE_OFFSETS.T:
         slopes = np.nan_to_num(np.asarray(lens.camera.cam_from_img(np.stack([x, y], -1) + offset)))
         rays = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) @ viewmat[:3, :3]
-        samples.append(trace(surfaces, center, rays.T.astype(np.float32))[0].astype(np.float64))
+        samples.append(trace_rays(surfaces, center, rays.T.astype(np.float32))[0].astype(np.float64))
     image = np.rint(np.mean(samples, axis=0)).astype(np.uint8).reshape(height, width, 3)
     rays_of_pixels = lens.rays(width, height)
     return np.where(np.isfinite(rays_of_pixels).all(axis=2)[..., None], image, np.uint8(0))
@@ -76,7 +76,7 @@ def write_scene(folder: Path, name: str) -> None:
     (folder / "images").mkdir(parents=True)
     frames = []
     for index, center in enumerate(camera_path(NUM_VIEWS)):
-        viewmat = look_at(center)
+        viewmat = viewmat_to_target(center)
         file = f"images/view_{index:03d}.png"
         Image.fromarray(photograph(surfaces, viewmat, lens)).save(folder / file)
         camera_to_world = np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])

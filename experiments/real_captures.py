@@ -25,7 +25,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.host.memory import tidy_memory
-from a2tg_jax.results.corrected import refined_views
+from a2tg_jax.results.corrected_metrics import refined_views
 from a2tg_jax.results.folder import write_json
 from a2tg_jax.training.corrections import exposed
 
@@ -35,7 +35,7 @@ SYSTEM = dataclasses.replace(
     a2tg.Gaussians2dMcmc.preset("quick"),
     stage1_iterations=1_000,
     stage2_iterations=0,
-    densify=a2tg.McmcConfig(cap=2_000),
+    densify=a2tg.Mcmc(cap=2_000),
 )
 VARIANTS: dict[str, dict[str, Any]] = {"": {}, "exposure": {"exposure": True}, "poses": {"refine_poses": True}}
 

@@ -51,7 +51,7 @@ def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, An
 def _figures(lab: Lab, scene: a2tg.Scene, model: a2tg.Model, background) -> dict[str, Any]:
     test = a2tg.evaluate(scene.test, model, background=background, lpips_weights=lab.folders.lpips_weights)
     assert model.textures is not None
-    texels = model.textures[1].num_texels
+    texels = model.textures.num_texels
     return {"bytes": model.num_bytes, "texels": texels, "psnr": test.psnr, "lpips": test.lpips}
 
 

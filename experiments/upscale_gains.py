@@ -22,16 +22,14 @@ from lab.jobs import MOST_TRAIN_VIEWS, background_of
 from lab.measured import measured_once
 
 import a2tg_jax as a2tg
-from a2tg_jax.adapt import reallocate
-from a2tg_jax.appearance import Plain, TexelRates, Textured
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.data import view_image
 from a2tg_jax.events import Change, Due, HostEvent
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
-from a2tg_jax.systems.bytewise import DetailTextureConfig
-from a2tg_jax.systems.stage1 import later_stage
+from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.systems.stage1 import TwoStages
 from a2tg_jax.training import Stage, fit_stage
 from a2tg_jax.training.losses import photometric_loss
 
@@ -66,24 +64,24 @@ class GrowRows(HostEvent):
         return (1,)
 
     def apply(self, due: Due, model: Model, moments, state) -> Change:
-        textures, layout = model.textures
         sizes = np.where(np.asarray(self.rows)[:, None], SIZE, (0, 0))
-        grown = reallocate(textures, layout, sizes, moments)
-        return Change(model.with_textures(grown.textures, grown.layout), grown.moments, state)
+        grown = a2tg.reallocate(model.textures, sizes, moments)
+        return Change(model.with_textures(grown.textures), grown.moments, state)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Trial(a2tg.System):
+class Trial(TwoStages):
     """One stage that continues from a model with textures of some rows, or without textures if `rows` is None."""
 
     rows: Any = dataclasses.field(default=None, hash=False)
-    iterations: int = ITERATIONS
+    stage2_iterations: int = ITERATIONS
 
     def stages(self) -> tuple[Stage, ...]:
         if self.rows is None:
-            return (later_stage(self, "trial", Plain(), (), self.iterations),)
-        rates = TexelRates(DetailTextureConfig().rate, 0.0)
-        return (later_stage(self, "trial", Textured((0, 0)), (GrowRows(self.rows),), self.iterations, rates),)
+            return (self.later_stage("trial", a2tg.Appearance()),)
+        rates = {"texture": a2tg.TexelRates(Bytewise().texel_rate, 0.0)}
+        empty = a2tg.Appearance(texture=a2tg.Texture(start=(0, 0)))
+        return (self.later_stage("trial", empty, (GrowRows(self.rows),), rates),)
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
@@ -113,7 +111,7 @@ def _measure(lab: Lab, result: tables.Result, model: Model) -> dict[str, Any]:
     options = result.run.job.system
     system = Trial(**{field.name: getattr(options, field.name) for field in dataclasses.fields(a2tg.System)})
     iterations = SMOKE_ITERATIONS if lab.is_smoke else ITERATIONS
-    system = dataclasses.replace(system, memory_budget=None, iterations=iterations)
+    system = dataclasses.replace(system, memory_budget=None, stage2_iterations=iterations)
     seeds, num_parts = (SEEDS[:1], SMOKE_PARTS) if lab.is_smoke else (SEEDS, NUM_PARTS)
     without = [_quality(scene, model, dataclasses.replace(system, seed=seed)) for seed in seeds]
     scores = criteria(model, scene)
@@ -156,10 +154,9 @@ def _quarters(figures: Mapping[str, Any], name: str) -> str:
 
 def criteria(model: Model, scene: a2tg.Scene) -> dict[str, np.ndarray]:
     """Return each criterion, [N], over all training views (host)."""
-    sizes = np.full((model.num, 2), SIZE)
-    textures, layout = a2tg.allocate_textures(sizes)
+    textures = a2tg.allocate_textures(np.full((model.num, 2), SIZE))
     background = jnp.asarray(background_of(scene) or (0.0, 0.0, 0.0))
-    own = dataclasses.replace(model, params=textures, layout=layout, appearance=Textured(SIZE))
+    own = dataclasses.replace(model, appearance=a2tg.Appearance(texture=a2tg.Texture(textures)))
     settings = plan_render(own, [view.camera for view in scene.train])
     look = jax.jit(functools.partial(_look, settings=settings))
     sums: Any = None
@@ -167,7 +164,7 @@ def criteria(model: Model, scene: a2tg.Scene) -> dict[str, np.ndarray]:
         key = jax.random.key(index)
         found = look(own, view.camera, jnp.asarray(view_image(view, np.asarray(background))), background, key)
         sums = found if sums is None else jax.tree.map(jnp.add, sums, found)
-    return {name: np.asarray(values) for name, values in _scores(model, layout, sums).items()}
+    return {name: np.asarray(values) for name, values in _scores(own, sums).items()}
 
 
 def _look(model: Model, camera, target: Array, background: Array, key: Array, *, settings) -> dict[str, Array]:
@@ -175,11 +172,11 @@ def _look(model: Model, camera, target: Array, background: Array, key: Array, *,
     probe = jnp.zeros((model.num, 4), model.gaussians.means.dtype)
 
     def draw(texels: Array, probe: Array) -> Array:
-        shown = dataclasses.replace(model, params=a2tg.Textures((texels,)))
-        output, _ = render_traced(shown.gaussians, camera, shown.rule, background, settings, probe=probe)
+        shown = model.appearance.with_textures(dataclasses.replace(model.textures, buckets=(texels,)))
+        output, _ = render_traced(model.gaussians, camera, shown, background, settings, probe=probe)
         return output.color
 
-    color, back = jax.vjp(draw, model.params.buckets[0], probe)
+    color, back = jax.vjp(draw, model.textures.buckets[0], probe)
     g_texels, g_probe = back(jax.grad(photometric_loss)(color, target))
     residual = color - target
     slopes, _ = back(residual)
@@ -196,8 +193,8 @@ def _look(model: Model, camera, target: Array, background: Array, key: Array, *,
     }  # fmt: skip
 
 
-def _scores(model: Model, layout, sums: Mapping[str, Array]) -> dict[str, Array]:
-    rows = layout.row
+def _scores(model: Model, sums: Mapping[str, Array]) -> dict[str, Array]:
+    rows = model.textures.row
     average = sums["norms"] / jnp.maximum(sums["views"], 1.0)
     size = jnp.exp(jnp.mean(model.gaussians.log_scales, axis=1))
     gain = jnp.sum(sums["slopes"] ** 2 / (2 * sums["squares"] + 1e-3), axis=(1, 2, 3))

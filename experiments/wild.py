@@ -148,18 +148,16 @@ def depth_weight(weight: float) -> dict[str, Any]:
 
 ROBUST = {"loss": {"robust_share": 0.3}}
 FLOATERS: dict[str, dict[str, Any]] = {
-    f"{name} {value}": {"floaters": {name: value}}
-    for name, value in {"min_views": 2, "near": 0.3, "near_share": 0.7}.items()
+    f"{name} {value}": {"floaters": {name: value}} for name, value in {"min_views": 2, "near": 0.3}.items()
 }
 GRID = {"exposure": True, "corrections": {"exposure_kind": "grid"}}
-JITTER = {"jitter 0.1": {"jitter": 0.1}}
 POINTS = {f"points_weight {weight}": {"loss": {"points_weight": weight}} for weight in (0.1, 0.3)}
 CASES: dict[str, tuple[Callable[[], a2tg.Scene], dict[str, dict[str, Any]]]] = {
-    "whole": (whole, {"plain": {}, "robust": ROBUST, "grid": GRID, **FLOATERS, **JITTER, **POINTS}),
+    "whole": (whole, {"plain": {}, "robust": ROBUST, "grid": GRID, **FLOATERS, **POINTS}),
     "distractors": (distractors, {"plain": {}, "robust": ROBUST}),
     "distractors, exact masks": (masked, {"plain": {}}),
     "floaters": (with_floaters, {"plain": {}, **FLOATERS}),
-    "few views": (few_views, {"plain": {}, **FLOATERS, **JITTER, **POINTS}),
+    "few views": (few_views, {"plain": {}, **FLOATERS, **POINTS}),
     "few views, depths": (lambda: with_depths(few_views()), {f"depth_weight {weight}": depth_weight(weight)
                                                              for weight in (0.1, 0.3, 1)}),
     "whole, depths": (lambda: with_depths(whole()), {"depth_weight 0.3": depth_weight(0.3)}),

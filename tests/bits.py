@@ -14,8 +14,8 @@ import a2tg_jax as a2tg
 SYSTEM = a2tg.A2tg(
     stage1_iterations=120,
     stage2_iterations=80,
-    densify=a2tg.McmcConfig(cap=20_000),
-    texture=a2tg.TextureConfig(upscale_at=(0.3, 0.6)),
+    densify=a2tg.Mcmc(cap=20_000),
+    texture=a2tg.Upscale(at=(0.3, 0.6)),
 )
 
 

@@ -78,10 +78,11 @@ def gpu_kernels(monkeypatch):
     import opencl
 
     from a2tg_jax.rasterize.kernels import choice
-    from a2tg_jax.rasterize.kernels.cuda import composite
+    from a2tg_jax.rasterize.kernels.cuda import composite, nvrtc
 
     opencl.queue()
-    monkeypatch.setattr(choice, "has_cuda", lambda: True)
+    monkeypatch.setitem(choice.PLATFORMS, "cuda", "cpu")
+    monkeypatch.setattr(nvrtc, "find", lambda: True)
     monkeypatch.setattr(composite, "launch", opencl.launch)
 
 

@@ -128,12 +128,12 @@ def _check_model(model):
     import numpy as np
 
     num = model.gaussians.means.shape[0]
-    leaves = jax.tree.leaves((model.gaussians, model.params))
+    leaves = jax.tree.leaves((model.gaussians, model.appearance))
     assert all(np.isfinite(np.asarray(leaf)).all() for leaf in leaves)
     assert all(leaf.shape[0] == num for leaf in jax.tree.leaves(model.gaussians))
     if model.textures is not None:
-        textures, layout = model.textures
-        bucket, row = np.asarray(layout.bucket), np.asarray(layout.row)
+        textures = model.textures
+        bucket, row = np.asarray(textures.bucket), np.asarray(textures.row)
         sizes = np.asarray([len(texels) for texels in textures.buckets])
         assert bucket.shape == row.shape == (num,) and (num == 0 or (row < sizes[bucket]).all())
     if model.origin is not None:

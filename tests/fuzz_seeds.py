@@ -28,13 +28,13 @@ from a2tg_jax.results.folder import write_json as write_run_json
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.systems.bbsplat import BBSplat
-from a2tg_jax.systems.bytewise import Bytewise, KernelConfig
+from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.systems.supergaussians import SuperGaussians
 from a2tg_jax.training import History, save_checkpoint
 
 SYSTEMS = {
     "a2tg": lambda: a2tg.A2tg(sh_degree=0),
-    "bytewise": lambda: Bytewise(kernel=KernelConfig(rate=0.01)),
+    "bytewise": lambda: Bytewise(kernel_rate=0.01),
     "supergaussians": lambda: SuperGaussians(sh_degree=0),
     "bbsplat": lambda: BBSplat(sh_degree=0),
     "gaussians-2d": lambda: a2tg.Gaussians2d(sh_degree=0),
@@ -75,10 +75,10 @@ def write_seeds(folder: Path) -> None:
 
 def _with_shapes(model: Model) -> Model:
     """The same model; kernels that have shapes differ."""
-    if model.appearance.shapes(model.params) is None:
+    if model.appearance.shapes is None:
         return model
     shapes = jnp.linspace(-2.0, 2.0, model.gaussians.num)
-    return dataclasses.replace(model, params=model.appearance.with_shapes(model.params, shapes))
+    return dataclasses.replace(model, appearance=model.appearance.with_shapes(shapes))
 
 
 def _write_scenes(folder: Path) -> None:

@@ -18,16 +18,16 @@ from jax.sharding import PartitionSpec as P
 from scenes_random import fisheye
 
 import a2tg_jax as a2tg
-from a2tg_jax.core import spread_arrays
+from a2tg_jax.appearance.base import cutoff_of
 from a2tg_jax.core.geometry import homographies, screen_bounds
-from a2tg_jax.core.spread_arrays import on_host, placed_like, rows_moved
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Change, Due, HostEvent, StepEvent
+from a2tg_jax.parallel import exchange as exchanges
+from a2tg_jax.parallel import rows
+from a2tg_jax.parallel.exchange import AXIS, ROOM_OF_A_BAND, exchange_among
+from a2tg_jax.parallel.image_bands import BorderRoom, ImageBands
+from a2tg_jax.parallel.rows import on_host, placed_like, readable, rows_moved, sharding_of_rows, spread
 from a2tg_jax.rasterize.capacity import pairs_of_view
-from a2tg_jax.rasterize.exchange import AXIS, ROOM_OF_A_BAND, exchange_among, spread
-from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
-from a2tg_jax.rasterize.kernels.native import composite as native
-from a2tg_jax.rasterize.placement import readable
 from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
@@ -79,9 +79,10 @@ def textured():
     """Textures of two sizes, of which every second Gaussian has the larger one."""
     model = plain()
     sizes = np.where(np.arange(ROWS)[:, None] % 2, [[2, 4]], [[1, 1]])
-    textures, layout = a2tg.allocate_textures(sizes, rgb=0.1)
-    textures = jax.tree.map(lambda texels: texels * jnp.linspace(0.2, 1.0, texels.size).reshape(texels.shape), textures)
-    return a2tg.Model(model.gaussians, textures, layout, appearance=a2tg.Textured())
+    textures = a2tg.allocate_textures(sizes, rgb=0.1)
+    buckets = [texels * jnp.linspace(0.2, 1.0, texels.size).reshape(texels.shape) for texels in textures.buckets]
+    textures = dataclasses.replace(textures, buckets=tuple(buckets))
+    return a2tg.Model(model.gaussians, a2tg.Appearance(texture=a2tg.Texture(textures)))
 
 
 def rendering(folder):
@@ -98,10 +99,10 @@ def rendering(folder):
         alone = a2tg.view_gradients(loss, model, view.camera, settings=settings)
         own = dataclasses.replace(settings, exchange=exchange)
         together = jax.jit(lambda m, own=own: a2tg.view_gradients(loss, m, view.camera, settings=own))
-        found = together(spread(exchange, model))
+        found = together(spread(exchange.mesh, model))
         assert not found.output.overflow and found.num_pairs > 0
         close(alone._replace(num_pairs=0), found._replace(num_pairs=0))
-        assert found.gaussians.means.sharding.spec[0] == "rows", "the gradient stays where its rows are"
+        assert found.gradient.gaussians.means.sharding.spec[0] == "rows", "the gradient stays where its rows are"
 
 
 def upper_quarter(height=512):
@@ -124,11 +125,11 @@ def balance(folder):
     alone = a2tg.view_gradients(loss, textured(), camera, settings=settings)
     own = dataclasses.replace(settings, exchange=exchange)
     together = jax.jit(lambda m: a2tg.view_gradients(loss, m, camera, settings=own))
-    found = together(spread(exchange, textured()))
+    found = together(spread(exchange.mesh, textured()))
     close(alone._replace(num_pairs=0), found._replace(num_pairs=0))
-    rule = textured().rule
-    pairs, boxes = pairs_of_view(textured().gaussians, camera, rule, settings), boxes_of(textured(), camera)
-    bands = Bands.of(TileGrid(camera.width, camera.height, settings.tile_size), exchange.num)
+    appearance = textured().appearance
+    pairs, boxes = pairs_of_view(textured().gaussians, camera, appearance, settings), boxes_of(textured(), camera)
+    bands = ImageBands.of(TileGrid(camera.width, camera.height, settings.tile_size), exchange.num)
     largest, largest_even = (
         int(fullest(bands, boxes, cut)) for cut in (bands.borders(bands.pairs_of_rows(boxes)), bands.even_borders())
     )
@@ -140,18 +141,18 @@ def balance(folder):
 
 def borders_without_room_overflow(exchange, camera):
     """The lists of a band whose borders moved too far stay within its tiles, and the overflow is told."""
-    heights, listed = [], native.tile_lists
+    heights, listed = [], exchanges.list_tiles
 
-    def watched(M, cutoff, near_plane, grid, capacity, height):
-        jax.debug.callback(lambda own: heights.append((int(own), grid.height)), height)
-        return listed(M, cutoff, near_plane, grid, capacity, height=height)
+    def watched(settings, M, cutoff, capacity, pixels, height):
+        jax.debug.callback(lambda own: heights.append((int(own), settings.grid.height)), height)
+        return listed(settings, M, cutoff, capacity, pixels, height)
 
     own = dataclasses.replace(exchange, border_room=BorderRoom(0, 0))
     settings = dataclasses.replace(a2tg.plan_render(plain(), [camera]), compositor="native", exchange=own)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(native, "tile_lists", watched)
+        patch.setattr(exchanges, "list_tiles", watched)
         draw = jax.jit(lambda gaussians: a2tg.render_image(gaussians, camera, settings=settings))
-        output = draw(spread(own, plain().gaussians))
+        output = draw(spread(own.mesh, plain().gaussians))
         jax.effects_barrier()
     assert bool(output.overflow)
     assert len(heights) == exchange.num and all(0 <= height <= most for height, most in heights), heights
@@ -163,7 +164,7 @@ def eager_renders_have_room(exchange):
     flat = dataclasses.replace(camera, K=jnp.asarray(camera.K).at[1, 1].multiply(0.05))
     gaussians = plain().gaussians
     expected = a2tg.render_image(gaussians, flat)
-    found = a2tg.render_image(spread(exchange, gaussians), flat, settings=a2tg.RenderSettings(exchange=exchange))
+    found = a2tg.render_image(spread(exchange.mesh, gaussians), flat, settings=a2tg.RenderSettings(exchange=exchange))
     assert not bool(found.overflow)
     close(expected.color, found.color)
 
@@ -171,9 +172,7 @@ def eager_renders_have_room(exchange):
 def boxes_of(model, camera):
     """Tiles of the splats of a model in a view."""
     M, _ = homographies(model.gaussians, camera)
-    bounds = screen_bounds(
-        M, model.rule.cutoff(model.rule.opacities(model.gaussians)), a2tg.RenderSettings().near_plane
-    )
+    bounds = screen_bounds(M, cutoff_of(model.appearance, model.gaussians.opacities), a2tg.RenderSettings().near_plane)
     return tile_rectangles(bounds, TileGrid(camera.width, camera.height, a2tg.RenderSettings().tile_size))
 
 
@@ -204,8 +203,8 @@ def any_bands_become_even(exchange):
             image = rng.random((num_views, 2, 101, 5))
             cuts = np.sort(rng.integers(0, grid.rows + 1, (num_views, num - 1)), axis=1)
             borders = np.pad(cuts, ((0, 0), (1, 1)), constant_values=((0, 0), (0, grid.rows))).astype(np.int32)
-            needed = np.max([Bands.of(grid, num).room_for(jnp.asarray(own)) for own in borders], axis=0)
-            bands = Bands.of(grid, num, BorderRoom(*needed.tolist()))
+            needed = np.max([ImageBands.of(grid, num).room_for(jnp.asarray(own)) for own in borders], axis=0)
+            bands = ImageBands.of(grid, num, BorderRoom(*needed.tolist()))
             shown = [
                 np.pad(image[view, :, top * 8 :], ((0, 0), (0, 101), (0, 0)), constant_values=np.nan)
                 for view in range(num_views) for top in borders[view, :-1]
@@ -235,8 +234,8 @@ def overflowing(folder):
     def told(capacity, rows_per_pair):
         own = dataclasses.replace(exchange, rows_per_pair=rows_per_pair)
         settings = a2tg.RenderSettings(capacity=capacity, exchange=own)
-        render = jax.jit(lambda m: render_traced(m.gaussians, view.camera, m.rule, jnp.zeros(3), settings))
-        output, num_pairs = render(spread(exchange, model))
+        render = jax.jit(lambda m: render_traced(m.gaussians, view.camera, m.appearance, jnp.zeros(3), settings))
+        output, num_pairs = render(spread(exchange.mesh, model))
         return bool(output.overflow), float(num_pairs)
 
     assert told(enough, 1.0)[0] is False
@@ -255,13 +254,13 @@ def borders_find_room():
         run = StageRun(scene(), own, 0, plain(), session=Session(devices=jax.devices()[:4]))
         (size,) = {view.picture.size for view in run.views}
         run.arguments(1)
-        run.room.exchanges[size] = dataclasses.replace(
-            run.room.exchanges[size], border_room=room or run.room.exchanges[size].border_room
+        run.exchanges[size] = dataclasses.replace(
+            run.exchanges[size], border_room=room or run.exchanges[size].border_room
         )
-        capacity, taken = run.room.capacities[size], 0
+        capacity, taken = run.capacities[size], 0
         while taken < 4:
             taken += len(run.steps(taken + 1, 4))
-        assert bool(run.num_regrown) == (room is not None) and run.room.capacities[size] == capacity
+        assert bool(run.num_regrown) == (room is not None) and run.capacities[size] == capacity
         states.append(run.model)
         run.photographs.close()
     for a, b in zip(*map(jax.tree.leaves, states), strict=True):
@@ -284,7 +283,7 @@ def fit(own, count, **options):
 
 def batches(folder):
     """Views that are drawn at once, each by its share of the devices, have the gradients of one device."""
-    own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True, jitter=0.1, loss={"points_weight": 0.1})
+    own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True, loss={"points_weight": 0.1})
     for index, size, is_streamed in ((1, 4, False), (0, 6, False), (0, 6, True)):
         own = dataclasses.replace(own, batch_size=size)
         if not is_streamed:
@@ -292,7 +291,7 @@ def batches(folder):
         loop.PhotoStore = functools.partial(PhotoStore, room=0 if is_streamed else None)
         run = StageRun(scene(), own, index, plain(), session=Session(devices=jax.devices()))
         arguments = run.arguments(1)
-        assert arguments[0].render.exchange.num_at_once(size) == (2 if size == 6 else size)
+        assert arguments[0].render.exchange.views_at_once == (2 if size == 6 else size)
         if is_streamed:
             check_parts(arguments[4].images, [run.views[index].image for index in run.order.indices(1)])
         close(alone, attempted(arguments))
@@ -316,7 +315,7 @@ def lenses(folder):
         alone = a2tg.view_gradients(loss, model, camera, settings=settings)
         own = dataclasses.replace(settings, exchange=exchange)
         together = jax.jit(lambda m, own=own: a2tg.view_gradients(loss, m, camera, settings=own))
-        drawn = together(spread(exchange, model))
+        drawn = together(spread(exchange.mesh, model))
         assert not drawn.output.overflow and float(alone.output.alpha.max()) > 0.5
         close(alone._replace(num_pairs=0), drawn._replace(num_pairs=0))
 
@@ -327,7 +326,7 @@ def lenses(folder):
         loop.PhotoStore = functools.partial(PhotoStore, room=0 if is_streamed else None)
         run = StageRun(found, own, 0, plain(), session=Session(devices=jax.devices()))
         arguments = run.arguments(1)
-        assert arguments[0].render.exchange.num_at_once(size) == size
+        assert arguments[0].render.exchange.views_at_once == size
         rays = arguments[4].rays
         assert len(rays.sharding.device_set) == 4 and rays.is_fully_replicated
         close(alone, attempted(arguments))
@@ -384,7 +383,7 @@ def training(folder):
 def textures(folder):
     """Textures grow as on one device; rows that do not divide evenly are filled up."""
     lengths = {"stage1_iterations": 8, "stage2_iterations": 8}
-    own = system(a2tg.A2tg, densify={"cap": 120}, texture={"upscale_at": (0.5,)}, **lengths)
+    own = system(a2tg.A2tg, densify={"cap": 120}, texture={"at": (0.5,)}, **lengths)
     alone, together = fit(own, 1), fit(own, 4)
     assert alone.model.num == together.model.num
     assert alone.model.num_bytes == together.model.num_bytes > 4 * (58 + 4) * alone.model.num, "textures have grown"
@@ -398,14 +397,14 @@ def pruned_and_detailed():
     return system(
         a2tg.Bytewise, densify={"cap": 120}, stage1_iterations=20, stage2_iterations=20,
         prune={"share": 0.3, "at": (0.2,)}, floaters={"min_views": 3, "at": (0.4,)},
-        view_dependence={"share": 0.2, "at": (0.2, 0.4)}, texture={"share": 0.2, "at": (0.4, 0.6)},
+        view_dependence_share=0.2, view_dependence={"at": (0.2, 0.4)}, texture_share=0.2, details={"at": (0.4, 0.6)},
     )  # fmt: skip
 
 
 def events(folder):
     """Events on the host."""
     rows_are_read_and_moved(exchange_among(jax.devices()))
-    others_get_all_rows(Session(devices=jax.devices()))
+    custom_events_change_rows(Session(devices=jax.devices()))
     events_change_the_same(Session(devices=jax.devices()))
 
 
@@ -442,13 +441,13 @@ HAPPENED = ["Prune", "PruneFloaters", "Prune", "AdaptDegrees", "AdaptDegrees", "
 def no_whole_rows(num):
     """Fail if a new array of so many rows or more lies on one device, or on each, while others are read and placed.
 
-    It sees the arrays that live whenever a function of `core.spread_arrays` returns.
+    It sees the arrays that live whenever a function of `parallel.rows` returns.
     """
     known, found = jax.live_arrays(), set()
     ids = set(map(id, known))
 
     def look(frame, what, result):
-        if what == "return" and frame.f_code.co_filename == spread_arrays.__file__:
+        if what == "return" and frame.f_code.co_filename == rows.__file__:
             new = [x for x in jax.live_arrays() if id(x) not in ids and x.size and x.ndim and len(x) >= num]
             found.update(x.shape for x in new if x.is_fully_replicated)
 
@@ -477,28 +476,28 @@ def same_bits(expected, found):
 
 @a2tg.pytree
 class Reverse(HostEvent):
-    """An event of somebody else: it turns the order of the rows, of arrays that it can read."""
+    """A custom event that reverses the order of the rows."""
 
     def iterations(self, num_iterations):
         return (2,)
 
     def apply(self, due, model, moments, state):
-        assert len(model.gaussians.means.devices()) == 1
-        rows = np.arange(model.gaussians.num)[::-1]
-        assert isinstance(due, Due) and np.asarray(model.gaussians.means).shape == (len(rows), 3)
-        gaussians = jax.tree.map(lambda x: x[rows], model.gaussians)
-        return Change(dataclasses.replace(model, gaussians=gaussians), moments, state, rows=rows)
+        assert isinstance(due, Due) and on_host(model.gaussians.means).shape == (model.gaussians.num, 3)
+        places = np.arange(model.gaussians.num)[::-1]
+        by_jax = jax.tree.map(lambda x: x[places], model.gaussians)
+        gaussians = dataclasses.replace(by_jax, means=on_host(model.gaussians.means)[places])
+        return Change(dataclasses.replace(model, gaussians=gaussians), moments, state, rows=places)
 
 
 @a2tg.pytree
 class Remember(StepEvent):
-    """An event of somebody else, whose state is made of values of the model and follows rows in a way of its own."""
+    """A custom event whose state is made of values of the model and follows rows in its own way."""
 
     def init(self, model):
-        return jnp.asarray(np.asarray(model.gaussians.means)[:, 0])
+        return jnp.asarray(on_host(model.gaussians.means)[:, 0])
 
     def gather(self, state, rows):
-        return jnp.asarray(np.asarray(state)[rows])
+        return jnp.asarray(on_host(state)[rows])
 
     def apply(self, now, model, moments, state):
         return Change(model, moments, state)
@@ -510,11 +509,11 @@ class Reversed(a2tg.System):
 
     def stages(self):
         events = SplitByGradient(ROWS), Reverse(), Remember()
-        return (a2tg.Stage("gaussians", a2tg.Plain(), events, self.loss.terms(), self.rates, 4),)
+        return (a2tg.Stage("gaussians", a2tg.Appearance(), events, self.loss.terms(), self.rates, 4),)
 
 
-def others_get_all_rows(session):
-    """Events that do not say otherwise get arrays of one device; their results, and statistics, are spread again."""
+def custom_events_change_rows(session):
+    """Whatever events return is spread over the devices, however they make it."""
     own = Reversed(sh_degree=1, initial_gaussians=ROWS)
     run = StageRun(scene(), own, 0, plain(), session=session)
     run.steps(1, 2)
@@ -536,20 +535,20 @@ def rows_are_read_and_moved(exchange):
     """Arrays are read in parts, and rows may become fewer or more. Each device has all rows if they do not divide."""
     rng, num = np.random.default_rng(0), 2 * exchange.num
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(spread_arrays, "LARGEST_PART", 48)
+        patch.setattr(rows, "LARGEST_PART", 48)
         for shape in ((3 * num, 4, 2), (3 * num,), (3 * num + 1, 2), (0, 2), ()):
             values = rng.normal(size=shape).astype(np.float32)
-            x = spread(exchange, values)
+            x = spread(exchange.mesh, values)
             np.testing.assert_array_equal(on_host(x), values)
             assert x._npy_value is None or not (shape and shape[0] % num == 0 and shape[0])
             assert placed_like(values, x).sharding == x.sharding
             if shape and shape[0]:
-                for rows in rng.permutation(2 * num), rng.integers(0, len(values), 4 * num + 1):
-                    moved = rows_moved(x, rows)
-                    np.testing.assert_array_equal(on_host(moved), values[rows])
-                    np.testing.assert_array_equal(rows_moved(jnp.asarray(values), rows), values[rows])
-                    assert moved.sharding == exchange.sharding_of((len(rows), *shape[1:]))
-        columns = spread(exchange, values_of := rng.normal(size=(3, num)).astype(np.float32), axis=1)
+                for places in rng.permutation(2 * num), rng.integers(0, len(values), 4 * num + 1):
+                    moved = rows_moved(x, places)
+                    np.testing.assert_array_equal(on_host(moved), values[places])
+                    np.testing.assert_array_equal(rows_moved(jnp.asarray(values), places), values[places])
+                    assert moved.sharding == sharding_of_rows(exchange.mesh, (len(places), *shape[1:]))
+        columns = spread(exchange.mesh, values_of := rng.normal(size=(3, num)).astype(np.float32), axis=1)
         np.testing.assert_array_equal(on_host(columns), values_of)
 
 

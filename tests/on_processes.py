@@ -23,14 +23,13 @@ import jax
 import numpy as np
 import pytest
 from jax.experimental import multihost_utils
-from on_devices import events_change_the_same, others_get_all_rows, rows_are_read_and_moved, scene, system
+from on_devices import custom_events_change_rows, events_change_the_same, rows_are_read_and_moved, scene, system
 from test_pictures import write_scene
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.spread_arrays import placed_like
 from a2tg_jax.data import decoding, photo_reading, photo_store
-from a2tg_jax.host.processes import LOST, Place, joined
-from a2tg_jax.rasterize.exchange import spread
+from a2tg_jax.parallel.processes import LOST, ProcessPlace, joined
+from a2tg_jax.parallel.rows import placed_like, spread
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
@@ -39,7 +38,7 @@ SYSTEMS = {
     "a2tg": lambda length: system(
         a2tg.A2tg,
         densify={"cap": 120},
-        texture={"upscale_at": (0.5,)},
+        texture={"at": (0.5,)},
         stage1_iterations=length,
         stage2_iterations=length,
     ),
@@ -51,7 +50,7 @@ SYSTEMS = {
 SMALL = ("--preset", "smoke", "--downscale", "4", "--densify.cap", "60")
 PRUNING = ("--floaters.min-views", "2", "--floaters.at", "0.25")
 """Options with which process 0 prunes for all."""
-SHORT = (*SMALL, *PRUNING, "--texture.upscale-at", "0.5", "--stage1-iterations", "20", "--stage2-iterations", "10")
+SHORT = (*SMALL, *PRUNING, "--texture.at", "0.5", "--stage1-iterations", "20", "--stage2-iterations", "10")
 LONG = (*SMALL, "--stage1-iterations", "20000")
 
 
@@ -184,9 +183,9 @@ def change(place):
     with joined(place):
         session = Session(devices=jax.devices())
         with pytest.raises(ValueError, match="the processes differ after a change of the model"):
-            placed_like(np.full(4, jax.process_index()), spread(session.exchange, np.zeros(4)))
+            placed_like(np.full(4, jax.process_index()), spread(session.mesh, np.zeros(4)))
         rows_are_read_and_moved(session.exchange)
-        others_get_all_rows(session)
+        custom_events_change_rows(session)
         events_change_the_same(session)
 
 
@@ -250,7 +249,7 @@ def main():
     add("--process-id", type=int)
     args = parser.parse_args()
     if args.coordinator is not None:
-        place = Place(args.coordinator, args.num_processes, args.process_id, args.seconds)
+        place = ProcessPlace(args.coordinator, args.num_processes, args.process_id, args.seconds)
         if args.what == "train":
             train(place, args.system, args.length, args.folder)
         elif args.what == "events":

@@ -11,7 +11,7 @@ import pytest
 from a2tg_jax.rasterize.kernels import cuda
 from a2tg_jax.rasterize.kernels.cuda.primitives import C_TYPES
 from a2tg_jax.rasterize.kernels.cuda.printing import Argument, c_function
-from a2tg_jax.rasterize.kernels.cuda.source import num_parts, num_threads, source
+from a2tg_jax.rasterize.kernels.cuda.source import block_threads, num_parts, source
 
 cl = pytest.importorskip("pyopencl", reason="the GPU kernels run on CPUs as OpenCL: pip install 'pyopencl[pocl]'")
 
@@ -49,7 +49,7 @@ def run(spec, name, num_tiles, inputs, results, totals):
     # OpenCL has no empty buffers.
     arrays = [array if array.size else np.zeros(1) for array in (*inputs, *results, *totals)]
     buffers = [cl.Buffer(queue().context, flags, hostbuf=array) for array in arrays]
-    threads, blocks = num_threads(spec.tile_size), num_tiles * num_parts(spec.tile_size)
+    threads, blocks = block_threads(spec.tile_size), num_tiles * num_parts(spec.tile_size)
     _kernel(spec, name)(queue(), (blocks * threads,), (threads,), *buffers)
     found = [np.array(array) for array in (*results, *totals)]
     for array, buffer in zip(found, buffers[len(inputs) :], strict=True):

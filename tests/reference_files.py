@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import CompactChoices, load_compact, load_gltf, load_model, save_compact, save_gltf, save_model
-from a2tg_jax.appearance import Banded, Shaped, Textured, TextureOptions
-from a2tg_jax.appearance.banded import BandedLayout, BandedParams
-from a2tg_jax.appearance.sh_bands import split_sh
-from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams, log_exponents_of
+from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture
+from a2tg_jax.appearance.bands import bands_of_dense
+from a2tg_jax.appearance.exponents import log_exponents_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
@@ -27,6 +26,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.texture import textures_from_arrays
 
 NUM = 10
+BACKGROUND = 0.25, 0.5, 0.75
 SUMS = "SHA256SUMS"
 SIZES = [(0, 0), (1, 1), (2, 3), (4, 1)]
 SHAPED = ("shaped.a2tgz", "shaped.a2tgw")
@@ -44,8 +44,9 @@ def reference_model() -> Model:
     """Splats of all degrees, with textures of several sizes, in a world of its own."""
     rng = np.random.default_rng(11)
     draw = lambda *shape, scale=1.0: np.asarray(scale * rng.normal(size=shape), np.float32)  # noqa: E731
-    textures, atlas = textures_from_arrays([draw(*SIZES[i % len(SIZES)], 4, scale=0.3) for i in range(NUM)])
-    bands, owners = split_sh(draw(NUM, 16, 3, scale=0.4), np.arange(NUM) % 4, 0)
+    textures = textures_from_arrays([draw(*SIZES[i % len(SIZES)], 4, scale=0.3) for i in range(NUM)])
+    sh = draw(NUM, 16, 3, scale=0.4)
+    bands = bands_of_dense(sh[:, 1:], np.arange(NUM) % 4, 0)
     gaussians = Gaussians(
         draw(NUM, 3), draw(NUM, 4), draw(NUM, 2, scale=0.5) - np.float32(2), draw(NUM), draw(NUM, 1, 3)
     )  # type: ignore[arg-type]
@@ -53,19 +54,17 @@ def reference_model() -> Model:
     viewmat[2, 3] = 4.0
     camera = Camera(viewmat, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)  # type: ignore[arg-type]
     world = Similarity(0.5, np.eye(3)[[1, 2, 0]], np.array([1.0, 2.0, 3.0]))
-    origin = Origin.of_cameras([camera], ["a.png"], transform=world, background=(0.25, 0.5, 0.75))
-    params, layout = BandedParams(bands, textures), BandedLayout(owners, atlas)
-    return Model(gaussians, params, layout, appearance=Banded(Textured(options=TextureOptions())), origin=origin)
+    origin = Origin.of_cameras([camera], ["a.png"], transform=world)
+    return Model(
+        gaussians, Appearance(texture=Texture(textures), bands=Bands(bands)), background=BACKGROUND, origin=origin
+    )
 
 
 def shaped_model() -> Model:
     """The same splats with kernels from long tails to sharp edges."""
     model = reference_model()
-    (bands, textures), (owners, atlas) = model.params, model.layout
-    shapes = jnp.linspace(-3.0, 3.0, NUM)
-    params, layout = BandedParams(bands, ShapedParams(shapes, textures)), BandedLayout(owners, ShapedLayout(atlas))
-    appearance = Banded(Shaped(Textured(options=TextureOptions())))
-    return dataclasses.replace(model, params=params, layout=layout, appearance=appearance)
+    appearance = dataclasses.replace(model.appearance, exponents=Exponents(jnp.linspace(-3.0, 3.0, NUM)))
+    return dataclasses.replace(model, appearance=appearance)
 
 
 def load(path: Path) -> Model:
@@ -77,13 +76,11 @@ def load(path: Path) -> Model:
 
 def numbers(model: Model) -> dict[str, np.ndarray]:
     """Numbers that a reader must find, in the order of the file."""
-    arrays = model.appearance.arrays(model.params, model.layout)
+    textures, shapes = model.textures, model.appearance.shapes
     fields = {name: getattr(model.gaussians, name) for name in ("means", "quats", "log_scales", "opacities")}
-    fields |= {"degrees": arrays["degrees"], "sh": model.sh}
-    prefix = model.appearance.array_prefix
-    found = fields | {name: arrays[f"{prefix}{name}"] for name in ("sizes", "texels")}
-    if model.appearance.shapes_name is not None:
-        found["exponents"] = np.exp(log_exponents_of(arrays[model.appearance.shapes_name]))
+    found = fields | {"degrees": model.degrees, "sh": model.sh, "sizes": textures.sizes, "texels": textures.flat()}
+    if shapes is not None:
+        found["exponents"] = np.exp(log_exponents_of(shapes))
     return {name: np.asarray(values, np.float64) for name, values in found.items()}
 
 

@@ -14,7 +14,6 @@ import numpy as np
 from oracle import DEFAULT_RULES, Float, Rules, Scene
 
 from a2tg_jax import (
-    AtlasLayout,
     Camera,
     Gaussians,
     RenderOutput,
@@ -244,10 +243,10 @@ def as_camera(scene: Scene, dtype: str) -> Camera:
     return Camera(jnp.asarray(scene.viewmat, dtype), jnp.asarray(scene.K, dtype), scene.width, scene.height)
 
 
-def as_textures(scene: Scene, dtype: str) -> tuple[Textures, AtlasLayout] | tuple[None, None]:
-    """The scene's textures and their layout, in the package's form; (None, None) without textures."""
+def as_textures(scene: Scene, dtype: str) -> Textures | None:
+    """The scene's textures, in the package's form; None without textures."""
     if scene.textures is None:
-        return None, None
+        return None
     return textures_from_arrays([jnp.asarray(texture, dtype) for texture in scene.textures])
 
 
@@ -261,10 +260,10 @@ def as_settings(rules: Rules = DEFAULT_RULES, **changes: Any) -> RenderSettings:
 
 @functools.cache
 def jitted_renderer(settings: RenderSettings) -> Callable[..., RenderOutput]:
-    """`render_image` of (gaussians, camera, textures, layout, background), compiled once for all tests."""
+    """`render_image` of (gaussians, camera, textures, background), compiled once for all tests."""
 
-    def draw(gaussians, camera, textures, layout, background):
-        return render_image(gaussians, camera, textures, layout, background=background, settings=settings)
+    def draw(gaussians, camera, textures, background):
+        return render_image(gaussians, camera, textures, background=background, settings=settings)
 
     return jax.jit(draw)
 
@@ -273,6 +272,6 @@ def render_scene(scene: Scene, dtype: str, settings: RenderSettings | None = Non
     """The package's image of a scene, checked to be whole."""
     renderer = jitted_renderer(dataclasses.replace(settings or RenderSettings(), capacity=CAPACITY))
     gaussians, camera, background = as_gaussians(scene, dtype), as_camera(scene, dtype), scene.background
-    output = renderer(gaussians, camera, *as_textures(scene, dtype), jnp.asarray(background, dtype))
+    output = renderer(gaussians, camera, as_textures(scene, dtype), jnp.asarray(background, dtype))
     assert not output.overflow
     return output

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax as a2tg
+from a2tg_jax.appearance import allocate_appearance
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.model import Model
@@ -28,13 +29,13 @@ def some_model(system=None):
     """Of the last stage of a system."""
     stage = (system or a2tg.A2tg(sh_degree=0)).stages()[-1]
     gaussians = some_gaussians()
-    params, layout = stage.appearance.allocate(jax.random.key(0), gaussians)
-    return Model(gaussians, params, layout, appearance=stage.appearance, origin=some_origin())
+    appearance = allocate_appearance(stage.appearance, jax.random.key(0), gaussians)
+    return Model(gaussians, appearance, origin=some_origin())
 
 
 def some_checkpoint(system):
     model = some_model(system)
-    live = Model(model.gaussians, model.params, model.layout, jnp.int32(NUM - 2), appearance=model.appearance)
+    live = Model(model.gaussians, model.appearance, jnp.int32(NUM - 2))
     stages = system.stages()
     history = History.empty().with_point(len(stages), 1, 0.5, 20.0, NUM, 0.1, 2.0)
     return Checkpoint(system, len(stages) - 1, initial_state(stages[-1], live), history)

@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 
 from a2tg_jax.adapt import Upscale, most_textures, next_sizes, reallocate, select
-from a2tg_jax.appearance import Textured
+from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
 from a2tg_jax.core.budget import event_budget
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import adam_init
+from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.core.table import Shape, plan_places
 from a2tg_jax.events import Due
 from a2tg_jax.model import Model
 from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.texture import Shape, allocate_textures, plan_layout, texture_arrays, textures_from_arrays
+from a2tg_jax.texture import allocate_textures, texture_arrays, textures_from_arrays
 
 ROUND, WIDE, TALL, WIDE_BUT_LARGE = (0.1, 0.1), (0.05, 0.009), (0.009, 0.05), (0.5, 0.02)
 
@@ -176,22 +178,27 @@ def test_there_is_room_for_all_that_textures_can_become(cap, anisotropic, start)
         resolutions, counts = np.unique(sizes, axis=0, return_counts=True)
         needed = dict(zip(map(tuple, resolutions.tolist()), counts, strict=True))
         assert all(room[size] >= count for size, count in needed.items())
-        layout, capacities = plan_layout(sizes, room=planned)
-        assert (layout.resolutions, capacities) == planned
-        np.testing.assert_array_equal(layout.sizes, sizes)
+        places, capacities = plan_places(sizes, room=planned)
+        assert (places.bucket_sizes, capacities) == planned
+        np.testing.assert_array_equal(np.asarray(places.bucket_sizes)[places.bucket], sizes)
     assert len(needed) > 3 - 2 * (not anisotropic) and np.prod(sizes, 1).sum() > 0.9 * budget / 16
 
 
 def test_textures_that_outgrow_their_room_get_more():
     sizes = np.array([[1, 1]] * 6 + [[2, 2]] * 3)
-    layout, capacities = plan_layout(sizes, room=Shape(((1, 1), (2, 2)), (6, 2)))
-    assert layout.resolutions == ((1, 1), (2, 2)) and capacities == (6, 3)
+    places, capacities = plan_places(sizes, room=Shape(((1, 1), (2, 2)), (6, 2)))
+    assert places.bucket_sizes == ((1, 1), (2, 2)) and capacities == (6, 3)
 
 
 def random_textures(seed, num=40, dtype=np.float32):
     rng = np.random.default_rng(seed)
     sizes = rng.choice([1, 2, 3, 4], (num, 2))
     return [rng.normal(size=(*size, 4)).astype(dtype) for size in sizes], sizes
+
+
+def with_places(floats, textures):
+    """Moments, which are floats only, with the places of the textures."""
+    return combine(floats, partition(textures)[1])
 
 
 def nearest_copy(texture, size):
@@ -208,16 +215,17 @@ def nearest_copy(texture, size):
 def test_reallocate_copies_the_nearest_texel(seed):
     """Growing, shrinking, odd ratios, and moments that go along."""
     arrays, _ = random_textures(seed)
-    textures, layout = textures_from_arrays(arrays)
-    doubled, squared = (jax.tree.map(change, textures) for change in (lambda x: 2 * x, lambda x: x * x))
+    textures = textures_from_arrays(arrays)
+    floats, _ = partition(textures)
+    doubled, squared = (jax.tree.map(change, floats) for change in (lambda x: 2 * x, lambda x: x * x))
     moments = (doubled, {"nu": squared})
     new_sizes = np.random.default_rng(seed + 9).choice([1, 2, 4, 7, 16], (len(arrays), 2))
-    new_textures, new_layout, (mu, rest) = reallocate(textures, layout, new_sizes, moments)
-    np.testing.assert_array_equal(new_layout.sizes, new_sizes)
+    new_textures, (mu, rest) = reallocate(textures, new_sizes, moments)
+    np.testing.assert_array_equal(new_textures.sizes, new_sizes)
     trees = (new_textures, mu, rest["nu"])
     for tree, change in zip(trees, (lambda x: x, lambda x: 2 * x, lambda x: x * x), strict=True):
         assert all(bucket.dtype == jnp.float32 for bucket in tree.buckets)
-        for got, old, size in zip(texture_arrays(tree, new_layout), arrays, new_sizes, strict=True):
+        for got, old, size in zip(texture_arrays(with_places(tree, new_textures)), arrays, new_sizes, strict=True):
             np.testing.assert_array_equal(got, nearest_copy(change(old), size))
 
 
@@ -225,10 +233,10 @@ def test_reallocate_copies_the_nearest_texel(seed):
 def test_moments_of_what_is_not_kept_are_zero(every):
     """All, a third, and none are kept."""
     arrays, sizes = random_textures(6)
-    textures, layout = textures_from_arrays(arrays)
+    textures = textures_from_arrays(arrays)
     kept = np.arange(1, len(arrays) + 1) % every == 0
-    rebuilt = reallocate(textures, layout, 2 * sizes, textures, kept=kept)
-    for got, old, is_kept in zip(texture_arrays(rebuilt.moments, rebuilt.layout), arrays, kept, strict=True):
+    _, moments = reallocate(textures, 2 * sizes, textures, kept=kept)
+    for got, old, is_kept in zip(texture_arrays(moments), arrays, kept, strict=True):
         np.testing.assert_array_equal(got, np.repeat(np.repeat(old, 2, 0), 2, 1) * is_kept)
 
 
@@ -236,33 +244,32 @@ def test_moments_of_what_is_not_kept_are_zero(every):
 def test_what_adam_remembers_of_a_texture_that_grows(moments):
     """The half with the larger statistic grows; all moments were 1."""
     gaussians = init_from_points(np.eye(3)[np.arange(12) % 3], np.full((12, 3), 0.5))
-    params, layout = Textured().allocate(jax.random.key(0), gaussians)
-    model = Model(gaussians, params, layout, appearance=Textured())
-    ones = jax.tree.map(jnp.ones_like, adam_init((gaussians, params)))
+    model = Model(gaussians, allocate_appearance(Appearance(texture=Texture()), jax.random.key(0), gaussians))
+    ones = jax.tree.map(jnp.ones_like, adam_init(partition(model)[0]))
     state = GradientStatistics.init(12, jnp.float32).observe(jnp.arange(12, dtype=jnp.float32), jnp.ones(12, bool))
     change = Upscale(fraction=0.5, moments=moments).apply(Due(), model, ones, state)
-    found = texture_arrays(change.moments.mu[1], change.model.layout)
+    found = texture_arrays(with_places(change.moments.mu.textures, change.model.textures))
     assert [array.shape[0] for array in found] == [1] * 6 + [2] * 6
     assert [float(array.min()) for array in found] == [1] * 6 + [float(moments == "copied")] * 6
 
 
 def test_doubling_repeats_texels_and_a_round_trip_is_the_identity():
     arrays, sizes = random_textures(5)
-    textures, layout = textures_from_arrays(arrays)
-    larger, larger_layout, moments = reallocate(textures, layout, 2 * sizes)
+    textures = textures_from_arrays(arrays)
+    larger, moments = reallocate(textures, 2 * sizes)
     assert moments is None
-    for got, old in zip(texture_arrays(larger, larger_layout), arrays, strict=True):
+    for got, old in zip(texture_arrays(larger), arrays, strict=True):
         np.testing.assert_array_equal(got, np.repeat(np.repeat(old, 2, 0), 2, 1))
-    back = reallocate(larger, larger_layout, sizes)
-    jax.tree.map(np.testing.assert_array_equal, texture_arrays(back.textures, back.layout), arrays)
+    back = reallocate(larger, sizes).textures
+    jax.tree.map(np.testing.assert_array_equal, texture_arrays(back), arrays)
 
 
 def test_padding_is_neutral_and_has_no_moments():
-    textures, layout = allocate_textures(np.ones((100, 2), int))
-    zeros = jax.tree.map(jnp.zeros_like, textures)
+    textures = allocate_textures(np.ones((100, 2), int))
+    zeros = jax.tree.map(jnp.zeros_like, partition(textures)[0])
     new_sizes = np.ones((100, 2), int)
     new_sizes[:33] = 2
-    new_textures, _, moments = reallocate(textures, layout, new_sizes, zeros)
+    new_textures, moments = reallocate(textures, new_sizes, zeros)
     for bucket, moment in zip(new_textures.buckets, moments.buckets, strict=True):
         np.testing.assert_array_equal(bucket, np.broadcast_to(np.float32([0, 0, 0, 1]), bucket.shape))
         np.testing.assert_array_equal(moment, 0)
@@ -276,10 +283,10 @@ def test_upscalings_that_fall_together_are_one():
 @pytest.mark.parametrize(
     "event, message",
     [
-        (Upscale("threshold"), "^select is 'threshold', so threshold must say which average gradient$"),
-        (Upscale("budget"), r"^select is 'budget', so budget_mb must say how many MB \(10\^6 bytes\)$"),
-        (Upscale(cap=32), r"^cap must lie in 1\.\.16; got 32$"),
-        (Upscale(fraction=1.5), r"^fraction must lie in \[0, 1\]; got 1\.5$"),
+        (Upscale("threshold"), r"Upscale\.select is 'threshold', so threshold must say which average gradient$"),
+        (Upscale("budget"), r"Upscale\.select is 'budget', so budget_mb must say how many MB \(10\^6 bytes\)$"),
+        (Upscale(cap=32), r"Upscale\.cap must be at least 1 and at most 16; got 32$"),
+        (Upscale(fraction=1.5), r"Upscale\.fraction must be at least 0 and at most 1; got 1\.5$"),
     ],
 )
 def test_impossible_choices_are_refused_before_training(event, message):
@@ -292,37 +299,36 @@ def test_impossible_choices_are_refused_before_training(event, message):
 def test_rows_that_do_not_exist_take_no_share(select, number):
     """Two Gaussians in ten rows: half of two grow, and a budget is theirs alone."""
     gaussians = init_from_points(np.random.default_rng(0).normal(size=(10, 3)), np.zeros((10, 3)))
-    appearance = Textured()
-    params, layout = appearance.allocate(jax.random.key(0), gaussians)
-    model = Model(gaussians, params, layout, num_live=jnp.int32(2), appearance=appearance)
+    appearance = allocate_appearance(Appearance(texture=Texture()), jax.random.key(0), gaussians)
+    model = Model(gaussians, appearance, num_live=jnp.int32(2))
     name = {"fraction": "fraction", "budget": "budget_mb"}[select]
     event = Upscale(select, k_s=0.0, **{name: number})
     seen = GradientStatistics(jnp.asarray([0.0, 0.0, *[9.0] * 8]), jnp.ones(10, jnp.int32))
     if select == "fraction":
         seen = GradientStatistics(jnp.asarray([1.0, 2.0, *[0.0] * 8]), jnp.ones(10, jnp.int32))
-    change = event.apply(Due(), model, adam_init((gaussians, params)), seen)
-    sizes = change.model.layout.sizes
+    change = event.apply(Due(), model, adam_init(partition(model)[0]), seen)
+    sizes = change.model.textures.sizes
     assert np.prod(sizes[:2], axis=1).sum() == 1 + 4 and np.all(sizes[2:] == 1)
 
 
 def test_reallocate_refuses_other_counts():
-    textures, layout = allocate_textures(np.ones((3, 2), int))
+    textures = allocate_textures(np.ones((3, 2), int))
     with pytest.raises(ValueError, match=r"new_sizes must be \[3, 2\]"):
-        reallocate(textures, layout, np.ones((4, 2), int))
+        reallocate(textures, np.ones((4, 2), int))
 
 
 def test_an_event_of_a_million_takes_seconds():
     """A loop over Gaussians would take minutes; the bound is loose on purpose."""
     num = 1_000_000
     rng = np.random.default_rng(0)
-    textures, layout = allocate_textures(np.ones((num, 2), int))
+    textures = allocate_textures(np.ones((num, 2), int))
     scales = np.exp(rng.normal(-5, 1.5, (num, 2)))
     start = time.perf_counter()
-    proposed = next_sizes(layout.sizes, scales, k_a=4, k_s=0.01, cap=4)
-    mask = select(rng.exponential(size=num), layout.sizes, proposed, budget_bytes=5_000_007)
-    result = reallocate(textures, layout, np.where(mask[:, None], proposed, 1))
+    proposed = next_sizes(textures.sizes, scales, k_a=4, k_s=0.01, cap=4)
+    mask = select(rng.exponential(size=num), textures.sizes, proposed, budget_bytes=5_000_007)
+    result = reallocate(textures, np.where(mask[:, None], proposed, 1))
     assert time.perf_counter() - start < 30
-    assert result.layout.num_texels - num <= 5_000_007 // 16
+    assert result.textures.num_texels - num <= 5_000_007 // 16
 
 
 def test_statistics_average_over_the_views_that_saw_it():
@@ -337,17 +343,17 @@ def test_statistics_average_over_the_views_that_saw_it():
 @pytest.mark.parametrize("new", [(1, 1), (2, 1), (2, 4)])
 def test_an_empty_texture_takes_no_bytes_and_grows_from_nothing(new):
     sizes = np.array([[0, 0], [2, 2], [0, 0], [1, 1]])
-    textures, layout = allocate_textures(sizes)
-    assert layout.num_texels == 5
-    textures = jax.tree.map(lambda bucket: bucket + 0.25, textures)
+    textures = allocate_textures(sizes)
+    assert textures.num_texels == 5
+    textures = dataclasses.replace(textures, buckets=tuple(bucket + 0.25 for bucket in textures.buckets))
     sizes[0] = new
-    moments = jax.tree.map(jnp.ones_like, textures)
-    grown = reallocate(textures, layout, sizes, moments)
-    first, kept, empty, _ = texture_arrays(grown.textures, grown.layout)
+    ones = jax.tree.map(jnp.ones_like, partition(textures)[0])
+    grown, moments = reallocate(textures, sizes, ones)
+    first, kept, empty, _ = texture_arrays(grown)
     np.testing.assert_array_equal(first, np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*new, 4)))
     np.testing.assert_array_equal(kept, np.full((2, 2, 4), [0.25, 0.25, 0.25, 1.25]))
     assert empty.size == 0
-    assert not texture_arrays(grown.moments, grown.layout)[0].any()
+    assert not texture_arrays(with_places(moments, grown))[0].any()
 
 
 def test_an_empty_texture_grows_as_one_texel_does():
@@ -360,5 +366,5 @@ def test_an_empty_texture_grows_as_one_texel_does():
 
 @pytest.mark.parametrize("size", [(0, 1), (1, 0), (17, 1), (-1, -1)])
 def test_a_side_out_of_range_is_named(size):
-    with pytest.raises(ValueError, match=r"texture sides must lie in 1\.\.16, or both be 0"):
+    with pytest.raises(ValueError, match=r"texture sides must be in 1\.\.16, or both 0"):
         allocate_textures(np.array([size]))

@@ -10,9 +10,9 @@ import pytest
 from a2tg_jax import Gaussians2dMcmc, align_poses, color_fit, evaluate, fit, synthetic_scene
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.rigid import moved_viewmat
-from a2tg_jax.systems.stage1 import McmcConfig
-from a2tg_jax.training.corrections import exposed
-from a2tg_jax.training.option_groups import CorrectionConfig
+from a2tg_jax.mcmc import Mcmc
+from a2tg_jax.training.corrections import Exposure, exposed
+from a2tg_jax.training.option_groups import Corrections
 
 TWIST = np.array([0.018, -0.012, 0.009, 0.012, -0.009, 0.015])
 
@@ -24,7 +24,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def system():
-    return Gaussians2dMcmc(stage1_iterations=150, initial_opacity=0.5, densify=McmcConfig(cap=420))
+    return Gaussians2dMcmc(stage1_iterations=150, initial_opacity=0.5, densify=Mcmc(cap=420))
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_exposures_win_back_what_known_ones_took(scene, system, model):
 
     known: list[float] = []
     changed = dataclasses.replace(scene, train=tuple(map(disturbed, scene.train)))
-    asked = dataclasses.replace(system, exposure=True, corrections=CorrectionConfig(exposure_rate=3e-2))
+    asked = dataclasses.replace(system, exposure=True, corrections=Corrections(affine=Exposure(rate=3e-2)))
     plain, corrected = (fit(changed, chosen, progress=False).model for chosen in (system, asked))
     learned = corrected.origin.corrections["exposure"][: len(known)]
     assert np.corrcoef(known, np.trace(learned[:, :, :3], axis1=1, axis2=2))[0, 1] > 0.9

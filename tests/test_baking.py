@@ -3,7 +3,6 @@
 import dataclasses
 import sys
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,10 +19,10 @@ from a2tg_jax import (
     save_splats,
     textures_from_arrays,
 )
-from a2tg_jax.appearance import Banded, Plain, Shaped, Textured
+from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture
+from a2tg_jax.appearance.bands import bands_of_dense
+from a2tg_jax.appearance.exponents import curves_of, falloff_of, shapes_of
 from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
-from a2tg_jax.appearance.sh_bands import split_sh
-from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams, curves_of, falloff_of, shapes_of
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import WHITE, Origin
@@ -32,7 +31,6 @@ from a2tg_jax.finish.baking import as_plain, bake, kernels, split_splats
 from a2tg_jax.finish.distilling import distill, drawn_scene, likeness, pictures
 from a2tg_jax.finish.texel_choice import fewest_texels
 from a2tg_jax.results import conversion
-from a2tg_jax.texture import Textures
 
 CAMERA = Camera(jnp.eye(4).at[2, 3].set(4), jnp.asarray([[60.0, 0, 24], [0, 60, 18], [0, 0, 1]]), 48, 36)
 
@@ -41,7 +39,7 @@ def textured(num: int = 3, side: int = 4, seed: int = 0) -> Model:
     """A few large splats with random textures, before a camera."""
     rng = np.random.default_rng(seed)
     texels = [rng.uniform(size=(side, side, 4)) * [0.8, 0.8, 0.8, 1] for _ in range(num)]
-    textures, layout = textures_from_arrays([np.asarray(t, np.float32) for t in texels])
+    textures = textures_from_arrays([np.asarray(t, np.float32) for t in texels])
     gaussians = Gaussians(
         means=jnp.asarray(rng.normal(size=(num, 3)) * 0.5, jnp.float32),
         quats=jnp.asarray(np.c_[np.ones(num), 0.3 * rng.normal(size=(num, 3))], jnp.float32),
@@ -49,26 +47,20 @@ def textured(num: int = 3, side: int = 4, seed: int = 0) -> Model:
         logit_opacities=jnp.full(num, 2.0),
         sh=jnp.zeros((num, 1, 3)),
     )
-    return Model(gaussians, textures, layout, appearance=Textured(), origin=Origin.of_cameras([CAMERA]))
+    return Model(gaussians, Appearance(texture=Texture(textures)), origin=Origin.of_cameras([CAMERA]))
 
 
 def banded(inner: Model) -> Model:
     """The same model with one splat of degree 3 and the others of degree 0."""
-    model = dataclasses.replace(inner, appearance=Banded(inner.appearance))
-    params, layout = model.appearance.allocate(jax.random.key(0), inner.gaussians)
-    model = dataclasses.replace(
-        model,
-        params=params._replace(inner=inner.params),
-        layout=layout._replace(inner=inner.layout),
-    )
-    return model.with_bands(*split_sh(np.ones((inner.num, 16, 3), np.float32), 3 * (np.arange(inner.num) == 0), 0))
+    degrees = 3 * (np.arange(inner.num) == 0)
+    bands = Bands(bands_of_dense(np.ones((inner.num, 15, 3), np.float32), degrees, 0))
+    return dataclasses.replace(inner, appearance=dataclasses.replace(inner.appearance, bands=bands))
 
 
 def shaped(inner: Model) -> Model:
     """The same model with kernels of long tails and of sharp edges by turns."""
     shapes = jnp.asarray(np.resize([-2.0, 2.0], inner.num), jnp.float32)
-    params, layout = ShapedParams(shapes, inner.params), ShapedLayout(inner.layout)
-    return dataclasses.replace(inner, params=params, layout=layout, appearance=Shaped(inner.appearance))
+    return dataclasses.replace(inner, appearance=dataclasses.replace(inner.appearance, exponents=Exponents(shapes)))
 
 
 def psnr(model: Model, other: Model) -> float:
@@ -130,10 +122,10 @@ def test_the_nearest_gaussian_has_the_least_squared_difference(log_exponent):
 def test_texels_are_kept_where_pictures_need_them():
     even, striped = np.ones((4, 4, 4), np.float32), np.ones((4, 4, 4), np.float32)
     striped[:, ::2, :3] = 0.2
-    textures, layout = textures_from_arrays([even, striped, striped])
-    shown = Textures(tuple(jnp.ones_like(bucket) for bucket in textures.buckets))
-    weights = Textures(tuple(bucket.at[2].set(1e-6) for bucket in shown.buckets))
-    tables = fewest_texels(textures, layout, weights, 6)
+    textures = textures_from_arrays([even, striped, striped])
+    weights = tuple(jnp.ones_like(bucket).at[2].set(1e-6) for bucket in textures.buckets)
+    weights = dataclasses.replace(textures, buckets=weights)
+    tables = fewest_texels(textures, weights, 6)
     sizes = {int(index): texels.shape[1:3] for ids, texels in tables for index in ids}
     assert sizes == {0: (1, 1), 1: (1, 4), 2: (1, 1)}
     found = next(texels for ids, texels in tables if 1 in ids)
@@ -154,15 +146,15 @@ def test_cameras_in_one_place_move_the_means_too(split):
 
 
 def test_training_draws_over_the_background_of_the_model(split):
-    over_white = dataclasses.replace(textured(), origin=Origin.of_cameras([CAMERA], background=WHITE))
-    start = dataclasses.replace(split, origin=over_white.origin)
+    over_white = dataclasses.replace(textured(), background=WHITE)
+    start = dataclasses.replace(split, background=WHITE)
     trained = distill(start, over_white, [CAMERA], iterations=30)
     assert psnr(trained, over_white) > psnr(start, over_white) + 0.5
 
 
 def test_growth_is_kept_where_degrees_differ(monkeypatch):
     monkeypatch.setattr(baking, "least_degree", lambda *_: 3)
-    monkeypatch.setattr(baking, "texel_weights_of", lambda model, *_: model.textures[0])
+    monkeypatch.setattr(baking, "texel_weights_of", lambda model, *_: model.textures)
     inner = textured(30, side=1)
     for model in (banded(inner), banded(Model(inner.gaussians))):
         baked = split_splats(model, [CAMERA], 1.6)
@@ -179,8 +171,7 @@ def test_held_out_cameras_do_not_train():
 
 
 def test_plain_files_hold_the_nearest_gaussians(tmp_path):
-    plain = textured()
-    model = shaped(dataclasses.replace(plain, params=(), layout=(), appearance=Plain()))
+    model = shaped(dataclasses.replace(textured(), appearance=Appearance()))
     save_splats(tmp_path / "a.ply", model)
     found = as_plain(load_splats(tmp_path / "a.ply").gaussians, model)
     (wanted,) = pictures(model, [CAMERA])
@@ -201,8 +192,9 @@ def test_other_appearances_give_their_gaussians():
 
 
 def test_convert_bakes(tmp_path, capsys):
-    official = dataclasses.replace(textured(), appearance=Textured((1, 1), TextureOptions.official()))
-    save_model(tmp_path / "a.npz", official)
+    model = textured()
+    official = Appearance(texture=Texture(model.textures, options=TextureOptions.official()))
+    save_model(tmp_path / "a.npz", dataclasses.replace(model, appearance=official))
     arguments = ["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.ply"), "--bake", "--bake-iterations", "0"]
     assert main(arguments) == 0
     told = capsys.readouterr().out

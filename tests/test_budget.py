@@ -13,12 +13,13 @@ import pytest
 
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Textured
+from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.budget import bytes_per_gaussian, megabytes_of, number_to_reach
 from a2tg_jax.core.gaussians import init_from_points, logit
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import adam_init
+from a2tg_jax.core.partition import partition
 from a2tg_jax.densify.clone_split import FillingDensity
 from a2tg_jax.events import Due, Now, Times
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
@@ -132,7 +133,7 @@ def test_monte_carlo_growth_leaves_the_cap(x64, dtype, num_iterations, count):
     """From few Gaussians, at the times that a stage of so many iterations has."""
     model = random_model(0, 300, 4, np.tile([0.5, 0.003], 150))
     model = jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, model)
-    event, moments = FillingMcmc(300), adam_init((model.gaussians, ()))
+    event, moments = FillingMcmc(300), adam_init(partition(model)[0])
     times = event.times(num_iterations)
     apply = jax.jit(lambda iteration, *rest: event.apply(now(iteration, num_iterations, times, 2), *rest, ()))
     counts = [4]
@@ -167,7 +168,7 @@ SHAPES = {"round": (ROUND, ROUND), "thin": (WIDE, TALL), "mixed": (WIDE, ROUND)}
 @pytest.mark.parametrize("budget", ["60.1kB", 0.1234])
 def test_textures_take_what_gaussians_leave(budget, shape, texture_cap, rounds):
     """Also where all Gaussians are so thin that they want fewer texels than there are bytes for."""
-    texture = {"cap": texture_cap, "upscale_at": [0.1 * (index + 1) for index in range(rounds)]}
+    texture = {"cap": texture_cap, "at": [0.1 * (index + 1) for index in range(rounds)]}
     system = smoke("a2tg", memory_budget=budget, texture=texture)
     (upscale,) = [event for event in system.stages()[1].events if isinstance(event, Upscale)]
     rng = np.random.default_rng(texture_cap)
@@ -175,8 +176,8 @@ def test_textures_take_what_gaussians_leave(budget, shape, texture_cap, rounds):
     gaussians = init_from_points(rng.normal(size=(num, 3)), np.full((num, 3), 0.5))
     scales = np.asarray(SHAPES[shape], np.float32)[np.arange(num) % 2]
     gaussians = dataclasses.replace(gaussians, log_scales=jnp.log(jnp.asarray(scales)))
-    model = Model(gaussians, *Textured().allocate(jax.random.key(0), gaussians), appearance=Textured())
-    moments = adam_init((gaussians, model.params))
+    model = Model(gaussians, allocate_appearance(Appearance(texture=Texture()), jax.random.key(0), gaussians))
+    moments = adam_init(partition(model)[0])
     for index in range(rounds):
         assert model.num_bytes <= system.budget_bytes
         sums = jnp.asarray(rng.exponential(size=num) * rng.integers(0, 2, num), jnp.float32)
@@ -274,8 +275,11 @@ def test_the_summary_tells_budgets():
             "textured-gaussians", {"memory_budget": "0.1MB", "initial_gaussians": 800},
             "0.1 MB has room for 204 Gaussians of 488 bytes, fewer than .* lower initial_gaussians, which is 800",
         ),
-        ("a2tg", {"memory_budget": 1.5, "texture": {"budget_mb": 1.5}}, "texture.budget_mb both say .* give one"),
-        ("a2tg", {"memory_budget": 1.5, "densify": {"is_enabled": False}}, "densify.is_enabled is off"),
+        (
+            "a2tg", {"memory_budget": 1.5, "texture": {"select": "budget", "budget_mb": 1.5}},
+            "texture.budget_mb both say .* give one",
+        ),
+        ("a2tg", {"memory_budget": 1.5, "densify": {"cap": 0}}, "densify.cap is 0"),
     ],
 )  # fmt: skip
 def test_budgets_that_cannot_be_kept_are_refused(name, changes, message):
@@ -328,7 +332,7 @@ def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene
     ],
 )
 def test_numbers_of_a_rule_that_is_not_chosen_are_refused(texture, name, select):
-    message = rf"texture\.{name} is .* say texture\.select {select}, or leave texture\.{name} out$"
+    message = rf"texture\.{name} is .* set select to '{select}', or leave {name} out$"
     with pytest.raises(ValueError, match=message):
         a2tg.A2tg.preset("quick", texture=texture).check()
 
@@ -338,13 +342,13 @@ def test_the_threshold_of_a_preset_may_stay(changes):
     a2tg.A2tg.preset("official", **changes).check()
 
 
-@pytest.mark.parametrize("is_enabled", [True, False])
-def test_a_budget_of_textures_is_checked_before_the_first_stage(scene, is_enabled):
+@pytest.mark.parametrize("cap", [500_000, 0])
+def test_a_budget_of_textures_is_checked_before_the_first_stage(scene, cap):
     """120 Gaussians of 248 bytes: they do not grow in 10 iterations, or because growth is off."""
-    densify = {"is_enabled": is_enabled}
+    densify = {"cap": cap}
     texture = {"select": "budget", "budget_mb": 0.0297}
     system = smoke("a2tg", stage1_iterations=10, densify=densify, texture=texture)
-    option = "densify.cap" if is_enabled else "initial_gaussians"
+    option = "densify.cap" if cap else "initial_gaussians"
     for start in (check_start, lambda *it: a2tg.fit(*it, progress=False)):
         with pytest.raises(ValueError, match=rf"but 120 Gaussians .* take 0\.030 MB: raise it, or lower {option}$"):
             start(scene, system)

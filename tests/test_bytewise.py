@@ -11,19 +11,19 @@ from small_values import some_gaussians
 import a2tg_jax as a2tg
 from a2tg_jax import Model
 from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Banded, Shaped, Textured
-from a2tg_jax.appearance.shaped import exponents_of
+from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, allocate_appearance
+from a2tg_jax.appearance.exponents import exponents_of
+from a2tg_jax.appearance.files import arrays_of
 from a2tg_jax.core.budget import bytes_of, event_budget
 from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.densify.exponents import LimitExponents
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import HostEvent
-from a2tg_jax.io.config_json import config_to_dict
 from a2tg_jax.results.plan import fingerprint
-from a2tg_jax.results.record import RunFile, compared_system
-from a2tg_jax.systems.bytewise import Bytewise, KernelConfig
+from a2tg_jax.results.record import compared_system
+from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint
-from a2tg_jax.training.registry import system_from_dict, system_to_dict, with_changes, with_earlier_options
+from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.step import jitted_step
 
 
@@ -37,7 +37,7 @@ def smoke(**changes) -> Bytewise:
     return with_changes(Bytewise.preset("smoke"), {**short, **changes}, "test")
 
 
-SHARES = {"view_dependence": {"share": 0.1}, "texture": {"share": 0.05}}
+SHARES = {"view_dependence_share": 0.1, "texture_share": 0.05}
 """One first stage is compiled for all that have the same."""
 
 
@@ -58,21 +58,21 @@ def test_presets_can_be_trained(preset):
 )
 def test_every_mix_fills_its_bytes(scene, base_degree, shares):
     view, texture = shares
-    system = smoke(base_degree=base_degree, view_dependence={"share": view}, texture={"share": texture})
+    system = smoke(base_degree=base_degree, view_dependence_share=view, texture_share=texture)
     result = a2tg.fit(scene, system, progress=False)
     model = result.model
     assert result.history.megabytes.max() <= 0.04
     assert 0.995 * 40_000 <= model.num_bytes <= 40_000
-    degrees = model.layout.bands.degrees
+    degrees = model.degrees
     assert degrees.min() == base_degree and (degrees.max() > base_degree) == (view > 0)
     assert (model.textures is not None) == (texture > 0)
     if texture:
-        assert 0 < (model.textures[1].sizes > 0).any(axis=1).sum() < model.num
+        assert 0 < (model.textures.sizes > 0).any(axis=1).sum() < model.num
 
 
 def assert_same(model, other):
     """Padding may differ."""
-    arrays = [one.appearance.arrays(one.params, one.layout) | vars(one.gaussians) for one in (model, other)]
+    arrays = [arrays_of(one.appearance, one.gaussians.sh_degree) | vars(one.gaussians) for one in (model, other)]
     assert arrays[0].keys() == arrays[1].keys()
     for name, array in arrays[0].items():
         np.testing.assert_array_equal(array, arrays[1][name], err_msg=name)
@@ -81,7 +81,7 @@ def assert_same(model, other):
 @pytest.fixture(scope="module")
 def before_details(scene):
     """A system, and the model of its first stage."""
-    system = smoke(stage2_iterations=30, texture={"share": 0.02}, view_dependence={"share": 0.1})
+    system = smoke(stage2_iterations=30, texture_share=0.02, view_dependence_share=0.1)
     return system, a2tg.fit_stage(scene, system, 0, progress=False).model
 
 
@@ -96,12 +96,12 @@ def test_details_have_their_room_before_they_come(scene, before_details, monkeyp
         result = a2tg.fit_stage(scene, system, 1, first, progress=False)
         return result.model, num_compiled(jitted_step()) - before - result.num_regrown
 
-    model, num_compiled = details()
-    assert num_compiled == 1
+    model, num_steps = details()
+    assert num_steps == 1
     for event in (AdaptDegrees, Upscale):
         monkeypatch.setattr(event, "with_room", HostEvent.with_room)
-    other, num_compiled = details()
-    assert num_compiled > 3
+    other, num_steps = details()
+    assert num_steps > 3
     assert_same(model, other)
     assert model.num_padding_bytes < 0.05 * model.num_bytes, "a finished model holds no room"
 
@@ -125,20 +125,20 @@ def test_what_goes_on_has_its_room_again(scene, before_details, tmp_path):
 
 def test_the_highest_degree_is_kept(scene):
     model = a2tg.fit(scene, smoke(sh_degree=1, **SHARES), progress=False).model
-    assert set(np.unique(model.layout.bands.degrees)) == {0, 1}
+    assert set(np.unique(model.degrees)) == {0, 1}
 
 
 def test_shapes_of_kernels_are_trained_in_both_stages_and_counted(scene, tmp_path):
-    system = smoke(kernel={"rate": 0.02}, **SHARES)
+    system = smoke(kernel_rate=0.02, **SHARES)
     first = a2tg.fit_stage(scene, system, 0, progress=False).model
-    before = np.asarray(first.appearance.shapes(first.params))
+    before = np.asarray(first.appearance.shapes)
     assert before.std() > 0.02 and before.max() > 0 > before.min()
-    resting = a2tg.fit_stage(scene, with_changes(system, {"kernel": {"rate": 1e-9}}, "test"), 1, first, progress=False)
-    after = resting.model.appearance.shapes(resting.model.params)
+    resting = a2tg.fit_stage(scene, with_changes(system, {"kernel_rate": 1e-9}, "test"), 1, first, progress=False)
+    after = resting.model.appearance.shapes
     np.testing.assert_allclose(after, before, atol=1e-6, err_msg="the second stage goes on from the first one's shapes")
     result = a2tg.fit_stage(scene, system, 1, first, progress=False)
     model = result.model
-    assert np.median(np.abs(np.asarray(model.appearance.shapes(model.params)) - before)) > 0.01
+    assert np.median(np.abs(np.asarray(model.appearance.shapes) - before)) > 0.01
     assert result.history.megabytes.max() <= 0.04 and 0.995 * 40_000 <= model.num_bytes <= 40_000
     assert first.num == 0.85 * 40_000 // (52 + 4)
     a2tg.save_model(tmp_path / "model.npz", model)
@@ -152,14 +152,14 @@ def test_without_a_budget_the_cap_says_how_many_bytes():
     degrees, textures, _ = system.stages()[1].events
     assert isinstance(degrees, AdaptDegrees) and isinstance(textures, Upscale)
     assert textures.budget_mb == pytest.approx(56e-6 * system.densify.cap)
-    assert degrees.budget_mb == pytest.approx((1 - system.texture.share) * textures.budget_mb)
+    assert degrees.budget_mb == pytest.approx((1 - system.texture_share) * textures.budget_mb)
 
 
 @pytest.mark.parametrize("limit", [{"densify": {"cap": 1_000}}, {"memory_budget": "56kB"}])
 @pytest.mark.parametrize(("shares", "most"), [((0.1, 0.02), 980), ((0.0, 0.02), 1_000), ((0.1, 0.0), 1_000)])
 def test_given_gaussians_must_leave_bytes_for_details(limit, shares, most):
     """A Gaussian takes 56 bytes. Degrees must leave the share of textures; textures take the rest."""
-    changes = {"view_dependence": {"share": shares[0]}, "texture": {"share": shares[1]}}
+    changes = {"view_dependence_share": shares[0], "texture_share": shares[1]}
     system = Bytewise.preset("quick", **changes, **limit)
     system.check_given_number(most)
     for event in system.stages()[1].events[:-1]:
@@ -171,14 +171,14 @@ def test_given_gaussians_must_leave_bytes_for_details(limit, shares, most):
 
 def test_textures_must_be_able_to_exceed_one_texel():
     """Textures of 1×1 have a rate of 0, so that their bytes would be lost."""
-    with pytest.raises(ValueError, match=r"^texture\.cap must lie in 2\.\.16; got 1$"):
-        Bytewise.preset("quick", texture={"cap": 1}).check()
-    for texture in ({"cap": 2}, {"cap": 1, "share": 0.0}):
-        Bytewise.preset("quick", texture=texture).check()
+    with pytest.raises(ValueError, match=r"^details\.cap must be at least 2; got 1$"):
+        Bytewise.preset("quick", details={"cap": 1}).check()
+    Bytewise.preset("quick", details={"cap": 2}).check()
+    Bytewise.preset("quick", details={"cap": 1}, texture_share=0.0).check()
 
 
 def test_given_gaussians_without_details_may_be_any_number():
-    Bytewise.preset("quick", view_dependence={"share": 0.0}, texture={"share": 0.0}).check_given_number(100_000)
+    Bytewise.preset("quick", view_dependence_share=0.0, texture_share=0.0).check_given_number(100_000)
 
 
 def test_beside_another_system_it_stays_what_it_is():
@@ -188,89 +188,78 @@ def test_beside_another_system_it_stays_what_it_is():
     assert compared_system("gaussians-2d-mcmc", Bytewise.preset("quick"), "quick").initial_sh_degree == 3
 
 
-class Other(Bytewise):
-    """A kind of `Bytewise` without an option of its own."""
-
-
-def test_options_by_hand_of_a_subclass_are_no_record():
-    assert with_earlier_options(Other, {"memory_budget": 1.0}) == {"memory_budget": 1.0}
-    record = config_to_dict(Other())
-    del record["kernel"]
-    assert with_earlier_options(Other, record)["kernel"] == {"rate": 0.0, "least_exponent": 0.0}
-
-
-def test_runs_of_before_there_were_shapes_go_on_with_gaussian_kernels():
-    """Records hold all options; options by hand lack most and get today's defaults."""
-    record = system_to_dict(Bytewise.preset("quick"))
-    del record["options"]["kernel"]
-    assert system_from_dict(record, "model.npz").kernel.rate == 0
-    file = RunFile(system="bytewise", preset="quick", options=record["options"])
-    assert file.chosen("run.toml").kernel.rate == 0
-    by_hand = dataclasses.replace(file, options={"prune": {"share": 0.2}})
-    assert by_hand.chosen("mine.toml").kernel.rate == Bytewise().kernel.rate > 0
-
-
-def test_runs_of_before_exponents_had_a_least_go_on_without_one():
-    record = system_to_dict(Bytewise.preset("quick"))
-    del record["options"]["kernel"]["least_exponent"]
-    before = system_from_dict(record, "model.npz").kernel
-    assert before == KernelConfig(Bytewise().kernel.rate, 0.0)
-    whole = with_changes(Bytewise.preset("quick"), {"kernel": {"least_exponent": 0.0}}, "test")
-    assert "LimitExponents" not in fingerprint(whole, 0)  # so that what was trained before is known
+def test_without_a_least_exponent_there_is_no_event():
+    whole = Bytewise.preset("quick", exponents={"least": 0.0})
+    assert "LimitExponents" not in fingerprint(whole, 0)
     assert "LimitExponents" in fingerprint(Bytewise.preset("quick"), 0)
 
 
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"details": {"select": "fraction", "fraction": 0.5}}, r"^details\.fraction must stay 0\.25, .*; got 0\.5"),
+        ({"view_dependence": {"budget_mb": 2.0}}, r"^view_dependence\.budget_mb must stay 0\.0, .*; got 2\.0"),
+    ],
+)
+def test_what_the_shares_decide_is_no_option(changes, message):
+    with pytest.raises(ValueError, match=message):
+        smoke(**changes).check()
+
+
 def test_the_least_exponent_reaches_both_stages(scene):
-    system = smoke(kernel={"rate": 1.0, "least_exponent": 0.8})
+    system = smoke(kernel_rate=1.0, exponents={"least": 0.8})
     model = a2tg.fit(scene, system, progress=False).model
-    exponents = exponents_of(model.appearance.shapes(model.params))[: model.num]
+    exponents = exponents_of(model.appearance.shapes)[: model.num]
     np.testing.assert_allclose(exponents.min(), 0.8, rtol=1e-5)
     assert exponents.max() > 1
 
 
-def test_exponents_are_limited_whatever_is_around_them():
+def some_model(template, shapes):
     gaussians = some_gaussians()
-    for appearance in (Shaped(), Banded(Shaped(Textured((2, 3))))):
-        model = Model(gaussians, *appearance.allocate(jax.random.key(0), gaussians), appearance=appearance)
-        shapes = jnp.linspace(-20.0, 20.0, gaussians.num)
-        model = dataclasses.replace(model, params=appearance.with_shapes(model.params, shapes))
-        limited = jax.jit(lambda model: LimitExponents(0.6).apply(None, model, None, ()).model)(model)
-        exponents = exponents_of(appearance.shapes(limited.params))
+    appearance = allocate_appearance(template, jax.random.key(0), gaussians)
+    return Model(gaussians, appearance.with_shapes(shapes))
+
+
+def test_exponents_are_limited_whatever_other_parts_there_are():
+    shapes = jnp.linspace(-20.0, 20.0, some_gaussians().num)
+    whole = Appearance(texture=Texture(start=(2, 3)), exponents=Exponents(), bands=Bands())
+    for template in (Appearance(exponents=Exponents()), whole):
+        limit = jax.jit(lambda model: LimitExponents(0.6).apply(None, model, None, ()).model)
+        limited = limit(some_model(template, shapes))
+        exponents = exponents_of(limited.appearance.shapes)
         np.testing.assert_allclose(exponents, np.maximum(exponents_of(shapes), 0.6), rtol=1e-6)
 
 
 @pytest.mark.parametrize("least", [0.0, 0.3, 0.36])
 def test_a_limit_below_all_exponents_changes_none(least):
-    gaussians = some_gaussians()
-    params, layout = Shaped().allocate(jax.random.key(0), gaussians)
-    shapes = jnp.linspace(-20.0, 20.0, gaussians.num)
-    model = Model(gaussians, params._replace(shapes=shapes), layout, appearance=Shaped())
+    shapes = jnp.linspace(-20.0, 20.0, some_gaussians().num)
+    model = some_model(Appearance(exponents=Exponents()), shapes)
     limited = LimitExponents(least).apply(None, model, None, ()).model
-    np.testing.assert_allclose(exponents_of(limited.params.shapes), exponents_of(shapes), rtol=1e-6)
+    np.testing.assert_allclose(exponents_of(limited.appearance.shapes), exponents_of(shapes), rtol=1e-6)
 
 
-def test_a_limit_of_exponents_wants_shapes():
-    with pytest.raises(ValueError, match="LimitExponents wants kernels with shapes"):
+def test_a_limit_of_exponents_needs_exponents():
+    with pytest.raises(ValueError, match="LimitExponents needs kernels with exponents"):
         LimitExponents().apply(None, Model(some_gaussians()), None, ())
 
 
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"kernel": {"least_exponent": 1.2}}, "kernel.least_exponent must lie in 0..1; got 1.2"),
-        ({"texture": {"share": 0.5}, "view_dependence": {"share": 0.5}}, "must leave bytes for Gaussians"),
-        ({"texture": {"share": 1.5}}, "texture.share must lie in 0..1; got 1.5"),
-        ({"view_dependence": {"share": -0.1}}, "view_dependence.share must lie in 0..1; got -0.1"),
-        ({"texture": {"rate": -1.0}}, "texture.rate must lie in 0..inf"),
-        ({"kernel": {"rate": -1.0}}, "kernel.rate must lie in 0..inf"),
-        ({"texture": {"cap": 32}}, "texture.cap must lie in 2..16; got 32"),
-        ({"view_dependence": {"idle": -1.0}}, "view_dependence.idle must lie in 0..inf"),
-        ({"sh_degree": 4}, "sh_degree must lie in 0..3"),
-        ({"base_degree": 2, "sh_degree": 1}, "base_degree must lie in 0..1; got 2"),
-        ({"base_degree": 3}, "view_dependence.share must be 0 where all Gaussians have the highest degree, 3"),
-        ({"texture": {"at": [0.5, 0.2]}}, "texture.at must be ascending"),
-        ({"texture": {"at": []}}, "texture.at must say when"),
-        ({"prune": {"share": 1.0}}, "prune.share must lie in 0..0.9; got 1.0"),
+        ({"exponents": {"least": 1.2}}, "exponents.least must be at least 0 and at most 1; got 1.2"),
+        ({"texture_share": 0.5, "view_dependence_share": 0.5}, "must leave bytes for Gaussians"),
+        ({"texture_share": 1.5}, "texture_share must be at least 0 and at most 1; got 1.5"),
+        ({"view_dependence_share": -0.1}, "view_dependence_share must be .*; got -0.1"),
+        ({"texel_rate": -1.0}, "texel_rate must be at least 0"),
+        ({"kernel_rate": -1.0}, "kernel_rate must be at least 0"),
+        ({"details": {"cap": 32}}, "details.cap must be at least 1 and at most 16; got 32"),
+        ({"view_dependence": {"idle": -1.0}}, "view_dependence.idle must be at least 0"),
+        ({"sh_degree": 4}, "sh_degree must be at least 0 and at most 3"),
+        ({"base_degree": 2, "sh_degree": 1}, "base_degree must be at least 0 and at most 1; got 2"),
+        ({"base_degree": 3}, "view_dependence_share must be 0 where all Gaussians have the highest degree, 3"),
+        ({"details": {"at": [0.5, 0.2]}}, "details.at must be ascending"),
+        ({"details": {"at": []}}, "details.at must say when"),
+        ({"prune": {"share": 1.0}}, "prune.share must be at least 0 and below 1; got 1.0"),
         ({"prune": {"at": [0.5, 0.83]}}, "prune.at must hold fractions up to 0.8, .* lower the last"),
         ({"prune": {"at": []}}, "prune.at must hold fractions"),
         ({"view_dependence": {"at": [0.5]}}, "view_dependence.at must be over when textures begin"),
@@ -286,6 +275,6 @@ def test_what_cannot_be_trained_is_refused_by_name(changes, message):
 
 def test_the_authors_alpha_can_be_had_without_any_texture(scene):
     """All textures are empty at first, and the largest alpha is that of none."""
-    lookup = {"lookup": {"alpha": "global-maximum", "rgb": "unit"}}
-    model = a2tg.fit(scene, smoke(**{**SHARES, "texture": SHARES["texture"] | lookup}), progress=False).model
+    lookup = {"alpha": "global-maximum", "rgb": "unit"}
+    model = a2tg.fit(scene, smoke(**SHARES, lookup=lookup), progress=False).model
     assert np.isfinite(model.render(scene.test[0].camera).color).all()

@@ -14,17 +14,19 @@ from a2tg_jax.core.cameras import check_camera
 from a2tg_jax.core.checks import check_floats, check_number, check_shape, described
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.host.text import shortened
+from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.training.losses import depth_normals, mean_scale
 
 CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(3), jnp.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]), 16, 12)
 SETTINGS = a2tg.RenderSettings(capacity=1024)
 IMAGE, MAP = jnp.ones((12, 16, 3)), jnp.ones((12, 16))
 KEY = jax.random.key(0)
-TEXTURES, LAYOUT = a2tg.allocate_textures(np.ones((7, 2), int))
+SIZES = np.ones((7, 2), int)
+TEXTURES = a2tg.allocate_textures(SIZES)
+WRONG_TEXTURES = dataclasses.replace(TEXTURES, buckets=(jnp.ones((7, 1, 1, 3)),))
 SCALES = np.ones((7, 2), np.float32)
 VIEW = a2tg.View("a.png", CAMERA, np.zeros((12, 16, 3), np.uint8))
-OUTPUT = a2tg.RenderOutput(IMAGE, MAP, MAP, IMAGE, jnp.zeros((), bool), MAP)
-WRONG_TEXTURES = a2tg.Textures((jnp.ones((7, 1, 1, 3)),))
+OUTPUT = a2tg.RenderOutput(IMAGE, MAP, jnp.zeros((), bool), Geometry(MAP, IMAGE, MAP))
 
 
 def changed(**fields) -> a2tg.Gaussians:
@@ -74,10 +76,9 @@ def adam(params, grads, rates=0.1):
     [
         (lambda: render(background=IMAGE), "background must be one colour [3]; got [12, 16, 3]"),
         (lambda: render(background=0.5), "background must be [3]; got []"),
-        (lambda: render(textures=TEXTURES), "textures and layout belong together"),
-        (lambda: render(textures=TEXTURES, layout=TEXTURES), "must be Textures and their AtlasLayout"),
-        (lambda: render(textures=WRONG_TEXTURES, layout=LAYOUT), "textures.buckets[0] must be [capacity, 1, 1, 4]"),
-        (lambda: render(textures=a2tg.Textures(()), layout=LAYOUT), "textures must have one bucket for each size"),
+        (lambda: render(textures=SIZES), "textures must be Textures; got ndarray"),
+        (lambda: render(textures=WRONG_TEXTURES), "textures.buckets[0] must be [capacity, 1, 1, 4]"),
+        (lambda: render(textures=dataclasses.replace(TEXTURES, buckets=())), "textures must have one bucket for each"),
         (lambda: a2tg.render_image(some_gaussians().means, CAMERA), "gaussians must be Gaussians; got Array"),
         (lambda: a2tg.render_image(some_gaussians(), IMAGE), "camera must be a Camera; got Array"),
         (
@@ -108,14 +109,14 @@ def adam(params, grads, rates=0.1):
         (lambda: a2tg.perturb(KEY, some_gaussians(), 3, jnp.ones(7)), "lr must be []; got [7]"),
         (lambda: a2tg.perturb(KEY, FLAT_SH, 3, 0.1), "gaussians.sh must be [7, 16, 3]"),
         (
-            lambda: a2tg.select(np.ones((7, 1)), LAYOUT.sizes, LAYOUT.sizes, fraction=0.5),
+            lambda: a2tg.select(np.ones((7, 1)), SIZES, SIZES, fraction=0.5),
             "statistic must be [N]; got [7, 1]",
         ),
-        (lambda: a2tg.select(np.ones(7), LAYOUT.sizes[:6], LAYOUT.sizes, fraction=0.5), "sizes must be [7, 2]"),
-        (lambda: a2tg.reallocate(WRONG_TEXTURES, LAYOUT, LAYOUT.sizes), "textures.buckets[0] must be"),
-        (lambda: a2tg.reallocate(TEXTURES, LAYOUT, LAYOUT.sizes, (WRONG_TEXTURES,)), "moments.buckets[0] must be"),
-        (lambda: a2tg.reallocate(TEXTURES, LAYOUT, LAYOUT.sizes[:6]), "new_sizes must be [7, 2]; got [6, 2]"),
-        (lambda: a2tg.texture_arrays(WRONG_TEXTURES, LAYOUT), "textures.buckets[0] must be"),
+        (lambda: a2tg.select(np.ones(7), SIZES[:6], SIZES, fraction=0.5), "sizes must be [7, 2]"),
+        (lambda: a2tg.reallocate(WRONG_TEXTURES, SIZES), "textures.buckets[0] must be"),
+        (lambda: a2tg.reallocate(TEXTURES, SIZES, (WRONG_TEXTURES,)), "moments.buckets[0] must be"),
+        (lambda: a2tg.reallocate(TEXTURES, SIZES[:6]), "new_sizes must be [7, 2]; got [6, 2]"),
+        (lambda: a2tg.texture_arrays(WRONG_TEXTURES), "textures.buckets[0] must be"),
         (lambda: a2tg.textures_from_arrays([np.ones((1, 1, 4), int)]), "texture 0 must be floats; got int64"),
         (
             lambda: a2tg.GradientStatistics.init(7).observe(jnp.ones((7, 1)), jnp.ones(7, bool)),
@@ -126,20 +127,20 @@ def adam(params, grads, rates=0.1):
         (lambda: adam(jnp.ones((7, 3)), jnp.ones((7, 3)), jnp.ones(3)), "rates must broadcast to [7, 3]"),
         (lambda: adam(jnp.ones((1, 3)), jnp.ones((1, 3)), jnp.ones((7, 3))), "rates must broadcast to [1, 3]"),
         (lambda: adam({"a": jnp.ones(7, int)}, {"a": jnp.ones(7)}), "params['a'] must be floats; got int32"),
-        (lambda: sizes_after(SCALES, LAYOUT.sizes), "sizes must be integers [N, 2] as (Tv, Tu); got float32 (7, 2)"),
-        (lambda: sizes_after(LAYOUT, SCALES), "sizes must be integers [N, 2]; got AtlasLayout: say layout.sizes"),
+        (lambda: sizes_after(SCALES, SIZES), "sizes must be integers [N, 2] as (Tv, Tu); got float32 (7, 2)"),
+        (lambda: sizes_after(TEXTURES, SCALES), "sizes must be integers [N, 2]; got Textures: pass textures.sizes"),
         (
-            lambda: sizes_after(100 * LAYOUT.sizes, SCALES),
-            "texture sides must lie in 1..16, or both be 0; got 100..100",
+            lambda: sizes_after(100 * SIZES, SCALES),
+            "texture sides must be in 1..16, or both 0; got 100..100",
         ),
-        (lambda: sizes_after(LAYOUT.sizes, -SCALES), "scales must be positive standard deviations; got -1: say"),
-        (lambda: sizes_after(LAYOUT.sizes, SCALES, k_a=np.nan), "k_a must be at least 0; got nan"),
-        (lambda: sizes_after(LAYOUT.sizes, SCALES, cap=4.5), "cap must be an int, 1 to 16; got 4.5"),
-        (lambda: sizes_after(LAYOUT.sizes, SCALES, axes="foo"), "axes must be one of paper, authors; got 'foo'"),
-        (lambda: a2tg.reallocate(LAYOUT, TEXTURES, LAYOUT.sizes), "must be Textures and their AtlasLayout"),
-        (lambda: a2tg.reallocate(TEXTURES, LAYOUT, LAYOUT.sizes, kept=np.arange(7)), "kept must be bools; got int64"),
-        (lambda: a2tg.texture_arrays(LAYOUT, TEXTURES), "Textures and their AtlasLayout; got AtlasLayout and Textures"),
-        (lambda: a2tg.allocate_textures(LAYOUT.sizes, rgb=(1, 1, 1)), "rgb must be a number; got (1, 1, 1)"),
+        (lambda: sizes_after(SIZES, -SCALES), "scales must be positive standard deviations; got -1: say"),
+        (lambda: sizes_after(SIZES, SCALES, k_a=np.nan), "k_a must be at least 0; got nan"),
+        (lambda: sizes_after(SIZES, SCALES, cap=4.5), "cap must be an int, 1 to 16; got 4.5"),
+        (lambda: sizes_after(SIZES, SCALES, axes="foo"), "axes must be one of paper, authors; got 'foo'"),
+        (lambda: a2tg.reallocate(SIZES, SIZES), "textures must be Textures; got ndarray"),
+        (lambda: a2tg.reallocate(TEXTURES, SIZES, kept=np.arange(7)), "kept must be bools; got int64"),
+        (lambda: a2tg.texture_arrays(SIZES), "textures must be Textures; got ndarray"),
+        (lambda: a2tg.allocate_textures(SIZES, rgb=(1, 1, 1)), "rgb must be a number; got (1, 1, 1)"),
         (lambda: render(settings=None), "settings must be RenderSettings; got NoneType"),
         (lambda: a2tg.RenderSettings(tile_size=8.0), "tile_size must be an int, 1 to 64; got 8.0"),
         (lambda: a2tg.RenderSettings(sh_degree=7), "sh_degree must be an int, 0 to 3; got 7"),
@@ -148,7 +149,7 @@ def adam(params, grads, rates=0.1):
         (lambda: a2tg.plan_render(CAMERA, some_gaussians()), "gaussians must be a Model or Gaussians; got Camera"),
         (lambda: a2tg.plan_render(some_gaussians(), None), "cameras must be a Camera or an Iterable; got NoneType"),
         (lambda: a2tg.plan_render(some_gaussians(), [VIEW]), "cameras[0] must be a Camera; got View: use view.camera"),
-        (lambda: a2tg.Renderer(some_gaussians(), CAMERA), "rule must be an AppearanceRule; got Camera"),
+        (lambda: a2tg.Renderer(some_gaussians(), CAMERA), "appearance must be an Appearance; got Camera"),
         (lambda: a2tg.resize_camera(CAMERA, 0, 12), "width must be an int, at least 1; got 0"),
         (lambda: a2tg.resize_camera(CAMERA, 16, np.nan), "height must be an int, at least 1; got nan"),
         (lambda: a2tg.resize_camera(CAMERA, 16, 12.0), "height must be an int, at least 1; got 12.0"),
@@ -163,7 +164,7 @@ def adam(params, grads, rates=0.1):
         (lambda: a2tg.normal_consistency(IMAGE, MAP, MAP, VIEW), "camera must be a Camera; got View: use view.camera"),
         (lambda: a2tg.normal_consistency(None, MAP, MAP, CAMERA), "normal must be [12, 16, 3]; got NoneType"),
         (lambda: a2tg.parameter_bytes(a2tg.Model(some_gaussians())), "got Model: say model.num_bytes"),
-        (lambda: a2tg.parameter_bytes(some_gaussians(), TEXTURES), "layout must be an AtlasLayout; got Textures"),
+        (lambda: a2tg.parameter_bytes(some_gaussians(), SIZES), "textures must be Textures; got ndarray"),
         (lambda: a2tg.view_image(CAMERA), "view must be a View; got Camera"),
         (
             lambda: a2tg.view_gradients(lambda m, o: 0.0, some_gaussians(), CAMERA),

@@ -9,11 +9,20 @@ import pytest
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Billboards, TextureOptions, textured_rule
-from a2tg_jax.appearance.textured import project_texels
+from a2tg_jax.appearance import (
+    Appearance,
+    Billboards,
+    Exponents,
+    Texture,
+    TextureOptions,
+    allocate_appearance,
+    projected,
+)
+from a2tg_jax.appearance.exponents import LARGEST_LOG_EXPONENT
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.numerics import at_least, within
 from a2tg_jax.core.optim import adam_init, adam_update
+from a2tg_jax.core.partition import combine, partition
 from a2tg_jax.training.start import start_colors
 
 UNIT = TextureOptions(rgb="unit", alpha="global-maximum")
@@ -107,66 +116,61 @@ def test_black_points_train_as_grey_ones(shared):
     assert abs(np.clip(image[..., 0], 0, 1).mean() - red) < 0.15 * red
 
 
-def gradient_of_texels(texels, options, gaussians):
+def with_texels(texels, options):
+    return Appearance(texture=Texture(a2tg.textures_from_arrays([texels]), options=options))
+
+
+def gradient_of_texels(appearance, gaussians):
     """The gradient that would brighten or thicken the splat at each texel."""
-    textures, layout = a2tg.textures_from_arrays([texels])
+    floats, places = partition(appearance)
 
-    def total(textures):
-        rule = textured_rule(textures, layout, options)
+    def total(floats):
         settings = a2tg.RenderSettings(capacity=64)
-        return jnp.sum(a2tg.render_appearance(gaussians, CAMERA, rule, settings=settings).color)
+        appearance = combine(floats, places)
+        return jnp.sum(a2tg.render_appearance(gaussians, CAMERA, appearance, settings=settings).color)
 
-    return jax.grad(total)(textures).buckets[0][0]
+    return jax.grad(total)(floats).textures.buckets[0][0]
 
 
 def test_texels_on_their_bounds_can_leave_them():
     texels = np.full((2, 2, 4), 0.5, np.float32)
     texels[0, 0], texels[1, 1, :3] = 0, 1
     for options in (TextureOptions(), TextureOptions(rgb="unit"), UNIT):
-        assert (gradient_of_texels(texels, options, one_splat()) != 0).all(), options
+        assert (gradient_of_texels(with_texels(texels, options), one_splat()) != 0).all(), options
 
 
 @pytest.mark.parametrize("options", [TextureOptions(rgb="unit"), UNIT])
 def test_projection_keeps_the_image_and_returns_texels_to_where_they_learn(options):
     rng = np.random.default_rng(0)
     texels = rng.uniform(-0.5, 1.5, (3, 4, 4)).astype(np.float32)
-    textures, layout = a2tg.textures_from_arrays([texels])
     if options.alpha == "projected":
-        textures = dataclasses.replace(textures, buckets=(textures.buckets[0].at[..., 3].set(0.7),))
-    projected = project_texels(textures, options)
-    images = [
-        a2tg.render_appearance(one_splat(), CAMERA, textured_rule(t, layout, options)).color
-        for t in (textures, projected)
-    ]
+        texels[..., 3] = 0.7
+    appearance = with_texels(texels, options)
+    images = [a2tg.render_appearance(one_splat(), CAMERA, one).color for one in (appearance, projected(appearance))]
     np.testing.assert_allclose(images[0], images[1], atol=1e-6)
-    assert (gradient_of_texels(np.asarray(projected.buckets[0][0]), options, one_splat())[..., :3] != 0).all()
+    assert (gradient_of_texels(projected(appearance), one_splat())[..., :3] != 0).all()
 
 
 def test_alphas_at_their_cap_can_fade():
     """Texels of pictures, whose alpha takes the place of opacity and Gaussian, are projected onto the cap."""
-    appearance, gaussians = Billboards(), one_splat()
-    params, layout = appearance.allocate(jax.random.key(0), gaussians)
-    params = appearance.project(jax.tree.map(lambda texels: jnp.full_like(texels, 5.0), params))
-    assert params.buckets[0][..., 3].max() == jnp.float32(0.99)
+    gaussians = one_splat()
+    floats, places = partition(allocate_appearance(Billboards(), jax.random.key(0), gaussians))
+    floats, _ = partition(projected(combine(jax.tree.map(lambda x: jnp.full_like(x, 5.0), floats), places)))
+    assert floats.pictures.buckets[0][..., 3].max() == jnp.float32(0.99)
 
-    def mean_of_picture(params):
-        return jnp.mean(a2tg.render_appearance(gaussians, CAMERA, appearance.rule(params, layout)).alpha)
+    def mean_of_picture(floats):
+        return jnp.mean(a2tg.render_appearance(gaussians, CAMERA, combine(floats, places)).alpha)
 
-    assert (jax.grad(mean_of_picture)(params).buckets[0][..., 3] > 0).all()
+    assert (jax.grad(mean_of_picture)(floats).pictures.buckets[0][..., 3] > 0).all()
 
 
 def test_exponents_at_their_limit_have_a_gradient():
-    from a2tg_jax.appearance import Plain, Shaped
-    from a2tg_jax.densify.exponents import LARGEST_LOG_EXPONENT
-
     gaussians = some_gaussians(5)
-    appearance = Shaped(Plain())
-    params, layout = appearance.allocate(jax.random.key(0), gaussians)
     limit = jnp.full(5, np.arctanh(np.log(0.6) / LARGEST_LOG_EXPONENT), jnp.float32)
     camera = a2tg.Camera(jnp.eye(4).at[2, 3].set(4.0), CAMERA.K, 16, 16)
 
     def total(shapes):
-        rule = appearance.rule(appearance.with_shapes(params, shapes), layout)
-        return jnp.sum(a2tg.render_appearance(gaussians, camera, rule).color)
+        appearance = Appearance(exponents=Exponents(shapes))
+        return jnp.sum(a2tg.render_appearance(gaussians, camera, appearance).color)
 
     assert np.count_nonzero(jax.grad(total)(limit)) >= 3

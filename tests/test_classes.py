@@ -13,22 +13,22 @@ from a2tg_jax.mcmc import Noise
 from a2tg_jax.results.plan import fingerprint, plan_run
 
 
-def rule_of(index: int) -> type:
+def appearance_of(index: int) -> type:
     @a2tg.pytree
-    class Rule(a2tg.PlainRule):
+    class Own(a2tg.Appearance):
         def falloff(self, numbers, rho):
             return jnp.exp(-0.5 * rho) + index
 
-    return Rule
+    return Own
 
 
 def test_no_class_runs_the_program_of_another():
     """Under `register_dataclass`, one in five of so many subclasses does."""
-    function = jax.jit(lambda rule, rho: rule.falloff((), rho))
-    rules = [rule_of(index)() for index in range(300)]
-    assert [float(function(rule, jnp.float32(0))) for rule in rules] == [1 + index for index in range(300)]
+    function = jax.jit(lambda appearance, rho: appearance.falloff((), rho))
+    made = [appearance_of(index)() for index in range(300)]
+    assert [float(function(appearance, jnp.float32(0))) for appearance in made] == [1 + index for index in range(300)]
     assert num_compiled(function) == 300
-    assert [float(function(rule, jnp.float32(0))) for rule in rules] == [1 + index for index in range(300)]
+    assert [float(function(appearance, jnp.float32(0))) for appearance in made] == [1 + index for index in range(300)]
     assert num_compiled(function) == 300
 
 
@@ -37,7 +37,7 @@ def test_fields_are_arrays_static_or_beside():
     class Parts:
         array: jax.Array
         choice: str = a2tg.static(default="a")
-        note: str | None = beside()
+        note: str | None = beside(default=None)
 
     one = Parts(jnp.ones(2), note="kept here")
     assert jax.tree.leaves(one) == [one.array] and jax.tree.structure(one) == jax.tree.structure(Parts(one.array))

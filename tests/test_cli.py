@@ -25,6 +25,7 @@ from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host import startup
+from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
@@ -32,14 +33,13 @@ from a2tg_jax.results import finishing, frame_folder, frames, run_training, web_
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.frame_folder import LIST
 from a2tg_jax.results.history import read_history
-from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.record import SceneSource, read_record, write_record
 from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.training import SYSTEMS, find_system
 
 TINY = [
     *("--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
-    *("--initial-gaussians", "60", "--densify.cap", "60", "--texture.cap", "2", "--texture.upscale-at", "0.5"),
+    *("--initial-gaussians", "60", "--densify.cap", "60", "--texture.cap", "2", "--texture.at", "0.5"),
 ]
 """One upscaling event and few shapes: what takes time is compiling."""
 TENSORBOARD = ("--tensorboard",) if importlib.util.find_spec("tensorboardX") else ()
@@ -213,8 +213,8 @@ def test_help_tells_the_options_of_a_system(capsys, name):
         cli.main(["train", "--system", name, "--help"])
     text = capsys.readouterr().out
     assert ("--densify.threshold" in text) == (name in ("gaussians-2d", "supergaussians"))
-    assert ("--texture.side" in text) == (name == "textured-gaussians")
-    assert ("--texture.lookup.uv" in text) == (name in ("textured-gaussians", "a2tg", "bytewise"))
+    assert ("--texture-side" in text) == (name == "textured-gaussians")
+    assert ("--lookup.uv" in text) == (name in ("textured-gaussians", "a2tg", "bytewise"))
     assert ("--billboard.side" in text) == (name == "bbsplat")
 
 
@@ -227,8 +227,8 @@ downscale = 2
 system = "textured-gaussians"
 preset = "quick"
 compare = ["gaussians-2d-mcmc"]
-[options.texture]
-side = 2
+[options]
+texture_side = 2
 """
 
 
@@ -240,12 +240,12 @@ def parsed_with_file(folder, text: str, *flags: str) -> cli.Train:
 def test_flags_win_over_the_file(tmp_path):
     said = parsed_with_file(tmp_path, FILE)
     assert said.record.scene == SceneSource("synthetic", downscale=2)
-    assert (said.options.texture.side, said.options.stage1_iterations) == (2, 2_000)
-    won = parsed_with_file(tmp_path, FILE, "--texture.side", "3", "--downscale", "1", "--compare", "gaussians-2d")
-    assert (won.options.texture.side, won.options.stage1_iterations, won.downscale) == (3, 2_000, 1)
+    assert (said.options.texture_side, said.options.stage1_iterations) == (2, 2_000)
+    won = parsed_with_file(tmp_path, FILE, "--texture-side", "3", "--downscale", "1", "--compare", "gaussians-2d")
+    assert (won.options.texture_side, won.options.stage1_iterations, won.downscale) == (3, 2_000, 1)
     assert won.record.compare == ("gaussians-2d-mcmc", "gaussians-2d")
     other_preset = parsed_with_file(tmp_path, FILE, "--preset", "paper").options
-    assert (other_preset.texture.side, other_preset.stage1_iterations) == (4, 30_000)
+    assert (other_preset.texture_side, other_preset.stage1_iterations) == (4, 30_000)
     other_system = parsed_with_file(tmp_path, FILE, "--system", "gaussians-2d")
     assert (other_system.record.name, other_system.options.stage1_iterations) == ("gaussians-2d", 30_000)
 
@@ -253,11 +253,11 @@ def test_flags_win_over_the_file(tmp_path):
 def test_own_systems_are_found_in_the_current_directory(tmp_path, monkeypatch):
     (tmp_path / "systems_of_mine.py").write_text(
         "import dataclasses\n"
-        "from a2tg_jax.systems.a2tg import A2tg, TextureConfig\n"
+        "from a2tg_jax.adapt import Upscale\nfrom a2tg_jax.systems.a2tg import A2tg\n"
         "@dataclasses.dataclass(frozen=True, kw_only=True)\n"
         "class Mine(A2tg):\n"
         "    strength: float = 2.0\n"
-        "VARIANT = Mine(texture=TextureConfig(cap=8))\n"
+        "VARIANT = Mine(texture=Upscale(cap=8))\n"
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -740,8 +740,7 @@ def test_doctor_compares_the_compositors(capsys, monkeypatch):
     assert "cuda is not available: it needs JAX on an NVIDIA GPU" in told
     assert "devices     the CPU\n" in told and re.search(r"memory +[\d.]+ GB may be used\n", told)
     assert told.splitlines()[-1].split(maxsplit=1) == ["verdict", "everything works on this machine"]
-    assert "but on the CPU" in doctor._verdict("cpu", has_driver=True)
-    monkeypatch.setattr(doctor.choice, "is_available", lambda name: False)
-    assert "but slowly: native is not available" in doctor._verdict("cpu", has_driver=False)
-    monkeypatch.setattr(doctor, "_compare", lambda: float("inf"))
+    assert "but on the CPU" in doctor._verdict("cpu", ["native"], has_driver=True)
+    assert "but slowly: native is not available" in doctor._verdict("cpu", [], has_driver=False)
+    monkeypatch.setattr(doctor, "_compare", lambda available: float("inf"))
     assert "the compositors differ by inf" in fails(capsys, "doctor")

@@ -95,8 +95,8 @@ def test_numbers_edited_between_two_attempts_are_refused(inside, tmp_path, capsy
     copy = RunFolder(shutil.copytree(inside.path, tmp_path / "copy"))
     copy.record.write_text(copy.record.read_text().replace("contrast_weight = 0.2", "contrast_weight = 0.3"))
     assert cli.main(["train", "--out", str(copy.path), "--resume"]) == 2
-    assert "Toy-rings.npz was made with another contrast_weight than in run.toml" in capsys.readouterr().err
+    assert "Toy-rings.npz was made with another --contrast-weight than in run.toml" in capsys.readouterr().err
     stopped = RunFolder(shutil.copytree("interrupted", tmp_path / "stopped"))
     shutil.copy(copy.record, stopped.record)
     assert cli.main(["train", "--out", str(stopped.path), "--resume"]) == 2
-    assert "Toy-rings-0000000001.npz was made with another contrast_weight than" in capsys.readouterr().err
+    assert "Toy-rings-0000000001.npz was made with another --contrast-weight than" in capsys.readouterr().err

@@ -15,16 +15,26 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from scipy.spatial import cKDTree
 from small_values import some_gaussians
 
-from a2tg_jax.appearance import Banded, Billboards, MovableKernels, Plain, Shaped, Textured, TextureOptions
-from a2tg_jax.appearance.banded import BandedLayout, BandedParams
-from a2tg_jax.appearance.sh_bands import split_sh
-from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams, log_exponents_of, shapes_of
+from a2tg_jax.appearance import (
+    Appearance,
+    Bands,
+    Billboards,
+    Exponents,
+    MovableKernels,
+    Texture,
+    TextureOptions,
+    allocate_appearance,
+    template_of,
+)
+from a2tg_jax.appearance.bands import bands_of_dense
+from a2tg_jax.appearance.exponents import log_exponents_of, shapes_of
+from a2tg_jax.appearance.files import arrays_of
 from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.io import coders, compact, quantise
 from a2tg_jax.io.compact import GROUPS, HEAD, CompactChoices, decode_model, encode_model, load_compact, save_compact
 from a2tg_jax.io.ply import load_ply, save_ply
-from a2tg_jax.io.streams import Reader, Writer
+from a2tg_jax.io.streams import ColumnReader, ColumnWriter
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.texture import textures_from_arrays
@@ -37,12 +47,16 @@ SETTINGS = RenderSettings(capacity=4096)
 
 def origin() -> Origin:
     camera = as_camera(SCENE, "float32")
-    return Origin.of_cameras([camera, camera], ["a é.png", "b.png"], is_test=[True, False], background=(0.1, 0.2, 0.3))
+    return Origin.of_cameras([camera, camera], ["a é.png", "b.png"], is_test=[True, False])
+
+
+def some_model(gaussians: Gaussians, appearance: Appearance) -> Model:
+    return Model(gaussians, appearance, background=(0.1, 0.2, 0.3), origin=origin())
 
 
 def plain(num_bases: int = 16) -> Model:
     gaussians = as_gaussians(SCENE, "float32")
-    return Model(dataclasses.replace(gaussians, sh=gaussians.sh[:, :num_bases]), appearance=Plain(0.9), origin=origin())
+    return some_model(dataclasses.replace(gaussians, sh=gaussians.sh[:, :num_bases]), Appearance(max_alpha=0.9))
 
 
 def some_textures(has_empty: bool = False):
@@ -53,22 +67,21 @@ def some_textures(has_empty: bool = False):
 
 
 def textured(has_empty: bool = False) -> Model:
-    appearance = Textured((2, 2), TextureOptions(max_alpha=0.95))
-    return Model(as_gaussians(SCENE, "float32"), *some_textures(has_empty), appearance=appearance, origin=origin())
+    texture = Texture(some_textures(has_empty), (2, 2), TextureOptions(max_alpha=0.95))
+    return some_model(as_gaussians(SCENE, "float32"), Appearance(texture=texture))
 
 
 def shaped(inner: Model) -> Model:
-    shapes = np.random.default_rng(2).normal(size=inner.gaussians.num).astype(np.float32)
-    params, layout = ShapedParams(jnp.asarray(shapes), inner.params), ShapedLayout(inner.layout)
-    return dataclasses.replace(inner, params=params, layout=layout, appearance=Shaped(inner.appearance))
+    exponents = Exponents(jnp.asarray(np.random.default_rng(2).normal(size=inner.gaussians.num), jnp.float32))
+    return dataclasses.replace(inner, appearance=dataclasses.replace(inner.appearance, exponents=exponents))
 
 
 def banded(base_degree: int, inner: Model) -> Model:
     degrees = np.random.default_rng(1).integers(base_degree, 4, NUM)
-    bands, owners = split_sh(np.asarray(inner.gaussians.sh), degrees, base_degree)
-    gaussians = dataclasses.replace(inner.gaussians, sh=inner.gaussians.sh[:, : (base_degree + 1) ** 2])
-    params, layout = BandedParams(bands, inner.params), BandedLayout(owners, inner.layout)
-    return Model(gaussians, params, layout, appearance=Banded(inner.appearance), origin=inner.origin)
+    num_bases = (base_degree + 1) ** 2
+    bands = Bands(bands_of_dense(np.asarray(inner.gaussians.sh)[:, num_bases:], degrees, base_degree))
+    gaussians = dataclasses.replace(inner.gaussians, sh=inner.gaussians.sh[:, :num_bases])
+    return some_model(gaussians, dataclasses.replace(inner.appearance, bands=bands))
 
 
 MODELS = {
@@ -103,8 +116,7 @@ def tables(model: Model, order=None) -> dict[str, np.ndarray]:
         "sh_0": sh[:, :1],
         "sh_rest": sh[:, 1:],
     }
-    arrays = model.appearance.arrays(model.params, model.layout)
-    arrays = {name.rpartition("inner.")[2]: array for name, array in arrays.items()}
+    arrays = arrays_of(model.appearance, model.gaussians.sh_degree)
     if "shapes" in arrays:
         found["shapes"] = log_exponents_of(arrays["shapes"][order])
     if "degrees" in arrays:
@@ -126,7 +138,8 @@ def test_floats_come_back_as_they_were_in_another_order(name, tmp_path):
     model = MODELS[name]()
     save_compact(tmp_path / "m.a2tgz", model, choices=EXACT)
     found = load_compact(tmp_path / "m.a2tgz")
-    assert found.appearance == model.appearance and found.origin == model.origin
+    assert template_of(found.appearance) == template_of(model.appearance)
+    assert found.background == model.background and found.origin == model.origin
     assert found.num_bytes == model.num_bytes and found.num == model.num
     order = order_of(model, found)
     for group, values in tables(found).items():
@@ -196,9 +209,9 @@ def test_rotations_are_within_the_diagonal_of_a_step(bits):
 @pytest.mark.parametrize("bits", [6, 10, 14, 16])
 def test_means_are_within_a_step_that_grows_with_the_distance(bits):
     means = np.random.default_rng(0).standard_t(2, size=(3, 400)).astype(np.float32) * 5
-    writer = Writer("none")
+    writer = ColumnWriter("none")
     order = writer.means("means", means, bits)
-    found = Reader(writer.body, writer.layout, 10**6).means("means", 400, bits)
+    found = ColumnReader(writer.body, writer.layout, 10**6).means("means", 400, bits)
     for axis, values in zip(means[:, order], found, strict=True):
         contraction = quantise.Contraction.of(axis)
         step = np.ptp(contraction.contracted(axis)) / (2**bits - 2)
@@ -213,11 +226,11 @@ def test_texels_keep_their_places(precision):
     gaussians = dataclasses.replace(some_gaussians(5), quats=jnp.tile(jnp.asarray([1.0, 0.1, 0.0, 0.0]), (5, 1)))
     rng = np.random.default_rng(0)
     arrays = [rng.normal(size=(*size, 4)).astype(np.float32) for size in ((1, 1), (2, 3), (0, 0), (4, 1), (2, 3))]
-    model = Model(gaussians, *textures_from_arrays(arrays), appearance=Textured())
+    model = Model(gaussians, Appearance(texture=Texture(textures_from_arrays(arrays))))
     found = decode_model(encode_model(model, CompactChoices(texels=precision)))
     order = order_of(model, found)
     wanted = np.concatenate([arrays[row].reshape(-1, 4) for row in order])
-    texels = found.appearance.arrays(found.params, found.layout)["texels"]
+    texels = found.textures.flat()
     for columns in (slice(0, 3), slice(3, 4)):
         error = np.abs(texels[:, columns] - wanted[:, columns]).max()
         assert error <= (0 if precision == "float32" else half_step(wanted[:, columns], precision))
@@ -228,8 +241,11 @@ def test_texels_keep_their_places(precision):
 def test_a_model_of_no_gaussians(name, choices):
     model = dataclasses.replace(MODELS[name](), num_live=jnp.asarray(0, jnp.int32))
     found = decode_model(encode_model(model, choices))
-    assert found.num == 0 and found.appearance == model.appearance and found.origin == model.origin
+    assert found.num == 0 and template_of(found.appearance) == template_of(model.appearance)
+    assert found.background == model.background and found.origin == model.origin
     assert found.gaussians.sh.shape == (0, *model.gaussians.sh.shape[1:])
+    image = found.render(found.origin.cameras[0], settings=SETTINGS).color
+    np.testing.assert_allclose(image[0, 0], found.background, rtol=1e-6)
 
 
 def test_only_rows_that_exist_are_kept():
@@ -274,7 +290,7 @@ def test_shapes_of_any_precision_are_finite(bits):
     """The ends of the range included, which even steps may move outwards."""
     model = shaped(plain(1))
     shapes = jnp.asarray(np.resize([-30.0, 30.0, 0.0, 0.3], NUM), jnp.float32)
-    model = dataclasses.replace(model, params=model.appearance.with_shapes(model.params, shapes))
+    model = dataclasses.replace(model, appearance=model.appearance.with_shapes(shapes))
     found = decode_model(encode_model(model, CompactChoices(shapes=bits)))
     wanted, values = tables(model, order_of(model, found))["shapes"], tables(found)["shapes"]
     assert np.abs(values - wanted).max() <= {1: 1.0, 2: 0.5}.get(bits, half_step(wanted, max(bits, 2))) + 1e-6
@@ -282,20 +298,20 @@ def test_shapes_of_any_precision_are_finite(bits):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e30, 1.6])
 def test_exponents_out_of_range_are_refused(value):
-    with pytest.raises(ValueError, match="logarithms of the exponents of kernels must lie within ±1"):
+    with pytest.raises(ValueError, match="logarithms of the exponents of kernels must be within ±1"):
         shapes_of(np.asarray([0.0, value]))
 
 
 # What is refused
 
 
-@pytest.mark.parametrize("appearance", [MovableKernels(), Billboards()])
-@pytest.mark.parametrize("wrap", [lambda x: x, Banded])
-def test_other_appearances_are_refused(appearance, wrap):
+@pytest.mark.parametrize("kind", [MovableKernels, Billboards])
+@pytest.mark.parametrize(("bands", "words"), [(None, ""), (Bands(), " with bands")])
+def test_other_appearances_are_refused(kind, bands, words):
     gaussians = some_gaussians()
-    params, layout = wrap(appearance).allocate(jax.random.key(0), gaussians)
-    with pytest.raises(ValueError, match=f"shows {type(appearance).__name__}: a compact file holds .*save_model"):
-        encode_model(Model(gaussians, params, layout, appearance=wrap(appearance)))
+    appearance = allocate_appearance(kind(bands=bands), jax.random.key(0), gaussians)
+    with pytest.raises(ValueError, match=f"shows {kind.__name__}{words}: a compact file holds .*save_model"):
+        encode_model(Model(gaussians, appearance))
 
 
 @pytest.mark.parametrize("field", [field.name for field in dataclasses.fields(Gaussians)])
@@ -445,8 +461,8 @@ def sizes_of(*size):
         (header_with(ends__sh_1=[-1e39, 1e39]), "the ends of sh_1 must be 2 numbers"),
         (header_with(ends__sh_1=["a", "b"]), "the ends of sh_1 must be 2 numbers"),
         (header_with(ends__sh_1=[0.5, 0.5]), "the part sh_1 holds bytes where there should be none"),
-        (header_with(ends__shapes=[-3.0, 3.0]), "exponents of kernels must lie within"),
-        (header_with(ends__shapes=[1e30, 1e31]), "exponents of kernels must lie within"),
+        (header_with(ends__shapes=[-3.0, 3.0]), "exponents of kernels must be within"),
+        (header_with(ends__shapes=[1e30, 1e31]), "exponents of kernels must be within"),
         (header_with(ends__shapes=[0.0, "NaN"]), "the ends of shapes must be 2 numbers"),
         (header_with(lengths__shapes=3), "its parts must have"),
         (header_with(choices__shapes=16), "the part shapes"),
@@ -458,10 +474,13 @@ def sizes_of(*size):
         (header_with(choices=7), "choices must hold"),
         (header_with(appearance__name="Billboards"), "Billboards|options"),
         (header_with(appearance__module="os", appearance__name="system"), "not known here"),
-        (header_with(appearance__held__inner__name="Plain"), "Plain|options"),
+        (header_with(appearance__parts__texture__start=7), "options of Texture"),
+        (header_with(appearance__parts={}), "degrees must lie in 0..0"),
+        (lambda header: header["appearance"]["parts"].pop("exponents"), r"\['shapes'\] came"),
+        (header_with(appearance__parts={"wings": {}}), "damaged"),
         (header_with(appearance=None), "damaged"),
         (header_with(origin__names=["x"] * 1000), "the part origin_viewmats|too small"),
-        (header_with(origin__background=[0, 1]), "unpack"),
+        (header_with(background=[0, 1]), "unpack"),
         (lambda header: header.pop("origin"), "the part origin_viewmats is not known"),
         (lambda header: header.pop("num"), "damaged"),
     ],
@@ -540,19 +559,19 @@ def test_bytes_of_numbers_come_back(dtype):
 
 
 def test_a_reader_reads_all_or_nothing():
-    writer = Writer("zstd")
+    writer = ColumnWriter("zstd")
     writer.numbers("a", np.eye(3), 8)
     writer.numbers("b", np.eye(3), 8)
-    reader = Reader(writer.body, writer.layout, 1000)
+    reader = ColumnReader(writer.body, writer.layout, 1000)
     with pytest.raises(ValueError, match="the part b is missing"):
         reader.numbers("b", 3, 3, 8)
     reader.numbers("a", 3, 3, 8)
     with pytest.raises(ValueError, match="the part b is not known"):
         reader.end()
     with pytest.raises(ValueError, match="its parts must have"):
-        Reader(writer.body[:-1], writer.layout, 1000)
+        ColumnReader(writer.body[:-1], writer.layout, 1000)
     with pytest.raises(ValueError, match="would take 9 bytes"):
-        Reader(writer.body, writer.layout, 8).numbers("a", 3, 3, 8)
+        ColumnReader(writer.body, writer.layout, 8).numbers("a", 3, 3, 8)
 
 
 def test_fewer_bits_take_fewer_bytes():

@@ -8,12 +8,12 @@ import pytest
 from small_values import some_gaussians
 
 from a2tg_jax.cli import main as cli
-from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.data import synthetic_scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import compaction
 from a2tg_jax.finish.compaction import Trial, loss_beside_renders, loss_on_views, measure_choices, smallest_within
+from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.compact import CompactChoices, encode_model, load_compact
 from a2tg_jax.io.model_file import save_model
 from a2tg_jax.measure.evaluation import evaluate

@@ -25,12 +25,12 @@ from a2tg_jax import (
 from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.core.rigid import moved_viewmat, rotation_exp
 from a2tg_jax.io.compact import load_compact
-from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.corrections import Exposure, PoseRefinement, exposed, initial_corrections, updated
 
 SYSTEM = A2tg(
-    stage1_iterations=24, stage2_iterations=16, initial_gaussians=80, densify=McmcConfig(cap=90), exposure=True,
+    stage1_iterations=24, stage2_iterations=16, initial_gaussians=80, densify=Mcmc(cap=90), exposure=True,
     refine_poses=True,
 )  # fmt: skip
 
@@ -172,8 +172,8 @@ def test_another_system_learns_them(scene):
 def test_a_system_that_does_not_ask_for_them_is_refused(scene):
     with pytest.raises(ValueError, match="refine_poses is asked for, but no stage of Toy learns it"):
         fit(scene, Toy(refine_poses=True), progress=False)
-    with pytest.raises(ValueError, match=r"corrections.pose_rate must be at least 0"):
-        corrections = dataclasses.replace(SYSTEM.corrections, pose_rate=-1.0)
+    with pytest.raises(ValueError, match=r"corrections.pose.rate must be at least 0"):
+        corrections = dataclasses.replace(SYSTEM.corrections, pose=PoseRefinement(rate=-1.0))
         dataclasses.replace(SYSTEM, corrections=corrections).check()
     stage = dataclasses.replace(SYSTEM.stages()[0], corrections=(Exposure(), Exposure()))
     with pytest.raises(ValueError, match="corrections of 'gaussians' must have different names"):

@@ -19,7 +19,7 @@ from a2tg_jax.data.decoding import picture_facts, picture_size, read_pixels
 from a2tg_jax.data.photo_folder import find_photos
 from a2tg_jax.data.sfm_database import join_rig, list_images
 from a2tg_jax.data.staging import _link, _prefixes, stage
-from a2tg_jax.host import bars
+from a2tg_jax.host import progress_bars
 from a2tg_jax.results.camera_picture import save_camera_picture
 
 
@@ -235,7 +235,7 @@ def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):
 @pytest.mark.parametrize("is_terminal", [False, True])
 def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd, monkeypatch, is_terminal):
     """Phases are bars on a terminal and plain lines in a pipe."""
-    for module in (bars, progress):
+    for module in (progress_bars, progress):
         monkeypatch.setattr(module, "has_terminal", lambda: is_terminal)
     save_photos(tmp_path / "photos", 4, 128, 96)
     with contextlib.suppress(ValueError):  # The phases count, not what they find.

@@ -20,18 +20,18 @@ from a2tg_jax import (
     save_checkpoint,
     synthetic_scene,
 )
-from a2tg_jax.appearance import Banded
+from a2tg_jax.adapt import Upscale
+from a2tg_jax.appearance import Appearance, Bands, allocate_appearance
 from a2tg_jax.core.pytree import pytree
-from a2tg_jax.systems.a2tg import TextureConfig
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
-from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import step
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.divergence import _not_finite, largest_loss
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model
 
-SIZES = {"initial_gaussians": 60, "densify": McmcConfig(cap=60)}
+SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60)}
 BAD_ROW = 7
 
 
@@ -95,8 +95,9 @@ def test_what_is_not_finite_is_named_and_the_state_before_is_kept(scene, tmp_pat
 def test_tables_without_rows_are_finite():
     """The tables of `bytewise` have no rows until a Gaussian gets a degree."""
     gaussians = init_from_points(np.eye(3), np.zeros((3, 3)), sh_degree=0)
-    tables, _ = Banded().allocate(jax.random.key(0), gaussians)
-    assert not jax.tree.leaves(tables)[0].size and not list(_not_finite((gaussians, tables, ())))
+    appearance = allocate_appearance(Appearance(bands=Bands()), jax.random.key(0), gaussians)
+    assert not appearance.coefficients.buckets[0].size
+    assert not list(_not_finite((gaussians, appearance, ())))
 
 
 @pytree
@@ -148,9 +149,7 @@ def test_each_restoration_has_an_order_of_its_own(scene):
 
 @pytest.mark.parametrize(("calls", "stage"), [(17, 0), (40, 1)])
 def test_a_stop_between_any_two_steps_changes_nothing(scene, tmp_path, calls, stage):
-    system = A2tg(
-        stage1_iterations=24, stage2_iterations=20, texture=TextureConfig(upscale_at=(0.3, 0.6)), seed=3, **SIZES
-    )
+    system = A2tg(stage1_iterations=24, stage2_iterations=20, texture=Upscale(at=(0.3, 0.6)), seed=3, **SIZES)
     left, kept = iter(range(calls)), []
 
     def keep(checkpoint):

@@ -35,8 +35,8 @@ def untrained(*args, **kwargs):
     given.get("on_log", dict)({"iteration": 1, "psnr": 9.0})
     gaussians = a2tg.init_from_points(scene.points, scene.colors, num=50, sh_degree=0)
     appearance = system.stages()[-1].appearance
-    params, layout = appearance.allocate(jax.random.key(0), gaussians)
-    model = a2tg.Model(gaussians, params, layout, appearance=appearance, origin=origin_of_scene(scene))
+    appearance = a2tg.allocate_appearance(appearance, jax.random.key(0), gaussians)
+    model = a2tg.Model(gaussians, appearance, origin=origin_of_scene(scene))
     return SimpleNamespace(model=model)
 
 
@@ -49,7 +49,7 @@ def test_the_readme_compares_a_transparent_photograph_on_the_background_of_the_m
     points = [[0, 0, 0.1 * i] for i in range(4)]
     scene = a2tg.scene_from_arrays(images, [each.viewmat for each in cameras], cameras[0].K, points)
     hidden = a2tg.init_from_points(scene.points, scene.colors, opacity=1e-4)
-    model = a2tg.Model(hidden, origin=origin_of_scene(scene, (1.0, 1.0, 1.0)))
+    model = a2tg.Model(hidden, background=(1.0, 1.0, 1.0), origin=origin_of_scene(scene))
     monkeypatch.setattr(a2tg, "fit", lambda scene, system: SimpleNamespace(model=model))
     names = run("README", {"given": scene}, {'a2tg.load_scene("scene", downscale=4)': "given"})
     assert names["loss"](names["view"].camera) < 1e-6
@@ -66,8 +66,8 @@ def test_textures_are_read_edited_and_put_back():
     gaussians = a2tg.Gaussians(jnp.zeros((1, 3)), quats, jnp.zeros((1, 2)), jnp.full(1, 2.0), sh)
     texels = np.zeros((2, 2, 4), np.float32)
     texels[..., 3], texels[:, 0, 0] = 1, 1
-    textures, layout = a2tg.textures_from_arrays([texels])
-    model = a2tg.Model(gaussians, textures, layout, appearance=a2tg.Textured())
+    textures = a2tg.textures_from_arrays([texels])
+    model = a2tg.Model(gaussians, a2tg.Appearance(texture=a2tg.Texture(textures)))
     camera = a2tg.look_at([0, 0, -4], [0, 0, 0], up=[0, -1, 0], width=16, height=16)
     names = {"model": model, "camera": camera, "a2tg": a2tg}
     exec(block, names)

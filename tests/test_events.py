@@ -14,6 +14,7 @@ from toy_system import Rings
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
+from a2tg_jax.core.partition import combine, partition
 from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.results.forecast import forecast_run
 from a2tg_jax.results.plan import plan_run
@@ -57,12 +58,13 @@ class Own(a2tg.System):
 
     events: Any = ()
     iterations: int = 20
-    appearance: Any = a2tg.Plain()  # noqa: RUF009 - frozen
-    params_rate: Any = None
+    appearance: Any = a2tg.Appearance()
+    appearance_rate: Any = None
 
     def stages(self):
         losses = (a2tg.Term(l1),)
-        return (a2tg.Stage("own", self.appearance, self.events, losses, self.rates, self.iterations, self.params_rate),)
+        rates = self.rates, self.iterations, self.appearance_rate
+        return (a2tg.Stage("own", self.appearance, self.events, losses, *rates),)
 
 
 def fitted(scene, *events, **options):
@@ -71,17 +73,16 @@ def fitted(scene, *events, **options):
 
 def test_rows_that_stay_come_first_at_the_same_shapes():
     """Gaussians, appearance and moments; the mask may have a place for each row, even for those that do not exist."""
-    model = some_model("shaped")
-    moments = adam_init((model.gaussians, model.params))
-    moments = dataclasses.replace(moments, mu=(model.gaussians, model.params))
+    model = some_model("exponents")
+    floats, _ = partition(model)
+    moments = dataclasses.replace(adam_init(floats), mu=floats)
     is_kept = np.arange(NUM) % 3 != 1
     change = a2tg.keep_rows(model, moments, (), is_kept)
     wanted = [row for row, kept in zip(rows_of(model), is_kept, strict=True) if kept]
     assert change.model.num == len(wanted) == 8
     assert jax.tree.map(jnp.shape, change.model) == jax.tree.map(jnp.shape, model)
     np.testing.assert_array_equal(rows_of(change.model), wanted)
-    gaussians, params = change.moments.mu
-    moved = dataclasses.replace(change.model, gaussians=gaussians, params=params)
+    moved = combine(change.moments.mu, partition(change.model)[1])
     np.testing.assert_array_equal(rows_of(moved), wanted)
     padded = a2tg.keep_rows(model, moments, (), jnp.asarray([*is_kept, True, True]))
     np.testing.assert_array_equal(padded.rows, change.rows)
@@ -94,14 +95,14 @@ def test_rows_that_stay_come_first_at_the_same_shapes():
         ("plain", np.ones(NUM), "is_kept must be bools; got float64"),
         ("plain", True, r"is_kept must be \[12\]; got \[\]"),
         ("plain", np.arange(NUM) == 3, "is_kept must keep at least 2 Gaussians; got 1 of 12"),
-        ("banded", np.ones(NUM, bool), "prune before they have"),
-        ("textured", np.arange(NUM) < 5, "textures of 3 sizes cannot change rows: densify and prune before they grow"),
+        ("bands", np.ones(NUM, bool), "sizes cannot change rows: densify and prune before they grow"),
+        ("texture", np.arange(NUM) < 5, "textures of 3 sizes cannot change rows: densify and prune before they grow"),
     ],
 )
 def test_rows_that_cannot_be_removed_are_refused(name, is_kept, message):
     model = some_model(name)
     with pytest.raises(ValueError, match=message):
-        a2tg.keep_rows(model, adam_init((model.gaussians, model.params)), (), is_kept)
+        a2tg.keep_rows(model, adam_init(partition(model)[0]), (), is_kept)
 
 
 def test_an_event_that_removes_rows_compiles_nothing(scene):
@@ -125,7 +126,7 @@ def test_an_event_that_removes_rows_compiles_nothing(scene):
 
 
 def test_moments_of_other_rows_are_refused_with_what_to_say(scene):
-    with pytest.raises(ValueError, match=r"moments.mu\[0\].means must be \[45, 3\]; got \[50, 3\].*: keep_rows\(model"):
+    with pytest.raises(ValueError, match=r"mu.gaussians.means must be \[45, 3\]; got \[50, 3\].*: keep_rows\(model"):
         fitted(scene, PruneFaint("model"))
 
 
@@ -178,9 +179,7 @@ def test_events_without_effect_are_told(scene):
 @pytest.mark.parametrize("given", [{"k_a": 3.0}, {"anisotropic": False}, {}])
 def test_choices_about_anisotropy_that_make_no_difference_are_told(scene, given):
     """Splats of the built-in scene are round after so few iterations. Defaults are nobody's choice."""
-    system = a2tg.A2tg(
-        stage2_iterations=8, initial_gaussians=50, texture=a2tg.TextureConfig(upscale_at=(0.5,), **given)
-    )
+    system = a2tg.A2tg(stage2_iterations=8, initial_gaussians=50, texture=a2tg.Upscale(at=(0.5,), **given))
     start = a2tg.Model(a2tg.init_from_points(scene.points, scene.colors))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -192,13 +191,13 @@ def test_choices_about_anisotropy_that_make_no_difference_are_told(scene, given)
 def test_choices_about_anisotropy_that_act_are_not_told():
     thin, square = a2tg.Upscale(k_a=3.0), np.ones((2, 2), int)
     assert thin._unused(square, np.array([[0.02, 0.005], [0.02, 0.02]])) is None
-    assert re.match(r"\{k_a\} made no difference", thin._unused(square, np.array([[0.02, 0.01], [0.02, 0.02]])))
+    assert re.match(r"k_a made no difference", thin._unused(square, np.array([[0.02, 0.01], [0.02, 0.02]])))
 
 
 def test_parameters_learn_by_the_rate_that_is_given(scene):
     """Without one a stage is refused; 0 leaves them as they are."""
-    with pytest.raises(ValueError, match="params_rate must be the learning rate of the parameters of Rings"):
+    with pytest.raises(ValueError, match="appearance_rate must be the learning rate of the arrays of Rings"):
         fitted(scene, appearance=Rings())
-    still, learned = (fitted(scene, appearance=Rings(), params_rate=rate, iterations=3).model for rate in (0, 1e-2))
-    np.testing.assert_array_equal(still.params, np.tile([0, 0, 0, 2.0], (50, 1)))
-    assert np.abs(learned.params[:, :3]).max() > 1e-2
+    still, learned = (fitted(scene, appearance=Rings(), appearance_rate=rate, iterations=3).model for rate in (0, 1e-2))
+    np.testing.assert_array_equal(still.appearance.rings, np.tile([0, 0, 0, 2.0], (50, 1)))
+    assert np.abs(learned.appearance.rings[:, :3]).max() > 1e-2

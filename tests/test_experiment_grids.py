@@ -82,7 +82,7 @@ def test_anisotropy_acts_at_the_smoke_scale():
     """Only a Gaussian that is elongated and thin gets a texture that is not square."""
     grid = read_grid("ablation", "smoke")
     scene = a2tg.synthetic_scene(num_views=4, width=104, height=78, num_points=500)
-    sizes = a2tg.fit(scene, grid.reference_job(grid.cells[0]).system, progress=False).model.layout.sizes
+    sizes = a2tg.fit(scene, grid.reference_job(grid.cells[0]).system, progress=False).model.textures.sizes
     assert (sizes[:, 0] != sizes[:, 1]).sum() > 10
 
 
@@ -333,8 +333,8 @@ def test_the_grid_of_the_documentation_can_be_read(tmp_path):
     (text,) = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
     grid = read_grid(own_grid(tmp_path, text), "small")
     assert (len(grid.cells), grid.table, grid.cells[0].scene.path) == (1, "choices", "synthetic")
-    rates = [run.job.system.texture.rate for run in grid.runs({})]
-    assert rates == [a2tg.A2tg.preset("quick").texture.rate, 2.5e-3, 5e-3]
+    rates = [run.job.system.texel_rate for run in grid.runs({})]
+    assert rates == [a2tg.A2tg.preset("quick").texel_rate, 2.5e-3, 5e-3]
 
 
 def test_the_smoke_scale_has_few_runs():

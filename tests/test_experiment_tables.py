@@ -186,7 +186,7 @@ def test_a_page_shows_the_tables_that_it_names(tmp_path, monkeypatch):
     assert pages.TEXT.read_text() == before and pages.names(wanted) == ["results/x.md"]
 
 
-UNCOMMITTED = ("quick_preset", "plain", "rates")
+UNCOMMITTED = ("quick_preset", "plain")
 """Experiments whose runs are not among the committed ones."""
 
 

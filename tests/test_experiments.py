@@ -83,7 +83,7 @@ def test_an_experiment_is_killed_goes_on_and_is_not_run_again(tmp_path):
     assert len(after) == 8 and {key: after[key] for key in before} == before
     assert not list((work / "checkpoints").glob("*.npz")), "what is finished needs none"
     own = [row for row in after.values() if row["stage"] == "textures" and row["system"] == "a2tg"]
-    (own,) = [row for row in own if "single_rate" not in row["options"]["texture"]]
+    (own,) = [row for row in own if "single_texel_rate" not in row["options"]]
     last = [row for row in after.values() if row["stage"] != "gaussians" and row["num"] != 400]
     assert len(last) == 2 and all(0.99 * own["mb"] < row["mb"] <= own["mb"] for row in last)
     assert "against 2DGS*-MCMC, equal bytes" in (out / "claim.md").read_text()

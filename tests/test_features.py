@@ -9,9 +9,7 @@ import oracle
 import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, draw_smooth_scene
 
-from a2tg_jax import Model, RenderSettings, render_appearance, render_image
-from a2tg_jax.appearance import PlainRule
-from a2tg_jax.core.pytree import pytree
+from a2tg_jax import Appearance, Model, RenderSettings, pytree, render_appearance, render_image
 
 SCENE = draw_scene(4, num=8, width=11, height=9)
 SMOOTH = draw_smooth_scene(53, width=8, height=8)
@@ -42,7 +40,7 @@ def test_features_are_weighted_as_colours_are(channels, compositor):
 
     def loss(features, background):
         shown = {"features": features, "background": background, "settings": settings}
-        output = render_image(gaussians, camera, *textures, **shown)
+        output = render_image(gaussians, camera, textures, **shown)
         return jnp.sum(jnp.asarray(cotangent) * output.color), output
 
     differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
@@ -108,8 +106,8 @@ def test_features_of_a_model():
 
 
 @pytree
-class Two(PlainRule):
-    """A rule of one's own with two channels."""
+class Two(Appearance):
+    """A custom appearance with two channels."""
 
     num_colors = 2
 
@@ -120,7 +118,7 @@ class Two(PlainRule):
         return (0.1 * u, -0.1 * u), None
 
 
-def test_a_rule_may_have_other_colours_than_three():
+def test_an_appearance_may_have_other_colours_than_three():
     gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
     color = render_appearance(gaussians, camera, Two()).color
     assert color.shape == (9, 11, 2) and jnp.abs(color).max() > 0.1

@@ -2,9 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +15,8 @@ from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.data import Picture
-from a2tg_jax.host import bars, memory
+from a2tg_jax.densify.pruning import Prune
+from a2tg_jax.host import memory, progress_bars
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results import forecast
 from a2tg_jax.results.forecast import (
@@ -32,12 +31,11 @@ from a2tg_jax.results.forecast import (
 )
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
-from a2tg_jax.systems.stage1 import PruneConfig
-from a2tg_jax.training import SYSTEMS, progress
-from a2tg_jax.training.bilateral import sliced
+from a2tg_jax.training import SYSTEMS, cost, progress
+from a2tg_jax.training.bilateral import BilateralGrid, sliced
 from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.option_groups import CorrectionConfig
+from a2tg_jax.training.option_groups import Corrections
 from a2tg_jax.training.progress import Pace
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import StepSettings, jitted_step
@@ -47,14 +45,13 @@ MB = 10**6
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Capped(Toy):
-    """A toy whose growth has an option of its own."""
+    """A toy whose growth is an option of another name."""
 
-    most: int = 50
-    event_options: ClassVar[Mapping[str, str]] = {"Mcmc.cap": "most"}
+    growth: Mcmc = Mcmc(50)
 
     def stages(self) -> tuple[a2tg.Stage, ...]:
         (stage,) = super().stages()
-        return (dataclasses.replace(stage, events=(*stage.events, Mcmc(self.most))),)
+        return (dataclasses.replace(stage, events=(*stage.events, self.growth)),)
 
 
 def scene_of(width, height, num_views=4):
@@ -76,7 +73,7 @@ def run_of(scene, system):
 def test_a_step_needs_what_xla_says(width, height, num):
     points = np.random.default_rng(0).normal(size=(num, 3)).astype(np.float32)
     scene = dataclasses.replace(scene_of(width, height), points=points, colors=np.full_like(points, 0.5))
-    system = a2tg.Gaussians2dMcmc(stage1_iterations=4, densify=a2tg.McmcConfig(cap=num))
+    system = a2tg.Gaussians2dMcmc(stage1_iterations=4, densify=a2tg.Mcmc(cap=num))
     run = StageRun(scene, system, 0, initial_model(scene, system))
     photographs, views = run.photographs.batch(1)
     settings = StepSettings(run.render_settings((height, width)), system.background)
@@ -92,8 +89,8 @@ def test_a_step_needs_what_xla_says(width, height, num):
 def test_rows_and_bytes_are_those_that_training_reaches():
     scene = scene_of(24, 16)
     system = a2tg.A2tg(
-        stage1_iterations=12, stage2_iterations=12, initial_gaussians=60, densify=a2tg.McmcConfig(cap=66),
-        texture=a2tg.TextureConfig(fraction=0.5, upscale_at=(0.3, 0.6)),
+        stage1_iterations=12, stage2_iterations=12, initial_gaussians=60, densify=a2tg.Mcmc(cap=66),
+        texture=a2tg.Upscale(fraction=0.5, at=(0.3, 0.6)),
     )  # fmt: skip
     first, second = forecast_stages(scene, system)
     assert (first.num_rows, second.num_rows) == (66, 66)
@@ -108,14 +105,14 @@ def test_rows_and_bytes_are_those_that_training_reaches():
 def test_advice_for_splats_of_a_file_is_a_smaller_file():
     scene, system = scene_of(24, 16), a2tg.A2tg.preset("smoke")
     own = plan_run({"a": system})
-    with pytest.raises(ValueError, match="change --batch-size, --sh-degree, or a smaller --init file, or allow"):
+    with pytest.raises(ValueError, match="change batch_size, sh_degree, or a smaller --init file, or allow"):
         tell_forecast(scene, own, 3 * 10**9, num_given=10**7)
     found = forecast_run(scene, plan_run({"a": system, "b": a2tg.Gaussians2d.preset("smoke")}), 10**7)
     assert found.of_file == {"a-gaussians", "a-textures"}
     gathered = dataclasses.replace(found, whole={"a-textures": 2.0, "b-gaussians": 1.0})
-    with pytest.raises(ValueError, match="change --sh-degree, or a smaller --init file"):
+    with pytest.raises(ValueError, match="change sh_degree, or a smaller --init file"):
         gathered.check_one_device(1)
-    with pytest.raises(ValueError, match=r"change --densify\.cap, --"):
+    with pytest.raises(ValueError, match=r"change densify\.cap, "):
         dataclasses.replace(gathered, of_file=frozenset()).check_one_device(1)
 
 
@@ -153,9 +150,9 @@ def test_textures_grow_to(event, expected):
 
 
 def test_more_of_anything_takes_more():
-    scene, system = scene_of(600, 400), a2tg.Gaussians2dMcmc(densify=a2tg.McmcConfig(cap=50_000))
+    scene, system = scene_of(600, 400), a2tg.Gaussians2dMcmc(densify=a2tg.Mcmc(cap=50_000))
     before = run_of(scene, system).peak[1].total
-    changes = ({"batch_size": 32}, {"densify": a2tg.McmcConfig(cap=200_000)}, {"sh_degree": 0})
+    changes = ({"batch_size": 32}, {"densify": a2tg.Mcmc(cap=200_000)}, {"sh_degree": 0})
     one, two, three = (run_of(scene, dataclasses.replace(system, **change)).peak[1].total for change in changes)
     assert one > before and two > before and three < before
     assert run_of(scene_of(1200, 800), system).peak[1].total > before
@@ -166,7 +163,7 @@ def test_more_of_anything_takes_more():
 def test_bilateral_grids_are_counted():
     scene, system = scene_of(480, 360), a2tg.Gaussians2dMcmc(exposure=True)
     few, many = (
-        dataclasses.replace(system, corrections=CorrectionConfig("grid", grid_size=size))
+        dataclasses.replace(system, corrections=Corrections("grid", grid=BilateralGrid(size=size)))
         for size in ((4, 4, 4), (16, 16, 8))
     )
     plain, small, large = (next(forecast_stages(scene, each)).bytes.corrections for each in (system, few, many))
@@ -195,10 +192,10 @@ def forecast_with(**sizes):
     ("name", "option"),
     [
         ("photographs", "--downscale"),
-        ("model", "--densify.cap"),
-        ("gradients", "--batch-size"),
+        ("model", "densify.cap"),
+        ("gradients", "batch_size"),
         ("pixels", "--downscale"),
-        ("corrections", "--corrections.grid-size or --downscale"),
+        ("corrections", "corrections.grid.size or --downscale"),
         ("program", "--max-memory"),
     ],
 )
@@ -215,10 +212,10 @@ def test_what_does_not_fit_is_refused_with_the_option_to_change(name, option):
 @pytest.mark.parametrize(
     "system, option",
     [
-        (a2tg.A2tg(), "change --densify.cap, --memory-budget or"),
-        (a2tg.A2tg(memory_budget="90MB"), "change --memory-budget or"),
-        (Toy(), "change --initial-gaussians, --memory-budget or"),
-        (Capped(), "change --most, --memory-budget or"),
+        (a2tg.A2tg(), "change densify.cap, memory_budget or"),
+        (a2tg.A2tg(memory_budget="90MB"), "change memory_budget or"),
+        (Toy(), "change initial_gaussians, memory_budget or"),
+        (Capped(), "change growth.cap, memory_budget or"),
     ],
 )
 def test_a_system_names_its_own_limit(system, option):
@@ -264,42 +261,23 @@ def test_on_an_accelerator_its_own_memory_counts(monkeypatch):
             return {"bytes_limit": 6 * 10**9}
 
     scene, system = scene_of(600, 400), a2tg.Gaussians2dMcmc()
-    monkeypatch.setattr(forecast.jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(forecast, "default_platform", lambda: "gpu")
     monkeypatch.setattr(forecast.jax, "local_devices", lambda: [Device()])
     found = run_of(scene, system)
     assert allowed_memory(None) == 6e9 and allowed_memory(5e9) == 5e9
     assert found.peak[1].program == 0 and found.seconds == 0
 
 
-@a2tg.pytree
-class Read(a2tg.HostEvent):
-    """An event of somebody else, which reads the whole state."""
-
-    def iterations(self, num_iterations):
-        return (1,)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Reading(Capped):
-    """A toy that reads the state."""
-
-    def stages(self) -> tuple[a2tg.Stage, ...]:
-        (stage,) = super().stages()
-        return (dataclasses.replace(stage, events=(*stage.events, Read())),)
-
-
-def test_the_model_must_fit_on_one_of_several_devices_and_the_state_if_an_event_reads_it(monkeypatch):
+def test_the_model_must_fit_on_one_of_several_devices(monkeypatch):
     monkeypatch.setattr(forecast, "memory_limit", lambda: 10**12)
-    scene, capped = scene_of(24, 16), a2tg.McmcConfig(cap=10**6)
-    pruned = a2tg.Gaussians2dMcmc(densify=capped, prune=PruneConfig(share=0.1))
+    scene, capped = scene_of(24, 16), a2tg.Mcmc(cap=10**6)
+    pruned = a2tg.Gaussians2dMcmc(densify=capped, prune=Prune(share=0.1, at=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)))
     found = run_of(scene, pruned)
     assert max(found.whole.values()) == (1 + 4) * 232 * 10**6
     for devices, own in ((1, 4), (4, 1)):
-        stages = (forecast_stages(scene, kind(most=10**6), num_devices=devices) for kind in (Capped, Reading))
-        (plain,), (reading,) = stages
+        (plain,) = forecast_stages(scene, Capped(growth=capped), num_devices=devices)
         assert plain.whole_bytes == (1 + own) * plain.model_bytes
-        assert reading.whole_bytes == (6 + own) * plain.model_bytes
-    with pytest.raises(ValueError, match=r"the model of .* must fit on one device: .* change --densify.cap"):
+    with pytest.raises(ValueError, match=r"the model of .* must fit on one device: .* change densify.cap"):
         found.check_one_device(2e8)
     tell_forecast(scene, plan_run({"a": pruned}), None, 2)
     monkeypatch.setattr(RunForecast, "check", lambda found, limit: None)
@@ -312,7 +290,7 @@ def test_the_model_must_fit_on_one_of_several_devices_and_the_state_if_an_event_
 def test_views_that_are_drawn_at_once_take_room_each(monkeypatch, batch_size, at_once):
     """On CPUs every device has their images whole."""
     scene = scene_of(480, 360)
-    system = a2tg.Gaussians2dMcmc(batch_size=batch_size, densify=a2tg.McmcConfig(cap=1000))
+    system = a2tg.Gaussians2dMcmc(batch_size=batch_size, densify=a2tg.Mcmc(cap=1000))
 
     def needed(num_devices):
         return next(forecast_stages(scene, system, num_devices=num_devices)).bytes
@@ -322,7 +300,7 @@ def test_views_that_are_drawn_at_once_take_room_each(monkeypatch, batch_size, at
     assert four.pixels - alone.pixels == pytest.approx((4 * at_once - 1) * per_pixel + pairs)
     rows = (at_once - 1) * 164 * 1000 + 3 * 232 * 1000  # MCMC gathers the rows that it moves on each device.
     assert four.gradients - alone.gradients == pytest.approx(rows)
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(cost, "default_platform", lambda: "gpu")
     assert needed(4).pixels - alone.pixels == pytest.approx((at_once - 1) * per_pixel + pairs)
 
 
@@ -420,16 +398,16 @@ def test_the_pace_stands_above_the_bar(capsys, monkeypatch, is_shown):
 
 
 def test_items_without_a_terminal_are_counted_in_plain_lines(capsys, monkeypatch):
-    monkeypatch.setattr(bars, "PLAIN_SECONDS", 0.0)
-    assert list(bars.progress_over(list(range(25)), "frames", "frame")) == list(range(25))
+    monkeypatch.setattr(progress_bars, "PLAIN_SECONDS", 0.0)
+    assert list(progress_bars.progress_over(list(range(25)), "frames", "frame")) == list(range(25))
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "frames: 3 of 25" and lines[-1] == "frames: 25 of 25" and len(lines) == 9
-    assert list(bars.progress_over([1, 2], "frames", "frame", is_shown=False)) == [1, 2]
+    assert list(progress_bars.progress_over([1, 2], "frames", "frame", is_shown=False)) == [1, 2]
     assert not capsys.readouterr().err
 
 
 def test_without_a_terminal_tenths_are_plain_lines(capsys, monkeypatch):
-    monkeypatch.setattr(bars, "PLAIN_SECONDS", 0.0)
+    monkeypatch.setattr(progress_bars, "PLAIN_SECONDS", 0.0)
     info, history = SimpleNamespace(loss=0.5, psnr=20.0), SimpleNamespace(iteration=())
     with progress.ProgressBar("a-stage", 0, 20, is_shown=True) as bar:
         for _ in range(20):

@@ -25,7 +25,7 @@ from a2tg_jax import (
     synthetic_scene,
     transform_gaussians,
 )
-from a2tg_jax.appearance import MovableKernels, Shaped, Textured
+from a2tg_jax.appearance import Appearance, Exponents, MovableKernels, Texture, allocate_appearance, template_of
 from a2tg_jax.cli import train
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.cameras import Camera
@@ -54,8 +54,11 @@ def needs_gaussforge() -> None:
 
 def textured() -> Model:
     """Textures of one texel that change nothing."""
-    params, layout = Textured().allocate(jax.random.key(0), some_gaussians())
-    return Model(some_gaussians(), params, layout, appearance=Textured())
+    return showing(Appearance(texture=Texture()))
+
+
+def showing(template: Appearance) -> Model:
+    return Model(some_gaussians(), allocate_appearance(template, jax.random.key(0), some_gaussians()))
 
 
 def small_scene() -> Model:
@@ -172,19 +175,16 @@ def test_what_a_format_does_not_keep():
     assert lost_by(model, "a.SPZ") == [TEXTURES, CUT, "cameras and background", "last digits"]
     assert "spherical harmonics above degree 2" in lost_by(Model(some_gaussians()), "a.ksplat")
     assert lost_by(Model(some_gaussians()), "a.splat") == ["spherical harmonics above degree 0", "last digits"]
-    params, layout = Shaped(Textured()).allocate(jax.random.key(0), some_gaussians())
-    shaped = Model(some_gaussians(), params, layout, appearance=Shaped(Textured()))
+    shaped = showing(Appearance(texture=Texture(), exponents=Exponents()))
     assert lost_by(shaped, "a.ply") == ["textures and shapes of kernels (--bake turns them into plain splats)"]
     assert lost_by(shaped, "a.glb") == lost_by(shaped, "a.a2tgz") == ["last digits"]
     unseen = "textures and shapes of kernels (--bake turns them into plain splats)"
     assert unseen_elsewhere(shaped, "a.glb") == unseen
     assert unseen_elsewhere(shaped, "a.a2tgz") == unseen_elsewhere(Model(some_gaussians()), "a.glb") == ""
-    kernels = Model(some_gaussians(), params._replace(inner=()), layout._replace(inner=()), appearance=Shaped())
+    kernels = showing(Appearance(exponents=Exponents()))
     assert lost_by(kernels, "a.usda")[0] == "shapes of kernels (--bake turns them into plain splats)"
-    moving = Shaped(MovableKernels())
-    params, layout = moving.allocate(jax.random.key(0), some_gaussians())
-    found = lost_by(Model(some_gaussians(), params, layout, appearance=moving), "a.ply")
-    assert found == [lost_by(kernels, "a.ply")[0], "what MovableKernels shows beside Gaussians"]
+    found = lost_by(showing(MovableKernels(exponents=Exponents())), "a.ply")
+    assert found == [lost_by(kernels, "a.ply")[0], "what MovableKernels shows besides Gaussians"]
     learned = {"exposure": np.zeros((0, 3, 4)), "pose": np.zeros((0, 6))}
     model = Model(some_gaussians(), origin=dataclasses.replace(model.origin, corrections=learned))
     assert lost_by(model, "a.npz") == []
@@ -219,7 +219,7 @@ def test_textures_and_origin_pass_through_gltf(tmp_path, capsys, suffix):
     assert f"not shown by other programs: {TEXTURES}\n" in told
     main(["convert", str(tmp_path / f"b{suffix}"), str(tmp_path / "c.npz")])
     found = load_model(tmp_path / "c.npz")
-    assert found.origin == model.origin and found.appearance == model.appearance
+    assert found.origin == model.origin and template_of(found.appearance) == template_of(model.appearance)
     np.testing.assert_array_equal(found.gaussians.means, model.gaussians.means)
 
 
@@ -320,7 +320,7 @@ def test_splats_of_a_file_are_taken_once(tmp_path):
 
 def test_what_a_first_stage_cannot_take_of_a_file_is_refused_or_told(tmp_path):
     save_model(tmp_path / "a.npz", textured())
-    with pytest.warns(UserWarning, match="leaves out what its splats show beside Gaussians"):
+    with pytest.warns(UserWarning, match="leaves out what its splats show besides Gaussians"):
         check_init(GivenSplats(tmp_path / "a.npz"), tmp_path / "run", A2tg(sh_degree=3))
     save_ply(tmp_path / "a.ply", init_from_points(np.eye(4, 3), np.eye(4, 3), sh_degree=2))
     with pytest.warns(UserWarning, match="its spherical harmonics above degree 1"):

@@ -15,12 +15,12 @@ from small_values import some_gaussians, some_world
 from test_compact import MODELS, every_model, plain, shaped, textured
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import MovableKernels, Shaped, TextureOptions
+from a2tg_jax.appearance import Exponents, MovableKernels, TextureOptions, allocate_appearance, template_of
 from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io import gltf, gltf_textures
-from a2tg_jax.io.exchange import matrix_of, placed, upright
+from a2tg_jax.io.exchange import joined_parts, matrix_of, upright
 from a2tg_jax.io.gltf import load_gltf, save_gltf
 from a2tg_jax.io.gltf_reader import Document
 from a2tg_jax.io.gltf_textures import EXTENSION
@@ -73,25 +73,33 @@ def test_models_come_back(tmp_path, name):
     save_gltf(path, model)
     found = load_gltf(path)
     assert_shows_the_same(found, model)
-    assert found.appearance == model.appearance and found.origin == model.origin
+    assert template_of(found.appearance) == template_of(model.appearance) and found.origin == model.origin
     assert found.num_bytes == model.num_bytes
     for x, y in zip(jax.tree.leaves(found.textures), jax.tree.leaves(model.textures), strict=True):
         np.testing.assert_array_equal(x, y)
-    shapes, wanted = (m.appearance.shapes(m.params) for m in (found, model))
+    shapes, wanted = found.appearance.shapes, model.appearance.shapes
     assert (shapes is None) == (wanted is None)
     if shapes is not None:
         np.testing.assert_allclose(np.tanh(shapes), np.tanh(wanted), atol=1e-6)
 
 
+def test_an_upper_limit_of_alpha_beside_textures_comes_back(tmp_path):
+    model = textured()
+    model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, max_alpha=0.5))
+    save_gltf(tmp_path / "m.glb", model)
+    assert extension_of(parts_of(tmp_path / "m.glb")[0])["maxAlpha"] == 0.5
+    assert template_of(load_gltf(tmp_path / "m.glb").appearance) == template_of(model.appearance)
+
+
 @pytest.mark.parametrize("options", [TextureOptions(), TextureOptions.official()])
 def test_textures_in_bytes_come_back_within_half_a_step(tmp_path, options):
     model = textured()
-    model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, options=options))
+    texture = dataclasses.replace(model.appearance.texture, options=options)
+    model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=texture))
     save_gltf(tmp_path / "m.glb", model, texels="uint8")
     found = load_gltf(tmp_path / "m.glb")
-    assert found.appearance == model.appearance
-    leaves = (np.concatenate([np.asarray(x).reshape(-1, 4) for x in jax.tree.leaves(m.params)]) for m in (found, model))
-    values, wanted = leaves
+    assert template_of(found.appearance) == template_of(model.appearance)
+    values, wanted = found.textures.flat(), model.textures.flat()
     for columns in (slice(0, 3), slice(3, 4)):
         step = np.ptp(wanted[:, columns]) / 254
         assert 0 < np.abs(values - wanted)[:, columns].max() <= step / 2 * 1.001
@@ -116,10 +124,9 @@ def test_programs_that_know_no_textures_see_plain_splats(tmp_path):
 
 def test_what_the_extension_cannot_hold_is_refused_or_left_out(tmp_path):
     gaussians = some_gaussians()
-    appearance = Shaped(MovableKernels())
-    params, layout = appearance.allocate(jax.random.key(0), gaussians)
-    model = Model(gaussians, params, layout, appearance=appearance)
-    with pytest.raises(ValueError, match=r"shows MovableKernels: a glTF file holds Plain, .*textures=False here"):
+    template = MovableKernels(exponents=Exponents())
+    model = Model(gaussians, allocate_appearance(template, jax.random.key(0), gaussians))
+    with pytest.raises(ValueError, match=r"shows MovableKernels with .*: a glTF file holds .*textures=False here"):
         save_gltf(tmp_path / "m.glb", model)
     save_gltf(tmp_path / "m.glb", model, textures=False)
     a2tg.save_ply(tmp_path / "m.ply", model)
@@ -178,7 +185,7 @@ def test_attributes_are_those_of_the_specification(tmp_path):
 
 def test_coefficients_go_up_to_the_highest_degree_of_a_splat(tmp_path):
     model = MODELS["banded and textured"]()
-    low = model[model.bands[1].degrees < 2]
+    low = model[model.degrees < 2]
     save_gltf(tmp_path / "m.glb", low)
     described, _ = parts_of(tmp_path / "m.glb")
     names = described["meshes"][0]["primitives"][0]["attributes"]
@@ -210,7 +217,7 @@ def test_a_moved_node_moves_the_model_and_its_cameras(tmp_path):
     described["nodes"] = [{"children": [1], "matrix": matrix_of(move).T.ravel().tolist()}, described["nodes"][0]]
     write_parts(path, described, binary)
     found = load_gltf(path)
-    wanted = placed([(model, upright(model.origin, "y").then(move))], "y")
+    wanted = joined_parts([(model, upright(model.origin, "y").then(move))], "y")
     assert_shows_the_same(found, wanted)
     np.testing.assert_allclose(own, matrix_of(upright(model.origin, "y")))
     assert np.abs(np.asarray(found.gaussians.means) - np.asarray(model.gaussians.means)).max() > 0.1
@@ -284,7 +291,7 @@ def test_the_extension_counts_more_than_the_extras(tmp_path, saved, changes, is_
     extended(**changes)(described)
     write_parts(tmp_path / "m.glb", described, saved[1])
     appearance = load_gltf(tmp_path / "m.glb").appearance
-    assert (appearance == textured().appearance) is is_kept
+    assert (template_of(appearance) == template_of(textured().appearance)) is is_kept
     options = appearance.texture_options
     assert (options.uv, options.max_alpha) == (changes.get("uv", "texel-centre"), changes.get("maxAlpha", 0.95))
 
@@ -293,7 +300,7 @@ def test_the_extension_counts_more_than_the_extras(tmp_path, saved, changes, is_
 def test_shapes_out_of_range_or_of_another_length_are_refused(tmp_path, monkeypatch, wrong):
     monkeypatch.setattr(gltf_textures, "log_exponents_of", lambda shapes: wrong)
     save_gltf(tmp_path / "m.glb", shaped(plain(1)))
-    refused(tmp_path / "m.glb", "shapes must be finite|kernels must lie within|shapes must be 50 numbers; got 49")
+    refused(tmp_path / "m.glb", "shapes must be finite|kernels must be within|shapes must be 50 numbers; got 49")
 
 
 def test_shapes_are_what_the_extension_says(tmp_path, saved):
@@ -303,7 +310,7 @@ def test_shapes_are_what_the_extension_says(tmp_path, saved):
     del first_primitive(described)["extensions"][SPLATS]["extensions"][EXTENSION]["shapes"]
     write_parts(tmp_path / "m.glb", described, binary)
     found = load_gltf(tmp_path / "m.glb")
-    assert found.appearance.shapes_name is None and found.textures is not None
+    assert found.appearance.exponents is None and found.textures is not None
 
 
 def test_other_kernels_and_colours_are_told(tmp_path):
@@ -480,8 +487,8 @@ def test_an_origin_elsewhere_is_taken_along():
     model = plain()
     origin = Origin.of_cameras(model.origin.cameras, transform=Similarity(2.0, np.eye(3), np.zeros(3)))
     model = dataclasses.replace(model, origin=origin)
-    assert placed([(model, upright(origin, "y"))], "y") is model
-    assert placed([(model, upright(None, "y"))], "y") is not model
+    assert joined_parts([(model, upright(origin, "y"))], "y") is model
+    assert joined_parts([(model, upright(None, "y"))], "y") is not model
 
 
 # The schema of the extension

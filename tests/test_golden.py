@@ -15,8 +15,8 @@ def test_a_run_of_version_0_1_0_is_repeated():
     recorded = json.loads(RECORD.read_text())
     scene = a2tg.synthetic_scene(num_views=8, width=80, height=60, num_points=300)
     system = a2tg.A2tg(
-        stage1_iterations=120, stage2_iterations=80, initial_gaussians=200, seed=3, densify=a2tg.McmcConfig(cap=260),
-        texture=a2tg.TextureConfig(upscale_at=(0.3, 0.6), moments="copied"),
+        stage1_iterations=120, stage2_iterations=80, initial_gaussians=200, seed=3, densify=a2tg.Mcmc(cap=260),
+        texture=a2tg.Upscale(at=(0.3, 0.6), moments="copied"),
     )  # fmt: skip
     history = a2tg.fit(scene, system, progress=False).history
     np.testing.assert_array_equal(history.num_gaussians, recorded["num_gaussians"])

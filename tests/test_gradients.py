@@ -12,7 +12,8 @@ from oracle import DEFAULT_RULES
 from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_scene
 
 import a2tg_jax as a2tg
-from a2tg_jax import Model, RenderSettings, Textured, view_gradients
+from a2tg_jax import Appearance, Model, RenderSettings, Texture, view_gradients
+from a2tg_jax.appearance import projected
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.events import Seen
 from a2tg_jax.rasterize.views import render_traced
@@ -22,21 +23,20 @@ from a2tg_jax.rasterize.views import render_traced
 def test_gradients_are_those_of_the_image_and_the_statistic_is_the_oracles():
     scene = draw_scene(4)
     cotangent = np.random.default_rng(4).normal(size=(scene.height, scene.width, 3))
-    model = Model(as_gaussians(scene, "float64"), *as_textures(scene, "float64"), appearance=Textured())
+    model = Model(as_gaussians(scene, "float64"), Appearance(texture=Texture(as_textures(scene, "float64"))))
     camera, settings = as_camera(scene, "float64"), RenderSettings(capacity=CAPACITY)
 
     def loss(model, output):
         return jnp.sum(output.color * jnp.asarray(cotangent)) + jnp.sum(model.gaussians.opacities)
 
-    def plain(gaussians, textures):
-        shown = dataclasses.replace(model, gaussians=gaussians, params=textures)
-        return loss(shown, shown.render(camera, background=scene.background, settings=settings))
+    def plain(model):
+        return loss(model, model.render(camera, background=scene.background, settings=settings))
 
     how = functools.partial(view_gradients, loss, background=scene.background, settings=settings)
     found = jax.jit(how)(model, camera)
-    value, (gaussians, params) = jax.jit(jax.value_and_grad(plain, argnums=(0, 1)))(model.gaussians, model.params)
+    value, gradient = jax.jit(a2tg.value_and_grad(plain))(model)
     np.testing.assert_allclose(found.value, value, rtol=1e-12)
-    for ours, wanted in zip(jax.tree.leaves(found[1:3]), jax.tree.leaves((gaussians, params)), strict=True):
+    for ours, wanted in zip(jax.tree.leaves(found.gradient), jax.tree.leaves(gradient), strict=True):
         np.testing.assert_allclose(ours, wanted, rtol=1e-9, atol=1e-12)
     expected = oracle.gradient_statistic(scene, cotangent, DEFAULT_RULES, "position")
     np.testing.assert_allclose(found.norms, np.linalg.norm(expected, axis=1), rtol=1e-8, atol=1e-10 * expected.max())
@@ -64,7 +64,7 @@ def test_norms_are_those_that_events_average(event):
 
     def of_probe(probe):
         output, _ = render_traced(
-            model.gaussians, camera, model.rule, jnp.zeros(3), settings, probe=probe, statistic=event.statistic
+            model.gaussians, camera, model.appearance, jnp.zeros(3), settings, probe=probe, statistic=event.statistic
         )
         return loss(model, output)
 
@@ -83,18 +83,18 @@ def test_a_loop_by_hand_learns_and_upscales():
     cameras = [as_camera(scene, "float32")] * 2
     truth = [a2tg.render_image(as_gaussians(scene, "float32"), camera).color for camera in cameras]
     gaussians = dataclasses.replace(as_gaussians(scene, "float32"), sh=jnp.zeros((50, 16, 3)))
-    textures, layout = a2tg.allocate_textures(np.ones((50, 2), int))
-    model = Model(gaussians, textures, layout, appearance=Textured())
+    textures = a2tg.allocate_textures(np.ones((50, 2), int))
+    model = Model(gaussians, Appearance(texture=Texture(textures)))
     settings = a2tg.plan_render(model, cameras, head_room=4)
 
     @jax.jit
     def step(model, moments, statistics, camera, target):
         loss = lambda model, output: a2tg.photometric_loss(output.color, target)  # noqa: E731
         found = view_gradients(loss, model, camera, settings=settings, has_geometry=False)
-        update = a2tg.adam_update((model.gaussians, model.params), (found.gaussians, found.params), moments, 0.005)
-        gaussians, params = update.params
-        params = model.appearance.project(params)
-        model = dataclasses.replace(model, gaussians=gaussians, params=params)
+        floats, rest = a2tg.partition(model)
+        update = a2tg.adam_update(floats, found.gradient, moments, 0.005)
+        model = a2tg.combine(update.params, rest)
+        model = dataclasses.replace(model, appearance=projected(model.appearance))
         return model, update.state, statistics.observe(found.norms, found.is_visible), found.value
 
     def train(model, moments):
@@ -105,15 +105,16 @@ def test_a_loop_by_hand_learns_and_upscales():
                 losses.append(float(loss))
         return model, moments, statistics, losses
 
-    model, moments, statistics, before = train(model, a2tg.adam_init((model.gaussians, model.params)))
+    model, moments, statistics, before = train(model, a2tg.adam_init(a2tg.partition(model)[0]))
     assert before[-1] < 0.8 * before[0]
 
-    proposed = a2tg.next_sizes(model.layout.sizes, model.gaussians.scales, k_a=4.0, k_s=0.01, cap=4)
-    chosen = a2tg.select(statistics.average(), model.layout.sizes, proposed, fraction=0.25)
-    sizes = np.where(chosen[:, None], proposed, model.layout.sizes)
-    grown = a2tg.reallocate(model.params, model.layout, sizes, moments)
-    assert grown.moments.mu[0].means is moments.mu[0].means and grown.moments.count is moments.count
-    moments, model = grown.moments, dataclasses.replace(model, params=grown.textures, layout=grown.layout)
+    sizes = model.textures.sizes
+    proposed = a2tg.next_sizes(sizes, model.gaussians.scales, k_a=4.0, k_s=0.01, cap=4)
+    chosen = a2tg.select(statistics.average(), sizes, proposed, fraction=0.25)
+    sizes = np.where(chosen[:, None], proposed, sizes)
+    grown = a2tg.reallocate(model.textures, sizes, moments)
+    assert grown.moments.mu.gaussians.means is moments.mu.gaussians.means and grown.moments.count is moments.count
+    moments, model = grown.moments, model.with_textures(grown.textures)
     assert model.num_bytes == 232 * 50 + 16 * sizes.prod(axis=1).sum() and chosen.sum() == 13
 
     model, moments, statistics, after = train(model, moments)

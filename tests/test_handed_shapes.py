@@ -9,27 +9,26 @@ import pytest
 from small_values import some_gaussians
 
 from a2tg_jax import A2tg, Bytewise, Model, load_model, save_model, save_ply, synthetic_scene, transform_gaussians
-from a2tg_jax.appearance import Appearance, Plain, Shaped, Textured
+from a2tg_jax.appearance import Appearance, Exponents, Texture, allocate_appearance, template_of
 from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
 from a2tg_jax.results.first_stage import GivenSplats, write_first_stage
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.preflight import check_init
 from a2tg_jax.results.record import RunRecord, SceneSource
-from a2tg_jax.systems.bytewise import KernelConfig
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.start import padded
 
 NUM = 40
 SHAPES = np.linspace(-1, 1, NUM).astype(np.float32)
 GAUSSIANS = dataclasses.replace(some_gaussians(NUM), sh=some_gaussians(NUM).sh[:, :1])
-OF_GAUSSIANS = Bytewise(kernel=KernelConfig(0.0))
+OF_GAUSSIANS = Bytewise(kernel_rate=0.0)
 
 
-def shaped(inner: Appearance = Plain()) -> Model:  # noqa: B008 - frozen
+def shaped(texture: Texture | None = None) -> Model:
     """A model whose kernels differ."""
-    appearance = Shaped(inner)
-    params, layout = appearance.allocate(jax.random.key(0), GAUSSIANS)
-    return Model(GAUSSIANS, appearance.with_shapes(params, jnp.asarray(SHAPES)), layout, appearance=appearance)
+    template = Appearance(exponents=Exponents(), texture=texture)
+    appearance = allocate_appearance(template, jax.random.key(0), GAUSSIANS)
+    return Model(GAUSSIANS, appearance.with_shapes(jnp.asarray(SHAPES)))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +42,7 @@ def first_model(file, scene, system, tmp_path) -> Model:
     run = create_run(tmp_path / "run")
     write_first_stage(run, planned, GivenSplats(file), scene)
     found = load_model(run.model(planned.name))
-    assert found.appearance == planned.stage.appearance
+    assert template_of(found.appearance) == planned.stage.appearance
     return found
 
 
@@ -51,7 +50,7 @@ def test_plain_splats_begin_as_gaussians_where_kernels_have_shapes(tmp_path, sce
     save_ply(tmp_path / "a.ply", transform_gaussians(GAUSSIANS, scene.transform.inverse()))
     found = first_model(tmp_path / "a.ply", scene, Bytewise(), tmp_path)
     np.testing.assert_allclose(found.gaussians.means, GAUSSIANS.means, atol=1e-5)
-    np.testing.assert_array_equal(found.params.shapes, np.zeros(NUM))
+    np.testing.assert_array_equal(found.appearance.shapes, np.zeros(NUM))
 
 
 @pytest.mark.parametrize(("system", "has_shapes"), [(Bytewise(), True), (OF_GAUSSIANS, False)])
@@ -63,7 +62,7 @@ def test_shapes_of_a_file_are_kept_or_its_nearest_gaussians_taken(tmp_path, scen
     grown = np.log(scene.transform.scale)
     np.testing.assert_allclose(found.gaussians.log_scales, wanted.log_scales + grown, atol=1e-5)
     if has_shapes:
-        np.testing.assert_array_equal(found.params.shapes, SHAPES)
+        np.testing.assert_array_equal(found.appearance.shapes, SHAPES)
 
 
 def test_a_first_stage_without_shapes_is_told(tmp_path, recwarn):
@@ -72,8 +71,8 @@ def test_a_first_stage_without_shapes_is_told(tmp_path, recwarn):
     assert not recwarn.list
     with pytest.warns(UserWarning, match=r"leaves out the shapes of its kernels \(the nearest Gaussians .* place\)$"):
         check_init(GivenSplats(tmp_path / "a.npz"), tmp_path / "run", A2tg())
-    save_model(tmp_path / "b.npz", shaped(Textured()))
-    with pytest.warns(UserWarning, match="leaves out what its splats show beside kernels$"):
+    save_model(tmp_path / "b.npz", shaped(Texture()))
+    with pytest.warns(UserWarning, match="leaves out what its splats show besides kernels$"):
         check_init(GivenSplats(tmp_path / "b.npz"), tmp_path / "run", Bytewise())
 
 
@@ -97,4 +96,4 @@ def test_a_stage_without_shapes_takes_the_nearest_gaussians():
     assert not np.allclose(nearest.log_scales, GAUSSIANS.log_scales)
     same = padded(shaped(), Bytewise().stages()[1], Bytewise())
     jax.tree.map(np.testing.assert_array_equal, same.live.gaussians, GAUSSIANS)
-    np.testing.assert_array_equal(same.appearance.shapes(same.live.params), SHAPES)
+    np.testing.assert_array_equal(same.live.appearance.shapes, SHAPES)

@@ -13,6 +13,7 @@ from small_models import NUM, some_checkpoint, some_gaussians, some_model
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.table import check_places
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.npz import read_npz
 from a2tg_jax.io.archive import FORMAT as CHECKPOINT
@@ -23,8 +24,8 @@ from a2tg_jax.io.ply import load_ply, save_ply
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model
-from a2tg_jax.systems.bytewise import Bytewise, KernelConfig
-from a2tg_jax.texture import AtlasLayout, Textures, check_places, check_textures
+from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.texture import Textures, check_textures
 from a2tg_jax.training import load_checkpoint, save_checkpoint
 from a2tg_jax.training.registry import system_from_dict
 
@@ -94,8 +95,8 @@ def test_models_with_numbers_that_are_not_finite(tmp_path, name, value):
         (with_number("origin/scale", np.inf), "positive scale"),
         (with_number("origin/rotation", 3.0), "must have a rotation"),
         (with_number("origin/translation", np.nan), "finite translation"),
-        (with_header(origin={"names": ["a", 5], "background": [0, 0, 0]}), "names must be texts"),
-        (with_header(origin={"names": ["a", "b"], "background": [0, 0, 1e400]}), "finite|JSON"),
+        (with_header(origin={"names": ["a", 5]}), "names must be texts"),
+        (with_header(background=[0, 0, 1e400]), "finite|JSON"),
     ],
 )  # fmt: skip
 def test_models_that_no_camera_sees(tmp_path, change, message):
@@ -112,17 +113,17 @@ def test_models_that_no_camera_sees(tmp_path, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (with_number("appearance/inner.shapes", np.nan), "must be finite"),
-        (with_number("appearance/inner.shapes", 1e30), "must lie within"),
-        (with_array("appearance/inner.shapes", lambda x: x[1:]), r"shapes must be \[12\], one for each Gaussian"),
-        (with_array("appearance/inner.shapes", lambda x: x[:, None]), r"shapes must be floats \[N\]"),
-        (with_array("appearance/inner.shapes", lambda x: x.astype(int)), r"shapes must be floats \[N\]"),
-        (lambda _, arrays: arrays.pop("appearance/inner.shapes"), "shapes of Shaped is missing"),
+        (with_number("appearance/shapes", np.nan), "must be finite"),
+        (with_number("appearance/shapes", 1e30), "must lie within"),
+        (with_array("appearance/shapes", lambda x: x[1:]), r"shapes must be \[12\], one for each Gaussian"),
+        (with_array("appearance/shapes", lambda x: x[:, None]), r"shapes must be floats \[N\]"),
+        (with_array("appearance/shapes", lambda x: x.astype(int)), r"shapes must be floats \[N\]"),
+        (lambda _, arrays: arrays.pop("appearance/shapes"), "the array shapes of the appearance is missing"),
     ],
 )  # fmt: skip
 def test_shapes_of_kernels_that_are_none(tmp_path, change, message):
     path = tmp_path / "m.npz"
-    save_model(path, some_model(Bytewise(kernel=KernelConfig(rate=0.01))))
+    save_model(path, some_model(Bytewise(kernel_rate=0.01)))
     spoiled(path, MODEL, change)
     refused(load_model, path, message)
 
@@ -136,31 +137,30 @@ def test_what_would_not_load_is_not_saved(tmp_path):
 
 
 def test_textures_lie_within_their_buckets_and_apart():
-    """Native loops read where the layout says."""
-    textures = Textures((jnp.zeros((4, 1, 1, 4)), jnp.zeros((2, 2, 1, 4))))
+    """Native loops read at the places of textures."""
 
-    def layout(bucket, row):
-        return AtlasLayout(jnp.asarray(bucket, jnp.int32), jnp.asarray(row, jnp.int32), ((1, 1), (2, 1)))
+    def placed(bucket, row):
+        buckets = jnp.zeros((4, 1, 1, 4)), jnp.zeros((2, 2, 1, 4))
+        return Textures(buckets, jnp.asarray(bucket, jnp.int32), jnp.asarray(row, jnp.int32), ((1, 1), (2, 1)))
 
-    check_places(textures, layout([0, 0, 1], [0, 3, 1]))
+    check_places(placed([0, 0, 1], [0, 3, 1]))
     for bucket, row, message in [
-        ([0, 0, 1], [0, 4, 1], "layout.row must be below the number"),
-        ([0, 0, 1], [0, -1, 1], "layout.row must be below the number"),
-        ([0, 0, 2], [0, 1, 1], "layout.bucket must be 0 to 1"),
-        ([0, -1, 1], [0, 1, 1], "layout.bucket must be 0 to 1"),
-        ([0, 0, 1], [2, 2, 0], "its own row"),
+        ([0, 0, 1], [0, 4, 1], "textures.row must be below the number"),
+        ([0, 0, 1], [0, -1, 1], "textures.row must be below the number"),
+        ([0, 0, 2], [0, 1, 1], "textures.bucket must be 0 to 1"),
+        ([0, -1, 1], [0, 1, 1], "textures.bucket must be 0 to 1"),
+        ([0, 0, 1], [2, 2, 0], "some share one"),
     ]:
         with pytest.raises(ValueError, match=message):
-            check_textures(textures, layout(bucket, row))
-            check_places(textures, layout(bucket, row))
+            check_textures(placed(bucket, row))
+            check_places(placed(bucket, row))
         with pytest.raises(ValueError, match=message):
-            model = some_model()
-            check_model(Model(model.gaussians[:3], textures, layout(bucket, row), appearance=model.appearance))
+            check_model(Model(some_gaussians()[:3], a2tg.Appearance(texture=a2tg.Texture(placed(bucket, row)))))
 
 
 # Checkpoints
 
-MU, EVENTS = "[1][0][0].mu[0].means", "[1][0][2]"
+MU, EVENTS = "[1][0][0].mu.gaussians.means", "[1][0][2]"
 
 
 @pytest.fixture(scope="module", params=["a2tg", "bytewise", "gaussians-2d"])
@@ -237,7 +237,7 @@ def test_every_array_of_nan_is_refused(checkpoint):
         (with_array("[1][0][3]", lambda x: x - 1), "iteration must be a whole number in"),
         (with_array("[1][0][4]", lambda x: x + 9), "status must be a whole number in 0..4"),
         (with_array("[1][0][0].count", lambda x: x - 9), "count must be a whole number in"),
-        (with_number("[1][0][0].nu[0].quats", -1.0), "must be at least 0; some are negative"),
+        (with_number("[1][0][0].nu.gaussians.quats", -1.0), "must be at least 0; some are negative"),
         (with_array(MU, lambda x: x.astype(np.int32)), "must be float32; got int32"),
         (with_array("[1][1]['iteration']", lambda x: x - 5), "history.iteration must be at least 0"),
     ],

@@ -8,14 +8,14 @@ import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 
 from a2tg_jax.core.geometry import homographies, screen_bounds
-from a2tg_jax.rasterize.image_bands import Bands, BorderRoom
+from a2tg_jax.parallel.image_bands import BorderRoom, ImageBands
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, tile_rectangles
 
 TILE = 8
 
 
 def bands_of(rows, num):
-    return Bands.of(TileGrid(40, rows * TILE, TILE), num)
+    return ImageBands.of(TileGrid(40, rows * TILE, TILE), num)
 
 
 def least_largest(pairs, num):
@@ -58,15 +58,15 @@ def test_an_even_image_needs_no_room_and_room_bounds_bands():
     borders = bands.borders(jnp.asarray(np.where(np.arange(64) < 16, 900, 0), jnp.int32))
     above, below = bands.room_for(borders).tolist()
     assert above > 20 * TILE and below == 0, "all borders move up"
-    own = Bands.of(bands.whole, 4, BorderRoom(above, below)).own
+    own = ImageBands.of(bands.whole, 4, BorderRoom(above, below)).own
     assert int(np.diff(borders).max()) <= own.rows < bands.whole.rows
-    assert [hop.bands for hop in Bands.of(bands.whole, 4, BorderRoom(0, 0)).hops()] == [0]
+    assert [hop.bands for hop in ImageBands.of(bands.whole, 4, BorderRoom(0, 0)).hops()] == [0]
 
 
 @pytest.mark.parametrize("tile, height, num", [(8, 3, 2), (8, 9, 3), (8, 17, 16), (8, 65, 64), (16, 17, 3), (8, 64, 4)])
 def test_the_largest_room_is_for_any_borders(tile, height, num):
     """Also if the devices' rows, or the tiles, end below the image."""
-    bands = Bands.of(TileGrid(40, height, tile), num)
+    bands = ImageBands.of(TileGrid(40, height, tile), num)
     rows = bands.whole.rows
     for pairs in (np.zeros(rows), *(1000 * np.eye(rows))):
         borders = bands.borders(jnp.asarray(pairs, jnp.int32))
@@ -79,7 +79,7 @@ def test_rows_of_tiles_have_the_pairs_of_the_lists():
     M, _ = homographies(as_gaussians(scene, "float32"), as_camera(scene, "float32"))
     cutoff, grid = jnp.full(200, 9.0), TileGrid(64, 45, TILE)
     boxes = tile_rectangles(screen_bounds(M, cutoff, 0.2), grid)
-    bands = Bands.of(grid, 3)
+    bands = ImageBands.of(grid, 3)
     pairs = np.asarray(bands.pairs_of_rows(boxes))
     for row in range(grid.rows):
         above, here = (

@@ -12,6 +12,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "a2tg_jax"
 LAYERS = (
     {"host"},
+    {"parallel"},
     {"core"},
     {"texture", "data"},
     {"appearance"},
@@ -28,12 +29,19 @@ LAYERS = (
     {"cli"},
 )
 """Lowest first. A module may import from lower layers, and, within one subpackage, from itself."""
+DRAWING = {"parallel.exchange", "parallel.image_bands", "parallel.pictures", "parallel.room"}
+"""Modules of `parallel` that belong to the layer of rasterize: how splats reach pixels. The others are arrays only."""
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 
 
 def component(path: Path) -> str:
     """The module or subpackage of the package that a file belongs to."""
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    return component_of(path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", "."))
+
+
+def component_of(name: str) -> str:
+    """The component of a module, given its dotted path below the package."""
+    return "rasterize" if name in DRAWING else name.split(".")[0]
 
 
 def imported_components(path: Path) -> set[str]:
@@ -49,7 +57,9 @@ def imported_components(path: Path) -> set[str]:
             names = [alias.name for alias in node.names]
         else:
             continue
-        found |= {name.split(".")[1] for name in names if name.startswith("a2tg_jax.")}
+        if isinstance(node, ast.ImportFrom) and node.module == "a2tg_jax.parallel":
+            names = [f"a2tg_jax.parallel.{alias.name}" for alias in node.names]
+        found |= {component_of(name.removeprefix("a2tg_jax.")) for name in names if name.startswith("a2tg_jax.")}
     return found
 
 
@@ -105,13 +115,14 @@ def test_no_modules_import_each_other():
 
 
 def test_mathematics_knows_nothing_of_the_host():
-    """Threads of native loops are the exception, and the words of errors."""
+    """Threads of native loops and the result of a GPU's check are the exceptions, and the words of errors."""
     rooms = {"core", "texture", "appearance", "rasterize", "render", "model", "events", "adapt", "mcmc", "densify"}
     own = [path for path in MODULES if component(path) in rooms]
     found = {dotted(path): {name for name in modules_imported(path) if name.startswith("host.")} for path in own}
     known = {name: hosts - {"host.text"} for name, hosts in found.items()}
     assert {name: hosts for name, hosts in known.items() if hosts} == {
-        "rasterize.kernels.native.threads": {"host.cores"}
+        "rasterize.kernels.cuda.check": {"host.atomic", "host.operating_system", "host.startup"},
+        "rasterize.kernels.native.threads": {"host.cores"},
     }
 
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from small_values import assert_same, some_gaussians, some_world
 
-from a2tg_jax.appearance import Billboards, MovableKernels
+from a2tg_jax.appearance import Billboards, MovableKernels, allocate_appearance
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.core.origin import Origin
@@ -278,11 +278,11 @@ def test_world_and_camera_moved_together_show_the_same(x64, seed):
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[2, 3] = Rotation.random(rng=rng).as_matrix(), 5
     camera = Camera(as_double(viewmat), as_double([[30, 0, 16], [0, 30, 12], [0, 0, 1]]), 32, 24)
-    textures, layout = textures_from_arrays([rng.uniform(size=(2, 4, 4)) for _ in range(20)])
+    textures = textures_from_arrays([rng.uniform(size=(2, 4, 4)) for _ in range(20)])
     world = some_world(seed)
     moved = dataclasses.replace(camera, viewmat=as_double(world.apply_to_viewmat(viewmat)))
-    before = render_image(gaussians, camera, textures, layout)
-    after = render_image(transform_gaussians(gaussians, world), moved, textures, layout)
+    before = render_image(gaussians, camera, textures)
+    after = render_image(transform_gaussians(gaussians, world), moved, textures)
     np.testing.assert_allclose(after.color, before.color, atol=1e-12)
     np.testing.assert_allclose(after.alpha, before.alpha, atol=1e-12)
     np.testing.assert_allclose(after.depth, world.scale * before.depth, atol=1e-12)
@@ -419,11 +419,11 @@ def test_an_option_that_is_missing_has_its_default():
         config_from_dict(Strict, {})
 
 
-@pytest.mark.parametrize("appearance", [MovableKernels(), Billboards(4)], ids=["kernels", "billboards"])
-def test_ply_of_splats_with_opacities_of_their_own(tmp_path, appearance):
+@pytest.mark.parametrize("template", [MovableKernels(), Billboards(side=4)], ids=["kernels", "billboards"])
+def test_ply_of_splats_with_opacities_of_their_own(tmp_path, template):
     gaussians = init_from_points(np.eye(3), np.eye(3), opacity=0.2)
-    params, layout = appearance.allocate(jax.random.key(0), gaussians)
+    appearance = allocate_appearance(template, jax.random.key(0), gaussians)
     faint = dataclasses.replace(gaussians, logit_opacities=gaussians.logit_opacities - 3)
-    save_ply(tmp_path / "a.ply", Model(faint, params, layout, appearance=appearance))
-    opacities = appearance.opacities(faint, params, layout)
+    save_ply(tmp_path / "a.ply", Model(faint, appearance))
+    opacities = appearance.opacities(faint)
     np.testing.assert_allclose(load_ply(tmp_path / "a.ply").opacities, opacities, rtol=1e-4)

@@ -1,4 +1,4 @@
-"""The native loops apart from the images they make: threads, lists, errors, other rules and fallback."""
+"""The native loops apart from the images they make: threads, lists, errors, other appearances and fallback."""
 
 import dataclasses
 import itertools
@@ -13,16 +13,16 @@ import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
-from a2tg_jax.appearance import AppearanceRule, PlainRule, TextureOptions, gaussian_cutoff, textured_rule
+from a2tg_jax.appearance import Appearance, Texture, TextureOptions, gaussian_cutoff
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import homographies
-from a2tg_jax.core.pytree import pytree
+from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.kernels.native import threads
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.render import rule_of
-from a2tg_jax.texture import texture_arrays, textures_from_arrays
+from a2tg_jax.texture import textures_from_arrays
 
 
 @pytest.mark.usefixtures("x64")
@@ -54,19 +54,19 @@ def test_lists_are_those_of_xla(monkeypatch, tile_size, dtype):
 def test_threads_share_the_work_and_nothing_else(monkeypatch, num_threads):
     """Images are bit for bit those of one thread; gradients, summed by thread, are equal to rounding."""
     scene = draw_scene(3, num=60)
-    gaussians, camera, textures = as_gaussians(scene, "float32"), as_camera(scene, "float32"), None
-    textures, layout = as_textures(scene, "float32")
+    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    textures = as_textures(scene, "float32")
 
-    def loss(gaussians, textures):
-        output = render_image(gaussians, camera, textures, layout)
+    def loss(gaussians, buckets):
+        output = render_image(gaussians, camera, dataclasses.replace(textures, buckets=buckets))
         return jnp.sum(output.color**2) + jnp.sum(output.depth), output
 
     differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
     monkeypatch.setattr(threads, "num_threads", lambda: 1)
-    (_, one), expected = differentiate(gaussians, textures)
+    (_, one), expected = differentiate(gaussians, textures.buckets)
     monkeypatch.setattr(threads, "num_threads", lambda: num_threads)
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 10)
-    (_, many), found = differentiate(gaussians, textures)
+    (_, many), found = differentiate(gaussians, textures.buckets)
     np.testing.assert_array_equal(many.color, one.color)
     np.testing.assert_array_equal(many.depth, one.depth)
     for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
@@ -80,17 +80,16 @@ def test_parts_cover_all_tiles():
     assert all(one[1] == other[0] for one, other in itertools.pairwise(parts))
 
 
-@pytree
-class HalvesRule(AppearanceRule):
-    """A rule of another kind: two colours and one opacity a splat, [2N, 3], by the sign of u, and another falloff."""
+@pytree(kw_only=True)
+class Halves(Appearance):
+    """An appearance of another kind: two halves [N, 2, 3] of a splat, by the sign of u, and another falloff."""
 
-    texels: jax.Array
-    first: jax.Array
-    sharpness: float = dataclasses.field(metadata={"static": True})
+    halves: jax.Array
+    sharpness: float = static()
 
-    @property
-    def regions(self):
-        return TextureRegion(self.first, jnp.ones_like(self.first), jnp.full_like(self.first, 2))
+    def atlas(self):
+        first = jnp.arange(len(self.halves), dtype=jnp.int32) * 2
+        return self.halves.reshape(-1, 3), TextureRegion(first, jnp.ones_like(first), jnp.full_like(first, 2))
 
     def texel_position(self, region, u, v):
         return (u > 0).astype(u.dtype), jnp.zeros_like(v)
@@ -104,21 +103,19 @@ class HalvesRule(AppearanceRule):
 
 
 @pytest.mark.usefixtures("x64")
-def test_any_appearance_rule_is_compiled():
+def test_any_appearance_is_compiled():
     scene = draw_scene(9)
     gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
-    params = jnp.asarray(np.random.default_rng(0).normal(size=(2 * gaussians.num, 3)))
-    first = jnp.arange(gaussians.num, dtype=jnp.int32) * 2
+    halves = jnp.asarray(np.random.default_rng(0).normal(size=(gaussians.num, 2, 3)))
 
-    def loss(gaussians, params, compositor):
-        rule = HalvesRule(params, first, 0.2)
+    def loss(gaussians, halves, compositor):
         settings = RenderSettings(compositor=compositor, capacity=1024)
-        output = render_appearance(gaussians, camera, rule, settings=settings)
+        output = render_appearance(gaussians, camera, Halves(halves=halves, sharpness=0.2), settings=settings)
         return jnp.sum(output.color**2), output.color
 
     differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True), static_argnums=2)
-    (_, expected), wanted = differentiate(gaussians, params, "xla")
-    (_, image), found = differentiate(gaussians, params, "native")
+    (_, expected), wanted = differentiate(gaussians, halves, "xla")
+    (_, image), found = differentiate(gaussians, halves, "native")
     assert jnp.abs(wanted[1]).max() > 1e-3
     np.testing.assert_allclose(image, expected, atol=1e-10)
     for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
@@ -126,21 +123,24 @@ def test_any_appearance_rule_is_compiled():
 
 
 @pytree
-class UntranslatableRule(PlainRule):
+class Untranslatable(Appearance):
     def falloff(self, numbers, rho):
         return jnp.exp(-0.5 * rho) + 0 * jax.lax.digamma(1 + rho)
 
 
-def test_a_rule_without_translation_is_left_to_xla():
+def test_an_appearance_without_translation_is_left_to_xla():
     """With "auto", with one warning that names the primitive; with "native" it is an error."""
     scene = draw_scene(9, num=8, width=16, height=16)
-    gaussians, camera, rule = as_gaussians(scene, "float32"), as_camera(scene, "float32"), UntranslatableRule()
-    show = lambda **settings: render_appearance(gaussians, camera, rule, settings=RenderSettings(**settings)).color  # noqa: E731
-    with pytest.warns(UserWarning, match=r"UntranslatableRule is composited by XLA.*'digamma'"):
+    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+
+    def show(**settings):
+        return render_appearance(gaussians, camera, Untranslatable(), settings=RenderSettings(**settings)).color
+
+    with pytest.warns(UserWarning, match=r"Untranslatable is composited by XLA.*'digamma'"):
         found = show()
     show(near_plane=0.3)
     np.testing.assert_array_equal(found, show(compositor="xla"))
-    with pytest.raises(ValueError, match=r"compositor='native' cannot run UntranslatableRule.*'digamma'"):
+    with pytest.raises(ValueError, match=r"compositor='native' cannot run Untranslatable.*'digamma'"):
         show(compositor="native")
 
 
@@ -152,16 +152,16 @@ def test_gpu_kernels_are_those_of_xla(has_textures, statistic):
     """Interpreted, on a small scene: the image, the gradient, and a statistic."""
     scene = draw_scene(4, num=16, width=19, height=13)
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    textures, layout = as_textures(scene, "float32") if has_textures else (None, None)
+    appearance = Appearance(texture=Texture(as_textures(scene, "float32"))) if has_textures else Appearance()
+    floats, rest = partition(appearance)
 
-    def loss(gaussians, textures, probe, compositor):
-        settings = RenderSettings(compositor=compositor, capacity=1024)
-        rule = rule_of(gaussians, textures, layout, settings)
-        output, _ = render_traced(gaussians, camera, rule, jnp.ones(3), settings, probe=probe, statistic=statistic)
+    def loss(gaussians, floats, probe, compositor):
+        settings, shown = RenderSettings(compositor=compositor, capacity=1024), combine(floats, rest)
+        output, _ = render_traced(gaussians, camera, shown, jnp.ones(3), settings, probe=probe, statistic=statistic)
         return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
 
     differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True), static_argnums=3)
-    inputs = gaussians, textures, jnp.zeros((gaussians.num, 4))
+    inputs = gaussians, floats, jnp.zeros((gaussians.num, 4))
     (_, expected), wanted = differentiate(*inputs, "xla")
     (_, output), found = differentiate(*inputs, "cuda")
     assert expected.alpha.max() > 0.5 and wanted[2][:, 3].max() > 10
@@ -182,17 +182,17 @@ def test_a_splat_without_a_texture_shows_its_gaussian(compositor, options):
     gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
     settings = RenderSettings(compositor=compositor, capacity=1024)
 
-    def loss(gaussians, textures, probe, layout):
-        rule = textured_rule(textures, layout, options)
+    def loss(gaussians, buckets, probe, textures):
+        shown = Appearance(texture=Texture(dataclasses.replace(textures, buckets=buckets), options=options))
         background = jnp.asarray(scene.background)
-        output, _ = render_traced(gaussians, camera, rule, background, settings, probe=probe)
+        output, _ = render_traced(gaussians, camera, shown, background, settings, probe=probe)
         return jnp.sum(output.color**2) + jnp.sum(output.depth), output.color
 
     def differentiate(textures):
-        textures, layout = textures_from_arrays([jnp.asarray(texture) for texture in textures])
+        textures = textures_from_arrays([jnp.asarray(texture) for texture in textures])
         found = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True))
-        (_, color), grads = found(gaussians, textures, jnp.zeros((16, 4)), layout)
-        return color, grads[0], texture_arrays(grads[1], layout), grads[2]
+        (_, color), grads = found(gaussians, textures.buckets, jnp.zeros((16, 4)), textures)
+        return color, grads[0], dataclasses.replace(textures, buckets=grads[1]).blocks(), grads[2]
 
     wanted, found = differentiate(neutral), differentiate(empty)
     # A neutral texel has a gradient, what is empty has none.
@@ -213,17 +213,18 @@ def test_mixed_precisions_are_composited_in_the_larger():
     Rounding decides here and there whether a splat reaches 1/255, which moves a gradient by that pixel's share.
     """
     scene = draw_scene(4)
-    gaussians, (textures, layout) = as_gaussians(scene, "float32"), as_textures(scene, "float32")
+    gaussians, textures = as_gaussians(scene, "float32"), as_textures(scene, "float32")
 
-    def loss(gaussians, textures, camera):
+    def loss(gaussians, buckets, camera):
         settings = RenderSettings(compositor="native", capacity=1024)
-        color = render_image(gaussians, camera, textures, layout, settings=settings).color
+        shown = dataclasses.replace(textures, buckets=buckets)
+        color = render_image(gaussians, camera, shown, settings=settings).color
         return jnp.sum(color**2), color
 
     differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
     with jax.numpy_dtype_promotion("standard"):
-        (_, expected), wanted = differentiate(gaussians, textures, as_camera(scene, "float32"))
-        (_, image), found = differentiate(gaussians, textures, as_camera(scene, "float64"))
+        (_, expected), wanted = differentiate(gaussians, textures.buckets, as_camera(scene, "float32"))
+        (_, image), found = differentiate(gaussians, textures.buckets, as_camera(scene, "float64"))
     assert image.dtype == jnp.float64
     assert np.mean(abs(np.asarray(image) - np.asarray(expected)) < 1e-5) > 0.99
     for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
@@ -231,17 +232,17 @@ def test_mixed_precisions_are_composited_in_the_larger():
         np.testing.assert_allclose(b, a, rtol=0, atol=2e-2 * float(jnp.abs(a).max()))
 
 
-def test_a_rule_defined_anew_is_compiled_anew():
+def test_a_class_defined_again_is_compiled_again():
     scene = draw_scene(9)
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
 
     def image(residual):
         @pytree
-        class Anew(PlainRule):
+        class Again(Appearance):
             def shade(self, numbers, values, u, v):
                 return (residual * jnp.ones_like(u),) * 3, None
 
-        return render_appearance(gaussians, camera, Anew()).color
+        return render_appearance(gaussians, camera, Again()).color
 
     assert jnp.max(jnp.abs(image(0.0) - image(0.5))) > 0.1
 

@@ -4,7 +4,7 @@ from kills import kill_runs
 
 TINY = (
     *("--downscale", "6", "--stage1-iterations", "60", "--stage2-iterations", "40"),
-    *("--initial-gaussians", "60", "--densify.cap", "60", "--texture.cap", "2", "--texture.upscale-at", "0.5"),
+    *("--initial-gaussians", "60", "--densify.cap", "60", "--texture.cap", "2", "--texture.at", "0.5"),
 )
 
 

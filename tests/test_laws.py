@@ -22,9 +22,11 @@ from scenes_random import (
 )
 
 from a2tg_jax import (
+    Appearance,
     Camera,
     RenderOutput,
     RenderSettings,
+    Texture,
     allocate_textures,
     init_from_points,
     parameter_bytes,
@@ -32,7 +34,6 @@ from a2tg_jax import (
     render_image,
     texture_arrays,
 )
-from a2tg_jax.appearance import Textured
 from a2tg_jax.model import Model
 
 FIELDS = ("color", "alpha", "depth", "normal")
@@ -64,8 +65,8 @@ def rotate_sh(sh: Float, rotation: Float) -> Float:
 @pytest.mark.usefixtures("x64")
 def test_initial_textures_are_no_textures():
     scene = draw_scene(1)
-    textures, layout = allocate_textures(np.array([texture.shape[:2] for texture in scene.textures]))
-    neutral = [np.asarray(texture) for texture in texture_arrays(textures, layout)]
+    textures = allocate_textures(np.array([texture.shape[:2] for texture in scene.textures]))
+    neutral = [np.asarray(texture) for texture in texture_arrays(textures)]
     assert_same(rendered(scene._replace(textures=neutral)), rendered(scene._replace(textures=None)))
 
 
@@ -108,7 +109,8 @@ def test_moving_world_and_camera_together(seed):
             viewmat=scene.viewmat @ inverse_motion,
         )
     )
-    assert_same(there._replace(normal=there.normal @ jnp.asarray(rotation)), rendered(scene), 1e-8)
+    turned = dataclasses.replace(there.geometry, normal=there.normal @ jnp.asarray(rotation))
+    assert_same(dataclasses.replace(there, geometry=turned), rendered(scene), 1e-8)
 
 
 @pytest.mark.usefixtures("x64")
@@ -151,18 +153,18 @@ def test_the_same_shapes_are_traced_once():
     """Other values are not traced again, nor are textures of the same sizes in another order: the buckets are alike."""
     scene = draw_scene(0)
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    settings = plan_render(gaussians, [camera], *as_textures(scene, "float32"))
+    settings = plan_render(gaussians, [camera], as_textures(scene, "float32"))
     num_traces = 0
 
     @jax.jit
-    def draw(gaussians, camera, textures, layout):
+    def draw(gaussians, camera, textures):
         nonlocal num_traces
         num_traces += 1
-        return render_image(gaussians, camera, textures, layout, settings=settings)
+        return render_image(gaussians, camera, textures, settings=settings)
 
     for shift, textures in [(0.0, scene.textures), (0.01, scene.textures), (0.02, scene.textures[::-1])]:
         moved = dataclasses.replace(gaussians, means=gaussians.means + shift)
-        draw(moved, camera, *as_textures(scene._replace(textures=textures), "float32"))
+        draw(moved, camera, as_textures(scene._replace(textures=textures), "float32"))
     assert num_traces == 1
 
 
@@ -183,7 +185,7 @@ def draw_with(settings: RenderSettings, scene: Scene) -> RenderOutput:
     """The float32 image under given settings, capacity included, under jit."""
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
     background = jnp.asarray(scene.background, jnp.float32)
-    return jitted_renderer(settings)(gaussians, camera, *as_textures(scene, "float32"), background)
+    return jitted_renderer(settings)(gaussians, camera, as_textures(scene, "float32"), background)
 
 
 @pytest.mark.parametrize("capacity", [10, 200, 600])
@@ -199,8 +201,8 @@ def test_too_small_a_capacity_is_flagged(capacity):
 def test_a_plan_holds_for_all_its_cameras():
     scene = draw_scene(0)
     views = [scene._replace(viewmat=other.viewmat, K=other.K) for other in map(draw_scene, (0, 1, 2))]
-    gaussians, packed = as_gaussians(scene, "float32"), as_textures(scene, "float32")
-    settings = plan_render(gaussians, [as_camera(view, "float32") for view in views], *packed)
+    gaussians, textures = as_gaussians(scene, "float32"), as_textures(scene, "float32")
+    settings = plan_render(gaussians, [as_camera(view, "float32") for view in views], textures)
     for view in views:
         assert not draw_with(settings, view).overflow
 
@@ -208,7 +210,7 @@ def test_a_plan_holds_for_all_its_cameras():
 def test_cameras_can_be_batched():
     scene = draw_scene(2)
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    textures, layout = as_textures(scene, "float32")
+    textures = as_textures(scene, "float32")
     offsets = np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.2, 0.3]])
     views = []
     for offset in offsets:
@@ -216,12 +218,12 @@ def test_cameras_can_be_batched():
         viewmat[:3, 3] += offset
         views.append(scene._replace(viewmat=viewmat))
     cameras = [as_camera(view, "float32") for view in views]
-    settings = plan_render(gaussians, cameras, textures, layout)
+    settings = plan_render(gaussians, cameras, textures)
     background = jnp.asarray(scene.background, jnp.float32)
 
     def draw(viewmat):
         view = Camera(viewmat, camera.K, camera.width, camera.height)
-        return render_image(gaussians, view, textures, layout, background=background, settings=settings)
+        return render_image(gaussians, view, textures, background=background, settings=settings)
 
     batched = jax.jit(jax.vmap(draw))(jnp.stack([view.viewmat for view in cameras]))
     for i, view in enumerate(views):
@@ -236,9 +238,9 @@ def test_quaternion_of_a_rotation():
 
 def test_a_model_reports_its_bytes():
     scene = draw_scene(0)
-    gaussians, (textures, layout) = as_gaussians(scene, "float32"), as_textures(scene, "float32")
-    model = Model(gaussians, textures, layout, appearance=Textured())
-    assert model.num_bytes == parameter_bytes(gaussians, layout)
+    gaussians, textures = as_gaussians(scene, "float32"), as_textures(scene, "float32")
+    model = Model(gaussians, Appearance(texture=Texture(textures)))
+    assert model.num_bytes == parameter_bytes(gaussians, textures)
     assert Model(gaussians).num_bytes == 232 * gaussians.num
 
 
@@ -246,12 +248,12 @@ def test_a_model_reports_its_bytes():
 @pytest.mark.parametrize("has_textures", [False, True])
 def test_no_gaussians_show_the_background(compositor, has_textures):
     nothing = init_from_points([[0, 0, 1], [0, 0, 2]], np.zeros((2, 3)))[:0]
-    textures = allocate_textures(np.zeros((0, 2), np.int64)) if has_textures else (None, None)
+    textures = allocate_textures(np.zeros((0, 2), np.int64)) if has_textures else None
     camera = Camera(jnp.eye(4), jnp.asarray([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 17, 13)
     settings = RenderSettings(compositor=compositor)
 
     def draw(gaussians):
-        return render_image(gaussians, camera, *textures, background=(0.1, 0.2, 0.3), settings=settings)
+        return render_image(gaussians, camera, textures, background=(0.1, 0.2, 0.3), settings=settings)
 
     output = draw(nothing)
     np.testing.assert_array_equal(output.color, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (13, 17, 3)))

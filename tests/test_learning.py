@@ -35,7 +35,7 @@ def frozen(scene, **changes):
     colors = np.zeros_like(scene.colors)
     colors[0] = 0.1  # a cloud of one colour would start grey
     black = dataclasses.replace(scene, colors=colors)
-    numbers = {"stage1_iterations": 210, "initial_opacity": 0.9, "densify": a2tg.McmcConfig(is_enabled=False)}
+    numbers = {"stage1_iterations": 210, "initial_opacity": 0.9, "densify": a2tg.Mcmc(cap=0)}
     return black, a2tg.Gaussians2dMcmc(**{**numbers, "rates": NO_RATES, **changes})
 
 

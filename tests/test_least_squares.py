@@ -10,7 +10,7 @@ import pytest
 from test_view_dependence import banded
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Banded, Plain, Shaped, Textured, TextureOptions
+from a2tg_jax.appearance import Appearance, Exponents, Texture, TextureOptions, allocate_appearance
 from a2tg_jax.data import View
 from a2tg_jax.finish.polishing import colors_of, draw_change, polish, with_colors
 from a2tg_jax.renderer import plan_render
@@ -34,12 +34,12 @@ def total_error(model, views) -> float:
     )
 
 
-@pytest.mark.parametrize("inner", [Plain(), Textured((2, 1)), Textured((0, 0))])
-def test_a_change_adds_what_it_draws(inner):
-    model, _, camera = banded(1, inner=inner)
+@pytest.mark.parametrize("texture", [None, Texture(start=(2, 1)), Texture(start=(0, 0))])
+def test_a_change_adds_what_it_draws(texture):
+    model, _, camera = banded(1, template=Appearance(texture=texture))
     rng = np.random.default_rng(0)
     change = jax.tree.map(lambda x: jnp.asarray(1e-3 * rng.normal(size=x.shape), x.dtype), colors_of(model))
-    settings = plan_render(model.gaussians, camera, rule=model.rule)
+    settings = plan_render(model, camera)
     after = with_colors(model, jax.tree.map(jnp.add, colors_of(model), change))
     drawn = draw_change(model, change, camera, settings)
     before, later = (one.render(camera, background=(0.2, 0.1, 0.3)).color for one in (model, after))
@@ -51,7 +51,7 @@ def test_a_change_adds_what_it_draws(inner):
 @pytest.mark.usefixtures("x64")
 def test_many_steps_are_at_the_least_error():
     """That of a dense matrix, column by column, solved by numpy."""
-    model, _, camera = banded(2, base=1, dtype="float64", inner=Textured((1, 2)))
+    model, _, camera = banded(2, base=1, dtype="float64", template=Appearance(texture=Texture(start=(1, 2))))
     model = dataclasses.replace(model, gaussians=model.gaussians, num_live=jnp.int32(4)).live
     # Half a grey above zero, no colour is cut off before or after.
     model = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=0.1 * model.gaussians.sh))
@@ -70,7 +70,7 @@ def test_many_steps_are_at_the_least_error():
 
 
 def test_a_few_steps_lower_the_error_and_leave_the_rest():
-    model, _, camera = banded(3, inner=Textured((2, 2)))
+    model, _, camera = banded(3, template=Appearance(texture=Texture(start=(2, 2))))
     views = some_views(model, camera)
     errors = [total_error(model, views), *(total_error(polish(model, views, num_steps=n), views) for n in (1, 5))]
     assert errors[0] > errors[1] > errors[2]
@@ -78,7 +78,7 @@ def test_a_few_steps_lower_the_error_and_leave_the_rest():
     for field in ("means", "quats", "log_scales", "logit_opacities"):
         np.testing.assert_array_equal(getattr(after.gaussians, field), getattr(model.gaussians, field))
     assert after.num_bytes == model.num_bytes
-    alphas = [[bucket[..., 3] for bucket in m.textures[0].buckets] for m in (model, after)]
+    alphas = [[bucket[..., 3] for bucket in m.textures.buckets] for m in (model, after)]
     jax.tree.map(np.testing.assert_array_equal, *alphas)
 
 
@@ -93,7 +93,7 @@ def test_what_is_not_linear_is_refused():
     model, _, camera = banded(1)
     with pytest.raises(ValueError, match="views must hold at least one view"):
         polish(model, [])
-    shown = Banded(Shaped(Textured(options=TextureOptions(rgb="unit"))))
-    other = a2tg.Model(model.gaussians, *shown.allocate(None, model.gaussians), appearance=shown)
-    with pytest.raises(ValueError, match="not linear in what Textured shows"):
+    template = Appearance(texture=Texture(options=TextureOptions(rgb="unit")), exponents=Exponents())
+    other = a2tg.Model(model.gaussians, allocate_appearance(template, jax.random.key(0), model.gaussians))
+    with pytest.raises(ValueError, match="not linear in the colours of Gaussians with texture and exponents"):
         polish(other, some_views(model, camera))

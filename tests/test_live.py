@@ -10,13 +10,13 @@ import numpy as np
 from test_compact import plain, textured
 
 from a2tg_jax import A2tg, fit, synthetic_scene
-from a2tg_jax.appearance import Billboards
+from a2tg_jax.adapt import Upscale
+from a2tg_jax.appearance import Billboards, allocate_appearance
 from a2tg_jax.io.web_scene import decode_web_scene
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.model import Model
-from a2tg_jax.results.live import SECONDS, SHARE, LiveView, shown_live
+from a2tg_jax.results.live_viewer import SECONDS, SHARE, LiveView, shown_live
 from a2tg_jax.results.whole_run import unseen
-from a2tg_jax.systems.a2tg import TextureConfig
-from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.checkpoint import History
 from a2tg_jax.training.loop import never
@@ -26,8 +26,8 @@ SCENE = synthetic_scene(num_views=4, width=24, height=16, num_points=40)
 SYSTEM = A2tg(
     stage1_iterations=24,
     stage2_iterations=4,
-    densify=McmcConfig(cap=50),
-    texture=TextureConfig(fraction=0.5, upscale_at=(0.5,)),
+    densify=Mcmc(cap=50),
+    texture=Upscale(fraction=0.5, at=(0.5,)),
 )
 
 
@@ -120,9 +120,9 @@ def test_pause_holds_the_training_up_until_it_is_resumed_or_stopped():
 
 def test_systems_that_cannot_be_shown_are_said_to_be():
     gaussians = plain(1).gaussians
-    params, layout = Billboards().allocate(jax.random.key(0), gaussians)
+    appearance = allocate_appearance(Billboards(), jax.random.key(0), gaussians)
     run = stage_run()
-    run.state.model = Model(gaussians, params, layout, appearance=Billboards())
+    run.state.model = Model(gaussians, appearance)
     live = LiveView(SCENE, "scene")
     live(run, never)
     encoded(live)

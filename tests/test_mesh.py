@@ -15,7 +15,7 @@ from a2tg_jax.data.synthetic import exact_points
 from a2tg_jax.io.exchange import upright_from
 from a2tg_jax.mesh import distance
 from a2tg_jax.mesh.blocks import BlockGrid, unique_blocks
-from a2tg_jax.mesh.depth_maps import DepthMap
+from a2tg_jax.mesh.depth_maps import RenderedDepth
 from a2tg_jax.mesh.distance import thinned
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.mesh.fusion import fuse
@@ -54,7 +54,7 @@ def sphere_depths(camera, radius=RADIUS):
     slant = np.abs(np.sum(rays * (center + rays * depth[..., None]), axis=-1)) / radius
     facing = np.maximum(slant / np.linalg.norm(rays, axis=-1), 0.1)
     arrays = (depth, np.zeros_like(depth), np.clip(slant, 0.1, 1), facing, color)
-    return DepthMap(camera, *(jnp.asarray(each, jnp.float32) for each in arrays))
+    return RenderedDepth(camera, *(jnp.asarray(each, jnp.float32) for each in arrays))
 
 
 def fused_sphere(space, distance=1.2, radius=RADIUS, directions=AROUND):

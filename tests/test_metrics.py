@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from a2tg_jax.appearance import Textured
+from a2tg_jax.appearance import Appearance, Texture
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.measure.metrics import load_lpips, lpips, parameter_bytes, psnr, ssim
 from a2tg_jax.model import Model
@@ -124,9 +124,9 @@ def test_bytes_are_counted_without_padding():
     gaussians = init_from_points(rng.normal(size=(100, 3)), rng.uniform(size=(100, 3)))
     sizes = np.ones((100, 2), int)
     sizes[:33] = (4, 2)
-    textures, layout = allocate_textures(sizes)
+    textures = allocate_textures(sizes)
     assert parameter_bytes(gaussians) == 23_200
-    assert parameter_bytes(gaussians, layout) == 23_200 + 16 * (67 + 33 * 8)
+    assert parameter_bytes(gaussians, textures) == 23_200 + 16 * (67 + 33 * 8)
     allocated = sum(bucket.nbytes for bucket in textures.buckets)
-    model = Model(gaussians, textures, layout, appearance=Textured())
+    model = Model(gaussians, Appearance(texture=Texture(textures)))
     assert model.num_padding_bytes == allocated - 16 * (67 + 33 * 8)

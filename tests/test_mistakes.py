@@ -12,8 +12,7 @@ from PIL import Image
 
 from a2tg_jax import save_model, synthetic_scene
 from a2tg_jax.cli import main as cli
-from a2tg_jax.cli.arguments import flag_with_value, with_flags
-from a2tg_jax.core.origin import BLACK
+from a2tg_jax.cli.arguments import flag_with_value, in_flags, typed_paths
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.results import whole_run
 from a2tg_jax.results.folder import create_run
@@ -44,7 +43,7 @@ MISTAKES = {
     f"{SYNTHETIC} --seed 0.5": "--seed wants a whole number; got '0.5'",
     f"{SYNTHETIC} --batch-size two": "'two'",
     f"{SYNTHETIC} --texture.select best": "--texture.select wants one of fraction, threshold, budget; got 'best'",
-    f"{SYNTHETIC} --texture.upscale-at soon": "--texture.upscale-at",
+    f"{SYNTHETIC} --texture.at soon": "--texture.at",
     f"{SYNTHETIC} --on-nan hope": "--on-nan wants one of stop, restore; got 'hope'",
     f"{SYNTHETIC} --system b2tg": "there is no system 'b2tg'",
     f"{SYNTHETIC} --system bytwise": "did you mean bytewise?",
@@ -52,23 +51,23 @@ MISTAKES = {
     f"{SYNTHETIC} --preset fast": "presets paper",
     f"{SYNTHETIC} --preset quik": "did you mean quick?",
     f"{SYNTHETIC} --compare b2tg": "there is no system 'b2tg'",
-    f"{SYNTHETIC} --system gaussians-2d --texture.cap 4": "gaussians-2d has no such option, but a2tg, bytewise have",
+    f"{SYNTHETIC} --system gaussians-2d --texture.cap 4": "gaussians-2d has no such option, but a2tg has",
     # Numbers out of range
     f"{SYNTHETIC} --batch-size 0": "--batch-size must be at least 1",
-    f"{SYNTHETIC} --seed -1": "seed must lie in",
+    f"{SYNTHETIC} --seed -1": "seed must be",
     f"{SYNTHETIC} --rates.means nan": "rates.means must be a finite number",
     f"{SYNTHETIC} --rates.quats -1": "rates.quats must be at least 0",
     f"{SYNTHETIC} --loss.ssim-weight inf": "--loss.ssim-weight must be a finite number",
-    f"{SYNTHETIC} --texture.fraction 2": "texture.fraction must lie in 0..1",
-    f"{SYNTHETIC} --texture.rate -0.1": "texture.rate must be at least 0",
-    f"{SYNTHETIC} --texture.cap 32": "texture.cap must lie in 1..16",
-    f"{SYNTHETIC} --texture.upscale-at 0.5 0.2": "--texture.upscale-at must be ascending",
+    f"{SYNTHETIC} --texture.fraction 2": "texture.fraction must be at least 0 and at most 1",
+    f"{SYNTHETIC} --texel-rate -0.1": "--texel-rate must be at least 0",
+    f"{SYNTHETIC} --texture.cap 32": "texture.cap must be at least 1 and at most 16",
+    f"{SYNTHETIC} --texture.at 0.5 0.2": "--texture.at must be ascending",
     f"{SYNTHETIC} --stage1-iterations 0": "at least 1 iteration",
     f"{SYNTHETIC} --densify.cap 1": "densify.cap must be at least 2",
     f"{SYNTHETIC} --system gaussians-2d --densify.threshold -1": "densify.threshold must be at least 0",
-    f"{SYNTHETIC} --system bbsplat --billboard.side 1": "billboard.side must lie in 2..16",
+    f"{SYNTHETIC} --system bbsplat --billboard.side 1": "billboard.side must be at least 2 and at most 16",
     f"{SYNTHETIC} --system supergaussians --kernels.colors -1": "kernels.colors must be at least 0",
-    f"{SYNTHETIC} --system textured-gaussians --texture.side 17": "texture.side must lie in 1..16",
+    f"{SYNTHETIC} --system textured-gaussians --texture-side 17": "--texture-side must be at least 1 and at most 16",
     f"{SYNTHETIC} --memory-budget 5XB": "--memory-budget must be a number of MB",
     f"{SYNTHETIC} --memory-budget 100B": "--memory-budget must be a number of MB",
     f"{SYNTHETIC} --memory-budget 0.0003": "there must be 2",
@@ -180,7 +179,7 @@ def place(tmp_path_factory):
         write_record(run, record)
         run.own(run.checkpoint("a2tg-gaussians", 1)).parent.mkdir()
         run.checkpoint("a2tg-gaussians", 1).write_bytes(b"")
-    model = dataclasses.replace(initial_model(scene, system), origin=origin_of_scene(scene, BLACK))
+    model = dataclasses.replace(initial_model(scene, system), origin=origin_of_scene(scene))
     save_model(run.own(run.model("a2tg-textures")), model)
     for name in ("photos/a", "scene/a", "photo", "many/a", "many/b", "many/c"):
         (place / name).parent.mkdir(exist_ok=True)
@@ -232,18 +231,20 @@ def test_help_names_values_without_none():
 
 @pytest.mark.parametrize("words, value", [(["0.1", "0.2"], (0.1, 0.2)), (["None"], None), ([], ())])
 def test_values_that_may_be_none(words, value):
-    command = cli._parse("train", ["s", "--out", "o", "--texture.upscale-at", *words, "--memory-budget", "None"])
-    assert command.options.texture.upscale_at == value and command.options.memory_budget is None
+    command = cli._parse("train", ["s", "--out", "o", "--texture.at", *words, "--memory-budget", "None"])
+    assert command.options.texture.at == value and command.options.memory_budget is None
 
 
-def test_only_options_that_were_typed_are_told_as_flags():
-    typed = ["--memory-budget", "1kB", "--seed=5"]
-    assert with_flags("raise memory_budget, or texture.cap", typed) == "raise --memory-budget, or texture.cap"
-    assert with_flags("seed must be small, as every seed", typed) == "--seed must be small, as every seed"
-    assert with_flags("run.toml: options.memory_budget", typed) == "run.toml: options.memory_budget"
+def test_paths_of_options_are_printed_as_flags():
+    paths = typed_paths(["--memory-budget", "1kB", "--seed=5"])
+    assert paths == {"memory_budget", "seed"}
+    assert in_flags("raise memory_budget, or texture.cap", paths) == "raise --memory-budget, or texture.cap"
+    assert in_flags("raise texture.cap", {"cap", "texture", "texture.cap"}) == "raise --texture.cap"
+    assert in_flags("seed must be small, as every seed", paths) == "--seed must be small, as every seed"
+    assert in_flags("run.toml: options.memory_budget", paths) == "run.toml: options.memory_budget"
 
 
 def test_flags_are_told_as_they_are_typed():
-    options = {"seed": 5, "texture.upscale_at": (0.1, 0.2), "texture.is_on": True, "texture.is_off": False}
-    told = ["--seed 5", "--texture.upscale-at 0.1 0.2", "--texture.is-on", "--texture.no-is-off"]
+    options = {"seed": 5, "texture.at": (0.1, 0.2), "texture.is_on": True, "texture.is_off": False}
+    told = ["--seed 5", "--texture.at 0.1 0.2", "--texture.is-on", "--texture.no-is-off"]
     assert [flag_with_value(*option) for option in options.items()] == told

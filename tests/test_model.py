@@ -10,9 +10,10 @@ import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 from small_values import assert_same, some_gaussians, some_world
 
-from a2tg_jax.appearance import Appearance, PlainRule, Textured, TextureOptions
+from a2tg_jax.appearance import Appearance, Exponents, Texture, TextureOptions, allocate_appearance, template_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
 from a2tg_jax.io.model_file import FORMAT, load_model, save_model
 from a2tg_jax.model import Model
@@ -22,19 +23,17 @@ from a2tg_jax.texture import texture_arrays, textures_from_arrays
 SIZES = [(1, 1), (4, 2), (1, 4), (2, 2), (4, 2), (1, 1), (3, 5)]
 
 
-@dataclasses.dataclass(frozen=True)
+@pytree(kw_only=True)
 class Tint(Appearance):
     """A colour of its own for each splat: an appearance from elsewhere."""
 
-    strength: float = 0.5
-    channels: tuple[int, ...] = (0, 1, 2)
-    name: str | None = None
+    tint: jax.Array | None = None
+    strength: float = static(default=0.5)
+    channels: tuple[int, ...] = static(default=(0, 1, 2))
+    name: str | None = static(default=None)
 
     def allocate(self, key, gaussians):
-        return {"tint": jnp.full((gaussians.num, 3), self.strength)}, ()
-
-    def rule(self, params, layout):
-        return PlainRule()
+        return dataclasses.replace(self, tint=jnp.full((gaussians.num, 3), self.strength))
 
 
 def some_textures(num: int = 7):
@@ -46,18 +45,17 @@ def some_textures(num: int = 7):
 def some_origin(num: int = 3) -> Origin:
     cameras = [as_camera(draw_scene(seed, width=20 + seed), "float32") for seed in range(num)]
     names = [f"{index}.png" for index in range(num)]
-    return Origin.of_cameras(
-        cameras, names, is_test=[True] + [False] * (num - 1), transform=some_world(), background=(0.1, 0.2, 0.3)
-    )
+    return Origin.of_cameras(cameras, names, is_test=[True] + [False] * (num - 1), transform=some_world())
 
 
 def textured_model() -> Model:
-    appearance = Textured(start=(2, 2), options=TextureOptions.official())
-    return Model(some_gaussians(), *textures_from_arrays(some_textures()), appearance=appearance, origin=some_origin())
+    texture = Texture(textures_from_arrays(some_textures()), (2, 2), TextureOptions.official())
+    return Model(some_gaussians(), Appearance(texture=texture), background=(0.1, 0.2, 0.3), origin=some_origin())
 
 
 def assert_same_model(found: Model, wanted: Model) -> None:
-    assert found.appearance == wanted.appearance and found.origin == wanted.origin
+    assert template_of(found.appearance) == template_of(wanted.appearance)
+    assert found.background == wanted.background and found.origin == wanted.origin
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
@@ -80,15 +78,17 @@ def test_round_trip_without_textures_and_origin(tmp_path):
 def test_a_loaded_model_shows_the_same_without_photographs(tmp_path):
     scene = draw_scene(4)
     camera = as_camera(scene, "float32")
-    textures, layout = textures_from_arrays([np.asarray(texture, np.float32) for texture in scene.textures])
+    textures = textures_from_arrays([np.asarray(texture, np.float32) for texture in scene.textures])
     background = tuple(scene.background.tolist())
     model = Model(
-        as_gaussians(scene, "float32"), textures, layout, appearance=Textured(),
-        origin=Origin.of_cameras([camera], background=background),
-    )  # fmt: skip
+        as_gaussians(scene, "float32"),
+        Appearance(texture=Texture(textures)),
+        background=background,
+        origin=Origin.of_cameras([camera]),
+    )
     save_model(tmp_path / "m.npz", model)
     loaded = load_model(tmp_path / "m.npz")
-    expected = render_image(model.gaussians, camera, textures, layout, background=background)
+    expected = render_image(model.gaussians, camera, textures, background=background)
     np.testing.assert_array_equal(loaded.render(loaded.origin.cameras[0]).color, expected.color)
 
 
@@ -98,14 +98,14 @@ def test_only_rows_that_exist_are_kept(tmp_path):
     loaded = load_model(tmp_path / "m.npz")
     assert loaded.num == 4 and loaded.num_live is None
     assert_same(loaded.gaussians, some_gaussians()[:4])
-    for array, again in zip(some_textures()[:4], texture_arrays(loaded.params, loaded.layout), strict=True):
+    for array, again in zip(some_textures()[:4], texture_arrays(loaded.textures), strict=True):
         np.testing.assert_array_equal(array, again)
     assert loaded.num_bytes == model.num_bytes == 232 * 4 + 16 * (1 + 8 + 4 + 4)
 
 
 @pytest.mark.parametrize("num", [0, 1])
 def test_few_gaussians(tmp_path, num):
-    model = Model(some_gaussians(num), *textures_from_arrays(some_textures(num)), appearance=Textured())
+    model = Model(some_gaussians(num), Appearance(texture=Texture(textures_from_arrays(some_textures(num)))))
     save_model(tmp_path / "m.npz", model)
     assert_same_model(load_model(tmp_path / "m.npz"), model)
     camera = as_camera(draw_scene(0), "float32")
@@ -119,16 +119,36 @@ def test_a_model_of_the_first_version(tmp_path):
     assert_same_model(load_model(tmp_path / "plain.npz"), Model(gaussians))
     sizes, texels = np.array(SIZES), np.concatenate([array.reshape(-1, 4) for array in arrays])
     write_archive(tmp_path / "textured.npz", {}, fields | {"sizes": sizes, "texels": texels}, format=FORMAT)
-    wanted = Model(gaussians, *textures_from_arrays(arrays), appearance=Textured())
+    wanted = Model(gaussians, Appearance(texture=Texture(textures_from_arrays(arrays))))
     assert_same_model(load_model(tmp_path / "textured.npz"), wanted)
+
+
+def test_models_of_version_0_2(tmp_path):
+    """One appearance held another one, whose arrays were inner.NAME, and the background was in the origin."""
+    wanted = dataclasses.replace(textured_model(), gaussians=some_gaussians())
+    shapes = np.linspace(-1, 1, 7).astype(np.float32)
+    shaped = dataclasses.replace(wanted.appearance, exponents=Exponents(jnp.asarray(shapes)))
+    save_model(tmp_path / "textured.npz", wanted)
+    header, arrays = read_archive(tmp_path / "textured.npz", format=FORMAT)
+    header["origin"]["background"] = header.pop("background")
+    options = header.pop("appearance")["parts"]["texture"]
+    inner = {"module": "a2tg_jax.appearance.textured", "name": "Textured", "options": options}
+    outer = {"module": "a2tg_jax.appearance.shaped", "name": "Shaped", "options": {}, "held": {"inner": inner}}
+    kept = {name: value for name, value in header.items() if name not in ("format", "version")}
+    write_archive(tmp_path / "textured.npz", {**kept, "appearance": inner}, arrays, format=FORMAT)
+    assert_same_model(load_model(tmp_path / "textured.npz"), wanted)
+    arrays = {name.replace("appearance/", "appearance/inner."): array for name, array in arrays.items()}
+    arrays["appearance/shapes"] = shapes
+    write_archive(tmp_path / "shaped.npz", {**kept, "appearance": outer}, arrays, format=FORMAT)
+    assert_same_model(load_model(tmp_path / "shaped.npz"), dataclasses.replace(wanted, appearance=shaped))
 
 
 # Appearances from elsewhere
 
 
 def tinted_model(**options) -> Model:
-    params, layout = Tint(**options).allocate(jax.random.key(0), some_gaussians())
-    return Model(some_gaussians(), params, layout, appearance=Tint(**options))
+    appearance = allocate_appearance(Tint(**options), jax.random.key(0), some_gaussians())
+    return Model(some_gaussians(), appearance)
 
 
 def test_an_appearance_of_an_imported_module_is_found(tmp_path):
@@ -152,7 +172,7 @@ def test_a_file_imports_nothing_and_says_what_to_do(tmp_path):
 
 
 def test_options_that_a_file_cannot_keep_are_refused(tmp_path):
-    model = dataclasses.replace(tinted_model(), appearance=Tint(name=object()))
+    model = tinted_model(name=object())
     with pytest.raises(ValueError, match="options of Tint cannot be kept"):
         save_model(tmp_path / "m.npz", model)
     assert not list(tmp_path.iterdir())
@@ -202,14 +222,14 @@ def head(**values) -> str:
         (with_header(head(note=float("nan"))), "damaged"),
         (with_header("[" * 100_000), "damaged"),
         (with_header(head(appearance=3)), "damaged"),
-        (with_header(head(appearance={"name": "Textured"})), "lacks 'module'"),
+        (with_header(head(appearance={"name": "Textured"})), "lacks 'options'"),
         (changed("means", lambda x: x[:, :2]), r"gaussians\.means must be \[N, 3\]; got \[7, 2\]"),
         (changed("means", lambda x: x[0, 0]), r"gaussians\.means must be \[N, 3\]"),
         (changed("sh", lambda x: x[:, :2]), r"gaussians\.sh must be \[7, 16, 3\]; got \[7, 2, 3\]"),
         (changed("quats", lambda x: x.astype(np.int32)), r"gaussians\.quats must be floats"),
         (changed("quats", lambda x: x.astype(str)), "quats must be of plain numbers"),
         (edit(lambda header, arrays: arrays.pop("quats")), "lacks 'quats'"),
-        (edit(lambda header, arrays: arrays.pop("appearance/texels")), "texels of textures is missing"),
+        (edit(lambda header, arrays: arrays.pop("appearance/texels")), "the array texels of the appearance is missing"),
         (changed("appearance/texels", lambda x: x[1:]), "disagree"),
         (changed("appearance/texels", lambda x: x.astype(np.int32)), "must be floats"),
         (changed("appearance/sizes", lambda x: -x), r"sizes must be integers \[N, 2\] in 0\.\.16"),
@@ -217,15 +237,15 @@ def head(**values) -> str:
         (changed("appearance/sizes", lambda x: x.ravel()), "sizes must be integers"),
         (
             edit(lambda _, a: a.update({"appearance/sizes": np.ones((2, 2), int), "appearance/texels": np.eye(2, 4)})),
-            "has 2 rows, but there are 7 Gaussians",
+            "textures are of 2 Gaussians, but there are 7 gaussians",
         ),
         (edit(lambda header, _: header["appearance"].update(name="Curtains")), "Curtains.*not known here"),
         (edit(lambda header, _: header["appearance"].update(name="jax.numpy")), "not known here"),
         (edit(lambda header, _: header["appearance"].update(module="os", name="system")), "not known here"),
-        (edit(lambda header, _: header["appearance"]["options"].update(start="big")), r"Textured\.start must be"),
+        (edit(lambda header, _: header["appearance"]["parts"]["texture"].update(start=9)), r"Texture\.start must be"),
         (changed("origin/Ks", lambda x: x[1:]), r"origin/Ks must be \[3, 3, 3\]"),
-        (edit(lambda header, _: header["origin"].update(background=[0, 1])), "bad.npz: .*unpack"),
-        (edit(lambda header, _: header["origin"].update(background="red")), "bad.npz: .*float"),
+        (edit(lambda header, _: header.update(background=[0, 1])), "bad.npz: .*unpack"),
+        (edit(lambda header, _: header.update(background="red")), "bad.npz: .*float"),
         (edit(lambda header, _: header.update(origin=None)), "damaged"),
     ],
 )
@@ -270,9 +290,9 @@ def test_a_model_of_wrong_shapes_is_not_written(tmp_path):
 @pytest.mark.usefixtures("x64")
 def test_a_moved_model_shows_the_same_to_its_cameras():
     scene = draw_scene(9)
-    textures, layout = textures_from_arrays(scene.textures)
+    textures = textures_from_arrays(scene.textures)
     origin = Origin.of_cameras([as_camera(scene, "float64")])
-    model = Model(as_gaussians(scene, "float64"), textures, layout, appearance=Textured(), origin=origin)
+    model = Model(as_gaussians(scene, "float64"), Appearance(texture=Texture(textures)), origin=origin)
     moved = model.transform(some_world())
 
     def first_view(model: Model):
@@ -302,7 +322,7 @@ def test_dead_rows_do_not_show():
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
     spoiled = jax.tree.map(lambda x: x.at[10:].set(jnp.nan), gaussians)
     model = Model(spoiled, num_live=jnp.asarray(10, jnp.int32))
-    expected = render_appearance(gaussians[:10], camera, PlainRule())
+    expected = render_appearance(gaussians[:10], camera, Appearance())
     np.testing.assert_array_equal(model.render(camera).color, expected.color)
     np.testing.assert_array_equal(model.live.render(camera).color, expected.color)
 
@@ -310,8 +330,8 @@ def test_dead_rows_do_not_show():
 def test_a_model_is_a_pytree_whose_origin_is_no_leaf():
     model = textured_model()
     again = jax.jit(lambda model: jax.tree.map(lambda x: x, model))(model)
-    assert_same_model(again, model)
-    assert jax.tree.structure(model) == jax.tree.structure(textured_model())
+    assert_same_model(again, dataclasses.replace(model, origin=None))
+    assert jax.tree.structure(model) == jax.tree.structure(textured_model()) == jax.tree.structure(again)
     assert hash(some_origin()) == hash(some_origin()) != hash(some_origin(2))
 
 
@@ -322,7 +342,7 @@ def test_reprs_are_short():
         "Gaussians(means=float32[7, 3], quats=float32[7, 4], log_scales=float32[7, 2]"
     )
     assert repr(camera) == "Camera(viewmat=float32[4, 4], K=float32[3, 3], width=43, height=30)"
-    assert "float32[2, 1, 1, 4]" in repr(model.params) and "int32[7]" in repr(model.layout)
+    assert "float32[2, 1, 1, 4]" in repr(model.textures) and "int32[7]" in repr(model.textures)
     assert repr(model) == (
-        "Model(7 Gaussians, SH degree 3, Textured, 2.28 kB, Origin(3 cameras, 1 of them for testing))"
+        "Model(7 Gaussians, SH degree 3, Gaussians with texture, 2.28 kB, Origin(3 cameras, 1 of them for testing))"
     )

@@ -8,72 +8,73 @@ import numpy as np
 import pytest
 from scenes_random import as_gaussians, draw_scene
 
-from a2tg_jax import adam_init, adam_update, concatenate, value_and_grad
-from a2tg_jax.appearance import Banded, Billboards, MovableKernels, Plain, Shaped, Textured
-from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax import adam_init, adam_update, combine, concatenate, partition, value_and_grad
+from a2tg_jax.appearance import (
+    Appearance,
+    Bands,
+    Billboards,
+    Exponents,
+    MovableKernels,
+    Texture,
+    allocate_appearance,
+)
+from a2tg_jax.appearance.bands import bands_of_dense
+from a2tg_jax.appearance.base import check_appearance
+from a2tg_jax.core.table import Table
 from a2tg_jax.events import gather_moments, gather_rows
 from a2tg_jax.model import Model
-from a2tg_jax.texture import texture_arrays, textures_from_arrays
+from a2tg_jax.texture import textures_from_arrays
 
 NUM = 12
 SIZES = [(1, 1), (4, 2), (2, 2)]
 
 
-def moved(params):
-    rng = np.random.default_rng(0)
-    return jax.tree.map(lambda leaf: leaf + rng.normal(size=leaf.shape).astype(np.float32), params)
+def moved(tree):
+    """The tree with other floats."""
+    rng, (floats, rest) = np.random.default_rng(0), partition(tree)
+    return combine(jax.tree.map(lambda leaf: leaf + rng.normal(size=leaf.shape).astype(np.float32), floats), rest)
 
 
 def some_model(name: str, seed: int = 2, num: int = NUM) -> Model:
     """A model of `num` Gaussians, behind which two rows do not exist."""
-    gaussians, appearance = as_gaussians(draw_scene(seed, num=num + 2), "float32"), APPEARANCES[name]
-    if appearance.has_degrees:
+    gaussians, template = as_gaussians(draw_scene(seed, num=num + 2), "float32"), APPEARANCES[name]
+    if template.bands is not None:
         gaussians = dataclasses.replace(gaussians, sh=gaussians.sh[:, :1])
-    params, layout = appearance.allocate(jax.random.key(seed), gaussians)
-    model = Model(gaussians, moved(params), layout, jnp.int32(num), appearance=appearance)
+    appearance = moved(allocate_appearance(template, jax.random.key(seed), gaussians))
     rng = np.random.default_rng(seed)
-    if model.textures and not isinstance(appearance.base, Billboards):
+    if template.texture is not None:
         sizes = [SIZES[(index + seed) % 3] for index in range(num + 2)]
-        model = model.with_textures(
-            *textures_from_arrays([rng.uniform(size=(*size, 4)).astype(np.float32) for size in sizes])
-        )
-    if model.bands:
-        dense = rng.normal(size=(num + 2, 16, 3)).astype(np.float32)
-        model = model.with_bands(*split_sh(dense, rng.integers(0, 4, num + 2), 0))
-    return model
+        arrays = [rng.uniform(size=(*size, 4)).astype(np.float32) for size in sizes]
+        appearance = appearance.with_textures(textures_from_arrays(arrays))
+    if template.bands is not None:
+        dense = rng.normal(size=(num + 2, 15, 3)).astype(np.float32)
+        appearance = appearance.with_coefficients(bands_of_dense(dense, rng.integers(0, 4, num + 2), 0))
+    return Model(gaussians, appearance, jnp.int32(num))
 
 
 APPEARANCES = {
-    "plain": Plain(),
-    "textured": Textured(start=(2, 3)),
+    "plain": Appearance(),
+    "texture": Appearance(texture=Texture(start=(2, 3))),
     "movable kernels": MovableKernels(),
     "billboards": Billboards(side=3),
-    "banded": Banded(Textured(start=(1, 2))),
-    "shaped": Shaped(),
-    "banded, shaped": Banded(Shaped(Textured(start=(1, 2)))),
+    "bands": Appearance(bands=Bands(), texture=Texture(start=(1, 2))),
+    "exponents": Appearance(exponents=Exponents()),
+    "all parts": Appearance(bands=Bands(), exponents=Exponents(), texture=Texture(start=(1, 2))),
 }
 
 
 def rows_of(model: Model) -> list[np.ndarray]:
     """All floats of each Gaussian that exists, as flat arrays."""
     model = model.live
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(model.gaussians)]
-    pieces = [[leaf[row].ravel() for leaf in leaves] for row in range(model.num)]
-    if model.textures:
-        for piece, texture in zip(pieces, texture_arrays(*model.textures), strict=True):
-            piece.append(texture.ravel())
-    elif jax.tree.leaves(model.params):
-        for leaf in jax.tree.leaves(model.params):
-            for piece, row in zip(pieces, np.asarray(leaf), strict=True):
-                piece.append(row.ravel())
-    for piece, row in zip(pieces, model.sh, strict=True):
-        piece.append(np.pad(row, ((0, 16 - len(row)), (0, 0))).ravel())
-    return [np.concatenate(piece) for piece in pieces]
+    leaves = jax.tree.leaves((model.gaussians, model.appearance), is_leaf=lambda leaf: isinstance(leaf, Table))
+    columns = [leaf.blocks() if isinstance(leaf, Table) else np.asarray(leaf) for leaf in leaves]
+    columns.append(np.pad(model.sh, ((0, 0), (0, 16 - model.sh.shape[1]), (0, 0))))
+    return [np.concatenate([np.ravel(column[row]) for column in columns]) for row in range(model.num)]
 
 
 def assert_rows(found: Model, wanted: list[np.ndarray]) -> None:
     assert found.num_live is None and found.num == len(wanted)
-    found.appearance.check(found.params, found.layout, found.gaussians)
+    check_appearance(found.appearance, found.gaussians)
     for a, b in zip(rows_of(found), wanted, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -120,42 +121,43 @@ def test_mistakes_are_named():
         _ = model[[0.5]]
     with pytest.raises(ValueError, match="concatenate needs at least one model"):
         concatenate([])
-    with pytest.raises(ValueError, match="one appearance; got Plain and MovableKernels"):
+    with pytest.raises(ValueError, match="one appearance; got plain Gaussians and MovableKernels"):
         concatenate([model, some_model("movable kernels")])
 
 
 def test_a_loss_of_a_whole_model_is_differentiated():
-    model = some_model("textured")
+    model = some_model("texture")
+    floats, rest = partition(model)
 
     def loss(model, weight):
-        return weight * sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(model.parameters))
+        return weight * sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(partition(model)[0]))
 
     with pytest.raises(TypeError, match="int32"):
         jax.grad(loss)(model, 2.0)
     value, gradient = jax.jit(value_and_grad(loss))(model, 2.0)
     loss = jax.jit(loss)
     np.testing.assert_allclose(value, loss(model, 2.0), rtol=1e-5)
-    expected = jax.tree.map(lambda x: 2 * np.cos(x), model.parameters)
+    expected = jax.tree.map(lambda x: 2 * np.cos(x), floats)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), gradient, expected)
-    updated, _ = adam_update(model.parameters, gradient, adam_init(model.parameters), 1e-2)
-    assert loss(model.with_parameters(updated), 2.0) < value
+    updated, _ = adam_update(floats, gradient, adam_init(floats), 1e-2)
+    assert loss(combine(updated, rest), 2.0) < value
 
 
 def test_a_loss_may_return_more():
     model = some_model("plain")
     found, gradient = value_and_grad(lambda m: (jnp.sum(m.gaussians.means**2), m.num_live), has_aux=True)(model)
-    assert found[1] == NUM and gradient.params == ()
+    assert found[1] == NUM and not jax.tree.leaves(gradient.appearance)
     np.testing.assert_allclose(gradient.gaussians.means, 2 * model.gaussians.means)
 
 
-@pytest.mark.parametrize("name", ["plain", "shaped"])
+@pytest.mark.parametrize("name", ["plain", "exponents"])
 @pytest.mark.parametrize("rows", [[0, 5, 3], [1, 1, *range(NUM + 2)]])
 def test_an_event_may_leave_fewer_rows_or_more(name, rows):
     model = some_model(name)
-    moments = adam_init((model.gaussians, model.params))
+    moments = adam_init(partition(model)[0])
     moments = dataclasses.replace(moments, mu=moved(moments.mu))
-    found, found_moments = gather_rows(model, np.asarray(rows)), gather_moments(model, moments, np.asarray(rows))
+    found, found_moments = gather_rows(model, np.asarray(rows)), gather_moments(moments, np.asarray(rows))
     assert found.gaussians.num == len(rows)
-    for before, after in ((model.gaussians, found.gaussians), (model.params, found.params)):
+    for before, after in ((model.gaussians, found.gaussians), (model.appearance, found.appearance)):
         jax.tree.map(lambda b, a: np.testing.assert_array_equal(np.asarray(b)[rows], a), before, after)
     jax.tree.map(lambda b, a: np.testing.assert_array_equal(np.asarray(b)[rows], a), moments.mu, found_moments.mu)

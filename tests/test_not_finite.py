@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
-from a2tg_jax import RenderSettings, render_image
+from a2tg_jax import Appearance, RenderSettings, render_image
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.render import rule_of
 
 COMPOSITORS = ("native", "xla", "cuda")
 SCENE = draw_scene(4, num=16, width=19, height=13)
@@ -52,8 +51,8 @@ def test_what_shows_nowhere_may_hold_anything(row, compositor):
     found = render_image(with_number(hidden, "sh", row, np.nan), camera, settings=settings).color
     np.testing.assert_array_equal(found, expected)
 
-    live, rule = 8, rule_of(gaussians, None, None, settings)
-    show = lambda gaussians: render_traced(gaussians, camera, rule, jnp.zeros(3), settings, num_live=live)[0].color  # noqa: E731
+    live, plain = 8, Appearance()
+    show = lambda gaussians: render_traced(gaussians, camera, plain, jnp.zeros(3), settings, num_live=live)[0].color  # noqa: E731
     np.testing.assert_array_equal(show(with_number(gaussians, "means", live + row, np.nan)), show(gaussians))
 
 
@@ -61,9 +60,9 @@ def test_what_shows_nowhere_may_hold_anything(row, compositor):
 @pytest.mark.parametrize("column", [0, 3])
 def test_a_texel_that_is_not_a_number_is_seen(column, compositor):
     gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
-    textures, layout = as_textures(SCENE, "float32")
+    textures = as_textures(SCENE, "float32")
     settings = RenderSettings(compositor=compositor, capacity=1024)
     broken = dataclasses.replace(textures, buckets=tuple(b.at[..., column].set(jnp.nan) for b in textures.buckets))
-    shown = render_image(gaussians, camera, textures, layout, settings=settings).alpha > 0.05
-    color = render_image(gaussians, camera, broken, layout, settings=settings).color
+    shown = render_image(gaussians, camera, textures, settings=settings).alpha > 0.05
+    color = render_image(gaussians, camera, broken, settings=settings).color
     assert shown.any() and jnp.isnan(color[..., 0])[shown].all()

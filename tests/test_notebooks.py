@@ -59,8 +59,8 @@ def _draws_nothing(monkeypatch, tmp_path):
 def test_training_by_hand_learns_and_grows_textures(monkeypatch):
     names = run("training_by_hand", monkeypatch)
     assert names["losses_after"][-4:].mean() < 0.9 * names["losses_after"][:4].mean()
-    assert names["before"].layout.resolutions == ((1, 1),)
-    assert names["after"].layout.sizes.max() == 2
+    assert names["before"].textures.bucket_sizes == ((1, 1),)
+    assert names["after"].textures.sizes.max() == 2
     disturbed = a2tg.photometric_loss(names["after"].render(names["disturbed"]).color, names["photograph"])
     assert names["value"] < 0.95 * disturbed, "the camera descends"
 
@@ -68,7 +68,7 @@ def test_training_by_hand_learns_and_grows_textures(monkeypatch):
 def test_a_system_of_your_own_trains_beside_others_and_is_loaded_again(monkeypatch):
     names = run("a_system_of_your_own", monkeypatch)
     models = names["models"]
-    assert abs(models["edges"].params[:, 3:]).max() > 1e-3
+    assert abs(models["edges"].appearance.edges[:, 3:]).max() > 1e-3
     assert max(model.num_bytes for model in models.values()) <= names["budget"]
     assert names["model"].num == models["edges"].num and len(names["frames"]) == 4
 

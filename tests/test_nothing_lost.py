@@ -21,28 +21,29 @@ import pytest
 
 from a2tg_jax import Change, StepEvent
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli.arguments import in_flags
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host import atomic, signals
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import this_machine
+from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results import preflight as checks
 from a2tg_jax.results import run_evaluation, run_training, whole_run
 from a2tg_jax.results.folder import RunFolder, create_run
-from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.lock import claimed, opened
 from a2tg_jax.results.preflight import check_apart
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
-from a2tg_jax.results.replacement import OLD, old_run, set_aside, undo_unfinished
+from a2tg_jax.results.run_replacement import OLD, old_run, set_aside, undo_unfinished
 from a2tg_jax.results.run_training import MOST_RESTORED, train_run
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
-from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.training import DivergedError, find_system, load_checkpoint, save_checkpoint
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.loop import StageRun
 
-SIZES = {"initial_gaussians": 60, "densify": McmcConfig(cap=60)}
+SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60)}
 SOURCE = SceneSource("synthetic", downscale=6)
 RECORD = RunRecord(SOURCE, "gaussians-2d-mcmc", Gaussians2dMcmc(stage1_iterations=20, **SIZES))
 NAME = "gaussians-2d-mcmc-gaussians"
@@ -587,7 +588,8 @@ def test_a_lack_of_memory_in_training_tells_how_to_go_on(told, tmp_path, monkeyp
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     how = whole_run.how_to_go_on(RunFolder(tmp_path / "run"))
-    assert error == f"a2tg: error: {told}{whole_run.LESS_MEMORY}; {how}"
+    advice = in_flags(whole_run.LESS_MEMORY, ["memory_budget", "batch_size"])
+    assert error == f"a2tg: error: {told}{advice}; {how}"
 
 
 @pytest.mark.parametrize(("name", "advice"), [("render", "lower --size or --supersample"), ("info", "close other")])

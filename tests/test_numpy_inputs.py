@@ -23,7 +23,7 @@ class Tensor:
 
 SCENE = draw_scene(1, num=20)
 GAUSSIANS, CAMERA = (jax.tree.map(np.asarray, make(SCENE, "float32")) for make in (as_gaussians, as_camera))
-TEXTURES, LAYOUT = jax.tree.map(np.asarray, as_textures(SCENE, "float32"))
+TEXTURES = jax.tree.map(np.asarray, as_textures(SCENE, "float32"))
 IMAGE = np.random.default_rng(0).uniform(size=(30, 43, 3)).astype(np.float32)
 KINDS = {
     "list": lambda x: x.tolist(),
@@ -36,8 +36,8 @@ KINDS = {
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 
-def image(gaussians=GAUSSIANS, camera=CAMERA, textures=TEXTURES, layout=LAYOUT, **options):
-    return np.asarray(a2tg.render_image(gaussians, camera, textures, layout, **options).color)
+def image(gaussians=GAUSSIANS, camera=CAMERA, textures=TEXTURES, **options):
+    return np.asarray(a2tg.render_image(gaussians, camera, textures, **options).color)
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +54,11 @@ def test_gaussians(kind, field, wanted):
 
 
 @every_kind
-def test_cameras_textures_and_layouts(kind, wanted):
+def test_cameras_and_textures(kind, wanted):
     camera = a2tg.Camera(kind(CAMERA.viewmat), kind(CAMERA.K), CAMERA.width, CAMERA.height)
-    textures = a2tg.Textures([kind(bucket) for bucket in TEXTURES.buckets])
-    layout = a2tg.AtlasLayout(kind(LAYOUT.bucket), kind(LAYOUT.row), LAYOUT.resolutions)
-    np.testing.assert_array_equal(image(camera=camera, textures=textures, layout=layout), wanted)
+    buckets = [kind(bucket) for bucket in TEXTURES.buckets]
+    textures = a2tg.Textures(buckets, kind(TEXTURES.bucket), kind(TEXTURES.row), TEXTURES.bucket_sizes)
+    np.testing.assert_array_equal(image(camera=camera, textures=textures), wanted)
 
 
 @every_kind
@@ -89,8 +89,9 @@ def masked(x):
     [
         ("gaussians.sh has masked entries: ", lambda: dataclasses.replace(GAUSSIANS, sh=masked(GAUSSIANS.sh))),
         ("camera.K has masked entries: ", lambda: dataclasses.replace(CAMERA, K=masked(CAMERA.K))),
-        ("layout.row has masked entries: ", lambda: dataclasses.replace(LAYOUT, row=masked(LAYOUT.row))),
-        ("textures.buckets[1] has masked", lambda: a2tg.Textures((TEXTURES.buckets[0], masked(TEXTURES.buckets[1])))),
+        ("textures.row has masked entries: ", lambda: dataclasses.replace(TEXTURES, row=masked(TEXTURES.row))),
+        ("textures.buckets[1] has masked", lambda: dataclasses.replace(
+            TEXTURES, buckets=(TEXTURES.buckets[0], masked(TEXTURES.buckets[1])))),
         ("image has masked entries: ", lambda: a2tg.photometric_loss(masked(IMAGE), IMAGE)),
         ("target has masked entries: ", lambda: a2tg.psnr(IMAGE, masked(IMAGE))),
         ("points has masked entries: ", lambda: a2tg.init_from_points(masked(IMAGE[0]), IMAGE[0])),
@@ -118,9 +119,9 @@ def test_pytrees_may_hold_anything_else():
     """What JAX and its users put in place of arrays is left as it is."""
     spec = jax.sharding.PartitionSpec("rows")
     for leaf in (None, 0, 1.5, "name", (5, 3), spec, [spec], jax.ShapeDtypeStruct((2,), jnp.float32), object()):
-        filled = jax.tree.map(lambda _, leaf=leaf: leaf, (GAUSSIANS, CAMERA, TEXTURES, LAYOUT))
+        filled = jax.tree.map(lambda _, leaf=leaf: leaf, (GAUSSIANS, CAMERA, TEXTURES))
         assert filled[0].means is leaf and filled[1].K is leaf and filled[2].buckets[0] is leaf
-        assert filled[3].row is leaf
+        assert filled[2].row is leaf
     shapes = jax.tree.map(jnp.shape, GAUSSIANS)
     assert shapes.means == (20, 3)
     traced = jax.jit(lambda x: dataclasses.replace(GAUSSIANS, means=[[x, x]]).means[0][0])(2.0)

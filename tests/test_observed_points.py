@@ -14,6 +14,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.observations import stacked_points
 from a2tg_jax.data.synthetic import exact_depths
+from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.training.batches import BatchOrder, Extras, PhotoStore, stack_views, view_bytes
 from a2tg_jax.training.depth_prior import PointDepths, points_loss
 
@@ -21,7 +22,7 @@ RNG = np.random.default_rng(0)
 
 
 def small(**options):
-    options = {"stage1_iterations": 4, "initial_gaussians": None, "densify": {"is_enabled": False}, **options}
+    options = {"stage1_iterations": 4, "initial_gaussians": None, "densify": {"cap": 0}, **options}
     return a2tg.find_system("gaussians-2d-mcmc").preset("smoke", **options)
 
 
@@ -123,14 +124,15 @@ class TestLoss:
     def test_right_depth_costs_nothing_and_no_points_neither(self):
         depth = jnp.asarray(self.depth, jnp.float32)
         at = np.arange(30, dtype=np.int32)
-        target = a2tg.Target(None, None, None, points=a2tg.ObservedPoints(at, depth.reshape(-1)))
-        output = a2tg.render.RenderOutput(None, jnp.ones_like(depth), depth, None, None, None)
+        target = a2tg.Target(None, None, None, observed=a2tg.ObservedPoints(at, depth.reshape(-1)))
+        output = a2tg.RenderOutput(None, jnp.ones_like(depth), None, Geometry(depth, None, None))
         assert float(PointDepths(1.0)(None, target, output)) < 1e-7
         for length in (0, 4):
             empty = stacked_points([None], (5, 6), length)
-            nothing = a2tg.Target(None, None, None, points=a2tg.ObservedPoints(*(x[0] for x in empty)))
+            nothing = a2tg.Target(None, None, None, observed=a2tg.ObservedPoints(*(x[0] for x in empty)))
             assert PointDepths(1.0)(None, nothing, output) == 0
-        assert PointDepths(1.0)(None, target, output._replace(depth=2 * depth)) > 0.1
+        wrong = dataclasses.replace(output, geometry=Geometry(2 * depth, None, None))
+        assert PointDepths(1.0)(None, target, wrong) > 0.1
 
 
 def test_views_of_the_built_in_scene_see_points_on_its_surfaces():
@@ -185,7 +187,7 @@ def test_training_moves_depths_to_the_points(scene):
 
 def test_scenes_without_points_are_refused(scene):
     views = tuple(dataclasses.replace(view, points=None) for view in scene.train)
-    with pytest.raises(ValueError, match=r"--loss.points-weight, or a term of your own, wants points .* COLMAP"):
+    with pytest.raises(ValueError, match=r"loss.points_weight, or a custom term, needs points .* COLMAP"):
         a2tg.fit(dataclasses.replace(scene, train=views), small(loss={"points_weight": 0.1}), progress=False)
 
 

@@ -1,111 +1,88 @@
-"""Names in messages: an event names its field, a system the option that sets it, and every option named exists."""
+"""Events are the option groups: the path of a field is the option, and messages name it."""
 
 import dataclasses
 import re
-from typing import Any
 
 import pytest
-from toy_system import Toy
+from toy_system import Shrink, Toy
 
 import a2tg_jax as a2tg
-from a2tg_jax.events import Event, FieldError, HostEvent, StepEvent, iterations_at
+from a2tg_jax.events import Event, iterations_at
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import FillingMcmc
-from a2tg_jax.training.registry import SYSTEMS, with_changes
+from a2tg_jax.training.registry import SYSTEMS, find_system, with_changes
 
 WITH_AND_WITHOUT = pytest.mark.parametrize("budget", [None, "9MB"])
 ALL = pytest.mark.parametrize("name", SYSTEMS)
 
 
-def system_of(name: str, budget: str | None) -> a2tg.System:
-    return dataclasses.replace(a2tg.find_system(name), memory_budget=budget)
-
-
-def events_of(system: a2tg.System) -> list[tuple[tuple[int, int], Event]]:
-    """All events of a system with their places: stage, event."""
-    stages = enumerate(system.stages())
-    return [((at, index), event) for at, stage in stages for index, event in enumerate(stage.events)]
-
-
-def changed(system: a2tg.System, option: str, value: Any) -> a2tg.System:
-    change = value
-    for part in reversed(option.split(".")):
-        change = {part: change}
-    return with_changes(system, change, "test")
-
-
-def other(field: str, value: Any) -> Any:
-    """Another valid value of an option that sets a field of an event."""
-    if isinstance(value, bool):
-        return not value
-    if field == "at":
-        return [0.01, 0.02]
-    if isinstance(value, int):
-        return value - 1
-    return value / 2 if value else 0.5
-
-
-def options_of(system: a2tg.System) -> list[tuple[tuple[int, int], str, str]]:
-    """Place, field and option of all fields of events of which the system knows the option."""
-    return [
-        (place, field.name, option)
-        for place, event in events_of(system)
-        for field in dataclasses.fields(event)
-        if (option := system.option_of(event, field.name)) is not None and getattr(event, "keep", None) is None
-    ]
+@ALL
+@WITH_AND_WITHOUT
+def test_events_of_stages_have_paths_of_options(name, budget):
+    system = dataclasses.replace(find_system(name), memory_budget=budget)
+    options = flatten_config(system)
+    for event in (event for stage in system.stages() for event in stage.events if dataclasses.fields(event)):
+        path = system.path_of(event)
+        assert {f"{path}.{field.name}" for field in dataclasses.fields(event)} <= set(options)
+    assert set(system.limits()) <= set(options)
+    assert system.caps() == ("densify.cap",)
 
 
 @ALL
-@WITH_AND_WITHOUT
-def test_the_option_named_for_a_field_sets_the_field(name, budget):
-    system = system_of(name, budget)
-    found = options_of(system)
-    values = flatten_config(system)
-    assert found and {option for _, _, option in found} <= set(values)
-    for place, field, option in found:
-        if isinstance(values[option], str):
-            continue
-        before, after = (
-            dict(events_of(each))[place] for each in (system, changed(system, option, other(field, values[option])))
-        )
-        assert getattr(before, field) != getattr(after, field), f"{option} does not set {field} of {before}"
+def test_messages_of_events_name_their_fields(name):
+    for stage in find_system(name).stages():
+        for event in stage.events:
+            names = {field.name for field in dataclasses.fields(event)}
+            assert set(re.findall(r"[a-z]+_[a-z_]+", getattr(event, "impossible", ""))) <= names
+            assert not event.limited_by or event.limited_by in names
 
 
 @ALL
-@WITH_AND_WITHOUT
-def test_messages_of_events_name_options_of_the_system(name, budget):
-    system = system_of(name, budget)
-    events = [event for _, event in events_of(system) if isinstance(event, StepEvent)]
-    told = [system.told(event, message) for event in events for message in (event.impossible, event.refused)]
-    named = re.findall(r"(?:raise|lower) (\S+)", " ".join(told))
-    assert set(named) <= set(flatten_config(system))
-    assert named or not any(event.refused for event in events)
+def test_every_group_checks_its_own_numbers(name):
+    """No number of an event may be negative."""
+    system = find_system(name)
+    for path, value in flatten_config(system).items():
+        group, _, field = path.partition(".")
+        if isinstance(getattr(system, group), Event) and type(value) in (int, float):
+            with pytest.raises(ValueError, match=rf"^{re.escape(path)} must "):
+                with_changes(system, {group: {field: type(value)(-1)}}, "test").check()
 
 
 @pytest.mark.parametrize(
-    "name, option",
-    [("a2tg", "texture.upscale_at"), ("bytewise", "texture.at"), ("bytewise", "view_dependence.at")],
+    "name, option", [("a2tg", "texture.at"), ("bytewise", "details.at"), ("bytewise", "view_dependence.at")]
 )
-def test_the_same_mistake_is_told_by_the_option_of_each_system(name, option):
-    system = changed(a2tg.find_system(name), option, [0.5, 0.2])
+def test_the_same_mistake_is_named_by_its_path(name, option):
+    group, _, field = option.partition(".")
+    system = with_changes(find_system(name), {group: {field: [0.5, 0.2]}}, "test")
     message = rf"^{re.escape(option)} must be ascending fractions between 0 and 1; got \(0.5, 0.2\)$"
     with pytest.raises(ValueError, match=message):
         system.check()
-    with pytest.raises(ValueError, match=message), system.naming_options():
-        for _, event in events_of(changed(system, option, [0.5])):
-            if isinstance(event, HostEvent) and system.option_of(event, "at") == option:
-                dataclasses.replace(event, at=(0.5, 0.2)).iterations(10)
 
 
 def test_without_a_system_an_event_names_its_field():
-    with pytest.raises(FieldError, match=r"^cap has room for 50 Gaussians, but in 9 iterations .* from 20$"):
+    with pytest.raises(ValueError, match=r"^cap has room for 50 Gaussians, but in 9 iterations .* from 20$"):
         FillingMcmc(50).num_rows(20, 9)
-    with pytest.raises(FieldError, match=r"^at must be ascending"):
-        a2tg.Upscale(at=(0.5, 0.2)).iterations(10)
-    with pytest.raises(ValueError, match=r"^prune\.at must be ascending"):
-        iterations_at((0.5, 0.2), 10, "prune.at")
+    with pytest.raises(ValueError, match=r"^cap must be at least 2; got 1$"):
+        a2tg.Mcmc(cap=1).check_options()
+    with pytest.raises(ValueError, match=r"^at must be ascending"):
+        iterations_at((0.5, 0.2), 10)
 
 
-def test_a_system_that_tells_no_option_names_field_and_event():
-    assert Toy().told(a2tg.Mcmc(5), "raise {cap}") == "raise cap of Mcmc"
-    assert Toy().more_growth() == "stage1_iterations or initial_gaussians"
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Own(Toy):
+    """A system with an event as an option group, and one without."""
+
+    densify: a2tg.Mcmc = a2tg.Mcmc(cap=60)
+
+    def stages(self):
+        (stage,) = super().stages()
+        return (dataclasses.replace(stage, events=(self.densify, *stage.events)),)
+
+
+def test_a_custom_system_gets_paths_for_free():
+    system = Own()
+    assert system.path_of(Shrink()) == "Shrink" and system.limits() == ("densify.cap",)
+    assert Toy().limits() == ("initial_gaussians",)
+    assert system.more_growth() == "stage1_iterations or initial_gaussians"
+    with pytest.raises(ValueError, match=r"^densify\.cap must be at least 2; got 1$"):
+        Own(densify=a2tg.Mcmc(cap=1)).check()

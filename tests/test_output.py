@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import MovableKernels
+from a2tg_jax.appearance import MovableKernels, allocate_appearance
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli import mesh
-from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.gaussians import init_from_points
+from a2tg_jax.host.text import in_bytes
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.forecast import RunForecast
 from a2tg_jax.results.info import describe_run
-from a2tg_jax.results.output import check_export, check_new, check_output
+from a2tg_jax.results.output_checks import check_export, check_new, check_output
 from a2tg_jax.results.preflight import warn_of_small_budget
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.training.cost import Bytes
@@ -132,13 +132,13 @@ def test_export_does_not_replace_what_it_reads(tmp_path, capsys, words):
 
 
 def test_export_tells_what_ply_does_not_keep(tmp_path, capsys):
-    params, layout = MovableKernels().allocate(jax.random.key(0), a_model().gaussians)
-    model = a2tg.Model(a_model().gaussians, params, layout, appearance=MovableKernels())
+    appearance = allocate_appearance(MovableKernels(), jax.random.key(0), a_model().gaussians)
+    model = a2tg.Model(a_model().gaussians, appearance)
     for name, given in (("kernels", model), ("plain", a_model())):
         a2tg.save_model(tmp_path / f"{name}.npz", given)
         out = tmp_path / f"{name}.compressed.ply"
         assert cli.main(["export", str(tmp_path / f"{name}.npz"), "--ply", str(out)]) == 0
-        told = "not kept by this format: what MovableKernels shows beside Gaussians\n" * (given is model)
+        told = "not kept by this format: what MovableKernels shows besides Gaussians\n" * (given is model)
         assert capsys.readouterr().out == f"file: {out}: 3 Gaussians\n{told}"
 
 

@@ -21,7 +21,7 @@ WIDTH, FACE = 640, 224
 def camera(rotation):
     """World to camera of a view with a rotation from the panorama's frame."""
     viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation @ synthetic.look_at(CENTER)[:3, :3]
+    viewmat[:3, :3] = rotation @ synthetic.viewmat_to_target(CENTER)[:3, :3]
     viewmat[:3, 3] = -viewmat[:3, :3] @ CENTER
     return viewmat
 

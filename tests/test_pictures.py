@@ -13,13 +13,13 @@ import pytest
 from PIL import Image
 from small_values import assert_same
 
-from a2tg_jax import Gaussians2dMcmc, McmcConfig, fit, load_scene, synthetic_scene
+from a2tg_jax import Gaussians2dMcmc, Mcmc, fit, load_scene, synthetic_scene
 from a2tg_jax.data import photo_store as pictures
 from a2tg_jax.data.photo_store import Picture, Shelf
 from a2tg_jax.training import batches, loop
 from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore, stack_views
 
-SYSTEM = Gaussians2dMcmc(stage1_iterations=12, initial_gaussians=60, densify=McmcConfig(cap=70))
+SYSTEM = Gaussians2dMcmc(stage1_iterations=12, initial_gaussians=60, densify=Mcmc(cap=70))
 KINDS = {
     "as in their files": {},
     "smaller": {"downscale": 2},

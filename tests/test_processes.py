@@ -17,14 +17,13 @@ from on_processes import SHORT, ended, free_port, pair, started, survivor_of, tr
 import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.train import train_defaults
-from a2tg_jax.host import liveness
-from a2tg_jax.host.liveness import Liveness, accept, connect, listen
 from a2tg_jax.host.machine import Devices
-from a2tg_jax.host.processes import LOST, is_of_collectives
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.rasterize import placement
-from a2tg_jax.results import together
+from a2tg_jax.parallel import liveness, rows
+from a2tg_jax.parallel.liveness import Liveness, accept, connect, listen
+from a2tg_jax.parallel.processes import LOST, is_of_collectives
+from a2tg_jax.results import several_processes
 from a2tg_jax.results.folder import RunFolder, create_run, resuming_command
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
@@ -86,15 +85,15 @@ def test_a_process_that_does_not_come_is_told():
     """And before, that there is no cluster."""
     code = f"""
 import os, sys
-from a2tg_jax.host import processes as p
+from a2tg_jax.parallel import processes as p
 os.environ["A2TG_DEBUG"] = "1"
 try:
-    p.joined(p.Place("auto", None, None, 60.0)).__enter__()
+    p.joined(p.ProcessPlace("auto", None, None, 60.0)).__enter__()
 except ValueError as error:
     print(error, file=sys.stderr)
 del os.environ["A2TG_DEBUG"]
 p.JOIN_SECONDS = 1
-p.joined(p.Place("127.0.0.1:{free_port()}", 2, 0, 60.0)).__enter__()
+p.joined(p.ProcessPlace("127.0.0.1:{free_port()}", 2, 0, 60.0)).__enter__()
 """
     alone = started(["-c", code])
     told = alone.communicate(timeout=120)[1]
@@ -191,7 +190,9 @@ def test_digests_differ_where_training_would():
     view, *others = scene.train
 
     def digests(record=record, session=session, view=view, **changes):
-        return together.digests_of(record, dataclasses.replace(scene, train=(view, *others), **changes), session)
+        return several_processes.digests_of(
+            record, dataclasses.replace(scene, train=(view, *others), **changes), session
+        )
 
     def changed(**values):
         return dataclasses.replace(view, **values)
@@ -208,7 +209,7 @@ def test_digests_differ_where_training_would():
     scenes += [digests(points=scene.points + np.float32(1e-6)), digests(colors=scene.colors * 0.5), digests(scale=9.0)]
     assert all(found[:2] == digests()[:2] and found[2] != digests()[2] for found in scenes)
     mesh = SimpleNamespace(devices=np.array([SimpleNamespace(process_index=0, id=index) for index in range(2)]))
-    on_two = digests(session=SimpleNamespace(exchange=SimpleNamespace(mesh=mesh)))
+    on_two = digests(session=SimpleNamespace(mesh=mesh))
     other_seed = digests(dataclasses.replace(record, system=dataclasses.replace(system, seed=1)))
     differing = [[a != b for a, b in zip(found, digests(), strict=True)] for found in (other_seed, on_two)]
     assert differing == [[True, False, False], [False, True, False]]
@@ -226,10 +227,11 @@ def test_a_process_that_follows_may_have_the_scene_elsewhere(tmp_path):
 
 def test_numbers_of_the_first_process_keep_their_bits(monkeypatch):
     own = (np.array([1 / 3, 2.0]), np.arange(4)[::2], np.ones((2, 2), np.float32))
-    assert placement.of_first(None, own) is own
+    assert rows.of_first(None, own) is own
     told = []
-    monkeypatch.setattr(placement.multihost_utils, "broadcast_one_to_all", lambda x: told.append(x.dtype) or x + 0)
-    found = placement.of_first(SimpleNamespace(is_of_processes=True), own)
+    monkeypatch.setattr(rows.multihost_utils, "broadcast_one_to_all", lambda x: told.append(x.dtype) or x + 0)
+    devices = np.array([SimpleNamespace(process_index=index) for index in range(2)])
+    found = rows.of_first(SimpleNamespace(devices=devices), own)
     jax.tree.map(np.testing.assert_array_equal, found, own)
     assert [x.dtype for x in found] == [x.dtype for x in own] and set(told) == {np.dtype(np.uint8)}
 

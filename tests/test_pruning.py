@@ -15,12 +15,13 @@ from test_view_dependence import banded
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
+from a2tg_jax.core.partition import partition
 from a2tg_jax.data import View
+from a2tg_jax.densify import pruning
 from a2tg_jax.densify.pruning import Prune, blending_weights
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Due
 from a2tg_jax.model import Model
-from a2tg_jax.systems.stage1 import PruneConfig
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model
 
@@ -60,16 +61,16 @@ def seen_from(camera, mask=None) -> View:
     return View("black.png", camera, np.zeros((camera.height, camera.width, 3), np.uint8), mask)
 
 
-def pruned(event: Prune, **told):
+def pruned(event: Prune):
     """What an event makes of a model with rows to spare, whose moments are the rows' numbers."""
     model, _, statistics = some_state()
     camera = a2tg.synthetic_scene(num_views=3, width=24, height=16).train[0].camera
-    moments = adam_init((model.gaussians, model.params))
+    moments = adam_init(partition(model)[0])
     numbers = jnp.arange(model.gaussians.num, dtype=jnp.float32)
     by_row = lambda x: jnp.broadcast_to(numbers.reshape(-1, *[1] * (x.ndim - 1)), x.shape)  # noqa: E731
     mu, nu = jax.tree.map(by_row, moments.mu), jax.tree.map(lambda x: 2 * by_row(x), moments.nu)
     moments = dataclasses.replace(moments, mu=mu, nu=nu)
-    change = event.apply(Due(views=[seen_from(camera)], **told), model, moments, ())
+    change = event.apply(Due(views=[seen_from(camera)]), model, moments, ())
     return model, camera, statistics, change
 
 
@@ -87,8 +88,8 @@ def test_those_that_show_least_go_and_all_of_a_gaussian_moves_along(share):
     for name in ("means", "sh", "logit_opacities"):
         old, new = (np.asarray(getattr(one.gaussians, name)) for one in (model, change.model))
         np.testing.assert_array_equal(new, old[change.rows])
-    np.testing.assert_array_equal(change.moments.mu[0].quats[:, 0], change.rows)
-    np.testing.assert_array_equal(change.moments.nu[0].means[:, 2], 2 * change.rows)
+    np.testing.assert_array_equal(change.moments.mu.gaussians.quats[:, 0], change.rows)
+    np.testing.assert_array_equal(change.moments.nu.gaussians.means[:, 2], 2 * change.rows)
     moved = SplitByGradient(400).gather(statistics, change.rows)
     np.testing.assert_array_equal(moved.gradients.total, np.asarray(statistics.gradients.total)[change.rows])
     np.testing.assert_array_equal(moved.pixels, np.asarray(statistics.pixels)[change.rows])
@@ -100,15 +101,16 @@ def test_so_many_are_kept_as_were_asked_for():
     assert change.model.num == model.num
 
 
-def test_the_weights_are_those_of_the_first_process():
-    change = pruned(Prune(keep=10), agreed=lambda weights: np.arange(len(weights)))[-1]
+def test_the_weights_are_those_of_the_first_process(monkeypatch):
+    monkeypatch.setattr(pruning, "of_first", lambda mesh, arrays: [np.arange(len(x)) for x in arrays])
+    change = pruned(Prune(keep=10))[-1]
     np.testing.assert_array_equal(np.diff(change.rows[:10]), 1)
 
 
 def test_degrees_stay_with_their_gaussians():
     model, _, camera = banded(0)
     with pytest.raises(ValueError, match="prune before"):
-        Prune().apply(Due(views=[seen_from(camera)]), model, adam_init((model.gaussians, model.params)), ())
+        Prune().apply(Due(views=[seen_from(camera)]), model, adam_init(partition(model)[0]), ())
 
 
 @pytest.mark.parametrize("at", [(0.5, 0.2), (0.0,), (0.5, 1.1)])
@@ -121,9 +123,9 @@ def test_times_must_exist(at):
 @pytest.mark.parametrize(
     "event, message",
     [
-        (Prune(share=1.0), r"^share must lie in \[0, 1\); got 1.0$"),
-        (Prune(share=-0.1), "^share"),
-        (Prune(keep=1), "^keep must be at least 2 Gaussians; got 1$"),
+        (Prune(share=1.0), r"Prune\.share must be at least 0 and below 1; got 1.0$"),
+        (Prune(share=-0.1), r"Prune\.share must be"),
+        (Prune(keep=1), r"Prune\.keep must be at least 2; got 1$"),
     ],
 )
 def test_impossible_numbers_are_refused_before_training(event, message):
@@ -135,9 +137,7 @@ def test_impossible_numbers_are_refused_before_training(event, message):
 def test_two_gaussians_are_left_at_least():
     """Pruning 0.993 of 300 Gaussians leaves 2. Pruning 0.997 would leave 1, so none is pruned."""
     assert pruned(Prune(share=0.993))[-1].model.num == 2
-    with pytest.warns(
-        UserWarning, match=r"^nothing is pruned, for 1 of 300 Gaussians .* needs 2: lower --prune\.share$"
-    ):
+    with pytest.warns(UserWarning, match=r"^nothing is pruned, for 1 of 300 Gaussians .* needs 2: lower the share$"):
         assert pruned(Prune(share=0.997))[-1].model.num == 300
 
 
@@ -157,7 +157,7 @@ SYSTEM = dataclasses.replace(
     stage2_iterations=10,
     memory_budget="30kB",
     initial_gaussians=None,
-    prune=PruneConfig(share=0.4),
+    prune=Prune(share=0.4, at=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)),
 )
 
 
@@ -180,7 +180,7 @@ def test_plain_systems_prune_and_grow_again(scene, name):
     system = a2tg.find_system(name).preset("smoke")
     system = dataclasses.replace(
         system, stage1_iterations=200, memory_budget="30kB", initial_gaussians=None, sh_degree=0,
-        prune=PruneConfig(share=0.3, at=(0.2, 0.3)),
+        prune=Prune(share=0.3, at=(0.2, 0.3)),
     )  # fmt: skip
     assert not any(isinstance(event, Prune) for event in a2tg.find_system(name).stages()[0].events)
     result = a2tg.fit(scene, system, progress=False)
@@ -190,8 +190,8 @@ def test_plain_systems_prune_and_grow_again(scene, name):
 
 def test_times_after_the_last_growth_are_refused():
     with pytest.raises(ValueError, match=r"prune.at must begin before the last growth, at 0.5 of the stage; got \(0.6"):
-        dataclasses.replace(a2tg.Gaussians2d(), prune=PruneConfig(share=0.3, at=(0.6, 0.7))).check()
-    dataclasses.replace(a2tg.Gaussians2dMcmc(), prune=PruneConfig(share=0.3, at=(0.6, 0.7))).check()
+        dataclasses.replace(a2tg.Gaussians2d(), prune=Prune(share=0.3, at=(0.6, 0.7))).check()
+    dataclasses.replace(a2tg.Gaussians2dMcmc(), prune=Prune(share=0.3, at=(0.6, 0.7))).check()
 
 
 def test_times_after_the_last_growth_of_a_short_stage_are_refused():

@@ -16,12 +16,11 @@ from small_values import some_gaussians, some_world
 from test_data_colmap import write_scene as write_colmap
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Banded, Shaped
-from a2tg_jax.appearance.sh_bands import split_sh
+from a2tg_jax.appearance import Bands, Exponents
 from a2tg_jax.host import signals
 from a2tg_jax.training import Checkpoint, History
-from a2tg_jax.training.option_groups import CorrectionConfig
-from a2tg_jax.training.resume import check_resume
+from a2tg_jax.training.checkpoint import check_resume
+from a2tg_jax.training.option_groups import Corrections
 
 CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(3), jnp.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]), 16, 12)
 
@@ -54,10 +53,10 @@ def test_a_capacity_is_a_positive_int(capacity):
 
 def test_plan_render_takes_a_model_as_evaluate_and_save_ply_do():
     model = some_model()
-    planned = a2tg.plan_render(model.gaussians, [CAMERA], rule=model.rule)
+    planned = a2tg.plan_render(model.gaussians, [CAMERA], appearance=model.appearance)
     assert a2tg.plan_render(model, [CAMERA]) == planned
     with pytest.raises(ValueError, match=re.escape("say plan_render(model, cameras)")):
-        a2tg.plan_render(model, [CAMERA], rule=model.rule)
+        a2tg.plan_render(model, [CAMERA], appearance=model.appearance)
 
 
 def test_a_moved_model_renders_the_same_with_settings_that_are_scaled_along():
@@ -148,8 +147,8 @@ class OneStage(a2tg.A2tg):
 
 
 MODEL, GAUSSIANS = a2tg.Model(some_gaussians()), some_gaussians()
-TEXTURES, LAYOUT = a2tg.allocate_textures(np.ones((7, 2), int))
-TEXTURED = a2tg.Model(GAUSSIANS, TEXTURES, LAYOUT, appearance=a2tg.Textured())
+TEXTURES = a2tg.allocate_textures(np.ones((7, 2), int))
+TEXTURED = a2tg.Model(GAUSSIANS, a2tg.Appearance(texture=a2tg.Texture(TEXTURES)))
 KINDS = {
     "scene must be a Scene; got str: say load_scene('/path')": lambda: a2tg.fit("/path", a2tg.A2tg()),
     "got a name: say find_system('a2tg')": lambda: a2tg.fit(scene(), "a2tg"),
@@ -169,7 +168,6 @@ KINDS = {
     "cameras must be a list of cameras, such as": lambda: a2tg.smooth_path(scene(), 5),
     "model must be a Model; got Gaussians: say Model(gaussians)": lambda: a2tg.save_model("g.npz", GAUSSIANS),
     "model must be a Model; got Gaussians": lambda: a2tg.save_compact("g.a2tgz", GAUSSIANS),
-    "parameters must be Parameters; got Gaussians: say": lambda: MODEL.with_parameters(GAUSSIANS),
     "model must be a Model; got ArrayImpl": lambda: a2tg.value_and_grad(jnp.sum)(jnp.ones(3)),
     "settings must be RenderSettings; got dict": lambda: MODEL.render(CAMERA, settings={"tile_size": 8}),
     "camera.viewmat must be an array; got tuple": lambda: MODEL.render(
@@ -179,7 +177,9 @@ KINDS = {
         dataclasses.replace(CAMERA, width=jnp.int32(80))
     ),
     "gaussians must be Gaussians; got Scen": lambda: a2tg.Model(scene()),
-    "model.params must be () for the appearance Plain": lambda: a2tg.Model(GAUSSIANS, TEXTURES, LAYOUT).render(CAMERA),
+    "appearance must be an Appearance; got Textures: such as Appearance(texture=Texture(textures))": lambda: a2tg.Model(
+        GAUSSIANS, TEXTURES
+    ),
     "x.ply: save_model writes *.npz files; call save_ply instead": lambda: a2tg.save_model("x.ply", MODEL),
     "save_compact writes *.a2tgz files; call save_model": lambda: a2tg.save_compact("x.npz", MODEL),
     "save_ply writes *.ply files; call save_compact": lambda: a2tg.save_ply("x.a2tgz", MODEL),
@@ -188,9 +188,7 @@ KINDS = {
     "load_ply reads *.ply files; call load_model": lambda: a2tg.load_ply("m.npz"),
     "similarity must be a Similarity; got ndarray": lambda: MODEL.transform(np.eye(4)),
     "similarity.rotation must be an array; got list: use np.asarray": lambda: moved(rotation=[[1, 0, 0]]),
-    "texture must be a TextureConfig; got dict: say TextureConfig(cap=8)": lambda: a2tg.A2tg(
-        texture={"cap": 8}
-    ).check(),
+    "texture must be an Upscale; got dict: say Upscale(cap=8)": lambda: a2tg.A2tg(texture={"cap": 8}).check(),
     "must be an array uint8 [H, W, 3], or [H, W, 4] with alpha; got float64 [12, 16, 3]: say np.rint(255": lambda: (
         a2tg.View("a.png", CAMERA, np.zeros((12, 16, 3)))
     ),
@@ -228,7 +226,7 @@ KINDS = {
         scene(), a2tg.A2tg(background="grey")
     ),
     "corrections.exposure_kind must be one of ": lambda: a2tg.A2tg(
-        corrections=CorrectionConfig(exposure_kind="foo")
+        corrections=Corrections(exposure_kind="foo")
     ).check(),
     "batch_size must be int; got '4'": lambda: a2tg.A2tg(batch_size="4").check(),
 }
@@ -257,14 +255,10 @@ VALUES = {
     "gaussians must be float32 or float64; got bfloat16": lambda: a2tg.Model(
         jax.tree.map(lambda x: x.astype(jnp.bfloat16), GAUSSIANS)
     ).render(CAMERA),
-    "Plain has no textures to replace: a model with textures is Model(gaussians, textures, layout, appearance="
-    "Textured())": lambda: MODEL.with_textures(TEXTURES, LAYOUT),
-    "Plain has no degrees per Gaussian to replace: say shown = Banded(appearance), params, ": lambda: MODEL.with_bands(
-        *SPLIT
+    "no textures to replace in plain Gaussians: build a model with Appearance(texture=Texture(textures))": lambda: (
+        MODEL.with_textures(TEXTURES)
     ),
-    "Plain has no shapes of kernels to replace": lambda: MODEL.appearance.with_shapes((), jnp.zeros(7)),
 }
-SPLIT = split_sh(np.asarray(GAUSSIANS.sh), np.full(GAUSSIANS.num, 3), 0)
 
 
 def started(**arguments) -> a2tg.Gaussians:
@@ -278,16 +272,23 @@ def test_an_impossible_value_is_named(message):
         VALUES[message]()
 
 
-@pytest.mark.parametrize("appearance", [a2tg.Textured(), Banded(), Shaped()])
-@pytest.mark.parametrize("needs", ["rule", "live", "num_bytes", "with_textures", "save_model", "evaluate"])
-def test_an_appearance_without_its_parameters_is_refused_where_they_are_needed(appearance, needs, tmp_path):
+TEMPLATES = {
+    "texture.texels": a2tg.Appearance(texture=a2tg.Texture()),
+    "bands.coefficients": a2tg.Appearance(bands=Bands()),
+    "exponents.shapes": a2tg.Appearance(exponents=Exponents()),
+}
+
+
+@pytest.mark.parametrize("field", TEMPLATES)
+@pytest.mark.parametrize("needs", ["render", "live", "num_bytes", "save_model", "evaluate"])
+def test_a_template_is_refused_where_its_arrays_are_needed(field, needs, tmp_path):
     calls = {
-        "with_textures": lambda model: model.with_textures(TEXTURES, LAYOUT),
+        "render": lambda model: model.render(CAMERA),
         "save_model": lambda model: a2tg.save_model(tmp_path / "m.npz", model),
         "evaluate": lambda model: a2tg.evaluate(scene().test, model),
     }
-    model = jax.tree.map(lambda x: x, a2tg.Model(GAUSSIANS, appearance=appearance))
-    message = f"model.params must be those of the appearance {type(appearance).__name__}; got (): say params, layout ="
+    model = jax.tree.map(lambda x: x, a2tg.Model(GAUSSIANS, TEMPLATES[field]))
+    message = f"model.appearance.{field} is None: this appearance is a template, without arrays; say Model(gaussians, "
     with pytest.raises(ValueError, match=re.escape(message)):
         calls.get(needs, lambda model: getattr(model, needs))(model)
 
@@ -295,7 +296,7 @@ def test_an_appearance_without_its_parameters_is_refused_where_they_are_needed(a
 def test_numbers_of_numpy_and_jax_are_options():
     times = np.float32(0.25), 0.5
     for at in (times, np.array(times)):
-        a2tg.A2tg(seed=np.int64(3), initial_opacity=jnp.float32(0.2), texture=a2tg.TextureConfig(upscale_at=at)).check()
+        a2tg.A2tg(seed=np.int64(3), initial_opacity=jnp.float32(0.2), texture=a2tg.Upscale(at=at)).check()
 
 
 def test_options_without_resolvable_annotations_are_not_looked_at():
@@ -322,7 +323,7 @@ def test_a_class_that_was_defined_anew_is_told_from_the_one_before():
 
 
 def test_transformations_may_put_anything_in_the_place_of_gaussians():
-    axes = a2tg.Model(0, None, None)
+    axes = a2tg.Model(0, None)
     assert jax.tree.map(lambda x: None, MODEL).gaussians.means is None and axes.gaussians == 0
 
 
@@ -370,9 +371,11 @@ def test_a_noted_ctrl_c_is_not_lost_at_the_end():
 ROWS = {
     "concatenate needs at least one model": lambda: a2tg.concatenate([]),
     "models[1] must be a Model; got Gaussians": lambda: a2tg.concatenate([MODEL, GAUSSIANS]),
-    "models must have one appearance; got Plain and Textured": lambda: a2tg.concatenate([MODEL, TEXTURED]),
-    "models must have one appearance; got Plain of different options": lambda: a2tg.concatenate(
-        [MODEL, a2tg.Model(GAUSSIANS, appearance=a2tg.Plain(0.5))]
+    "models must have one appearance; got plain Gaussians and Gaussians with texture": lambda: a2tg.concatenate(
+        [MODEL, TEXTURED]
+    ),
+    "models must have one appearance; got plain Gaussians of different options": lambda: a2tg.concatenate(
+        [MODEL, a2tg.Model(GAUSSIANS, a2tg.Appearance(max_alpha=0.5))]
     ),
     "for one Gaussian say model[3:4]": lambda: MODEL[3],
     "for one Gaussian say model[-1:]": lambda: MODEL[-1],
@@ -407,11 +410,11 @@ ADVICE = {
     "name of a system": (lambda: a2tg.fit(scene(), "a2tg"), a2tg.System),
     "class of a system": (lambda: a2tg.fit(scene(), a2tg.A2tg), a2tg.System),
     "Gaussians": (lambda: a2tg.save_model("g.npz", GAUSSIANS), a2tg.Model),
-    "Gaussians for parameters": (lambda: MODEL.with_parameters(GAUSSIANS), a2tg.Parameters),
+    "template": (lambda: a2tg.Model(GAUSSIANS, TEMPLATES["texture.texels"]).live, a2tg.Model),
     "colours of 0 to 1": (lambda: a2tg.View("a", CAMERA, np.zeros((12, 16, 3))), np.ndarray),
     "one row": (lambda: MODEL[3], a2tg.Model),
     "last row": (lambda: MODEL[-1], a2tg.Model),
-    "group of options": (lambda: a2tg.A2tg(texture={"cap": 8}).check(), a2tg.TextureConfig),
+    "group of options": (lambda: a2tg.A2tg(texture={"cap": 8}).check(), a2tg.Upscale),
 }
 
 
@@ -423,24 +426,9 @@ def test_what_a_message_says_to_write_works(mistake, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_colmap(tmp_path / "fox")
     said = Said(gaussians=GAUSSIANS, model=MODEL, image=np.zeros((12, 16, 3)), np=np)
+    said |= {"appearance": TEMPLATES["texture.texels"], "key": jax.random.key(0)}
     for code in str(told.value).rpartition("say ")[2].partition(" of ")[0].split(" or "):
         assert isinstance(eval(code, {}, said), made)
-
-
-@pytest.mark.parametrize("layer", [Banded, Shaped])
-def test_what_a_message_says_to_build_works(layer):
-    change = {
-        Banded: lambda: MODEL.with_bands(*SPLIT),
-        Shaped: lambda: MODEL.appearance.with_shapes((), jnp.zeros(7)),
-    }
-    with pytest.raises(ValueError, match="say shown = ") as told:
-        change[layer]()
-    said = str(told.value).rpartition("say ")[2]
-    code = said.replace(", params, layout =", "; params, layout =").replace(", and Model", "; made = Model")
-    names = {layer.__name__: layer, "appearance": MODEL.appearance, "gaussians": GAUSSIANS, "Model": a2tg.Model}
-    names["key"] = jax.random.key(0)
-    exec(code, names)
-    assert isinstance(names["made"].appearance, layer) and names["made"].num == MODEL.num
 
 
 @pytest.mark.parametrize("row", [7, -8])

@@ -13,12 +13,12 @@ from PIL import Image
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, fisheye
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import PlainRule
+from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.cameras import Camera, looking, resize_camera
 from a2tg_jax.data.scene import kinds_of, ray_bytes
+from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import pairs_of_view
-from a2tg_jax.systems.stage1 import PruneConfig
 from a2tg_jax.training import batches
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.cost import fed_bytes
@@ -39,7 +39,7 @@ def pinhole_rays(camera: Camera, K) -> Camera:
 
 def draw(scene, camera, **settings):
     settings = a2tg.RenderSettings(**settings)
-    return a2tg.render_image(as_gaussians(scene, "float64"), camera, *as_textures(scene, "float64"), settings=settings)
+    return a2tg.render_image(as_gaussians(scene, "float64"), camera, as_textures(scene, "float64"), settings=settings)
 
 
 @pytest.mark.parametrize(("compositor", "tile_size"), [("xla", 8), ("native", 8), ("native", 5)])
@@ -53,7 +53,7 @@ def test_rays_of_a_pinhole_camera_show_what_it_shows(x64, change, compositor, ti
     of_pinhole = draw(scene, dataclasses.replace(camera, K=jnp.asarray(K)), tile_size=tile_size, compositor=compositor)
     of_rays = draw(scene, pinhole_rays(camera, K), tile_size=tile_size, compositor=compositor)
     assert float(of_pinhole.alpha.max()) > 0.5
-    for wanted, found in zip(of_pinhole, of_rays, strict=True):
+    for wanted, found in zip(*map(jax.tree.leaves, (of_pinhole, of_rays)), strict=True):
         np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
@@ -148,7 +148,7 @@ def test_wide_lenses_make_a_few_times_the_pairs():
         log_scales=jnp.full((200, 2), np.log(0.01), jnp.float32),
     )
     settings = a2tg.RenderSettings()
-    of_pinhole, of_rays = (pairs_of_view(gaussians, seen, PlainRule(), settings) for seen in (camera, wide))
+    of_pinhole, of_rays = (pairs_of_view(gaussians, seen, Appearance(), settings) for seen in (camera, wide))
     assert of_pinhole > 200 and of_rays < 4 * of_pinhole
 
 
@@ -272,7 +272,7 @@ def test_training_through_lenses_learns_and_prunes(kept):
     mixed = dataclasses.replace(kept, train=views)
     system = dataclasses.replace(
         a2tg.Gaussians2dMcmc.preset("smoke"), stage1_iterations=60, initial_gaussians=200, sh_degree=0,
-        prune=PruneConfig(share=0.3, at=(0.5,)),
+        prune=Prune(share=0.3, at=(0.5,)),
     )  # fmt: skip
     model = a2tg.fit(mixed, system, progress=False).model
     before, after = (a2tg.evaluate(mixed.train, known).psnr for known in (initial_model(mixed, system), model))

@@ -12,7 +12,7 @@ import pytest
 from reference_files import FILES, NUM, SUMS, checksum, load, numbers, reference_model, shaped_model
 
 from a2tg_jax import save_splats
-from a2tg_jax.appearance import TextureOptions, appearance_for
+from a2tg_jax.appearance import TextureOptions
 from a2tg_jax.io.web_scene import encode_web_scene
 
 DATA = Path(__file__).parent / "data"
@@ -53,9 +53,8 @@ def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path, has
     """It follows the rules of the page alone."""
     read_model, draw = reference
     model, options = shaped_model() if has_shapes else reference_model(), {"outside": "identity"}
-    shown = TextureOptions(**options)
-    appearance = appearance_for(shown, has_textures=True, has_degrees=True, has_shapes=has_shapes)
-    model = dataclasses.replace(model, appearance=appearance)
+    texture = dataclasses.replace(model.appearance.texture, options=TextureOptions(**options))
+    model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=texture))
     for name in ("m.npz", "m.glb"):
         save_splats(tmp_path / name, model)
     origin = model.origin
@@ -63,7 +62,7 @@ def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path, has
     assert (found is None) == (again is None) == (not has_shapes)
     np.testing.assert_allclose([] if again is None else again, [] if found is None else found, rtol=1e-6)
     found = read_model(tmp_path / "m.npz")
-    image = draw(found, origin.viewmats[0], origin.Ks[0], 64, 48, origin.background, **options)
+    image = draw(found, origin.viewmats[0], origin.Ks[0], 64, 48, model.background, **options)
     wanted = np.asarray(model.render(origin.cameras[0]).color)
     assert np.ptp(wanted) > 0.5
     np.testing.assert_allclose(image, wanted, atol=2e-3)

@@ -114,7 +114,7 @@ def test_float32(seed, compositor, tile_size):
 @pytest.mark.usefixtures("x64")
 def test_an_eager_call_finds_its_own_capacity():
     scene = draw_scene(3, num=12)
-    inputs = as_gaussians(scene, "float64"), as_camera(scene, "float64"), *as_textures(scene, "float64")
+    inputs = as_gaussians(scene, "float64"), as_camera(scene, "float64"), as_textures(scene, "float64")
     output = render_image(*inputs, background=scene.background.tolist())
     assert not output.overflow
     expected = oracle.render(scene)

@@ -22,11 +22,12 @@ from scenes_random import (
 )
 
 from a2tg_jax import (
-    AtlasLayout,
     Camera,
     Gaussians,
     RenderSettings,
     Textures,
+    combine,
+    partition,
     plan_render,
     render_image,
     texture_arrays,
@@ -54,12 +55,12 @@ class Inputs(NamedTuple):
     background: jax.Array
 
 
-def as_inputs(scene: Scene, dtype: str) -> tuple[Inputs, AtlasLayout | None]:
-    """The scene's differentiable inputs, and its texture layout."""
-    textures, layout = as_textures(scene, dtype)
+def as_inputs(scene: Scene, dtype: str) -> tuple[Inputs, Inputs]:
+    """The scene's differentiable inputs, and the places of its textures."""
+    textures = as_textures(scene, dtype)
     camera = as_camera(scene, dtype)
     background = jnp.asarray(scene.background, dtype)
-    return Inputs(as_gaussians(scene, dtype), textures, camera.viewmat, camera.K, background), layout
+    return partition(Inputs(as_gaussians(scene, dtype), textures, camera.viewmat, camera.K, background))
 
 
 def draw_weights(scene: Scene) -> dict[str, Float]:
@@ -72,29 +73,28 @@ def draw_weights(scene: Scene) -> dict[str, Float]:
 
 @functools.cache
 def jitted_gradient(settings: RenderSettings) -> Callable[..., Any]:
-    """The loss and its gradient as a function of (inputs, layout, weights) and the static image size."""
+    """The loss and its gradient as a function of (inputs, places, weights) and the static image size."""
 
-    def loss(inputs: Inputs, layout: AtlasLayout | None, weights: dict[str, jax.Array], size: tuple[int, int]):
-        camera = Camera(inputs.viewmat, inputs.K, *size)
-        return weighted_sum(inputs, camera, layout, weights, settings)
+    def loss(inputs: Inputs, places: Inputs, weights: dict[str, jax.Array], size: tuple[int, int]):
+        return weighted_sum(combine(inputs, places), weights, size, settings)
 
     return jax.jit(jax.value_and_grad(loss), static_argnums=3)
 
 
-def weighted_sum(inputs: Inputs, camera: Camera, layout: AtlasLayout | None, weights, settings) -> jax.Array:
+def weighted_sum(inputs: Inputs, weights, size: tuple[int, int], settings) -> jax.Array:
     """The weighted sum of all outputs."""
-    output = render_image(
-        inputs.gaussians, camera, inputs.textures, layout, background=inputs.background, settings=settings
-    )
+    camera = Camera(inputs.viewmat, inputs.K, *size)
+    output = render_image(inputs.gaussians, camera, inputs.textures, background=inputs.background, settings=settings)
     return sum(jnp.sum(getattr(output, name) * weight) for name, weight in weights.items())
 
 
 def package_gradient(scene: Scene, dtype: str, settings: RenderSettings) -> tuple[jax.Array, Inputs]:
     """The loss and its gradient, under jit."""
-    inputs, layout = as_inputs(scene, dtype)
+    inputs, places = as_inputs(scene, dtype)
     weights = {name: jnp.asarray(weight, dtype) for name, weight in draw_weights(scene).items()}
     settings = dataclasses.replace(settings, capacity=CAPACITY)
-    return jitted_gradient(settings)(inputs, layout, weights, (scene.width, scene.height))
+    loss, gradient = jitted_gradient(settings)(inputs, places, weights, (scene.width, scene.height))
+    return loss, combine(gradient, places)
 
 
 def oracle_loss(scene: Scene, rules: Rules, name: str, texels: list[Float] | None = None) -> Callable[[Float], float]:
@@ -169,9 +169,8 @@ def assert_leaves_match(gradient: Inputs, scene: Scene, rules: Rules, texels: li
 
 def assert_textures_match(gradient: Inputs, scene: Scene, rules: Rules):
     """Every texel of every texture, by differences."""
-    _, layout = as_textures(scene, "float64")
     loss = oracle_loss(scene, rules, "textures")
-    for i, found in enumerate(texture_arrays(gradient.textures, layout)):
+    for i, found in enumerate(texture_arrays(gradient.textures)):
 
         def loss_of_one(texture: Float, i: int = i) -> float:
             return loss([*scene.textures[:i], texture, *scene.textures[i + 1 :]])
@@ -217,8 +216,7 @@ def test_gradients_do_not_depend_on_tiles():
         for one, other in zip(jax.tree.leaves(expected), jax.tree.leaves(gradient), strict=True):
             np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * abs(np.asarray(one)).max())
 
-    _, layout = as_textures(scene, "float64")
-    repacked, _ = textures_from_arrays(texture_arrays(expected.textures, layout))
+    repacked = textures_from_arrays(texture_arrays(expected.textures))
     for bucket, without_padding in zip(expected.textures.buckets, repacked.buckets, strict=True):
         np.testing.assert_allclose(np.sum(abs(bucket[..., :3])), np.sum(abs(without_padding[..., :3])))
 
@@ -226,17 +224,15 @@ def test_gradients_do_not_depend_on_tiles():
 @pytest.mark.usefixtures("x64")
 def test_an_eager_gradient_is_the_planned_one():
     scene = draw_smooth_scene(SMOOTH_SEEDS[0])
-    inputs, layout = as_inputs(scene, "float64")
+    inputs, places = as_inputs(scene, "float64")
     weights = {name: jnp.asarray(weight) for name, weight in draw_weights(scene).items()}
 
     def loss(inputs: Inputs) -> jax.Array:
-        camera = Camera(inputs.viewmat, inputs.K, scene.width, scene.height)
-        return weighted_sum(inputs, camera, layout, weights, RenderSettings())
+        return weighted_sum(combine(inputs, places), weights, (scene.width, scene.height), RenderSettings())
 
     eager = jax.grad(loss)(inputs)
-    camera = as_camera(scene, "float64")
-    planned = plan_render(inputs.gaussians, [camera], inputs.textures, layout)
-    _, jitted = jitted_gradient(planned)(inputs, layout, weights, (scene.width, scene.height))
+    planned = plan_render(inputs.gaussians, [as_camera(scene, "float64")], as_textures(scene, "float64"))
+    _, jitted = jitted_gradient(planned)(inputs, places, weights, (scene.width, scene.height))
     for one, other in zip(jax.tree.leaves(eager), jax.tree.leaves(jitted), strict=True):
         np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * abs(np.asarray(one)).max())
 
@@ -246,7 +242,8 @@ def test_float32_gradients_are_those_of_float64():
     """To 1e-3 of the largest entry: float32 carries about 1e-7 through a few thousand sums and divisions."""
     scene = smooth_scene(SMOOTH_SEEDS[1], DEFAULT_RULES)
     (_, exact), (_, rounded) = (package_gradient(scene, dtype, RenderSettings()) for dtype in ("float64", "float32"))
-    for one, other in zip(jax.tree.leaves(exact), jax.tree.leaves(rounded), strict=True):
+    floats, _ = zip(partition(exact), partition(rounded), strict=True)
+    for one, other in zip(*map(jax.tree.leaves, floats), strict=True):
         assert other.dtype == jnp.float32
         np.testing.assert_allclose(other, one, rtol=0, atol=1e-3 * abs(np.asarray(one)).max())
 

@@ -2,18 +2,19 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 
 from a2tg_jax import (
+    Appearance,
     Model,
     Origin,
-    PlainRule,
     Renderer,
     RenderSettings,
-    Textured,
+    Texture,
     evaluate,
     plan_render,
     render_image,
@@ -80,19 +81,24 @@ def test_several_sizes_and_models_of_one_shape():
 def test_a_model_with_all_that_belongs_to_it():
     scene = draw_scene(4)
     camera = as_camera(scene, "float32")
-    textures, layout = textures_from_arrays([np.asarray(texture, np.float32) for texture in scene.textures])
+    textures = textures_from_arrays([np.asarray(texture, np.float32) for texture in scene.textures])
     background = tuple(scene.background.tolist())
-    gaussians, origin = as_gaussians(scene, "float32"), Origin.of_cameras([camera], background=background)
-    model = Model(gaussians, textures, layout, jnp.asarray(45), appearance=Textured(), origin=origin)
+    model = Model(
+        as_gaussians(scene, "float32"),
+        Appearance(texture=Texture(textures)),
+        jnp.asarray(45),
+        background=background,
+        origin=Origin.of_cameras([camera]),
+    )
     found, expected = Renderer(model)(camera), model.live.render(camera)
-    for image, wanted in zip(found, expected, strict=True):
+    for image, wanted in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
         np.testing.assert_array_equal(image, wanted)
     assert expected.depth.max() > 0
 
 
 def test_what_a_renderer_refuses():
-    with pytest.raises(ValueError, match="rule: a model says itself"):
-        Renderer(Model(cloud()), PlainRule())
+    with pytest.raises(ValueError, match="appearance: a model has its own"):
+        Renderer(Model(cloud()), Appearance())
     with pytest.raises(ValueError, match=r"background must be \[3\]; got \[4\]"):
         Renderer(cloud(), background=(0, 0, 0, 1))
     with pytest.raises(ValueError, match=r"camera\.K must be \[3, 3\]; got \[4, 4\]"):
@@ -114,18 +120,18 @@ def test_gaussians_alone_are_as_opaque_as_the_settings_let_them_be():
     assert np.abs(np.rint(255 * np.clip(np.asarray(opaque), 0, 1)) - wanted).max() > 1
 
 
-def test_plan_with_a_rule_and_head_room():
+def test_plan_with_an_appearance_and_head_room():
     camera = flight(3)[1]
-    rule = PlainRule()
-    assert plan_render(cloud(), camera, rule=rule) == plan_render(cloud(), camera)
-    roomy = plan_render(cloud(3000), camera, rule=rule, head_room=10)
-    assert roomy.capacity > 4 * plan_render(cloud(3000), camera, rule=rule).capacity
+    appearance = Appearance()
+    assert plan_render(cloud(), camera, appearance=appearance) == plan_render(cloud(), camera)
+    roomy = plan_render(cloud(3000), camera, appearance=appearance, head_room=10)
+    assert roomy.capacity > 4 * plan_render(cloud(3000), camera, appearance=appearance).capacity
     with pytest.raises(ValueError, match="head_room must be at least 1"):
         plan_render(cloud(), camera, head_room=0.5)
     with pytest.raises(ValueError, match="cameras must be one camera at least"):
         plan_render(cloud(), [])
-    with pytest.raises(ValueError, match="give it, or textures and layout"):
-        plan_render(cloud(), camera, *textures_from_arrays(np.ones((300, 1, 1, 4))), rule=rule)
+    with pytest.raises(ValueError, match="give an appearance or textures, not both"):
+        plan_render(cloud(), camera, textures_from_arrays(np.ones((300, 1, 1, 4))), appearance=appearance)
 
 
 def test_a_cropped_view_keeps_its_centre_and_proportions():

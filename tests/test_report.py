@@ -18,13 +18,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 from test_results import NAMES, circle, some_history, some_result
 
-from a2tg_jax.appearance import Banded, Plain, Textured
-from a2tg_jax.appearance.banded import BandedLayout, BandedParams
-from a2tg_jax.appearance.sh_bands import allocate_bands
+from a2tg_jax.appearance import Appearance, Bands, Texture
+from a2tg_jax.appearance.bands import empty_bands
 from a2tg_jax.core.gaussians import SH_C0, init_from_points
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.model import Model
+from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.render import RenderOutput, RenderSettings
 from a2tg_jax.results.figures import curves_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import create_run
@@ -210,8 +210,8 @@ def some_model(num: int = 4) -> Model:
     for array in arrays:
         array[..., 3] = 1
     arrays[1][:, 0, 0], arrays[2][0, :, 3] = 0.5, 0.0
-    textures, layout = textures_from_arrays(arrays)
-    return Model(gaussians, textures, layout, appearance=Textured())
+    textures = textures_from_arrays(arrays)
+    return Model(gaussians, Appearance(texture=Texture(textures)))
 
 
 def test_learned_textures_are_shown_as_their_gaussians_wear_them():
@@ -227,10 +227,14 @@ def test_learned_textures_are_shown_as_their_gaussians_wear_them():
 
 def test_without_larger_textures_there_is_no_sheet():
     model = some_model()
-    plain = dataclasses.replace(model, params=(), layout=(), appearance=Plain())
-    assert learned_textures(plain) is None
-    textures, layout = textures_from_arrays([np.ones((1, 1, 4), np.float32)] * 4)
-    assert learned_textures(model.with_textures(textures, layout)) is None
+    assert learned_textures(Model(model.gaussians)) is None
+    textures = textures_from_arrays([np.ones((1, 1, 4), np.float32)] * 4)
+    assert learned_textures(model.with_textures(textures)) is None
+
+
+def shown(alpha, depth, normal=None) -> RenderOutput:
+    """A render of which only these are read."""
+    return RenderOutput(None, jnp.asarray(alpha), None, Geometry(jnp.asarray(depth), normal, None))
 
 
 def test_depth_and_normals_are_pictures():
@@ -240,7 +244,7 @@ def test_depth_and_normals_are_pictures():
     depth = alpha * np.linspace(1, 3, camera.height, dtype=np.float32)[:, None]
     towards = -np.asarray(camera.viewmat)[2, :3]
     normal = alpha[..., None] * towards
-    output = RenderOutput(*map(jnp.asarray, (normal, alpha, depth, normal, False, depth)))
+    output = shown(alpha, depth, normal)
     seen, stops = depth_picture(output)
     assert seen[0, -1].sum() > seen[-1, -1].sum()
     distances = [distance for distance, _ in stops]
@@ -256,14 +260,13 @@ def test_outliers_leave_the_colours_of_depth_to_the_scene(share, factor):
     """A far background, and splats before the camera."""
     depth = np.broadcast_to(np.linspace(1, 3, 100, dtype=np.float32), (100, 100)).copy()
     depth[: round(100 * share)] *= factor
-    output = RenderOutput(*map(jnp.asarray, (depth, np.ones_like(depth), depth, depth, False, depth)))
-    colors = depth_picture(output).picture[-1].astype(int)
+    colors = depth_picture(shown(np.ones_like(depth), depth)).picture[-1].astype(int)
     assert np.abs(colors[5] - colors[94]).max() > 150
 
 
 def test_without_a_hit_there_is_a_picture_of_depth():
     nothing = jnp.zeros((4, 4))
-    assert depth_picture(RenderOutput(*[nothing] * 4, False, nothing)).picture.shape == (4, 4, 3)
+    assert depth_picture(shown(nothing, nothing)).picture.shape == (4, 4, 3)
 
 
 def test_maps_show_what_varies_between_gaussians():
@@ -273,11 +276,10 @@ def test_maps_show_what_varies_between_gaussians():
     textured = some_model()
     assert legends(textured) == {"resolutions.png": ["1 or none", "2", "4", "8"]}
     for side in (1, 4):
-        alike, layout = textures_from_arrays([np.ones((side, side, 4), np.float32)] * 4)
-        assert legends(textured.with_textures(alike, layout)) == {}
+        alike = textures_from_arrays([np.ones((side, side, 4), np.float32)] * 4)
+        assert legends(textured.with_textures(alike)) == {}
     gaussians = init_from_points(np.eye(3, dtype=np.float32) / 2, np.full((3, 3), 0.5), sh_degree=0)
-    bands, owners = allocate_bands([0, 2, 1], 0)
-    banded = Model(gaussians, BandedParams(bands, ()), BandedLayout(owners, ()), appearance=Banded())
+    banded = Model(gaussians, Appearance(bands=Bands(empty_bands([0, 2, 1], 0))))
     assert legends(banded) == {"degrees.png": ["0", "1", "2"]}
 
 

@@ -8,18 +8,19 @@ import pytest
 from bits import bits_of
 
 from a2tg_jax import A2tg, fit, synthetic_scene
+from a2tg_jax.adapt import Upscale
+from a2tg_jax.densify.clone_split import CloneSplitPrune
 from a2tg_jax.host.machine import Machine, this_machine
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.rasterize.kernels import choice
-from a2tg_jax.systems.a2tg import TextureConfig
 from a2tg_jax.systems.gaussians_2d import Gaussians2d
-from a2tg_jax.systems.stage1 import DensityConfig, McmcConfig
 
 FIRST = A2tg(
     stage1_iterations=24,
     stage2_iterations=20,
     initial_gaussians=80,
-    densify=McmcConfig(cap=90),
-    texture=TextureConfig(upscale_at=(0.3, 0.6)),
+    densify=Mcmc(cap=90),
+    texture=Upscale(at=(0.3, 0.6)),
     seed=3,
 )
 
@@ -28,9 +29,9 @@ def test_what_ran_before_in_the_process_changes_nothing():
     """Runs in between leave larger tile lists, other buckets of textures, other programs, another seed's orders."""
     scene = synthetic_scene(num_views=8, width=40, height=30, num_points=150)
     before = fit(scene, FIRST, progress=False)
-    larger = dataclasses.replace(FIRST, densify=McmcConfig(cap=130), texture=TextureConfig(cap=8, fraction=0.9), seed=4)
+    larger = dataclasses.replace(FIRST, densify=Mcmc(cap=130), texture=Upscale(cap=8, fraction=0.9), seed=4)
     fit(scene, larger, progress=False)
-    fit(scene, Gaussians2d(stage1_iterations=20, densify=DensityConfig(cap=200), batch_size=2), progress=False)
+    fit(scene, Gaussians2d(stage1_iterations=20, densify=CloneSplitPrune(cap=200), batch_size=2), progress=False)
     again = fit(scene, FIRST, progress=False)
     assert bits_of(again.model) == bits_of(before.model)
     jax.tree.map(np.testing.assert_array_equal, again.stages[0].model, before.stages[0].model)
@@ -39,7 +40,7 @@ def test_what_ran_before_in_the_process_changes_nothing():
 
 
 @pytest.mark.parametrize(
-    ("flags", "compositor"),
+    ("flags", "wanted"),
     [
         ("", "cuda"),
         ("--xla_gpu_deterministic_ops=true", "xla"),
@@ -47,11 +48,10 @@ def test_what_ran_before_in_the_process_changes_nothing():
         ("--xla_gpu_deterministic_ops=true --xla_gpu_deterministic_ops=false", "cuda"),
     ],
 )
-def test_kernels_with_atomic_sums_are_not_chosen_where_xla_is_to_be_deterministic(monkeypatch, flags, compositor):
-    monkeypatch.setattr(choice, "has_native", lambda: False)
+def test_kernels_with_atomic_sums_are_not_chosen_where_xla_is_to_be_deterministic(monkeypatch, flags, wanted):
     monkeypatch.setattr(choice, "has_cuda", lambda: True)
     monkeypatch.setenv("XLA_FLAGS", flags)
-    assert choice.choose("auto") == compositor and choice.choose("cuda") == "cuda"
+    assert choice.choose("auto", "cuda") == wanted
 
 
 def test_what_may_change_bits_is_told():

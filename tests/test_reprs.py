@@ -15,11 +15,12 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from small_models import some_model
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Appearance, Banded, Shaped, Textured
+from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, allocate_appearance
 from a2tg_jax.cli.main import main as cli
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics
 from a2tg_jax.model import Model
+from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.render import RenderOutput
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training.checkpoint import Checkpoint, History
@@ -45,9 +46,9 @@ def small_model() -> Model:
     return Model(as_gaussians(draw_scene(1, num=5), "float32"))
 
 
-def shaped_model(appearance: Appearance) -> Model:
+def shown_by(template: Appearance) -> Model:
     gaussians = small_model().gaussians
-    return Model(gaussians, *appearance.allocate(jax.random.key(0), gaussians), appearance=appearance)
+    return Model(gaussians, allocate_appearance(template, jax.random.key(0), gaussians))
 
 
 def some_history() -> History:
@@ -72,10 +73,12 @@ LINES = {
     "Evaluation(3 views, PSNR 21.00 dB, SSIM 0.500, 42 frames/s)": lambda: dataclasses.replace(
         EVALUATION, lpips_network=None
     ),
-    "Model(5 Gaussians, SH degree 3, Plain, 1.16 kB)": small_model,
-    "Model(5 Gaussians, SH degree 3, Shaped around Plain, 1.18 kB)": lambda: shaped_model(Shaped()),
-    "Model(5 Gaussians, SH degrees 3 to 3, Banded and Shaped around Textured, 1.26 kB)": lambda: shaped_model(
-        Banded(Shaped(Textured()))
+    "Model(5 Gaussians, SH degree 3, plain Gaussians, 1.16 kB)": small_model,
+    "Model(5 Gaussians, SH degree 3, Gaussians with exponents, 1.18 kB)": lambda: shown_by(
+        Appearance(exponents=Exponents())
+    ),
+    "Model(5 Gaussians, SH degrees 3 to 3, Gaussians with texture, exponents and bands, 1.26 kB)": lambda: shown_by(
+        Appearance(texture=Texture(), exponents=Exponents(), bands=Bands())
     ),
     "FitResult(A2tg, 2 stages, 5 Gaussians, 1.16 kB, 25 s)": fit_result,
     "StageResult('texture', 5 Gaussians, 1.16 kB, 12 s)": lambda: fit_result().stages[0],
@@ -111,7 +114,7 @@ def decoded(file: bytes) -> np.ndarray:
 def some_output(*views: int) -> RenderOutput:
     color = jnp.linspace(-0.5, 1.5, 13 * 21 * 3).reshape(13, 21, 3)
     plane = jnp.zeros((13, 21))
-    output = RenderOutput(color, plane, plane, jnp.zeros((13, 21, 3)), jnp.asarray(False), plane)
+    output = RenderOutput(color, plane, jnp.asarray(False), Geometry(plane, jnp.zeros((13, 21, 3)), plane))
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (*views, *x.shape)), output)
 
 
@@ -165,11 +168,11 @@ def test_model_is_a_short_table():
     [
         (a2tg.Model, "num_live", "int32 number of rows that exist; None if all do."),
         (a2tg.Camera, "K", "[3, 3] intrinsics in pixels, last row (0, 0, 1)."),
-        (a2tg.Parameters, "gaussians", "Floats of the Gaussians."),
+        (a2tg.Appearance, "given_colors", "[N, 3] colours in place of those of spherical harmonics, for rendering;"),
         (a2tg.A2tg, "batch_size", "Views per iteration."),
         (type(a2tg.A2tg().floaters), "min_views", "Least number of training views in which a Gaussian must show"),
     ],
-    ids=["dataclass", "camera", "tuple", "inherited", "not public"],
+    ids=["dataclass", "camera", "appearance", "inherited", "not public"],
 )
 def test_help_has_the_docstrings_of_fields(kind, field, text):
     """As `help` prints them, and once. Of subclasses, those of the base classes, too."""

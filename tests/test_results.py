@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import tomli_w
 
+from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import init_from_points
@@ -19,16 +20,17 @@ from a2tg_jax.core.paths import smooth_path
 from a2tg_jax.data import View, synthetic_scene, view_image
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.io.model_file import save_model
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics, evaluate
 from a2tg_jax.measure.metrics import psnr
 from a2tg_jax.model import Model
 from a2tg_jax.render import render_image
 from a2tg_jax.results.figures import curves_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, open_run
-from a2tg_jax.results.held_out import check_held_out
 from a2tg_jax.results.history import read_history, write_history
 from a2tg_jax.results.images import error_picture, largest_gain, level_colors, side_by_side, to_uint8
 from a2tg_jax.results.plan import plan_run
+from a2tg_jax.results.preflight import check_held_out
 from a2tg_jax.results.record import (
     RunRecord,
     SceneSource,
@@ -38,8 +40,8 @@ from a2tg_jax.results.record import (
     repeating_command,
     write_record,
 )
-from a2tg_jax.results.replacement import OLD, drop_old, set_aside
 from a2tg_jax.results.run_evaluation import evaluate_run
+from a2tg_jax.results.run_replacement import OLD, drop_old, set_aside
 from a2tg_jax.results.run_training import train_run
 from a2tg_jax.results.summary import (
     ModelResult,
@@ -50,12 +52,11 @@ from a2tg_jax.results.summary import (
     per_view_json,
     summary_text,
 )
-from a2tg_jax.systems.a2tg import A2tg, TextureConfig
+from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.systems.bbsplat import BBSplat
 from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.systems.gaussians_2d import Gaussians2d
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
-from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.systems.textured_gaussians import TexturedGaussians
 from a2tg_jax.training import History, LearningRates, find_system, like
 
@@ -226,8 +227,8 @@ def test_record_round_trip(tmp_path):
             r"run\.toml: options\.texture\.caps is an unknown key; did you mean cap\?",
         ),
         ('scene = "a"\n[options]\nseed = 0.5', r"run\.toml: options\.seed must be int; got 0\.5"),
-        ('scene = "a"\n[options]\ntexture = 1', r"run\.toml: options\.texture must hold the fields of TextureConfig"),
-        ('scene = "a"\n[options.texture]\nupscale_at = ["1"]', r"run\.toml: options\.texture\.upscale_at must be"),
+        ('scene = "a"\n[options]\ntexture = 1', r"run\.toml: options\.texture must hold the fields of Upscale"),
+        ('scene = "a"\n[options.texture]\nat = ["1"]', r"run\.toml: options\.texture\.at must be"),
         (
             'scene = "a"\n[options.texture]\naxes = "both"',
             r"options\.texture\.axes must be one of paper, authors",
@@ -250,24 +251,24 @@ def test_wrong_record_is_one_clear_line(tmp_path, text, message):
 def test_a_run_that_this_version_refuses_names_the_version_that_began_it(tmp_path, capsys, version, words):
     run = create_run(tmp_path)
     write_record(run, RECORD)
-    text = run.record.read_text().replace("jitter = 0.0", "jitter = 3.0")
+    text = run.record.read_text().replace("initial_opacity = 0.5", "initial_opacity = 3.0")
     if version != "now":
         line = "" if version is None else f'version = "{version}"\n'
         text = re.sub(r'version = ".*"\n', line, text)
     run.record.write_text(text)
     assert cli.main(["train", "--out", str(tmp_path), "--resume"]) == 2
     told = capsys.readouterr().err.replace("\n", " ")
-    assert "run.toml: jitter must lie in 0..1; got 3.0" in told and words in told
+    assert "run.toml: initial_opacity must be above 0 and below 1; got 3.0" in told and words in told
 
 
 def test_configuration_file_says_a_part(tmp_path):
     run = create_run(tmp_path / "run")
-    run.record.write_text('scene = "../fox"\npreset = "quick"\n[options.texture]\nk_a = 9\nupscale_at = [0.25, 0.5]\n')
+    run.record.write_text('scene = "../fox"\npreset = "quick"\n[options.texture]\nk_a = 9\nat = [0.25, 0.5]\n')
     record = read_record(run)
     assert record.scene == SceneSource(str(tmp_path / "fox"))
     assert (record.system.stage1_iterations, record.system.densify.cap) == (2_000, 10_000)
-    assert (record.system.texture.k_a, record.system.texture.upscale_at) == (9.0, (0.25, 0.5))
-    assert all(isinstance(number, float) for number in (record.system.texture.k_a, *record.system.texture.upscale_at))
+    assert (record.system.texture.k_a, record.system.texture.at) == (9.0, (0.25, 0.5))
+    assert all(isinstance(number, float) for number in (record.system.texture.k_a, *record.system.texture.at))
 
 
 @pytest.mark.parametrize("scene", ["../fox", "synthetic"])
@@ -291,8 +292,8 @@ def test_paths_in_a_configuration_file_start_from_its_folder(tmp_path, monkeypat
         (
             "a2tg",
             A2tg(
-                texture=TextureConfig(select="budget", upscale_at=(0.1, 0.5), budget_mb=3.5),
-                densify=McmcConfig(cap=7),
+                texture=Upscale(select="budget", at=(0.1, 0.5), budget_mb=3.5),
+                densify=Mcmc(cap=7),
                 initial_gaussians=50,
                 background="white",
                 rates=LearningRates(quats=float("inf")),
@@ -357,7 +358,7 @@ def test_shared_stages_are_trained_once():
         {"background": "white"},
         {"stage1_iterations": 7},
         {"rates": LearningRates(sh_rest=1.0)},
-        {"densify": McmcConfig(cap=9)},
+        {"densify": Mcmc(cap=9)},
     ],
 )
 def test_stages_that_differ_are_not_shared(change):
@@ -368,8 +369,8 @@ def test_stages_that_differ_are_not_shared(change):
 
 def test_compared_systems_take_the_options(tmp_path, monkeypatch):
     (tmp_path / "variants_of_mine.py").write_text(
-        "from a2tg_jax import A2tg\nfrom a2tg_jax.systems.a2tg import TextureConfig\n"
-        "SQUARE = A2tg(texture=TextureConfig(anisotropic=False))\n"
+        "from a2tg_jax import A2tg\nfrom a2tg_jax.adapt import Upscale\n"
+        "SQUARE = A2tg(texture=Upscale(anisotropic=False))\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     record = dataclasses.replace(RECORD, compare=("variants_of_mine:SQUARE", "textured-gaussians"))
@@ -391,22 +392,15 @@ class TestComparedOptions:
 
     record = dataclasses.replace(RECORD, compare=("bytewise", "gaussians-2d-mcmc"), preset="quick")
 
-    def kept(self, folder, change=lambda table: table):
-        run = create_run(folder)
-        write_record(run, self.record)
-        table = change(tomllib.loads(run.record.read_text()))
-        run.record.write_text(tomli_w.dumps(table))
-        return read_record(run).systems["bytewise"]
-
     def test_they_stay_when_defaults_change(self, tmp_path, monkeypatch):
         before = self.record.systems["bytewise"]
-        assert before.kernel.rate != 0.123
+        assert before.exponents.least != 0.123
         run = create_run(tmp_path)
         write_record(run, self.record)
-        kernel = dataclasses.replace(before.kernel, rate=0.123)
-        presets = {"quick": dataclasses.replace(before, kernel=kernel)}
+        exponents = dataclasses.replace(before.exponents, least=0.123)
+        presets = {"quick": dataclasses.replace(before, exponents=exponents)}
         monkeypatch.setattr(type(before), "presets", classmethod(lambda _: presets))
-        assert self.record.systems["bytewise"].kernel.rate == 0.123
+        assert self.record.systems["bytewise"].exponents.least == 0.123
         assert read_record(run).systems["bytewise"] == before
         again = cli._parse("train", ["--config", str(run.record), "--out", "again", "--seed", "3"]).record
         assert again.systems["bytewise"] == dataclasses.replace(before, seed=3)
@@ -428,43 +422,29 @@ class TestComparedOptions:
         write_record(run, self.record)
         table = tomllib.loads(run.record.read_text())["compare_options"]
         assert set(table) == set(self.record.compare)
-        assert "rate" in table["bytewise"]["kernel"] and "cap" not in table["bytewise"].get("texture", {})
-
-    def test_runs_of_before_have_the_options_of_then(self, tmp_path):
-        def without(table):
-            return {name: value for name, value in table.items() if name != "compare_options"}
-
-        kernel = self.kept(tmp_path / "none", without).kernel
-        assert (kernel.rate, kernel.least_exponent) == (0.0, 0.0)
-
-        def without_one(table):
-            del table["compare_options"]["bytewise"]["kernel"]["least_exponent"]
-            return table
-
-        kernel = self.kept(tmp_path / "one", without_one).kernel
-        assert kernel == dataclasses.replace(self.record.systems["bytewise"].kernel, least_exponent=0.0)
+        assert "least" in table["bytewise"]["exponents"] and "texel_rate" not in table["bytewise"]
 
     def test_a_file_may_set_them(self, tmp_path):
         file = tmp_path / "mine.toml"
-        text = 'scene = "synthetic"\ncompare = ["bytewise"]\n[compare_options.bytewise.kernel]\nrate = 0.5\n'
+        text = 'scene = "synthetic"\ncompare = ["bytewise"]\n[compare_options.bytewise.exponents]\nleast = 0.5\n'
         file.write_text(text)
         said = cli._parse("train", ["--config", str(file), "--out", "run", "--seed", "3"]).record
-        assert said.systems["bytewise"].kernel.rate == 0.5 and said.systems["bytewise"].seed == 3
+        assert said.systems["bytewise"].exponents.least == 0.5 and said.systems["bytewise"].seed == 3
         for preset in ("smoke", "paper"):
             other = cli._parse("train", ["--config", str(file), "--out", "run", "--preset", preset]).record
-            assert other.systems["bytewise"].kernel.rate == Bytewise.preset(preset).kernel.rate
+            assert other.systems["bytewise"].exponents == Bytewise.preset(preset).exponents
         file.write_text(text.replace('compare = ["bytewise"]', ""))
         added = cli._parse("train", ["--config", str(file), "--out", "run", "--compare", "bytewise"]).record
         added.check()
-        assert added.systems["bytewise"].kernel.rate == 0.5
+        assert added.systems["bytewise"].exponents.least == 0.5
         with pytest.raises(ValueError, match=r"bytewise: the run does not compare this system: add it"):
             cli._parse("train", ["--config", str(file), "--out", "run"]).record.check()
 
     @pytest.mark.parametrize(
         ("table", "told"),
         [
-            ("kernel.rat = 1.0", r"compare_options\.bytewise\.kernel\.rat is an unknown key"),
-            ("kernel.rate = []", r"compare_options\.bytewise\.kernel\.rate must be float; got \[\]"),
+            ("exponents.leas = 1.0", r"compare_options\.bytewise\.exponents\.leas is an unknown key"),
+            ("exponents.least = []", r"compare_options\.bytewise\.exponents\.least must be float; got \[\]"),
         ],
     )
     def test_others_are_refused(self, tmp_path, table, told):
@@ -480,7 +460,7 @@ class TestComparedOptions:
         run = create_run(tmp_path / "run")
         write_record(run, dataclasses.replace(self.record, scene=SceneSource("synthetic")))
         file, table = tmp_path / "mine.toml", tomllib.loads(run.record.read_text())
-        table["compare_options"]["bytewise"]["kernel"]["rate"] = 0.5
+        table["compare_options"]["bytewise"]["exponents"]["least"] = 0.5
         file.write_text(tomli_w.dumps(table))
         assert cli.main(["train", "--config", str(file), "--out", str(run.path), "--resume"]) == 2
         told = capsys.readouterr().err
@@ -500,21 +480,20 @@ class TestComparedOptions:
         assert read_record(run).systems["gaussians-2d-mcmc"].sh_degree == 0
 
     def test_systems_of_ones_own_with_options_of_another_type(self, tmp_path, monkeypatch):
-        """`kernel` of the main system is a number, that of bytewise a group."""
-        (tmp_path / "with_kernel.py").write_text(
+        """`details` of the main system is a number, in bytewise a group."""
+        (tmp_path / "with_details.py").write_text(
             "import dataclasses\nfrom a2tg_jax import Gaussians2dMcmc\n"
-            "@dataclasses.dataclass(frozen=True, kw_only=True)\nclass Main(Gaussians2dMcmc):\n    kernel: float = 1.0\n"
+            "@dataclasses.dataclass(frozen=True, kw_only=True)\n"
+            "class Main(Gaussians2dMcmc):\n    details: float = 1.0\n"
         )
         monkeypatch.syspath_prepend(tmp_path)
-        kind = type(find_system("with_kernel:Main"))
+        kind = type(find_system("with_details:Main"))
         record = RunRecord(
-            SceneSource("synthetic"), "with_kernel:Main", kind(stage2_iterations=9), ("bytewise",), "quick"
+            SceneSource("synthetic"), "with_details:Main", kind(stage2_iterations=9), ("bytewise",), "quick"
         )
         run = create_run(tmp_path / "run")
         write_record(run, record)
-        assert set(tomllib.loads(run.record.read_text())["compare_options"]["bytewise"]["kernel"]) == {
-            "rate", "least_exponent"
-        }  # fmt: skip
+        assert set(tomllib.loads(run.record.read_text())["compare_options"]["bytewise"]["details"]) > {"at", "cap"}
         assert read_record(run).systems == record.systems
 
 

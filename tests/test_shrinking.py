@@ -2,16 +2,26 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_results import circle
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Banded, MovableKernels, Plain, Shaped, Textured, TextureOptions
+from a2tg_jax.appearance import (
+    Appearance,
+    Bands,
+    Exponents,
+    MovableKernels,
+    Texture,
+    TextureOptions,
+    allocate_appearance,
+    template_of,
+)
 from a2tg_jax.core.gaussians import SH_C0, init_from_points
 from a2tg_jax.data import View
-from a2tg_jax.finish.shrinking import halved, shrink_textures, taken, texel_weights
+from a2tg_jax.finish.shrinking import halve_textures, shrink_textures, taken, texel_weights
 from a2tg_jax.model import Model
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.texture import texture_arrays, textures_from_arrays
@@ -31,7 +41,7 @@ def some_model(seed: int = 0, roughness: float = 0.25) -> Model:
         texels = rng.uniform(-roughness, roughness, (4, 4, 4)).astype(np.float32)
         texels[..., 3] = rng.uniform(0.5, 1, (4, 4))
         arrays.append([texels, np.repeat(texels[:, :1], 4, axis=1), texels[:1, :1]][index % 3])
-    return Model(gaussians, *textures_from_arrays(arrays), appearance=Textured())
+    return Model(gaussians, Appearance(texture=Texture(textures_from_arrays(arrays))))
 
 
 def views_of(model: Model) -> list[View]:
@@ -50,7 +60,7 @@ def test_what_is_constant_shrinks_at_next_to_no_loss():
     model = some_model()
     views = views_of(model)
     small = shrink_textures(model, views, max_loss=0.05, background=BACKGROUND)
-    sizes, found = model.textures[1].sizes, small.textures[1].sizes
+    sizes, found = model.textures.sizes, small.textures.sizes
     assert (found[2::3] == 0).all() and (found[1::3, 1] == 1).all()  # single texels, and what is constant along u
     assert small.num == model.num and small.num_bytes <= model.num_bytes - 16 * (4 * 12 + 4)
     assert (found <= sizes).all()
@@ -69,11 +79,11 @@ def test_no_more_is_lost_than_may_be(max_loss):
 
 def test_single_texels_go_into_their_gaussians():
     model = some_model()
-    step = halved(model, texel_weights(model, views_of(model), BACKGROUND))
-    is_single = (model.textures[1].sizes == 1).all(axis=1)
+    step = halve_textures(model, texel_weights(model, views_of(model), BACKGROUND))
+    is_single = (model.textures.sizes == 1).all(axis=1)
     after = taken(model, step, is_single)
     np.testing.assert_allclose(images_of(after), images_of(model), atol=1e-5)
-    texels = texture_arrays(*model.textures)
+    texels = texture_arrays(model.textures)
     sh0 = np.asarray(model.gaussians.sh)[2, 0] + texels[2][0, 0, :3] / SH_C0
     np.testing.assert_allclose(np.asarray(after.gaussians.sh)[2, 0], sh0, rtol=1e-5)
     opacity = float(model.gaussians.opacities[2]) * texels[2][0, 0, 3]
@@ -83,7 +93,7 @@ def test_single_texels_go_into_their_gaussians():
 def test_the_cost_predicts_the_change_of_the_picture():
     model = some_model(2)
     views = views_of(model) * 8  # many draws of signs
-    step = halved(model, texel_weights(model, views, BACKGROUND))
+    step = halve_textures(model, texel_weights(model, views, BACKGROUND))
     before, costs, changes = images_of(model), [], []
     for index in range(0, NUM, 3):
         is_chosen = np.arange(NUM) == index
@@ -97,43 +107,43 @@ def test_weights_are_the_squared_slopes_of_the_picture():
     """Against finite differences, on one texture."""
     model = some_model(3)
     views = views_of(model) * 50
-    weights = texture_arrays(texel_weights(model, views, BACKGROUND), model.textures[1])[0] / 50
-    texels = texture_arrays(*model.textures)
+    weights = texture_arrays(texel_weights(model, views, BACKGROUND))[0] / 50
+    texels = texture_arrays(model.textures)
     for place in [(1, 2, 0), (2, 1, 1), (1, 1, 3)]:
         images = []
         for sign in (-1, 1):
             moved = [own.copy() for own in texels]
             moved[0][place] += sign * 1e-2
-            images.append(images_of(model.with_textures(*textures_from_arrays(moved))))
+            images.append(images_of(model.with_textures(textures_from_arrays(moved))))
         exact = np.sum(((images[1] - images[0]) / 2e-2) ** 2)
         np.testing.assert_allclose(weights[place], exact, rtol=0.5)
 
 
 def test_bands_and_shapes_stay_as_they_are():
-    inner = some_model()
-    banded = Banded(Shaped(Textured()))
-    params, layout = banded.allocate(None, inner.gaussians)
-    params = banded.with_shapes(params, jnp.linspace(-2.0, 2.0, NUM))
-    model = dataclasses.replace(inner, params=params, layout=layout, appearance=banded)
-    model = model.with_textures(*inner.textures)
+    model = some_model()
+    shapes, bands = Exponents(jnp.linspace(-2.0, 2.0, NUM)), Bands().allocate(model.gaussians)
+    appearance = dataclasses.replace(model.appearance, exponents=shapes, bands=bands)
+    model = Model(model.gaussians, appearance)
     small = shrink_textures(model, views_of(model), max_loss=0.05, background=BACKGROUND)
-    assert small.appearance == banded and small.num_bytes < model.num_bytes
-    np.testing.assert_array_equal(banded.shapes(small.params), banded.shapes(params))
+    assert template_of(small.appearance) == template_of(model.appearance) and small.num_bytes < model.num_bytes
+    np.testing.assert_array_equal(small.appearance.shapes, model.appearance.shapes)
 
 
 def test_what_cannot_shrink_is_refused():
     model = some_model()
     views = views_of(model)
-    plain = dataclasses.replace(model, params=(), layout=(), appearance=Plain())
-    with pytest.raises(ValueError, match="Plain has no textures that can shrink"):
-        shrink_textures(plain, views)
-    official = dataclasses.replace(model, appearance=Textured(options=TextureOptions.official()))
-    with pytest.raises(ValueError, match="signed RGB"):
-        shrink_textures(official, views)
-    for appearance, name in ((MovableKernels(), "MovableKernels"), (Banded(Shaped()), "Plain")):
-        params, layout = appearance.allocate(None, model.gaussians)
-        other = dataclasses.replace(model, params=params, layout=layout, appearance=appearance)
-        with pytest.raises(ValueError, match=f"^{name} has no textures that can shrink"):
+    told = "cannot shrink: only textures with signed RGB and projected alpha can"
+    with pytest.raises(ValueError, match=f"^plain Gaussians {told}"):
+        shrink_textures(Model(model.gaussians), views)
+    official = Appearance(texture=Texture(model.textures, options=TextureOptions.official()))
+    with pytest.raises(ValueError, match=f"^Gaussians with texture {told}"):
+        shrink_textures(Model(model.gaussians, official), views)
+    for template, name in (
+        (MovableKernels(), "MovableKernels"),
+        (Appearance(bands=Bands(), exponents=Exponents()), "Gaussians with exponents and bands"),
+    ):
+        other = Model(model.gaussians, allocate_appearance(template, jax.random.key(0), model.gaussians))
+        with pytest.raises(ValueError, match=f"^{name} {told}"):
             shrink_textures(other, views)
     with pytest.raises(ValueError, match="at least one view"):
         shrink_textures(model, [])

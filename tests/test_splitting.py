@@ -13,6 +13,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState, adam_init
+from a2tg_jax.core.partition import partition
 from a2tg_jax.densify.splitting import (
     SplitByGradient,
     SplitStatistics,
@@ -34,7 +35,7 @@ def some_state(seed: int = 0) -> tuple[Model, AdamState, SplitStatistics]:
     rng = np.random.default_rng(seed)
     opacities = np.where(np.arange(NUM) % 10 == 3, 0.001, rng.uniform(0.1, 0.9, NUM))
     model = Model(random_gaussians(NUM, seed, opacities), num_live=jnp.int32(LIVE))
-    moments = adam_init((model.gaussians, model.params))
+    moments = adam_init(partition(model)[0])
     moments = dataclasses.replace(moments, mu=jax.tree.map(jnp.ones_like, moments.mu))
     statistics = GradientStatistics(jnp.asarray(rng.uniform(0, 3, NUM), jnp.float32), jnp.full(NUM, 3, jnp.int32))
     return model, moments, SplitStatistics(statistics, jnp.full(NUM, 5.0))
@@ -116,7 +117,7 @@ def test_hosts_and_copies_become_halves(seed):
     steps = moved[is_split, :2] / np.asarray(before.scales)[is_split]
     assert 0.5 < steps.std() < 1.6 and np.abs(steps).max() < 6
     # Adam forgets both, and both share what was seen of the host.
-    np.testing.assert_array_equal(np.asarray(new_moments.mu[0].means)[:330, 0], np.where(is_split, 0, 1)[:330])
+    np.testing.assert_array_equal(np.asarray(new_moments.mu.gaussians.means)[:330, 0], np.where(is_split, 0, 1)[:330])
     shares = np.bincount(rows[:330], minlength=NUM)
     np.testing.assert_allclose(
         new_statistics.gradients.total[:330],

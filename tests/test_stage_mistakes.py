@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Shaped
+from a2tg_jax.appearance import Exponents
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.training.corrections import Exposure
 from a2tg_jax.training.terms import Photometric, l1
@@ -28,7 +28,7 @@ class Own(a2tg.System):
     given: Any = None
 
     def stages(self):
-        first = a2tg.Stage("own", a2tg.Plain(), (), (Photometric(),), self.rates, 2)
+        first = a2tg.Stage("own", a2tg.Appearance(), (), (Photometric(),), self.rates, 2)
         return (dataclasses.replace(first, **self.given),)
 
 
@@ -118,13 +118,17 @@ class Correcting(Exposure):
 
 
 GIVEN = {
-    "stage 'own': appearance must be an Appearance; got the class Plain: say Plain(…)": {"appearance": a2tg.Plain},
-    "stage 'own': rates must be LearningRates; got float": {"rates": 0.1},
-    "stage 'own': params_rate must be the learning rate of the parameters of Shaped, such as 1e-2, or 0 if": {
-        "appearance": Shaped(),
-        "params_rate": None,
+    "stage 'own': appearance must be an Appearance; got the class Appearance: say Appearance(…)": {
+        "appearance": a2tg.Appearance
     },
-    "stage 'own': params_rate must be the learning rate of the parameters of Textured": {"appearance": a2tg.Textured()},
+    "stage 'own': rates must be LearningRates; got float": {"rates": 0.1},
+    "stage 'own': appearance_rate must be the learning rate of the arrays of Gaussians with exponents, such as": {
+        "appearance": a2tg.Appearance(exponents=Exponents()),
+        "appearance_rate": None,
+    },
+    "stage 'own': appearance_rate must be the learning rate of the arrays of Gaussians with texture": {
+        "appearance": a2tg.Appearance(texture=a2tg.Texture())
+    },
     "stage 'own': iterations must be an integer; got '30'": {"iterations": "30"},
     "stage 'own': events must be a tuple or a list; got Noise: one of them stands in (…,)": {"events": a2tg.Noise()},
     "stage 'own': events[1] must be a StepEvent or a HostEvent; got the class Noise: say Noise(…)": {
@@ -152,7 +156,7 @@ def test_a_part_of_the_wrong_kind_is_named(message):
 RETURNED = {
     "stage 'own': Returning.apply: the result must be a Change; got tuple": {"events": (Returning(),)},
     "stage 'own': Returning.apply: model must be a Model; got Gaussians": {"events": (Returning("model"),)},
-    "stage 'own': Returning.apply: moments.mu[0].means must be [": {"events": (Returning("half"),)},
+    "stage 'own': Returning.apply: moments.mu.gaussians.means must be [": {"events": (Returning("half"),)},
     "stage 'own': Returning.apply: state must keep its structure": {"events": (Returning("state"),)},
     "stage 'own': Observing.observe must keep its structure": {"events": (Observing(),)},
     "stage 'own': OnHost.apply: the result must be a Change; got Model": {"events": (OnHost(),)},
@@ -190,16 +194,15 @@ def test_depth_that_was_not_rendered_is_no_zero(scene):
     settings = a2tg.RenderSettings(capacity=64, compositor="xla", supersample=2)
 
     def shown(has_geometry):
-        arguments = model.gaussians, camera, model.rule, jnp.zeros(3), settings
+        arguments = model.gaussians, camera, model.appearance, jnp.zeros(3), settings
         return render_traced(*arguments, has_geometry=has_geometry)[0]
 
     assert jax.eval_shape(lambda: roughness(model, None, shown(True))).shape == ()
     with pytest.raises(ValueError, match="depth was not rendered: say has_geometry=True"):
         jax.eval_shape(lambda: roughness(model, None, shown(False)))
     output = jax.eval_shape(lambda: shown(False))
-    assert output.alpha.shape == (16, 16) and "normal=None" in repr(output)
+    assert output.alpha.shape == (16, 16) and output.geometry is None
     for name in ("depth", "normal", "distortion"):
-        assert not hasattr(output, name)
         with pytest.raises(ValueError, match=f"{name} was not rendered"):
             getattr(output, name)
 
@@ -207,7 +210,7 @@ def test_depth_that_was_not_rendered_is_no_zero(scene):
 def test_photographs_too_small_for_ssim_are_refused_before_anything_compiles(scene):
     """Unless the loss has none."""
     tiny = a2tg.synthetic_scene(num_views=3, width=10, height=10, num_points=50)
-    told = "has 10 by 10 pixels, but the loss has SSIM, which needs 11 by 11: lower --downscale, or set"
+    told = "has 10 by 10 pixels, but the loss has SSIM, which needs 11 by 11: take larger photographs, or set"
     with pytest.raises(ValueError, match=told):
         a2tg.fit(tiny, own(losses=(Photometric(1),)), progress=False)
     assert a2tg.fit(tiny, own(losses=(a2tg.Term(l1),)), progress=False).model.num == 50
@@ -216,12 +219,11 @@ def test_photographs_too_small_for_ssim_are_refused_before_anything_compiles(sce
 def test_terms_of_ones_own_want_depth_maps_and_points(scene):
     views = tuple(dataclasses.replace(view, points=None) for view in scene.train)
     without = dataclasses.replace(scene, train=views)
-    for flag, told in (("has_depths", "wants depth maps"), ("has_points", "wants points that photographs observed")):
+    for flag, told in (("has_depths", "needs depth maps"), ("has_points", "needs points that photographs observed")):
         term = a2tg.Term(lambda model, target, output: 0.0 * output.color.sum(), **{flag: True})
-        with pytest.raises(ValueError, match=f"or a term of your own, {told}"):
+        with pytest.raises(ValueError, match=f"or a custom term, {told}"):
             a2tg.fit(without, own(losses=(Photometric(), term)), progress=False)
     seen = a2tg.Term(
         lambda model, target, output: target.points.depths.mean() + 0 * output.color.sum(), has_points=True
     )
     assert a2tg.fit(scene, own(losses=(Photometric(), seen)), progress=False).model.num == 50
-    assert not hasattr(a2tg.Target(None, None, None), "depth")

@@ -11,19 +11,19 @@ from oracle import DEFAULT_RULES, OFFICIAL, Scene
 from scenes_random import CAPACITY, as_camera, as_gaussians, as_settings, as_textures, draw_scene
 
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.render import RenderSettings, rule_of
+from a2tg_jax.render import RenderSettings, appearance_of
 
 
 def statistic(scene: Scene, cotangent: np.ndarray, settings: RenderSettings, which: str) -> np.ndarray:
     """[N, 4] gradient at the probe: the statistic, and the number of pixels composited."""
     gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
     settings = dataclasses.replace(settings, capacity=CAPACITY)
-    rule = rule_of(gaussians, *as_textures(scene, "float64"), settings)
+    appearance = appearance_of(gaussians, as_textures(scene, "float64"), settings)
 
     def loss(probe):
         background = jnp.asarray(scene.background)
         output, _ = render_traced(
-            gaussians, camera, rule, background, settings, has_geometry=False, probe=probe, statistic=which
+            gaussians, camera, appearance, background, settings, has_geometry=False, probe=probe, statistic=which
         )
         return jnp.sum(output.color * jnp.asarray(cotangent))
 

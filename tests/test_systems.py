@@ -38,7 +38,7 @@ class Own(a2tg.System):
     {options}
 
     def stages(self):
-        return tuple(a2tg.Stage(name, a2tg.Plain(), (), self.loss.terms(), self.rates, 5) for name in {names})
+        return tuple(a2tg.Stage(name, a2tg.Appearance(), (), self.loss.terms(), self.rates, 5) for name in {names})
 """
 
 
@@ -54,7 +54,7 @@ def tiny(name: str, **changes):
 
 
 def assert_same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, (a.gaussians, a.params), (b.gaussians, b.params))
+    jax.tree.map(np.testing.assert_array_equal, (a.gaussians, a.appearance), (b.gaussians, b.appearance))
 
 
 def interrupted_and_resumed(scene, system, path, every: int = 8):
@@ -114,12 +114,12 @@ def test_training_goes_on_in_the_dtype_of_its_model(scene, tmp_path, name):
 def test_a_toy_of_one_file_does_all_that_the_others_do(scene, tmp_path):
     system = Toy()
     result = a2tg.fit(scene, system, progress=False)
-    rings = np.asarray(result.model.params)
-    assert np.abs(rings[:, :3]).max() > 1e-3, "the rule's numbers are trained"
+    rings = np.asarray(result.model.appearance.rings)
+    assert np.abs(rings[:, :3]).max() > 1e-3, "the appearance's numbers are trained"
     start = a2tg.fit(scene, dataclasses.replace(system, factor=1.0), progress=False).model.gaussians
     assert result.model.gaussians.log_scales.mean() < start.log_scales.mean() - 0.05, "the event shrinks"
     heavy = a2tg.fit(scene, dataclasses.replace(system, contrast_weight=100.0), progress=False).model
-    assert np.square(heavy.params[:, :3]).mean() < 0.2 * np.square(rings[:, :3]).mean(), "the term weighs"
+    assert np.square(heavy.appearance.rings[:, :3]).mean() < 0.2 * np.square(rings[:, :3]).mean(), "the term weighs"
 
     assert_same(interrupted_and_resumed(scene, system, tmp_path / "checkpoint.npz", every=5), result.model)
     a2tg.save_model(tmp_path / "model.npz", result.model)
@@ -133,33 +133,35 @@ def test_a_toy_of_one_file_does_all_that_the_others_do(scene, tmp_path):
 @pytest.mark.filterwarnings("ignore:stage 'textures'. Upscale changed nothing")  # Of a share of 0.
 def test_textures_of_one_texel_that_do_not_learn_change_nothing(scene):
     """They stay (0, 0, 0, 1), and the Gaussians are those of a stage without textures."""
-    plain, textured = tiny("gaussians-2d-mcmc"), tiny("a2tg", texture={"fraction": 0.0, "single_rate": 0.0})
+    plain, textured = tiny("gaussians-2d-mcmc"), tiny("a2tg", texture={"fraction": 0.0}, single_texel_rate=0.0)
     first = fit_stage(scene, plain, 0, progress=False).model
     expected, found = (fit_stage(scene, one, 1, first, progress=False).model for one in (plain, textured))
-    (texels,) = found.params.buckets
+    (texels,) = found.textures.buckets
     np.testing.assert_array_equal(texels[: found.num], np.broadcast_to([0, 0, 0, 1], (found.num, 1, 1, 4)))
     for a, b in zip(jax.tree.leaves(found.gaussians), jax.tree.leaves(expected.gaussians), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
 
 
 def test_textures_that_have_grown_learn_though_those_of_one_texel_do_not(scene):
-    system = tiny("a2tg", texture={"fraction": 0.5, "single_rate": 0.0, "upscale_at": [0.5]})
+    system = tiny("a2tg", texture={"fraction": 0.5, "at": [0.5]}, single_texel_rate=0.0)
     model = a2tg.fit(scene, system, progress=False).model
-    for (height, width), bucket in zip(model.layout.resolutions, model.params.buckets, strict=True):
+    for (height, width), bucket in zip(model.textures.bucket_sizes, model.textures.buckets, strict=True):
         is_neutral = bool((bucket == jnp.asarray([0, 0, 0, 1], bucket.dtype)[None, None, None]).all())
         assert is_neutral == (height * width == 1)
 
 
 def test_negative_rates_of_texels_are_refused():
-    with pytest.raises(ValueError, match=r"texture\.single_rate must be at least 0; got -1"):
-        tiny("a2tg", texture={"single_rate": -1.0}).check()
+    with pytest.raises(ValueError, match=r"single_texel_rate must be at least 0; got -1"):
+        tiny("a2tg", single_texel_rate=-1.0).check()
 
 
 def test_textured_gaussians_are_a2tg_with_one_size_and_no_events(scene):
-    fixed = tiny("textured-gaussians", texture={"side": 2})
+    fixed = tiny("textured-gaussians", texture_side=2)
     other = tiny("a2tg")
     first, second = other.stages()
-    textured = dataclasses.replace(second, appearance=dataclasses.replace(second.appearance, start=(2, 2)), events=())
+    texture = dataclasses.replace(second.appearance.texture, start=(2, 2))
+    appearance = dataclasses.replace(second.appearance, texture=texture)
+    textured = dataclasses.replace(second, appearance=appearance, events=())
     as_system = dataclasses.make_dataclass("Fixed", [], bases=(type(other),), frozen=True)
     as_system.stages = lambda self: (first, textured)
     composed = as_system(**{field.name: getattr(other, field.name) for field in dataclasses.fields(other)})
@@ -168,7 +170,7 @@ def test_textured_gaussians_are_a2tg_with_one_size_and_no_events(scene):
 
 def test_without_upscaling_textures_stay_at_one_texel(scene):
     result = a2tg.fit(scene, tiny("a2tg", texture={"cap": 1}), progress=False)
-    assert result.model.layout.resolutions == ((1, 1),)
+    assert result.model.textures.bucket_sizes == ((1, 1),)
 
 
 @pytest.mark.filterwarnings("ignore:stage 'textures'. texture.anisotropic made no difference")
@@ -177,7 +179,7 @@ def test_textures_reach_their_cap(scene, cap):
     """As many upscalings as doublings; the Gaussians that are chosen each time become cap × cap, but for thin ones."""
     texture = {"cap": cap, "fraction": 1.0, "anisotropic": False}
     result = a2tg.fit(scene, tiny("a2tg", texture=texture, initial_gaussians=20, densify={"cap": 20}), progress=False)
-    sizes = result.model.layout.sizes
+    sizes = result.model.textures.sizes
     assert sizes.max() == cap and np.mean(sizes == cap) > 0.8
     assert [round(n / 30_000, 4) for n in a2tg.Upscale(cap=cap).iterations(30_000)] == [
         round(k / 60, 4) for k in range(1, cap.bit_length())
@@ -192,7 +194,7 @@ def test_official_is_a_preset_of_all_options():
         "authors",
         "screen",
     )
-    lookup = dataclasses.asdict(texture.lookup)
+    lookup = dataclasses.asdict(a2tg.A2tg.preset("official").lookup)
     defaults = dataclasses.asdict(a2tg.TextureOptions())
     assert all(lookup[name] != defaults[name] for name in defaults), "each choice differs from the paper's"
     official = a2tg.A2tg.preset("official")
@@ -224,7 +226,7 @@ def test_a_sweep_compiles_each_step_once(scene, sweep, name, thresholds):
         before, rooms = num_compiled(jitted_step()), copy.deepcopy(session.capacities)
         merged = dict(changes)
         if name == "a2tg":
-            merged["texture"] = {"upscale_at": [0.5], **changes.get("texture", {})}
+            merged["texture"] = {"at": [0.5], **changes.get("texture", {})}
         result = a2tg.fit(scene, tiny(name, **merged), progress=False, session=session)
         # Lists that grow in the middle of a run are compiled anew; a run tells how often that was.
         count = max(0, num_compiled(jitted_step()) - before - result.num_regrown)
@@ -237,7 +239,7 @@ def test_a_sweep_compiles_each_step_once(scene, sweep, name, thresholds):
 def test_the_host_waits_once_for_many_steps(scene, monkeypatch):
     waits = []
     monkeypatch.setattr(loop, "read", lambda infos: waits.append(len(infos)) or jax.device_get(infos))
-    a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=45, densify=a2tg.McmcConfig(cap=60)), progress=False)
+    a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=45, densify=a2tg.Mcmc(cap=60)), progress=False)
     assert waits == [10, 10, 10, 10, 5]
 
 
@@ -287,16 +289,19 @@ def test_a_resumed_training_says_what_found_no_room_before(scene, tmp_path):
 
 
 def test_the_cap_of_alphas_is_the_same_in_both_stages():
-    system = tiny("textured-gaussians", texture={"lookup": {"max_alpha": 0.95}})
+    system = tiny("textured-gaussians", lookup={"max_alpha": 0.95})
     first, second = (stage.appearance for stage in system.stages())
-    assert first.max_alpha == second.max_alpha == 0.95
+    assert first.alpha_limit == second.alpha_limit == 0.95
 
 
 @pytest.mark.parametrize(
     "name, reason",
     [
         ("gaussians-2d-mcmc", "no Gaussian above the death opacity is left"),
-        ("gaussians-2d", "adaptive density control would prune every Gaussian: lower densify.least_opacity"),
+        (
+            "gaussians-2d",
+            "densify: adaptive density control would prune every Gaussian; a lower least_opacity keeps some",
+        ),
     ],
 )
 def test_a_training_without_gaussians_left_tells_what_to_change(scene, name, reason):
@@ -321,10 +326,10 @@ def test_a_file_imports_nothing():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"texture": {"select": "threshold"}}, "texture.threshold must say"),
+        ({"texture": {"select": "threshold"}}, "so threshold must say"),
         ({"texture": {"select": "budget"}}, "budget_mb must say"),
         ({"texture": {"cap": 32}}, "texture.cap"),
-        ({"texture": {"upscale_at": [0.5, 0.2]}}, "upscale_at"),
+        ({"texture": {"at": [0.5, 0.2]}}, "at"),
         ({"batch_size": 0}, "batch_size"),
         ({"sh_degree": 4}, "sh_degree"),
         ({"densify": {"cap": 1}}, "densify.cap"),
@@ -392,7 +397,7 @@ def test_the_opacity_term_acts_on_what_a_billboard_shows(scene):
     for weight in (0.0, 0.5):
         system = tiny("bbsplat", loss={"opacity_weight": weight})
         model = a2tg.fit(scene, system, progress=False).model
-        alphas.append(float(jnp.mean(model.appearance.opacities(model.gaussians, model.params, model.layout))))
+        alphas.append(float(jnp.mean(model.appearance.opacities(model.gaussians))))
     assert alphas[0] > 1.05 * alphas[1]
 
 
@@ -400,6 +405,6 @@ def test_gradients_of_a_sweep_are_those_of_its_numbers(scene):
     """A traced weight is the weight: twice the opacity term fades Gaussians more."""
     means = []
     for weight in (0.0, 0.5, 2.0):
-        system = tiny("gaussians-2d-mcmc", loss={"opacity_weight": weight}, densify={"cap": 60, "is_enabled": False})
+        system = tiny("gaussians-2d-mcmc", loss={"opacity_weight": weight}, densify={"cap": 0})
         means.append(float(jnp.mean(a2tg.fit(scene, system, progress=False).model.gaussians.opacities)))
     assert means[0] > means[1] > means[2]

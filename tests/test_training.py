@@ -19,18 +19,18 @@ from a2tg_jax import (
     Term,
     fit,
     load_checkpoint,
+    partition,
     save_checkpoint,
     ssim,
     synthetic_scene,
     view_image,
 )
-from a2tg_jax.appearance import Textured
+from a2tg_jax.adapt import Upscale
+from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
 from a2tg_jax.core.pytree import num_compiled, pytree
+from a2tg_jax.core.table import Shape
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.a2tg import TextureConfig
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
-from a2tg_jax.systems.stage1 import McmcConfig
-from a2tg_jax.texture import Shape
 from a2tg_jax.training import LearningRates, LossConfig, Stage, fit_stage, like, loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.loop import StageRun
@@ -42,8 +42,8 @@ CONFIG = A2tg(
     stage1_iterations=24,
     stage2_iterations=20,
     initial_gaussians=100,
-    densify=McmcConfig(cap=110),
-    texture=TextureConfig(upscale_at=(0.3, 0.6)),
+    densify=Mcmc(cap=110),
+    texture=Upscale(at=(0.3, 0.6)),
     seed=3,
 )
 NUM_EVENTS = 2
@@ -78,12 +78,12 @@ def test_both_stages_improve_and_grow(trained):
     assert np.isfinite(history.loss).all()
     assert history.loss[-1] < history.loss[0]
     assert result.model.num == 110
-    assert result.model.layout.num_texels > 110
+    assert result.model.textures.num_texels > 110
 
 
 def test_texels_stay_where_they_belong(trained):
     result, _, _ = trained
-    for bucket in result.model.params.buckets:
+    for bucket in result.model.textures.buckets:
         alpha = np.asarray(bucket)[..., 3]
         assert alpha.min() >= 0 and alpha.max() <= 1
 
@@ -103,15 +103,15 @@ def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
         return
     trained = request.getfixturevalue("trained")
     model = trained[0].model
-    capacities = (*(len(bucket) + 2 for bucket in model.params.buckets), 1)
+    capacities = (*(len(bucket) + 2 for bucket in model.textures.buckets), 1)
     session = Session()
-    session.shapes.add(Shape((*model.layout.resolutions, (5, 5)), capacities))
+    session.shapes.add(Shape((*model.textures.bucket_sizes, (5, 5)), capacities))
     path, rooms = tmp_path / "checkpoint.npz", []
 
     def keep(checkpoint):
         if checkpoint.iteration == 16 and checkpoint.stage == 1:
             save_checkpoint(path, checkpoint)
-            rooms.append(tuple(map(len, checkpoint.state.model.params.buckets)))
+            rooms.append(tuple(map(len, checkpoint.state.model.textures.buckets)))
 
     told = {"progress": False, "session": session}
     assert_same(fit(scene, CONFIG, on_checkpoint=keep, checkpoint_every=8, **told), trained[0])
@@ -121,10 +121,10 @@ def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
 
 @pytree
 class Places(StepEvent):
-    """Gathers a number of every row, made of Gaussians and layout."""
+    """Gathers a number of every row, made of Gaussians and places of textures."""
 
     def init(self, model):
-        return jnp.stack([model.layout.row, jnp.arange(model.gaussians.num, dtype=jnp.int32)])
+        return jnp.stack([model.textures.row, jnp.arange(model.gaussians.num, dtype=jnp.int32)])
 
     def apply(self, now, model, moments, state):
         return Change(model, moments, state)
@@ -154,12 +154,12 @@ def test_rows_that_do_not_exist_are_not_trained(scene, trained):
 
 
 def test_rows_are_not_added_to_textures_of_another_size(trained):
-    start, textured = trained[0].stages[0].model, Textured((2, 2))
-    other = dataclasses.replace(start, appearance=textured)
-    params, layout = Textured((1, 1)).allocate(jax.random.key(0), start.gaussians)
-    stage = Stage("more", textured, (Mcmc(500),), (), CONFIG.rates, 3_000)
+    start, template = trained[0].stages[0].model, Appearance(texture=Texture(start=(2, 2)))
+    single = allocate_appearance(Appearance(texture=Texture()), jax.random.key(0), start.gaussians).textures
+    appearance = template.with_textures(single)
+    stage = Stage("more", template, (Mcmc(500),), (), CONFIG.rates, 3_000)
     with pytest.raises(ValueError, match=r"stage 'more' would add Gaussians .* whose textures or degrees have grown"):
-        padded(dataclasses.replace(other, params=params, layout=layout), stage, CONFIG)
+        padded(dataclasses.replace(start, appearance=appearance), stage, CONFIG)
 
 
 def test_what_is_passed_in_stays_usable(scene, trained):
@@ -192,7 +192,7 @@ def test_events_that_the_host_decides_are_those_of_the_step(scene, trained, monk
             yield run.state.model
 
     decided_inside = [jax.tree.map(np.array, model) for model in states()]
-    monkeypatch.setattr(loop, "are_events_decided_by_host", lambda: True)
+    monkeypatch.setattr(loop, "are_events_decided_by_host", lambda state: True)
     before = num_compiled(jitted_step())
     for own, other in zip(states(), decided_inside, strict=True):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), own, other)
@@ -211,7 +211,7 @@ def test_overflow_loses_nothing(scene):
     def one_step(capacity):
         run = StageRun(scene, CONFIG, 0, initial_model(scene, CONFIG))
         if capacity is not None:
-            run.room.capacities[scene.train[0].picture.size] = capacity
+            run.capacities[scene.train[0].picture.size] = capacity
         taken = run.steps(1, 1)
         return run, len(taken) or len(run.steps(1, 1))
 
@@ -236,19 +236,19 @@ def test_memory_budget_holds(scene, trained):
     texture = dataclasses.replace(CONFIG.texture, select="budget", budget_mb=budget)
     result = fit_stage(scene, dataclasses.replace(CONFIG, texture=texture), 1, first, progress=False)
     assert result.history.megabytes.max() <= budget
-    assert result.model.layout.num_texels > first.num
+    assert result.model.textures.num_texels > first.num
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (
-            {"texture": TextureConfig(select="budget", budget_mb=0.001)},
+            {"texture": Upscale(select="budget", budget_mb=0.001)},
             "budget of 0.001 MB is below the 0.027 MB",
         ),
-        ({"texture": TextureConfig(select="budget")}, "budget_mb must say"),
-        ({"texture": TextureConfig(cap=32)}, "texture.cap"),
-        ({"texture": TextureConfig(upscale_at=(0.5, 0.2))}, "upscale_at"),
+        ({"texture": Upscale(select="budget")}, "budget_mb must say"),
+        ({"texture": Upscale(cap=32)}, "texture.cap"),
+        ({"texture": Upscale(at=(0.5, 0.2))}, "at"),
         ({"batch_size": 0}, "batch_size"),
         ({"sh_degree": 4}, "sh_degree"),
     ],
@@ -261,13 +261,13 @@ def test_impossible_configurations_are_refused(scene, trained, change, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"seed": -1}, "seed must lie in 0..2147483647; got -1"),
-        ({"tile_size": 0}, "tile_size must lie in 1..64; got 0"),
+        ({"seed": -1}, "seed must be an int, 0 to 2147483647; got -1"),
+        ({"tile_size": 0}, "tile_size must be at least 1 and at most 64; got 0"),
         ({"rates": LearningRates(means=float("nan"))}, "rates.means must be a finite number; got nan"),
         ({"rates": LearningRates(quats=-1.0)}, "rates.quats must be at least 0; got -1.0"),
-        ({"rates": LearningRates(means_final_factor=0.0)}, "means_final_factor must be larger than 0"),
-        ({"loss": LossConfig(ssim_weight=2.0)}, "loss.ssim_weight must lie in 0..1; got 2.0"),
-        ({"texture": TextureConfig(fraction=2.0)}, "texture.fraction must lie in 0..1; got 2.0"),
+        ({"rates": LearningRates(means_final_factor=0.0)}, "rates.means_final_factor must be above 0"),
+        ({"loss": LossConfig(ssim_weight=2.0)}, "loss.ssim_weight must be at most 1; got 2.0"),
+        ({"texture": Upscale(fraction=2.0)}, "texture.fraction must be at least 0 and at most 1; got 2.0"),
         ({"stage1_iterations": 2**31}, r"fewer than 2\^31; 'gaussians' has 2147483648"),
     ],
 )
@@ -314,7 +314,7 @@ def test_views_of_two_sizes_wherever_they_are_kept(scene, monkeypatch, request):
         return
     larger = synthetic_scene(num_views=8, width=48, height=30, num_points=150).train
     mixed = dataclasses.replace(scene, train=(scene.train[0], larger[1], scene.train[2]))
-    config = Gaussians2dMcmc(stage1_iterations=6, batch_size=3, initial_gaussians=100, densify=McmcConfig(cap=40))
+    config = Gaussians2dMcmc(stage1_iterations=6, batch_size=3, initial_gaussians=100, densify=Mcmc(cap=40))
     resident = fit(mixed, config, progress=False)
     assert resident.model.num == 40
     monkeypatch.setattr(loop, "PhotoStore", lambda *told: PhotoStore(*told, room=0))
@@ -324,7 +324,7 @@ def test_views_of_two_sizes_wherever_they_are_kept(scene, monkeypatch, request):
 def test_float64_is_not_forced_on_a_model(scene, trained):
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         model = fit(scene, dataclasses.replace(CONFIG, stage1_iterations=3, stage2_iterations=4), progress=False).model
-    assert {str(leaf.dtype) for leaf in jax.tree.leaves((model.gaussians, model.params))} == {"float32"}
+    assert {str(leaf.dtype) for leaf in jax.tree.leaves(partition(model)[0])} == {"float32"}
 
 
 def test_a_cap_of_texels_is_no_cap_of_gaussians(scene):
@@ -354,7 +354,7 @@ def test_batches_of_several_views(scene, trained):
     config = dataclasses.replace(like(Gaussians2dMcmc, CONFIG), batch_size=2, stage2_iterations=3)
     result = fit_stage(scene, config, 1, trained[0].stages[0].model, progress=False)
     assert np.isfinite(result.history.loss).all()
-    assert result.model.params == ()
+    assert result.model.textures is None
 
 
 def roughness(model, target, output):
@@ -372,7 +372,7 @@ def test_the_history_has_the_loss_by_term(scene):
             return (dataclasses.replace(stage, losses=losses), *others)
 
     logged = []
-    system = Own(stage1_iterations=11, stage2_iterations=0, initial_gaussians=60, densify=McmcConfig(cap=60))
+    system = Own(stage1_iterations=11, stage2_iterations=0, initial_gaussians=60, densify=Mcmc(cap=60))
     history = fit(scene, system, on_log=logged.append, progress=False).history
     names = ["l1", "ssim", "opacity", "roughness", "lambda", "lambda_5"]
     assert set(history.terms) == {*names} and len(history.loss) == 2

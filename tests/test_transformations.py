@@ -12,7 +12,7 @@ import oracle
 import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, draw_smooth_scene, render_scene
 
-from a2tg_jax import Camera, RenderSettings, render_image
+from a2tg_jax import Camera, RenderSettings, combine, partition, render_image
 
 SCENE = draw_scene(1, num=4, width=8, height=8)
 SMOOTH = draw_smooth_scene(53, width=8, height=8)
@@ -126,18 +126,18 @@ def test_other_derivatives_name_the_compositor_to_use(mode, compositor):
 def smooth_loss():
     """A loss of all that a textured scene shows, by gaussians and texels, and where to differentiate it."""
     gaussians, camera = as_gaussians(SMOOTH, "float64"), as_camera(SMOOTH, "float64")
-    textures, layout = as_textures(SMOOTH, "float64")
+    parameters, places = partition((gaussians, as_textures(SMOOTH, "float64")))
     settings = RenderSettings(capacity=1024, compositor="autodiff")
     rng = np.random.default_rng(0)
     weights = jnp.asarray(rng.normal(size=(8, 8, 9)))
 
     def loss(parameters):
-        output = render_image(parameters[0], camera, parameters[1], layout, settings=settings)
+        gaussians, textures = combine(parameters, places)
+        output = render_image(gaussians, camera, textures, settings=settings)
         images = [output.color, output.alpha[..., None], output.depth[..., None], output.normal]
         images = jnp.concatenate([*images, output.distortion[..., None]], axis=-1)
         return jnp.sum(weights * images + images**2)
 
-    parameters = gaussians, textures
     direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), parameters)
     return loss, parameters, direction
 

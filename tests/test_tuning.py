@@ -12,7 +12,7 @@ from test_compact import MODELS, SETTINGS, every_model, order_of
 from test_compaction import SCENE, a_model
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance import Shaped
+from a2tg_jax.appearance import Appearance, Exponents, allocate_appearance, files
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.data import Scene
 from a2tg_jax.data.scene import origin_of_scene
@@ -23,7 +23,7 @@ from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tuned, TunedFiles
 from a2tg_jax.io.compact import GROUPS, CompactChoices, decode_model, encode_model, grids_of, half_turned
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.results.corrected import refined_views
+from a2tg_jax.results.corrected_metrics import refined_views
 from a2tg_jax.training import DivergedError, Stage
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement, exposed
 
@@ -38,14 +38,15 @@ round_to = jax.jit(lambda rounding, model: rounding(model))
 def moved(model: Model, size: float = 0.05) -> Model:
     """The model with other numbers, some of them beyond the ends of its grids."""
     rng = np.random.default_rng(3)
-    return model.with_parameters(
-        jax.tree.map(lambda x: x + size * jnp.asarray(rng.normal(size=x.shape), x.dtype), model.parameters)
-    )
+    floats, rest = a2tg.partition(model)
+    floats = jax.tree.map(lambda x: x + size * jnp.asarray(rng.normal(size=x.shape), x.dtype), floats)
+    return a2tg.combine(floats, rest)
 
 
 def arrays_of(model: Model) -> dict[str, np.ndarray]:
     own = {field.name: getattr(model.gaussians, field.name) for field in dataclasses.fields(model.gaussians)}
-    return {name: np.asarray(x) for name, x in (own | model.appearance.arrays(model.params, model.layout)).items()}
+    shown = files.arrays_of(model.appearance, model.gaussians.sh_degree)
+    return {name: np.asarray(x) for name, x in (own | shown).items()}
 
 
 def assert_same(found: Model, wanted: Model) -> None:
@@ -148,14 +149,27 @@ def test_a_diverged_tuning_is_an_error():
         tune_compact(a_model(), SCENE, spoiled, COARSE, iterations=3)
 
 
+def test_models_with_textures_are_tuned():
+    system = a2tg.find_system("a2tg").preset("smoke", sh_degree=0)
+    appearance = allocate_appearance(system.stages()[-1].appearance, jax.random.key(0), a_model().gaussians)
+    found = tune_compact(dataclasses.replace(a_model(), appearance=appearance), SCENE, system, COARSE, iterations=2)
+    assert found.model.textures is not None and decode_model(found.data).num == a_model().num
+
+
 @pytest.mark.parametrize(
     ("model", "iterations", "words"),
     [
         (a_model(), 0, "iterations must be at least 1; got 0"),
-        (Model(some_gaussians(), *Shaped().allocate(jax.random.key(0), some_gaussians()), appearance=Shaped()), 5,
-         "model must show what the last stage of the system, .gaussians., trains: Plain.*; it shows Shaped"),
+        (
+            Model(
+                some_gaussians(),
+                allocate_appearance(Appearance(exponents=Exponents()), jax.random.key(0), some_gaussians()),
+            ),
+            5,
+            "model must show what the last stage of the system, .gaussians., trains, .* shows Gaussians with exponents",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_tuned_is_refused(model, iterations, words):
     with pytest.raises(ValueError, match=words):
         tune_compact(model, SCENE, SYSTEM, COARSE, iterations=iterations)

@@ -10,22 +10,18 @@ import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax import Model, load_model, load_ply, plan_render, save_model, save_ply
-from a2tg_jax.appearance import Banded, BandedRates, Billboards, MovableKernels, Plain, Shaped, Textured
-from a2tg_jax.appearance.banded import BandedLayout, BandedParams
-from a2tg_jax.appearance.sh_bands import (
-    allocate_bands,
-    dense_sh,
-    floats_of_band,
-    gather_bands,
-    reallocate_bands,
-    split_sh,
-)
+from a2tg_jax import Appearance, Model, Texture, load_model, load_ply, plan_render, save_model, save_ply
+from a2tg_jax.appearance import Bands, Billboards, Exponents, MovableKernels, allocate_appearance, template_of
+from a2tg_jax.appearance.bands import bands_of_dense, dense_bands, empty_bands, floats_of_band, sizes_of_degrees
 from a2tg_jax.core.budget import within_budget
 from a2tg_jax.core.optim import adam_init
+from a2tg_jax.core.partition import combine, partition
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.densify.view_dependence import AdaptDegrees, ViewDependence, most_rows, raised, without_idle
+from a2tg_jax.core.table import Shape, bucket_capacity, resize
+from a2tg_jax.densify.view_dependence import AdaptDegrees, ViewDependence, most_blocks, raised_degrees, without_idle
 from a2tg_jax.events import Due, Seen
+from a2tg_jax.io.archive import read_archive, write_archive
+from a2tg_jax.io.model_file import FORMAT
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import LearningRates, Stage
@@ -46,18 +42,16 @@ def cut(sh: np.ndarray, degrees: np.ndarray) -> np.ndarray:
     return np.where(np.arange(16)[None, :, None] < bases[:, None, None], sh, 0)
 
 
-def banded(seed: int, base: int = 0, dtype: str = "float32", inner=None):
+def banded(seed: int, base: int = 0, dtype: str = "float32", template: Appearance = Appearance()):  # noqa: B008 - frozen
     """A model of a random degree per Gaussian, and the same of degree 3 with zeros."""
     scene, degrees = draw_scene(seed, num=NUM), random_degrees(seed, base)
     full = as_gaussians(scene, dtype)
     full = dataclasses.replace(full, sh=jnp.asarray(cut(np.asarray(full.sh), degrees), full.means.dtype))
     gaussians = dataclasses.replace(full, sh=full.sh[:, : (base + 1) ** 2])
-    bands, layout = split_sh(np.asarray(full.sh), degrees, base)
-    inner = inner or Plain()
-    params, inner_layout = inner.allocate(jax.random.key(0), gaussians)
-    shown = BandedParams(bands, params), BandedLayout(layout, inner_layout)
-    plain = Model(full, params, inner_layout, appearance=inner)
-    return Model(gaussians, *shown, appearance=Banded(inner)), plain, as_camera(scene, dtype)
+    plain = Model(full, allocate_appearance(template, jax.random.key(0), gaussians))
+    coefficients = bands_of_dense(full.sh[:, (base + 1) ** 2 :], degrees, base)
+    appearance = dataclasses.replace(plain.appearance, bands=Bands(coefficients))
+    return Model(gaussians, appearance), plain, as_camera(scene, dtype)
 
 
 @pytest.mark.usefixtures("x64")
@@ -72,7 +66,7 @@ def test_the_picture_is_that_of_zeros_for_what_is_missing(base, seed):
 def test_bytes_are_those_of_each_degree(base):
     model, _, _ = banded(1, base)
     degrees = random_degrees(1, base)
-    np.testing.assert_array_equal(model.layout.bands.degrees, degrees)
+    np.testing.assert_array_equal(model.degrees, degrees)
     assert model.num_bytes == 4 * sum(NUM_FLOATS[degree] for degree in degrees)
     first = dataclasses.replace(model, num_live=jnp.int32(25))
     assert first.num_bytes == first.live.num_bytes == 4 * sum(NUM_FLOATS[degree] for degree in degrees[:25])
@@ -92,29 +86,36 @@ def test_gradients_are_those_of_the_dense_coefficients():
     settings = plan_render(plain.gaussians, camera, head_room=2.0)
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)))
 
-    def loss(gaussians, params, shown):
-        changed = dataclasses.replace(shown, gaussians=gaussians, params=params)
-        return jnp.sum(weights * changed.render(camera, settings=settings).color)
+    def gradient(model):
+        floats, rest = partition(model)
+        loss = lambda floats: jnp.sum(weights * combine(floats, rest).render(camera, settings=settings).color)  # noqa: E731
+        return combine(jax.grad(loss)(floats), rest)
 
-    of_gaussians, of_params = jax.grad(loss, argnums=(0, 1))(model.gaussians, model.params, model)
-    expected, _ = jax.grad(loss, argnums=(0, 1))(plain.gaussians, plain.params, plain)
-    found = dense_sh(np.asarray(of_gaussians.sh), of_params.bands, model.layout.bands)
-    degrees = model.layout.bands.degrees
-    np.testing.assert_allclose(found, cut(np.asarray(expected.sh), degrees)[:, : found.shape[1]], atol=1e-12)
-    np.testing.assert_allclose(of_gaussians.means, expected.means, atol=1e-10)
+    found, expected = gradient(model), gradient(plain)
+    wanted = cut(np.asarray(expected.gaussians.sh), model.degrees)
+    np.testing.assert_allclose(found.sh, wanted[:, : found.sh.shape[1]], atol=1e-12)
+    np.testing.assert_allclose(found.gaussians.means, expected.gaussians.means, atol=1e-10)
 
 
 @pytest.mark.parametrize(
-    "inner", [Plain(), Textured((2, 1)), Textured((0, 0)), MovableKernels(), Billboards(3), Shaped()]
+    "template",
+    [
+        Appearance(),
+        Appearance(texture=Texture(start=(2, 1))),
+        Appearance(texture=Texture(start=(0, 0))),
+        MovableKernels(),
+        Billboards(side=3),
+        Appearance(exponents=Exponents()),
+    ],
 )
-def test_whatever_else_is_shown_is_as_without(inner, tmp_path):
-    model, plain, camera = banded(3, inner=inner)
+def test_whatever_else_is_shown_is_as_without(template, tmp_path):
+    model, plain, camera = banded(3, template=template)
     expected = plain.render(camera).color
     np.testing.assert_allclose(model.render(camera).color, expected, atol=1e-6)
     save_model(tmp_path / "m.npz", dataclasses.replace(model, num_live=jnp.int32(30)))
     loaded = load_model(tmp_path / "m.npz")
-    assert loaded.appearance == model.appearance and loaded.num == 30
-    np.testing.assert_array_equal(loaded.layout.bands.degrees, model.layout.bands.degrees[:30])
+    assert template_of(loaded.appearance) == template_of(model.appearance) and loaded.num == 30
+    np.testing.assert_array_equal(loaded.degrees, model.degrees[:30])
     shorter = dataclasses.replace(plain, num_live=jnp.int32(30))
     np.testing.assert_allclose(loaded.render(camera).color, shorter.render(camera).color, atol=1e-6)
 
@@ -122,12 +123,8 @@ def test_whatever_else_is_shown_is_as_without(inner, tmp_path):
 def test_view_dependence_turns_with_the_world():
     model, plain, _ = banded(4)
     world = Similarity(1.5, Rotation.random(random_state=0).as_matrix(), np.array([0.3, -0.2, 0.1]))
-    moved = model.transform(world)
-    np.testing.assert_allclose(
-        dense_sh(np.asarray(moved.gaussians.sh), moved.params.bands, moved.layout.bands),
-        np.asarray(plain.transform(world).gaussians.sh),
-        atol=1e-6,
-    )
+    expected = np.asarray(plain.transform(world).gaussians.sh)
+    np.testing.assert_allclose(model.transform(world).sh, expected, atol=1e-6)
 
 
 def test_a_ply_file_holds_all_coefficients(tmp_path):
@@ -144,31 +141,26 @@ def test_a_ply_file_has_the_degree_of_the_gaussians(degree, tmp_path):
     np.testing.assert_array_equal(load_ply(tmp_path / "m.ply").sh, gaussians.sh)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_rows_that_move_take_along_what_there_is_room_for(seed):
-    model, plain, _ = banded(seed)
-    rows = np.random.default_rng(seed + 10).integers(0, NUM, NUM)
-    layout = model.layout.bands
-    found = gather_bands(model.params.bands, layout, jnp.asarray(rows))
-    expected = cut(np.asarray(plain.gaussians.sh)[rows], layout.degrees)
-    found = dense_sh(expected[:, :1], found, layout)
-    np.testing.assert_array_equal(found, expected[:, : found.shape[1]])
+def test_rows_move_while_all_have_one_degree():
+    gaussians, rows = as_gaussians(draw_scene(0, num=NUM), "float32"), np.random.default_rng(10).integers(0, NUM, NUM)
+    table = bands_of_dense(gaussians.sh[:, 1:], np.full(NUM, 3), 0)
+    np.testing.assert_array_equal(dense_bands(table.gather(rows), 0), gaussians.sh[rows, 1:])
+    model, _, _ = banded(0)
+    with pytest.raises(ValueError, match="blocks of 4 sizes cannot change rows: densify and prune before they grow"):
+        model.appearance.coefficients.gather(rows)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_other_degrees_keep_what_a_gaussian_keeps(seed):
     model, plain, _ = banded(seed)
-    moments = adam_init((model.gaussians, model.params))
-    ones = jax.tree.map(jnp.ones_like, moments.mu)
+    ones = jax.tree.map(jnp.ones_like, partition(model)[0])
     degrees = random_degrees(seed + 20)
-    layout = model.layout.bands
-    bands, new, mu = reallocate_bands(model.params.bands, layout, degrees, ones)
-    np.testing.assert_array_equal(new.degrees, degrees)
-    both = np.minimum(degrees, layout.degrees)
-    expected = cut(np.asarray(plain.gaussians.sh), both)
-    found = dense_sh(expected[:, :1], bands, new)
-    np.testing.assert_array_equal(found, expected[:, : found.shape[1]])
-    kept = dense_sh(np.ones((NUM, 1, 3), np.float32), mu[1].bands, new)
+    table, ones = resize(model.appearance.coefficients, sizes_of_degrees(degrees, 0), ones)
+    changed = dataclasses.replace(model, appearance=model.appearance.with_coefficients(table))
+    np.testing.assert_array_equal(changed.degrees, degrees)
+    both = np.minimum(degrees, model.degrees)
+    np.testing.assert_array_equal(changed.sh, cut(np.asarray(plain.gaussians.sh), both)[:, : changed.sh.shape[1]])
+    kept = combine(ones, partition(changed)[1]).sh
     np.testing.assert_array_equal(kept, cut(np.ones((NUM, 16, 3)), both)[:, : kept.shape[1]])
 
 
@@ -193,86 +185,85 @@ def test_degrees_rise_where_the_gradient_per_byte_is_largest():
     degrees = np.array([0, 0, 1, 2, 3])
     strengths = np.array([[4.0, 9, 9], [3.0, 9, 9], [9, 6.0, 9], [9, 9, 6.0], [9, 9, 9]])
     # Per byte: 4/36, 3/36, 6/60, 6/84; the last has all.
-    np.testing.assert_array_equal(raised(degrees, strengths, 36), [1, 0, 1, 2, 3])
-    np.testing.assert_array_equal(raised(degrees, strengths, 96), [1, 0, 2, 2, 3])
-    np.testing.assert_array_equal(raised(degrees, strengths, 1000), [1, 1, 2, 3, 3])
-    np.testing.assert_array_equal(raised(degrees, strengths, 0), degrees)
+    np.testing.assert_array_equal(raised_degrees(degrees, strengths, 36), [1, 0, 1, 2, 3])
+    np.testing.assert_array_equal(raised_degrees(degrees, strengths, 96), [1, 0, 2, 2, 3])
+    np.testing.assert_array_equal(raised_degrees(degrees, strengths, 1000), [1, 1, 2, 3, 3])
+    np.testing.assert_array_equal(raised_degrees(degrees, strengths, 0), degrees)
 
 
 def test_idle_bands_are_given_up():
-    degrees = np.array([0, 1, 1, 2])
-    bands, layout = allocate_bands(degrees, 0)
-    tables = [table.at[: len(np.flatnonzero(degrees > k))].set(0.0) for k, table in enumerate(bands.tables)]
-    tables[0] = tables[0].at[1].set(1.0)
-    found = without_idle(dataclasses.replace(bands, tables=tuple(tables)), layout, 0.01)
-    np.testing.assert_array_equal(found, [0, 0, 1, 1])
-    np.testing.assert_array_equal(without_idle(bands, layout, 0.0), degrees)
+    degrees, dense = np.array([0, 1, 1, 2]), np.zeros((4, 15, 3), np.float32)
+    dense[2, :3] = dense[3, :3] = 1.0
+    np.testing.assert_array_equal(without_idle(bands_of_dense(dense, degrees, 0), 0, 0.01), [0, 0, 1, 1])
+    np.testing.assert_array_equal(without_idle(empty_bands(degrees, 0), 0, 0.0), degrees)
 
 
 @pytest.mark.parametrize("budget_mb", [0.0025, 0.0031])
 def test_an_event_stays_within_its_budget_and_spends_it(budget_mb):
-    model, _, camera = banded(6, inner=Textured((0, 0)))
+    model, _, camera = banded(6, template=Appearance(texture=Texture(start=(0, 0))))
     event = AdaptDegrees(budget_mb, at=(0.5,))
     cameras = jax.tree.map(lambda x: x[None], camera)
     colors = jnp.asarray(np.random.default_rng(0).normal(size=(1, NUM, 3)), jnp.float32)
     nothing = jnp.zeros_like(colors)
     seen = Seen(cameras, nothing, jnp.zeros((1, NUM), bool), colors)
-    params, layout = model.appearance.allocate(jax.random.key(0), model.gaussians)
-    base = dataclasses.replace(model, params=params, layout=layout)
+    appearance = allocate_appearance(template_of(model.appearance), jax.random.key(0), model.gaussians)
+    base = Model(model.gaussians, appearance)
     state = event.observe(event.init(base), base, seen)
-    after = event.apply(Due(), base, adam_init((base.gaussians, base.params)), state).model
+    after = event.apply(Due(), base, adam_init(partition(base)[0]), state).model
     assert 1e6 * budget_mb - 36 < after.num_bytes <= 1e6 * budget_mb
     np.testing.assert_allclose(after.render(camera).color, base.render(camera).color, atol=1e-6)
 
 
 @pytest.mark.parametrize("base, highest, num_bytes", [(0, 2, 5_000), (1, 3, 900), (0, 3, 100_000)])
 def test_there_is_room_for_all_degrees_that_fit(base, highest, num_bytes):
-    """Any degrees within the bytes fit the tables that are planned before, and no table has a row too many."""
-    rng = np.random.default_rng(highest)
-    rows = most_rows(num_bytes, base, highest, NUM)
-    bands = range(base + 1, 4)
+    """Any degrees within the bytes fit the shape that is planned before, which has few rows to spare."""
+    empty = empty_bands(np.full(NUM, base), base)
+    room = most_blocks(num_bytes, base, highest, NUM, empty)
+    expected = {(0,): bucket_capacity(NUM)}
     for favourite in range(base + 1, highest + 1):  # As many of one degree as fit.
-        cost = 4 * sum(floats_of_band(band) for band in bands if band <= favourite)
-        count = min(NUM, num_bytes // cost)
-        wanted = [count if band <= favourite else 0 for band in bands]
-        assert all(room >= need for room, need in zip(rows, wanted, strict=True))
-        assert rows[favourite - base - 1] == count
-    assert all(room == 0 for room, band in zip(rows, bands, strict=True) if band > highest)
-    degrees = rng.integers(base, highest + 1, NUM)
-    empty, layout = allocate_bands(np.full(NUM, base), base)
-    tables, owners, _ = reallocate_bands(empty, layout, degrees, None, [NUM] * len(layout.owners))
-    assert [len(table) for table in tables.tables] == [NUM] * len(bands)
-    np.testing.assert_array_equal(owners.degrees, degrees)
-    tables, owners, _ = reallocate_bands(tables, owners, degrees, None, [1] * len(bands))
-    np.testing.assert_array_equal(owners.degrees, degrees)
+        cost = 4 * sum(map(floats_of_band, range(base + 1, favourite + 1)))
+        if count := min(NUM, num_bytes // cost):
+            size = tuple(sizes_of_degrees(np.array([favourite]), base)[0].tolist())
+            expected[size] = bucket_capacity(count)
+    assert dict(zip(*room, strict=True)) == expected
+    degrees = np.random.default_rng(highest).integers(base, highest + 1, NUM)
+    sizes = sizes_of_degrees(degrees, base)
+    wide = Shape(room.sizes, (bucket_capacity(NUM),) * len(room.sizes))
+    table = resize(empty, sizes, room=wide).table
+    assert table.shape == wide
+    np.testing.assert_array_equal(table.sizes, sizes)
+    table = resize(table, sizes, room=Shape(room.sizes, (1,) * len(room.sizes))).table
+    np.testing.assert_array_equal(table.sizes, sizes)
 
 
-@pytest.mark.parametrize("damage", ["bands", "inner", "degree"])
-def test_a_file_whose_parts_disagree_is_refused(tmp_path, monkeypatch, damage):
-    model, _, _ = banded(3, inner=Textured((2, 1)))
-    other, _, _ = banded(4, base=1, inner=Textured((2, 1)))
+@pytest.mark.parametrize("damage", ["bands", "texture", "degree"])
+def test_a_file_whose_parts_disagree_is_refused(tmp_path, damage):
+    template = Appearance(texture=Texture(start=(2, 1)))
+    (model, _, _), (other, _, _) = banded(3, template=template), banded(4, base=1, template=template)
     if damage == "degree":
-        model = dataclasses.replace(model, gaussians=other.gaussians)
+        damaged = dataclasses.replace(model, gaussians=other.gaussians)
     else:
-        part = Banded(Textured((2, 1))).first_rows(model.params, model.layout, 20)
-        layout = model.layout._replace(**{damage: getattr(part[1], damage)})
-        params = model.params._replace(**{damage: getattr(part[0], damage)})
-        model = dataclasses.replace(model, params=params, layout=layout)
+        part = {damage: getattr(model[:20].appearance, damage)}
+        damaged = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, **part))
     with pytest.raises(
         ValueError,
-        match=r"^(Banded has (20 degrees, but there are 40|bands above degree 0, but the)|Textured has 20 rows)",
+        match=r"^(bands\.coefficients|textures) (are of 20 Gaussians, but there are 40|have blocks of 3 coefficients)",
     ):
-        save_model(tmp_path / "m.npz", model)
-    with monkeypatch.context() as patch:
-        patch.setattr("a2tg_jax.io.model_file.check_model", lambda model: None)
-        save_model(tmp_path / "m.npz", model)
-    with pytest.raises(ValueError, match=r"m\.npz: .*(Banded|Textured) has"):
+        save_model(tmp_path / "m.npz", damaged)
+    for name, own in {"whole": model, "part": model[:20], "other": other}.items():
+        save_model(tmp_path / f"{name}.npz", own)
+    header, arrays = read_archive(tmp_path / "whole.npz", format=FORMAT)
+    _, others = read_archive(tmp_path / ("other.npz" if damage == "degree" else "part.npz"), format=FORMAT)
+    names = {"bands": ("degrees", "band_1", "band_2", "band_3"), "texture": ("sizes", "texels")}
+    paths = ["sh"] if damage == "degree" else [f"appearance/{name}" for name in names[damage]]
+    write_archive(tmp_path / "m.npz", header, arrays | {path: others[path] for path in paths}, format=FORMAT)
+    with pytest.raises(ValueError, match=r"m\.npz: (bands|textures)(\.coefficients)? are (of 20|above degree 0)"):
         load_model(tmp_path / "m.npz")
 
 
 def test_degrees_that_have_risen_are_not_lost_where_gaussians_are_added():
     model, _, _ = banded(5)
-    stage = Stage("more", model.appearance, (Mcmc(2 * NUM),), (), LearningRates(), 100, BandedRates(0.0))
+    stage = Stage("more", template_of(model.appearance), (Mcmc(2 * NUM),), (), LearningRates(), 100, 0.0)
     with pytest.raises(ValueError, match="textures or degrees have grown already"):
         padded(model, stage, Gaussians2dMcmc())
 
@@ -280,8 +271,8 @@ def test_degrees_that_have_risen_are_not_lost_where_gaussians_are_added():
 def test_degrees_rise_in_banded_models_only():
     model = Model(as_gaussians(draw_scene(1, num=NUM), "float32"))
     event = AdaptDegrees(1.0)
-    with pytest.raises(ValueError, match="Plain has no degrees that could rise; Banded has"):
-        event.apply(Due(), model, adam_init((model.gaussians, ())), event.init(model))
+    with pytest.raises(ValueError, match=r"^plain Gaussians cannot raise degrees: the stage needs Appearance\(bands="):
+        event.apply(Due(), model, adam_init(partition(model)[0]), event.init(model))
 
 
 def test_a_ply_file_of_nothing(tmp_path):

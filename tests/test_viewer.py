@@ -19,11 +19,11 @@ from PIL import Image
 from small_values import some_gaussians
 from test_compact import textured
 
-from a2tg_jax.appearance import shaped
+from a2tg_jax.appearance import exponents
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.display import in_bytes
 from a2tg_jax.data import synthetic_scene
 from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.compact import save_compact
 from a2tg_jax.io.model_file import save_model
 from a2tg_jax.io.ply import save_ply
@@ -207,7 +207,7 @@ def test_view_tells_the_address_for_a_phone(monkeypatch, tmp_path, capsys):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_ctrl_c_is_the_usual_end_of_a_server(monkeypatch, tmp_path, number, code):
     save_ply(tmp_path / "a.ply", some_gaussians())
-    monkeypatch.setattr("a2tg_jax.cli.view.View._started", lambda *_: signal.raise_signal(number))
+    monkeypatch.setattr("a2tg_jax.cli.view.ViewCommand._started", lambda *_: signal.raise_signal(number))
     assert main(["view", str(tmp_path / "a.ply")]) == code
 
 
@@ -248,7 +248,7 @@ def test_the_policy_allows_the_page_its_own_script_and_style_and_nothing_else():
 def test_the_page_and_the_renderer_have_kernels_of_the_same_numbers():
     found = re.search(r"const float OFFSET = ([\d.]+), LARGEST_LOG_EXPONENT = ([\d.]+);", viewer_html())
     assert found is not None
-    assert tuple(map(float, found.groups())) == (shaped.OFFSET, shaped.LARGEST_LOG_EXPONENT)
+    assert tuple(map(float, found.groups())) == (exponents.OFFSET, exponents.LARGEST_LOG_EXPONENT)
 
 
 def test_a_page_holds_a_scene():

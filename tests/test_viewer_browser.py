@@ -15,8 +15,8 @@ from viewer_cases import shaped_model, small_model, small_numbers, write_case
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.ply import ATTRIBUTES, SCALES
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results.viewing import Source, open_source
-from a2tg_jax.systems.stage1 import McmcConfig
 from a2tg_jax.web.page import viewer_html
 
 WEB = Path(__file__).resolve().parents[1] / "web"
@@ -24,8 +24,9 @@ CHROMIUM = ("/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-c
 SYSTEM = a2tg.A2tg(
     stage1_iterations=60,
     stage2_iterations=60,
-    densify=McmcConfig(cap=700),
-    texture=a2tg.TextureConfig(fraction=0.5, upscale_at=(0.1, 0.3), rate=1e-2),
+    densify=Mcmc(cap=700),
+    texture=a2tg.Upscale(fraction=0.5, at=(0.1, 0.3)),
+    texel_rate=1e-2,
 )
 
 

@@ -11,12 +11,15 @@ import jax.numpy as jnp
 import a2tg_jax as a2tg
 
 
-@a2tg.pytree
-class RingsRule(a2tg.PlainRule):
-    """What the renderer is given: rings around the centre of each splat, beside its own colour."""
+@a2tg.pytree(kw_only=True)
+class Rings(a2tg.Appearance):
+    """Rings around the centre of each splat, added to its own colour; colourless at first."""
 
-    rings: jax.Array
+    rings: jax.Array | None = None
     """[N, 4] red, green, blue, and how narrow the rings are."""
+
+    def allocate(self, key, gaussians):
+        return dataclasses.replace(self, rings=jnp.zeros((gaussians.num, 4)).at[:, 3].set(2.0))
 
     def numbers(self, gaussians, camera):
         return self.rings
@@ -25,17 +28,6 @@ class RingsRule(a2tg.PlainRule):
         red, green, blue, frequency = numbers
         wave = jnp.cos(frequency * (u * u + v * v))
         return (red * wave, green * wave, blue * wave), None
-
-
-@dataclasses.dataclass(frozen=True)
-class Rings(a2tg.Appearance):
-    """What a model has: it makes the parameters, colourless at first, and the rule that shows them."""
-
-    def allocate(self, key, gaussians):
-        return jnp.zeros((gaussians.num, 4)).at[:, 3].set(2.0), ()
-
-    def rule(self, params, layout):
-        return RingsRule(rings=params)
 
 
 @a2tg.pytree
@@ -57,7 +49,7 @@ class Shrink(a2tg.StepEvent):
 
 def contrast(model, target, output):
     """A loss term: rings are to earn their keep."""
-    return jnp.mean(model.params[:, :3] ** 2)
+    return jnp.mean(model.appearance.rings[:, :3] ** 2)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -14,10 +14,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Banded, Plain, Shaped, Textured, TextureOptions
-from a2tg_jax.appearance.banded import BandedLayout, BandedParams
-from a2tg_jax.appearance.sh_bands import split_sh
-from a2tg_jax.appearance.shaped import ShapedLayout, ShapedParams
+from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOptions
+from a2tg_jax.appearance.bands import bands_of_dense
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
@@ -37,27 +35,25 @@ def small_model(options: TextureOptions = TextureOptions()) -> Model:  # noqa: B
     rng = np.random.default_rng(7)
     draw = lambda *shape, scale=1.0: np.asarray(scale * rng.normal(size=shape), np.float32)  # noqa: E731
     sizes = [(0, 0), (1, 1), (2, 3), (4, 1), (5, 5)]
-    textures, atlas = textures_from_arrays([draw(*sizes[i % 5], 4, scale=0.3) for i in range(NUM)])
-    bands, owners = split_sh(draw(NUM, 16, 3, scale=0.4), rng.integers(0, 4, NUM), 0)
+    textures = textures_from_arrays([draw(*sizes[i % 5], 4, scale=0.3) for i in range(NUM)])
+    bands = bands_of_dense(draw(NUM, 16, 3, scale=0.4)[:, 1:], rng.integers(0, 4, NUM), 0)
     gaussians = Gaussians(
         draw(NUM, 3), draw(NUM, 4), draw(NUM, 2, scale=0.5) - np.float32(2), draw(NUM), draw(NUM, 1, 3)
     )  # type: ignore[arg-type]
     viewmat = np.eye(4)
     viewmat[2, 3] = 4.0
     camera = Camera(viewmat, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)  # type: ignore[arg-type]
-    origin = Origin.of_cameras([camera], ["<b>a</b>.png"], background=(0.25, 0.5, 0.75))
-    params, layout = BandedParams(bands, textures), BandedLayout(owners, atlas)
-    return Model(gaussians, params, layout, appearance=Banded(Textured(options=options)), origin=origin)
+    origin = Origin.of_cameras([camera], ["<b>a</b>.png"])
+    appearance = Appearance(texture=Texture(textures, options=options), bands=Bands(bands))
+    return Model(gaussians, appearance, background=(0.25, 0.5, 0.75), origin=origin)
 
 
 def shaped_model() -> Model:
     """The same Gaussians with kernels of every exponent from 1/e, with long tails, to e, with a sharp edge."""
     model = small_model()
-    (bands, textures), (owners, atlas) = model.params, model.layout
     shapes = np.arctanh(np.linspace(-1, 1, NUM) * (1 - 1e-6))
-    shaped = ShapedParams(jnp.asarray(np.random.default_rng(8).permutation(shapes), jnp.float32), textures)
-    params, layout = BandedParams(bands, shaped), BandedLayout(owners, ShapedLayout(atlas))
-    return dataclasses.replace(model, params=params, layout=layout, appearance=Banded(Shaped(Textured())))
+    exponents = Exponents(jnp.asarray(np.random.default_rng(8).permutation(shapes), jnp.float32))
+    return dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, exponents=exponents))
 
 
 def write_small(folder: Path) -> None:
@@ -70,17 +66,15 @@ def write_small(folder: Path) -> None:
 def small_numbers(data: bytes) -> dict[str, list]:
     """What a reader must find in the file, rounded, by row."""
     model = decode_web_scene(data).model
-    arrays = model.appearance.arrays(model.params, model.layout)
-    sh = model.sh
     found = {
         "means": model.gaussians.means,
         "log_scales": model.gaussians.log_scales,
         "quats": model.gaussians.quats,
         "opacities": model.gaussians.opacities,
-        "degrees": arrays["degrees"],
-        "sizes": arrays["inner.sizes"],
-        "sh": sh[:40],
-        "texels": arrays["inner.texels"][:400],
+        "degrees": model.degrees,
+        "sizes": model.textures.sizes,
+        "sh": model.sh[:40],
+        "texels": model.textures.flat()[:400],
     }
     return {name: np.round(np.asarray(array, np.float64), 5).ravel().tolist() for name, array in found.items()}
 
@@ -123,9 +117,7 @@ def _picture(output: RenderOutput, mode: str) -> np.ndarray:
 
 def without_textures(model: Model) -> Model:
     """The Gaussians alone."""
-    textured = model.appearance
-    assert isinstance(textured, Textured)
-    return dataclasses.replace(model, params=(), layout=(), appearance=Plain(textured.options.max_alpha))
+    return dataclasses.replace(model, appearance=Appearance(max_alpha=model.appearance.alpha_limit))
 
 
 def _view(camera: Camera, mode: str, of: str) -> dict:

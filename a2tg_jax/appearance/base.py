@@ -1,130 +1,459 @@
-"""The interface of appearances: static values that allocate, show, project and count what a model's splats show.
+"""Appearance: what splats show. One pytree of arrays and static options, which the renderer draws and training changes.
 
-An appearance is hashable and holds options only. Its parameters travel beside it: `params`, a pytree of float arrays
-that training differentiates, and `layout`, integers beside them.
+Each of N splats may own a texture of one or more texels among all texels [T, C], and K numbers. At (u, v), in standard
+deviations, an appearance gives the position of the texture lookup (`texel_position`). From the C interpolated values
+and the K numbers it computes a colour residual and an alpha factor (`shade`):
 
-    params, layout = appearance.allocate(key, gaussians)
-    rule = appearance.rule(params, layout)          # for the renderer
+    residual, factor = shade(numbers, texture interpolated at texel_position(region, u, v), u, v)
+    α = min(max_alpha, peak opacity · falloff(numbers, ρ) · factor),  colour = SH colour + residual
+
+`Appearance()` is plain 2DGS. Its optional parts are a texture, exponents of the kernels, and bands of spherical
+harmonics. A subclass adds arrays of its own and overrides what differs; the parts work with it too.
+
+An appearance whose arrays are None is a template, such as the one of a stage: it has the options only, and
+`allocate_appearance` makes the arrays for some Gaussians. A plain array of a subclass has a row for each Gaussian.
 """
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, Self
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance.options import TextureOptions
-from a2tg_jax.appearance.rows import MovableRows
-from a2tg_jax.appearance.rule import AppearanceRule
-from a2tg_jax.appearance.sh_bands import BandLayout, Bands
-from a2tg_jax.appearance.stored import StoredArrays, parameter_shapes
-from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.appearance.bands import Bands, Coefficients
+from a2tg_jax.appearance.copies import share
+from a2tg_jax.appearance.exponents import Exponents, curves_of, reach_of
+from a2tg_jax.appearance.lookup import Texture, TextureOptions
+from a2tg_jax.appearance.part import Factor, Part, Residual
+from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import FLOATS, described
+from a2tg_jax.core.gaussians import Gaussians, logit
+from a2tg_jax.core.numerics import at_least
+from a2tg_jax.core.partition import partition
+from a2tg_jax.core.pytree import pytree, static
+from a2tg_jax.core.sh import sh_sum
+from a2tg_jax.core.table import Table, check_places, check_table
+from a2tg_jax.texture import NEUTRAL_TEXEL, Textures
 
-WITH_TEXTURES = "a model with textures is Model(gaussians, textures, layout, appearance=Textured())"
+MAX_ALPHA = 0.99
 
 
-def _with_wrapper(name: str) -> str:
-    """Return how to make a model whose appearance is wrapped by the class of that name."""
-    return (
-        f"say shown = {name}(appearance), params, layout = shown.allocate(key, gaussians), and "
-        "Model(gaussians, params, layout, appearance=shown)"
-    )
+@pytree(kw_only=True)
+class Appearance:
+    """Plain 2D Gaussians with optional parts, and base class of other appearances."""
 
+    texture: Texture | None = None
+    """Colour residual and alpha factor from a texture of each splat; None: no textures."""
+    exponents: Exponents | None = None
+    """Shapes of the kernels; None: all are Gaussians."""
+    bands: Bands | None = None
+    """Spherical harmonics with a degree per Gaussian, beyond those of the Gaussians; None: none."""
+    given_colors: Array | None = None
+    """[N, 3] colours in place of those of spherical harmonics, for rendering; None otherwise."""
+    features: Array | None = None
+    """[N, D] numbers to show in place of all colour, residuals of textures included, D >= 1, of either sign; None
+    otherwise."""
+    max_alpha: float | None = static(default=None)
+    """Upper limit of alpha, in (0, 1); None: the one of the texture's options, or 0.99."""
 
-@dataclasses.dataclass(frozen=True)
-class Appearance(MovableRows, StoredArrays):
-    """Appearance of splats. The defaults suit an appearance whose parameters have one row per Gaussian and no layout.
+    # For subclasses: class attributes.
 
-    A subclass overrides `allocate` and `rule`, and whatever else differs. Callers ask for capabilities (`is_linear`,
-    `texture_options`, `has_degrees`, …), never for a class: each defaults to no.
-    """
+    has_low_pass = True
+    """Whether the low-pass filter of 2DGS shows splats that are smaller than a pixel or seen edge-on. Without it, ρ is
+    u² + v² at the hit of the pixel's ray, and a splat without a hit is invisible."""
+    num_colors = 3
+    """Number D of colours of a splat: red, green and blue, or as many features."""
+    empty: ClassVar[tuple[float, ...]] = ()
+    """C values of a splat without a texture, whose region has no texels; () if all splats have one."""
+    replaced_floats = 0
+    """Number of floats of a Gaussian that are not trained, such as an opacity that the appearance does not use."""
 
-    def allocate(self, key: Array, gaussians: Gaussians) -> tuple[Any, Any]:
-        """Return initial parameters and layout for N Gaussians (host)."""
-        return (), ()
+    def __post_init__(self) -> None:
+        """Refuse exponents where the kernel is not a Gaussian; take the default limit of alpha for None."""
+        if self.max_alpha == MAX_ALPHA and self.texture is None:
+            object.__setattr__(self, "max_alpha", None)  # Appearances that show the same are equal.
+        if self.exponents is not None and type(self).falloff is not Appearance.falloff:
+            raise ValueError(f"exponents replace a Gaussian falloff, and {type(self).__name__} has another one")
+        # Equal appearances have one form, so that systems share stages, and models compiled programs.
+        if self.texture is None and self.max_alpha == MAX_ALPHA:
+            object.__setattr__(self, "max_alpha", None)
 
-    def rule(self, params: Any, layout: Any) -> AppearanceRule:
-        """Return the rule that the renderer is given; traceable, and differentiable in `params`."""
-        raise NotImplementedError(f"{type(self).__name__} must say which appearance rule shows it")
+    # What the renderer draws. A subclass overrides some of these.
 
-    def project(self, params: Any) -> Any:
-        """Return the parameters moved to where they are allowed, after an update; traceable."""
-        return params
+    def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
+        """Return the differentiable numbers [N, K] of `shade` and `falloff`, which may depend on the view.
 
-    def rates(self, rate: Any, params: Any) -> Any:
-        """Return Adam's learning rates, a prefix of the parameters' tree, from those of a stage; traceable."""
-        return rate
+        The renderer calls it once per view, and JAX differentiates it. Gradients of invisible rows are zero.
+        """
+        return jnp.zeros((gaussians.num, 0), gaussians.means.dtype)
 
-    def num_floats(self, layout: Any, num: int) -> int:
-        """Return the trained floats of `num` live Gaussians, without those of `Gaussians` and padding (host)."""
-        per_row = sum(np.prod(leaf.shape[1:], dtype=int) for leaf in jax.tree.leaves(parameter_shapes(self)[0]))
-        return int(per_row) * num
+    def peak_opacities(self, gaussians: Gaussians) -> Array:
+        """Return the peak opacities [N], before falloff and alpha factor."""
+        return gaussians.opacities
 
-    def num_published_floats(self, layout: Any, num: int) -> int:
-        """Return the floats as the method's authors count them (host)."""
-        return self.num_floats(layout, num)
+    def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+        """Return the colours [N, D] in this view.
 
-    # Capabilities.
+        By default, D = 3 of spherical harmonics up to `degree`, which may be traced.
+        """
+        return at_least(color_sums(self, gaussians, camera, degree) + 0.5, 0.0)
 
-    @property
-    def base(self) -> "Appearance":
-        """The appearance inside wrappers that change nothing but colours. `Banded` has the base of what it wraps."""
+    def atlas(self) -> tuple[Array, TextureRegion | None]:
+        """Return the texels [T, C] of all splats, T >= 1, and the N places of the splats' textures among them; None
+        without textures."""
+        return (jnp.zeros((1, 0), jnp.float32), None) if self.texture is None else self.texture.atlas()
+
+    def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
+        """Return the lookup position (x, y) in texels, clamped to [0, width − 1] and [0, height − 1].
+
+        Element-wise, on scalars or on arrays that broadcast, as `shade` and `falloff`. These three see the static
+        fields only: return differentiated values, and values that differ between splats, from `numbers` or `atlas`.
+        """
+        if self.texture is None:
+            raise NotImplementedError(f"{type(self).__name__} has textures, but no method texel_position")
+        return self.texture.position(region, u, v)
+
+    def shade(
+        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
+    ) -> tuple[Residual, Factor]:
+        """Return colour residual and alpha factor at (u, v), from the K numbers and the C values of the texture."""
+        return (None, None) if self.texture is None else self.texture.shade(values, u, v)
+
+    def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
+        """Return the kernel at squared distance rho; exp(−rho/2) for a Gaussian."""
+        return jnp.exp(-0.5 * rho)
+
+    def cutoff(self, opacities: Array) -> Array:
+        """Return the squared distance rho [N] beyond which alpha is below 1/255; not positive if it always is.
+
+        These are bounds without gradient. Too large a bound costs time, too small a one cuts the splat off.
+        """
+        return gaussian_cutoff(opacities if self.texture is None else opacities * self.texture.peaks())
+
+    # What training changes. A subclass overrides some of these.
+
+    def allocate(self, key: Array, gaussians: Gaussians) -> Self:
+        """Return the appearance with initial arrays of the subclass for N Gaussians; parts have theirs already
+        (host)."""
         return self
 
+    def project(self) -> Self:
+        """Return the appearance with arrays of the subclass moved to where they are allowed, after an update;
+        traceable."""
+        return self
+
+    def rates(self, rate: Any) -> Any:
+        """Return Adam's learning rates, a prefix of the tree of floats, from those of a stage.
+
+        A number holds for all floats. A mapping has rates by field, 0 for those it lacks.
+        """
+        if not isinstance(rate, Mapping):
+            return rate
+        floats = [field.name for field in _array_fields(self) if getattr(self, field.name) is not None]
+        if unknown := [*rate.keys() - set(floats)]:
+            raise ValueError(f"rates must be by the fields {', '.join(floats)}; got {unknown[0]!r}")
+        own = {name: getattr(self, name) for name in floats}
+        return dataclasses.replace(
+            self,
+            **{
+                name: value.rates(rate.get(name, 0.0)) if isinstance(value, Part) else rate.get(name, 0.0)
+                for name, value in own.items()
+            },
+        )
+
+    def opacities(self, gaussians: Gaussians) -> Array:
+        """Return the opacities [N] that densification compares with its thresholds; traceable."""
+        return gaussians.opacities
+
+    def share(self, gaussians: Gaussians, num_shares: Array) -> tuple[Gaussians, Self]:
+        """Return each row as one of num_shares [N] coincident copies that together look like it; traceable."""
+        opacities, scales = share(gaussians.logit_opacities, gaussians.log_scales, num_shares)
+        return dataclasses.replace(gaussians, logit_opacities=opacities, log_scales=scales), self
+
+    def limit_opacities(self, gaussians: Gaussians, most: Array) -> tuple[Gaussians, Self]:
+        """Return Gaussians and appearance of splats no more opaque than `most`; traceable."""
+        limited = jnp.minimum(gaussians.logit_opacities, logit(jnp.asarray(most, gaussians.means.dtype)))
+        return dataclasses.replace(gaussians, logit_opacities=limited), self
+
+    def check_arrays(self, gaussians: Gaussians) -> None:
+        """Raise ValueError unless arrays of the subclass, with a row for each Gaussian, fit its options (host)."""
+
+    def num_published_floats(self, num: int) -> int:
+        """Return the floats of `num` Gaussians, beside their own, as the method's authors count them (host)."""
+        return count_floats(self, num)
+
+    # Facts
+
     @property
-    def layers(self) -> tuple["Appearance", ...]:
-        """The appearance, and what it wraps, from the outermost to the innermost."""
-        return (self,)
+    def alpha_limit(self) -> float:
+        """Upper limit of alpha."""
+        if self.max_alpha is not None:
+            return self.max_alpha
+        return MAX_ALPHA if self.texture is None else self.texture.options.max_alpha
+
+    @property
+    def is_portable(self) -> bool:
+        """Whether Gaussians and parts define the appearance completely.
+
+        Compact files, web scenes and `shrink_textures` need this.
+        """
+        return type(self) is Appearance
 
     @property
     def is_linear(self) -> bool:
-        """Whether a picture is linear in spherical harmonics and in the RGB of `textures`."""
-        return False
+        """Whether a picture is linear in spherical harmonics and in the RGB of the textures."""
+        return type(self) is Appearance and (self.texture is None or self.texture.options.rgb == "signed")
+
+    @property
+    def has_own_opacities(self) -> bool:
+        """Whether splats are exactly as opaque as their Gaussians."""
+        return type(self).opacities is Appearance.opacities
 
     @property
     def texture_options(self) -> TextureOptions | None:
-        """How textures that may differ in size are read; None without such textures."""
-        return None
+        """How textures are read; None without the part `texture`."""
+        return None if self.texture is None else self.texture.options
 
     @property
-    def has_degrees(self) -> bool:
-        """Whether each Gaussian has a degree of spherical harmonics of its own."""
-        return False
+    def textures(self) -> Textures | None:
+        """Textures of the splats; None without."""
+        return None if self.texture is None else self.texture.texels
 
-    def textures(self, params: Any, layout: Any) -> tuple[Textures, AtlasLayout] | None:
-        """Return textures and their layout; None without textures."""
-        return None
+    @property
+    def coefficients(self) -> Coefficients | None:
+        """Spherical harmonics beyond those of the Gaussians; None without."""
+        return None if self.bands is None else self.bands.coefficients
 
-    def with_textures(self, params: Any, layout: Any, textures: Textures, atlas: AtlasLayout) -> tuple[Any, Any]:
-        """Return parameters and layout with other textures.
+    @property
+    def shapes(self) -> Array | None:
+        """[N] shapes of the kernels; None if all are Gaussians."""
+        return None if self.exponents is None else self.exponents.shapes
 
-        Raises:
-          ValueError: if the appearance has no textures.
-        """
-        raise ValueError(f"{type(self).__name__} has no textures to replace: {WITH_TEXTURES}")
-
-    def bands(self, params: Any, layout: Any) -> tuple[Bands, BandLayout] | None:
-        """Return the coefficients beyond those of `Gaussians.sh`, and their owners; None without degrees."""
-        return None
-
-    def with_bands(self, params: Any, layout: Any, bands: Bands, owners: BandLayout) -> tuple[Any, Any]:
-        """Return parameters and layout with other coefficients.
+    def with_textures(self, textures: Textures) -> Self:
+        """Return the appearance with other textures.
 
         Raises:
-          ValueError: if the appearance has no degrees per Gaussian.
+          ValueError: if it has none.
         """
-        raise ValueError(f"{type(self).__name__} has no degrees per Gaussian to replace: {_with_wrapper('Banded')}")
+        if self.texture is None:
+            raise ValueError(
+                f"no textures to replace in {in_words(self)}: build a model with Appearance(texture=Texture(textures))"
+            )
+        return dataclasses.replace(self, texture=dataclasses.replace(self.texture, texels=textures))
 
-    def shapes(self, params: Any) -> Array | None:
-        """Return the shapes [N] of the kernels; None if all are Gaussians."""
-        return None
+    def with_coefficients(self, coefficients: Coefficients) -> Self:
+        """Return the appearance, which has bands, with other coefficients."""
+        return dataclasses.replace(self, bands=Bands(coefficients))
 
-    def with_shapes(self, params: Any, shapes: Array) -> Any:
-        """Return parameters with other shapes of the kernels.
+    def with_shapes(self, shapes: Array) -> Self:
+        """Return the appearance, which has exponents, with other shapes."""
+        return dataclasses.replace(self, exponents=Exponents(shapes))
 
-        Raises:
-          ValueError: if the appearance has no shapes.
-        """
-        raise ValueError(f"{type(self).__name__} has no shapes of kernels to replace: {_with_wrapper('Shaped')}")
+
+def appearance_for(
+    options: TextureOptions,
+    *,
+    has_textures: bool,
+    has_degrees: bool = False,
+    has_shapes: bool = False,
+    start: tuple[int, int] = (1, 1),
+) -> Appearance:
+    """Return the template of plain Gaussians with some parts; without textures, only `options.max_alpha` counts."""
+    max_alpha = None if has_textures or options.max_alpha == MAX_ALPHA else options.max_alpha
+    return Appearance(
+        texture=Texture(None, start, options) if has_textures else None,
+        exponents=Exponents() if has_shapes else None,
+        bands=Bands() if has_degrees else None,
+        max_alpha=max_alpha,
+    )
+
+
+def in_words(appearance: Appearance) -> str:
+    """Return an appearance in words, such as "Rings with texture and bands"; "plain Gaussians" without anything."""
+    kind = "Gaussians" if type(appearance) is Appearance else type(appearance).__name__
+    parts = [name for name in PARTS if getattr(appearance, name) is not None]
+    if not parts:
+        return "plain Gaussians" if kind == "Gaussians" else kind
+    *first, last = parts
+    return f"{kind} with {', '.join(first)} and {last}" if first else f"{kind} with {last}"
+
+
+PARTS = ("texture", "exponents", "bands")
+VIEW_FIELDS = ("given_colors", "features")
+"""Arrays that only change how a model is rendered."""
+
+
+def _array_fields(node: Any) -> list[dataclasses.Field[Any]]:
+    """Return the fields of an appearance, or of a part, that are not static."""
+    return [field for field in dataclasses.fields(node) if not field.metadata.get("static")]
+
+
+def gaussian_cutoff(peak: Array) -> Array:
+    """Return r² = 2·ln(255·peak), at which peak·exp(−r²/2) = 1/255; negative if the peak is not positive."""
+    return 2 * jnp.log(jnp.maximum(255 * peak, 1e-6))
+
+
+# The composition of an appearance with its parts, for the renderer
+
+
+def color_sums(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+    """Return the sums of spherical harmonics [N, 3] behind the colours, of either sign; linear in the coefficients."""
+    own = sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
+    bands = appearance.bands
+    return own if bands is None else own + bands.color_sums(gaussians, camera.center, degree)
+
+
+def colors_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+    """Return the colours [N, D], or the features, of the splats in a view."""
+    for given in (appearance.features, appearance.given_colors):
+        if given is not None:
+            return given
+    return appearance.own_colors(gaussians, camera, degree)
+
+
+def numbers_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera) -> Array:
+    """Return the numbers [N, K] of the splats in a view, followed by the curves of kernels with exponents."""
+    own = appearance.numbers(gaussians, camera)
+    shapes = appearance.shapes
+    return own if shapes is None else jnp.concatenate([own, jnp.stack(curves_of(shapes), axis=1)], axis=1)
+
+
+def cutoff_of(appearance: Appearance, opacities: Array) -> Array:
+    """Return the squared distance [N] beyond which alpha is below 1/255, of kernels with their exponents."""
+    bound, shapes = appearance.cutoff(opacities).astype(opacities.dtype), appearance.shapes
+    # The bound of a Gaussian says at which exponent of the falloff alpha is below 1/255.
+    return bound if shapes is None else reach_of(curves_of(shapes), bound)
+
+
+def num_colors_of(appearance: Appearance) -> int:
+    """Return the number of colours of a splat, or of features."""
+    return appearance.num_colors if appearance.features is None else int(appearance.features.shape[1])
+
+
+def empty_values(appearance: Appearance) -> tuple[float, ...]:
+    """Return the values of a splat without a texture; () if all splats have one."""
+    return appearance.empty if appearance.texture is None else NEUTRAL_TEXEL
+
+
+# Templates and arrays
+
+
+def without_arrays(node: Any, instead: Callable[[str], Any], name: str = "") -> Any:
+    """Return an appearance or a part with a value in place of each array field that is not None.
+
+    Args:
+      node: the appearance.
+      instead: makes the value of the field's path, such as "texture.texels".
+    """
+    changes = {}
+    for field in _array_fields(node):
+        value, path = getattr(node, field.name), f"{name}.{field.name}" if name else field.name
+        if isinstance(value, Part):
+            changes[field.name] = without_arrays(value, instead, path)
+        elif value is not None:
+            changes[field.name] = instead(path)
+    return dataclasses.replace(node, **changes) if changes else node
+
+
+def template_of(appearance: Appearance) -> Any:
+    """Return the appearance without its arrays: its options."""
+    return without_arrays(appearance, lambda path: None)
+
+
+def allocate_appearance(template: Appearance, key: Array, gaussians: Gaussians) -> Any:
+    """Return an appearance of the options of a template, with initial arrays for N Gaussians (host)."""
+    parts = {name: part.allocate(gaussians) for name in PARTS if (part := getattr(template, name)) is not None}
+    return dataclasses.replace(template, **parts).allocate(key, gaussians)
+
+
+def projected(appearance: Appearance) -> Any:
+    """Return the appearance with all numbers moved to where they are allowed, after an update; traceable."""
+    parts = {name: part.project() for name in PARTS if (part := getattr(appearance, name)) is not None}
+    return dataclasses.replace(appearance, **parts).project()
+
+
+def count_floats(appearance: Appearance, num: int) -> int:
+    """Return the trained floats of the first `num` Gaussians beside their own, without padding (host).
+
+    An opacity that is not trained counts as -1.
+    """
+    total = -appearance.replaced_floats * num
+    for leaf in jax.tree.leaves(appearance, is_leaf=_is_table):
+        total += leaf.count_floats(num) if isinstance(leaf, Table) else int(np.prod(leaf.shape[1:], dtype=int)) * num
+    return total
+
+
+def check_appearance(appearance: Any, gaussians: Gaussians) -> None:
+    """Raise ValueError, naming the field, unless the arrays of an appearance are there and fit the Gaussians (host)."""
+    kind = type(appearance).__name__
+    check_arrays_given(appearance)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(partition(appearance)[0]):
+        if str(leaf.dtype) not in FLOATS:
+            where = f"{kind}{jax.tree_util.keystr(path)}"
+            raise ValueError(f"{where} must be floats, {' or '.join(FLOATS)}; got {leaf.dtype}")
+    for name in PARTS:
+        if (part := getattr(appearance, name)) is not None:
+            part.check(gaussians)
+    for field in _array_fields(appearance):
+        if field.name in PARTS:
+            continue
+        for leaf in jax.tree.leaves(getattr(appearance, field.name), is_leaf=_is_table):
+            if isinstance(leaf, Table):
+                check_table(leaf, gaussians.num, f"{kind}.{field.name}")
+                check_places(leaf, f"{kind}.{field.name}")
+                continue
+            if str(leaf.dtype) not in FLOATS:
+                raise ValueError(f"{kind}.{field.name} must be floats, {' or '.join(FLOATS)}; got {leaf.dtype}")
+            if leaf.shape[:1] != (gaussians.num,):
+                raise ValueError(
+                    f"{kind}.{field.name} must have a row for each of {gaussians.num} Gaussians; got {described(leaf)}"
+                )
+    appearance.check_arrays(gaussians)
+
+
+def check_arrays_given(appearance: Appearance) -> None:
+    """Raise ValueError if a part, or a table of a subclass, is a template without its arrays."""
+    for name in PARTS:
+        part = getattr(appearance, name)
+        for field in [] if part is None else _array_fields(part):
+            if getattr(part, field.name) is None:
+                raise ValueError(
+                    f"model.appearance.{name}.{field.name} is None: this appearance is a template, without arrays; say "
+                    "Model(gaussians, allocate_appearance(appearance, key, gaussians))"
+                )
+
+
+def _is_table(leaf: Any) -> bool:
+    return isinstance(leaf, Table)
+
+
+# Rows, of Gaussians and appearances alike: every array has a row for each Gaussian, every table a block
+
+
+def clear_rows(tree: Any, is_cleared: Array) -> Any:
+    """Return moments with the rows of marked Gaussians [N] at zero; traceable. Tables must have their places."""
+
+    def cleared(leaf: Any) -> Any:
+        if isinstance(leaf, Table):
+            return leaf.clear(is_cleared)
+        return jnp.where(is_cleared.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.zeros_like(leaf), leaf)
+
+    return jax.tree.map(cleared, tree, is_leaf=_is_table)
+
+
+def take_rows(tree: Any, rows: np.ndarray) -> Any:
+    """Return the rows of some Gaussians, which may repeat; tables in buckets as small as they need (host)."""
+    return jax.tree.map(lambda leaf: leaf.take(rows) if _is_table(leaf) else leaf[rows], tree, is_leaf=_is_table)
+
+
+def join_rows(trees: Sequence[Any]) -> Any:
+    """Return the rows of several trees of one structure but for their tables, one after the other (host)."""
+
+    def joined(*leaves: Any) -> Any:
+        return type(leaves[0]).joined(leaves) if _is_table(leaves[0]) else jnp.concatenate(leaves)
+
+    return jax.tree.map(joined, *trees, is_leaf=_is_table)

@@ -7,24 +7,25 @@ beyond the border:
     α = min(max_alpha, A(u, v)),   colour = SH colour + RGB(u, v) − initial RGB
 
 There is no low-pass filter. RGB is the sigmoid of the trained numbers. The authors lower the first SH coefficient so
-that the initial colours stay; here the rule subtracts the initial RGB, and the Gaussians stay unchanged.
+that the initial colours stay; here the appearance subtracts the initial RGB, and the Gaussians stay unchanged.
 """
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance.bucketed import Bucketed
-from a2tg_jax.appearance.rule import AppearanceRule, Factor, Residual
+from a2tg_jax.appearance.base import Appearance
+from a2tg_jax.appearance.part import Factor, Residual
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_divide
-from a2tg_jax.core.pytree import pytree
-from a2tg_jax.texture import MAX_SIDE, AtlasLayout, Textures, allocate_textures, nearest_places
+from a2tg_jax.core.pytree import pytree, static
+from a2tg_jax.texture import MAX_SIDE, Textures, allocate_textures
 
 INITIAL_PEAK, INITIAL_SIGMA = 0.5, 0.3
 """Peak and σ, in units of u, of the initial alpha picture; it falls to an invisible 0.002 at the border."""
@@ -32,28 +33,36 @@ LEAST_PEAK = 0.999 / 255
 
 
 @pytree
-class BillboardRule(AppearanceRule):
-    """Appearance rule: RGB residual and alpha from each splat's own picture."""
+class Billboards(Appearance):
+    """Picture for each splat."""
 
-    texels: Array
-    """[T, 4] texels of all pictures, RGB in (0, 1) and alpha."""
-    first: Array
-    """[N] first texel of each picture."""
-    peaks: Array
-    """[N] largest alpha of each picture; only for bounds, without gradient."""
-    side: int = dataclasses.field(metadata={"static": True})
-    """Side S of a picture in texels."""
-    initial_rgb: float = dataclasses.field(metadata={"static": True})
-    """Initial RGB, which is subtracted."""
-    max_alpha: float = dataclasses.field(default=0.99, metadata={"static": True})
-    has_low_pass: bool = dataclasses.field(default=False, metadata={"static": True})
+    pictures: Textures | None = None
+    """Pictures of N splats, S × S texels each: RGB before the sigmoid, and alpha; None until allocated."""
+    side: int = static(default=16)
+    """Side S of a picture in texels, 2 to 16."""
+    initial_rgb: float = static(default=0.1)
+    """Initial RGB, in (0, 1), which is subtracted."""
 
-    @property
-    def regions(self) -> TextureRegion:  # type: ignore[override]
-        side = jnp.full_like(self.first, self.side)
-        return TextureRegion(self.first, side, side)
+    has_low_pass = False
+    replaced_floats = 1
 
-    def opacities(self, gaussians: Gaussians) -> Array:
+    def __post_init__(self) -> None:
+        """Refuse sides and colours out of range."""
+        super().__post_init__()
+        if not 2 <= self.side <= MAX_SIDE:
+            raise ValueError(f"side must be in 2..{MAX_SIDE}; got {self.side}")
+        if not 0 < self.initial_rgb < 1:
+            raise ValueError(f"initial_rgb must be in (0, 1); got {self.initial_rgb}")
+
+    def atlas(self) -> tuple[Array, TextureRegion]:
+        """Return the texels [T, 4], RGB in (0, 1) and alpha, and the places of the pictures."""
+        (bucket,), row = self._bucket(), self._rows()
+        shown = jnp.concatenate([jax.nn.sigmoid(bucket[..., :3]), bucket[..., 3:]], axis=-1)
+        first = row * jnp.int32(self.side**2)
+        side = jnp.full_like(first, self.side)
+        return shown.reshape(-1, 4), TextureRegion(first, side, side)
+
+    def peak_opacities(self, gaussians: Gaussians) -> Array:
         return jnp.ones(gaussians.num, gaussians.means.dtype)
 
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
@@ -72,8 +81,10 @@ class BillboardRule(AppearanceRule):
 
     def cutoff(self, opacities: Array) -> Array:
         """Return the circle around the picture, border included."""
+        (bucket,) = self._bucket()
+        peaks = jax.lax.stop_gradient(jnp.max(bucket[..., 3], axis=(1, 2)))[self._rows()]
         half_side = 1 + 2 / (self.side - 1)
-        return jnp.where(opacities * self.peaks >= LEAST_PEAK, 2 * half_side * half_side, -1.0)
+        return jnp.where(opacities * peaks >= LEAST_PEAK, 2 * half_side * half_side, -1.0)
 
     def _place(self, u: Array) -> Array:
         """Return the position of u along an axis, in texels."""
@@ -85,85 +96,74 @@ class BillboardRule(AppearanceRule):
         x = self._place(u)
         return jnp.clip(1 - jnp.maximum(-x, x - (self.side - 1.0)), 0.0, 1.0)
 
-
-@dataclasses.dataclass(frozen=True)
-class Billboards(Bucketed):
-    """Picture for each splat: `params` are `Textures` of one size, raw RGB and alpha; `layout` is their layout."""
-
-    side: int = 16
-    """Side S of a picture in texels, 2 to 16."""
-    initial_rgb: float = 0.1
-    """Initial RGB, in (0, 1)."""
-    max_alpha: float = 0.99
-    """Upper limit of alpha."""
-    has_low_pass = False
-
-    def __post_init__(self) -> None:
-        if not 2 <= self.side <= MAX_SIDE:
-            raise ValueError(f"side must lie in 2..{MAX_SIDE}; got {self.side}")
-        if not 0 < self.initial_rgb < 1:
-            raise ValueError(f"initial_rgb must lie in (0, 1); got {self.initial_rgb}")
-
-    def allocate(self, key: Array, gaussians: Gaussians) -> tuple[Textures, AtlasLayout]:
+    def allocate(self, key: Array, gaussians: Gaussians) -> "Billboards":
         """Return pictures of a Gaussian, half opaque in the middle, that do not change the splats' colour."""
-        textures, layout = allocate_textures(np.full((gaussians.num, 2), self.side), dtype=gaussians.means.dtype)
+        pictures = allocate_textures(np.full((gaussians.num, 2), self.side), dtype=gaussians.means.dtype)
         along = np.exp(-0.5 * (np.linspace(-1, 1, self.side) / INITIAL_SIGMA) ** 2)
         picture = np.full((self.side, self.side, 4), np.log(self.initial_rgb / (1 - self.initial_rgb)))
         picture[..., 3] = INITIAL_PEAK * np.outer(along, along)
-        filled = lambda texels: jnp.broadcast_to(jnp.asarray(picture, texels.dtype)[None], texels.shape)  # noqa: E731
-        return jax.tree.map(filled, textures), layout
+        (bucket,) = pictures.buckets
+        filled = jnp.broadcast_to(jnp.asarray(picture, bucket.dtype)[None], bucket.shape)
+        return dataclasses.replace(self, pictures=dataclasses.replace(pictures, buckets=(filled,)))
 
-    def rule(self, params: Textures, layout: AtlasLayout) -> BillboardRule:
-        (bucket,) = self.only(params)
-        layout = nearest_places(params, layout)
-        shown = jnp.concatenate([jax.nn.sigmoid(bucket[..., :3]), bucket[..., 3:]], axis=-1)
-        peaks = jax.lax.stop_gradient(jnp.max(bucket[..., 3], axis=(1, 2)))[layout.row]
-        first = layout.row * jnp.int32(self.side**2)
-        return BillboardRule(shown.reshape(-1, 4), first, peaks, self.side, self.initial_rgb, self.max_alpha)
+    def project(self) -> "Billboards":
+        """Return pictures with alpha clamped to [0, the upper limit]: above it nothing would ever fade again."""
+        return self._with_alpha(lambda alpha: jnp.clip(alpha, 0.0, self.alpha_limit))
 
-    def project(self, params: Textures) -> Textures:
-        """Return pictures with alpha clamped to [0, `max_alpha`]: above it nothing would ever fade again."""
-        return self._with_alpha(params, lambda alpha: jnp.clip(alpha, 0.0, self.max_alpha))
-
-    def rates(self, rate: tuple[float, float], params: Textures) -> Array:
-        """Return the rates of RGB and alpha, given as a pair."""
+    def rates(self, rate: Any) -> Any:
+        """Return the rates of RGB and alpha, given as a pair, or one rate."""
+        if not isinstance(rate, tuple):
+            return rate
         rgb, alpha = rate
-        return jnp.full((1, 1, 1, 4), rgb).at[..., 3].set(alpha)
+        assert self.pictures is not None
+        of_texels = jnp.full((1, 1, 1, 4), rgb).at[..., 3].set(alpha)
+        return dataclasses.replace(self, pictures=dataclasses.replace(self.pictures, buckets=(of_texels,)))
 
-    def num_floats(self, layout: AtlasLayout, num: int) -> int:
-        """Return 4·S² − 1 per splat, beside the Gaussian's own: its opacity is not trained."""
-        return (4 * self.side**2 - 1) * num
-
-    def opacities(self, gaussians: Gaussians, params: Textures, layout: AtlasLayout) -> Array:
+    def opacities(self, gaussians: Gaussians) -> Array:
         """Return the mean alpha [N] of the texels."""
-        return self._means(params)[: gaussians.num]
+        return self._means()[: gaussians.num]
 
-    def limit_opacities(
-        self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, most: Array
-    ) -> tuple[Gaussians, Textures]:
+    def limit_opacities(self, gaussians: Gaussians, most: Array) -> tuple[Gaussians, "Billboards"]:
         """Fade pictures whose mean alpha is larger than `most`, by one factor each."""
-        fading = jnp.minimum(safe_divide(jnp.asarray(most, params.buckets[0].dtype), self._means(params), 1.0), 1.0)
-        return gaussians, self._with_alpha(params, lambda alpha: alpha * fading[:, None, None])
+        (bucket,) = self._bucket()
+        fading = jnp.minimum(safe_divide(jnp.asarray(most, bucket.dtype), self._means(), 1.0), 1.0)
+        return gaussians, self._with_alpha(lambda alpha: alpha * fading[:, None, None])
 
-    def share(
-        self, gaussians: Gaussians, params: Textures, layout: AtlasLayout, num_shares: Array
-    ) -> tuple[Gaussians, Textures]:
+    def share(self, gaussians: Gaussians, num_shares: Array) -> tuple[Gaussians, "Billboards"]:
         """Return texels such that n coincident pictures are as opaque as one was; scales stay unchanged."""
-        (bucket,) = self.only(params)
+        (bucket,) = self._bucket()
         num_shares = jnp.pad(num_shares, (0, bucket.shape[0] - gaussians.num), constant_values=1)
         exponents = (1 / num_shares.astype(bucket.dtype))[:, None, None]
-        return gaussians, self._with_alpha(params, lambda alpha: 1 - (1 - alpha) ** exponents)
+        return gaussians, self._with_alpha(lambda alpha: 1 - (1 - alpha) ** exponents)
 
-    def from_arrays(self, arrays: dict[str, np.ndarray]) -> tuple[Textures, AtlasLayout]:
-        params, layout = super().from_arrays(arrays)
-        if not np.all(layout.sizes == self.side):
-            raise ValueError(f"sizes must all be ({self.side}, {self.side}); got {layout.resolutions}")
-        return params, layout
+    @property
+    def textures(self) -> Textures | None:
+        return self.pictures
 
-    def _means(self, params: Textures) -> Array:
+    def with_textures(self, textures: Textures) -> "Billboards":
+        return dataclasses.replace(self, pictures=textures)
+
+    def check_arrays(self, gaussians: Gaussians) -> None:
+        if gaussians.num:
+            self._bucket()
+
+    def _bucket(self) -> tuple[Array]:
+        """Return the one bucket of pictures. Raise ValueError if there are several sizes."""
+        if self.pictures is None or self.pictures.bucket_sizes != ((self.side, self.side),):
+            found = None if self.pictures is None else self.pictures.bucket_sizes
+            raise ValueError(f"pictures must all have {self.side} × {self.side} texels; got sizes {found}")
+        return self.pictures.buckets  # type: ignore[return-value]
+
+    def _rows(self) -> Array:
+        assert self.pictures is not None
+        return self.pictures.nearest_places().row
+
+    def _means(self) -> Array:
         """Return the mean alphas [capacity]."""
-        return jnp.mean(self.only(params)[0][..., 3], axis=(1, 2))
+        return jnp.mean(self._bucket()[0][..., 3], axis=(1, 2))
 
-    def _with_alpha(self, params: Textures, change: Callable[[Array], Array]) -> Textures:
-        (bucket,) = self.only(params)
-        return Textures((bucket.at[..., 3].set(change(bucket[..., 3])),))
+    def _with_alpha(self, change: Callable[[Array], Array]) -> "Billboards":
+        (bucket,) = self._bucket()
+        bucket = bucket.at[..., 3].set(change(bucket[..., 3]))
+        assert self.pictures is not None
+        return dataclasses.replace(self, pictures=dataclasses.replace(self.pictures, buckets=(bucket,)))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.appearance.copies import LARGEST_OPACITY
-from a2tg_jax.appearance.shaped import LARGEST_LOG_EXPONENT, curves_of, falloff_of, log_exponents_of, shapes_of
+from a2tg_jax.appearance.exponents import LARGEST_LOG_EXPONENT, curves_of, falloff_of, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import Gaussians, logit
 
 LEAST_OPACITY = 1e-6

@@ -45,7 +45,7 @@ def flag_of(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def flag_with_value(name: str, value: Any) -> str:
+def flag_with_value(name: str, value: object) -> str:
     """Return the flag of an option with its value, as it is typed."""
     if isinstance(value, bool):
         group, dot, own = name.rpartition(".")
@@ -61,15 +61,20 @@ def check_path(text: str) -> None:
         raise ValueError(f"{told}: only SCENE of a2tg train may be a URL; copy it here, or mount the bucket")
 
 
-def with_flags(message: str, arguments: Sequence[str]) -> str:
-    """Return a message with flags in place of the names of the options that were typed as flags.
+def typed_paths(arguments: Sequence[str]) -> set[str]:
+    """Return the paths of the options that were typed as flags."""
+    flags = (word.partition("=")[0] for word in arguments if word.startswith("--"))
+    return {flag[2:].replace("-", "_") for flag in flags}
 
-    A name of one word is replaced at the beginning only, for it may be a word of the message.
+
+def in_flags(message: str, paths: Iterable[str]) -> str:
+    """Return a message with flags in place of the paths of options.
+
+    A path of one word is replaced at the beginning only, for it may be a word of the message.
     """
-    for flag in [word.partition("=")[0] for word in arguments if word.startswith("--")]:
-        name = flag[2:].replace("-", "_")
-        before = r"(?<![\w./-])" if re.search(r"[._]", name) else "^"
-        message = re.sub(rf"{before}{re.escape(name)}(?!\w|\.\w)", flag, message)
+    for path in sorted(paths, key=len, reverse=True):
+        before = r"(?<![\w./-])" if re.search(r"[._]", path) else "^"
+        message = re.sub(rf"{before}{re.escape(path)}(?!\w|\.\w)", flag_of(path), message)
     return message
 
 
@@ -110,7 +115,7 @@ def parse(
     raise ValueError(f"{told} (see {program} --help)")
 
 
-def _tell_in_paragraphs(kind: type, default: Any) -> None:
+def _tell_in_paragraphs(kind: type, default: object) -> None:
     """Have the help of a dataclass, and of those in its default, fill its lines; tyro breaks them where the docstrings
     in the source do."""
     params = itertools.chain.from_iterable(parse_from_object(one).params for one in kind.__mro__[-2::-1])

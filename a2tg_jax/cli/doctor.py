@@ -4,8 +4,8 @@ import dataclasses
 import os
 import platform
 import time
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from a2tg_jax.host.operating_system import cuda_of_driver
 from a2tg_jax.host.startup import compilation_cache_folder
 from a2tg_jax.rasterize.kernels import choice
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.rasterize.splats import Wanted
+from a2tg_jax.rasterize.splats import Compositor
 from a2tg_jax.render import render_image
 
 PACKAGES = ("jax", "jaxlib", "jax-cuda13-plugin", "jaxopt", "numpy", "llvmlite", "nvidia-cuda-nvrtc", "pycolmap")
@@ -47,14 +47,18 @@ class Doctor:
         _tell("memory", f"{memory_limit() / 1e9:.1f} GB may be used")
         _tell("XLA_FLAGS", os.environ.get("XLA_FLAGS") or "not set")
         _tell("cache", str(compilation_cache_folder()))
-        _tell("compositor", f"{choice.choose('auto')} is the choice of 'auto'")
+        device = jax.devices()[0]
+        # As JAX names it when it compiles; a device calls both CUDA and ROCm "gpu".
+        platform_of_jax = "cuda" if "cuda" in device.client.platform_version.lower() else device.platform
+        _tell("compositor", f"{choice.choose('auto', platform_of_jax)} is the choice of 'auto'")
+        available = [name for name in choice.PLATFORMS if choice.is_available(name, platform_of_jax)]
         for name, remedy in choice.REMEDIES.items():
-            if not choice.is_available(name):
+            if name not in available:
                 _tell("", f"{name} is not available: it needs {remedy}")
-        largest = _compare()
+        largest = _compare(available)
         if not largest <= MOST_DIFFERENCE:
             raise ValueError(f"the compositors differ by {largest:.2g}; please report this with the lines above")
-        _tell("verdict", _verdict(jax.default_backend(), has_driver=cuda is not None))
+        _tell("verdict", _verdict(platform_of_jax, available, has_driver=cuda is not None))
 
 
 def _described(device: jax.Device) -> str:
@@ -62,13 +66,13 @@ def _described(device: jax.Device) -> str:
     return "the CPU" if device.platform == "cpu" else f"{device.platform} ({device.device_kind})"
 
 
-def _verdict(backend: str, *, has_driver: bool) -> str:
+def _verdict(platform: str, available: Sequence[Compositor], *, has_driver: bool) -> str:
     """Return whether everything works on a machine whose compositors agree."""
-    if backend == "cpu" and has_driver:
+    if platform == "cpu" and has_driver:
         return "everything works, but on the CPU: JAX does not see the NVIDIA GPU; pip install 'a2tg-jax[cuda13]'"
-    fastest: Literal["native", "cuda"] = "native" if backend == "cpu" else "cuda"
-    if backend in ("cpu", "gpu") and not choice.is_available(fastest):
-        return f"everything works, but slowly: {fastest} is not available, which needs {choice.REMEDIES[fastest]}"
+    for name, remedy in choice.REMEDIES.items():
+        if choice.PLATFORMS[name] == platform and name not in available:
+            return f"everything works, but slowly: {name} is not available, which needs {remedy}"
     return "everything works on this machine"
 
 
@@ -83,15 +87,14 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def _compare() -> float:
+def _compare(available: Sequence[Compositor]) -> float:
     """Render an image by each compositor; return the largest difference from XLA's, infinite if it is not finite."""
     rng = np.random.default_rng(0)
     gaussians = init_from_points(rng.uniform(-1, 1, (NUM, 3)), rng.uniform(0, 1, (NUM, 3)), opacity=0.5)
     viewmat = jnp.eye(4, dtype=jnp.float32).at[2, 3].set(4)
     K = jnp.asarray([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]], jnp.float32)
-    names: list[Wanted] = ["xla", *(name for name in choice.REMEDIES if choice.is_available(name))]
     colors, largest = {}, 0.0
-    for name in names:
+    for name in ("xla", *available):
         start = time.perf_counter()
         output = render_image(gaussians, Camera(viewmat, K, WIDTH, HEIGHT), settings=RenderSettings(compositor=name))
         colors[name] = np.asarray(output.color)

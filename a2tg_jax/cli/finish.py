@@ -9,7 +9,7 @@ from tyro.conf import Positional, arg
 from a2tg_jax.results.finish_options import FinishOptions
 from a2tg_jax.results.finishing import finish_run
 from a2tg_jax.results.folder import RunFolder, open_run
-from a2tg_jax.results.output import check_output
+from a2tg_jax.results.output_checks import check_output
 from a2tg_jax.results.preflight import check_apart, check_weights
 
 

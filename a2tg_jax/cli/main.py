@@ -7,35 +7,36 @@ import inspect
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import check_path, defaulting_to, parse, with_flags
+from a2tg_jax.cli.arguments import check_path, defaulting_to, in_flags, parse, typed_paths
 from a2tg_jax.cli.convert import Convert
 from a2tg_jax.cli.doctor import Doctor
 from a2tg_jax.cli.download import Download
 from a2tg_jax.cli.finish import Finish
-from a2tg_jax.cli.mesh import Mesh
+from a2tg_jax.cli.mesh import MeshCommand
 from a2tg_jax.cli.render import Render
 from a2tg_jax.cli.sfm import Sfm
 from a2tg_jax.cli.train import Demo, Train, other_systems_text, tell_result, train_defaults
-from a2tg_jax.cli.view import Export, View
+from a2tg_jax.cli.view import Export, ViewCommand
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.field_docs import without_fields
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.host.urls import is_url
+from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.results.compression import SUFFIX, check_compact, compress, compression_text, default_output
 from a2tg_jax.results.folder import json_text, open_run
 from a2tg_jax.results.info import describe_run, run_facts
 from a2tg_jax.results.lock import opened
-from a2tg_jax.results.output import check_export, check_output
+from a2tg_jax.results.output_checks import check_export, check_output
 from a2tg_jax.results.preflight import check_weights
 from a2tg_jax.results.summary import metrics_json
 from a2tg_jax.results.whole_run import LESS_MEMORY, measure
@@ -164,11 +165,14 @@ class Info:
         print(json_text(run_facts(run)) if self.json else describe_run(run))
 
 
-Command = Demo | Train | Eval | Finish | Render | Mesh | View | Export | Convert | Compress | Info | Sfm | Download
+Command = (
+    Demo | Train | Eval | Finish | Render | MeshCommand | ViewCommand | Export | Convert | Compress | Info | Sfm
+    | Download
+)  # fmt: skip
 COMMANDS: dict[str, type] = {
-    "demo": Demo, "train": Train, "eval": Eval, "finish": Finish, "render": Render, "mesh": Mesh, "view": View,
-    "export": Export, "convert": Convert, "compress": Compress, "info": Info, "sfm": Sfm, "download": Download,
-    "doctor": Doctor,
+    "demo": Demo, "train": Train, "eval": Eval, "finish": Finish, "render": Render, "mesh": MeshCommand,
+    "view": ViewCommand, "export": Export, "convert": Convert, "compress": Compress, "info": Info, "sfm": Sfm,
+    "download": Download, "doctor": Doctor,
 }  # fmt: skip
 
 
@@ -194,10 +198,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         _find_own_systems()
     except ValueError as error:
         return _fail(str(error))
+    paths = typed_paths(arguments)  # What errors and warnings call an option is printed as its flag.
     try:
         with warnings.catch_warnings(), signals.raised():
-            warnings.showwarning = functools.partial(_show_warning, arguments)
-            _parse(name, arguments).run()
+            warnings.showwarning = functools.partial(_show_warning, paths)
+            command = _parse(name, arguments)
+            if isinstance(command, Train):
+                paths.update(path for path in flatten_config(command.options) if "." in path or "_" in path)
+            command.run()
             sys.stdout.flush()
     except KeyboardInterrupt as stop:
         stopped = signals.Stopped.of(stop)
@@ -211,7 +219,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         told = error_text(error, SMALLER.get(name, "close other programs"))
         if told is None or os.environ.get("A2TG_DEBUG"):
             raise
-        return _fail(with_flags(told, arguments))
+        return _fail(in_flags(told, paths))
     return 0
 
 
@@ -258,7 +266,7 @@ def _check_urls(arguments: Sequence[str], command: Command) -> None:
 
 
 def _show_warning(
-    arguments: Sequence[str],
+    paths: Set[str],
     message: Warning | str,
     category: type[Warning],
     filename: str,
@@ -266,4 +274,4 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    print(f"a2tg: warning: {with_flags(' '.join(str(message).split()), arguments)}", file=sys.stderr)
+    print(f"a2tg: warning: {in_flags(' '.join(str(message).split()), paths)}", file=sys.stderr)

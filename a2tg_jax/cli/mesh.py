@@ -7,16 +7,15 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import LastModel, defaulting_to
-from a2tg_jax.events import from_options
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, TextureSource, write_mesh
-from a2tg_jax.results.output import check_export, check_not_source, check_output
+from a2tg_jax.results.output_checks import check_export, check_not_source, check_output
 from a2tg_jax.results.viewing import open_source
 
 
 @dataclasses.dataclass(frozen=True)
-class Mesh:
+class MeshCommand:
     """Write the surface of a trained scene as triangles, by fusion of rendered depths.
 
     GLB stands upright with the lengths of the original world, PLY and OBJ are in the original world. Photographs are
@@ -60,7 +59,7 @@ class Mesh:
         is_run = self.source.is_dir()
         default = self.source / "mesh.glb" if is_run else self.source.with_name(f"{self.source.stem}-mesh.glb")
         out = self.out or default
-        options = from_options(MeshOptions, self)
+        options = MeshOptions(**{field.name: getattr(self, field.name) for field in dataclasses.fields(MeshOptions)})
         options.check(out)
         files = mesh_files(out, has_texture=options.texture != "none")
         check_not_source(files, self.source, "--out")

@@ -18,7 +18,7 @@ from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.results.camera_picture import save_camera_picture
 from a2tg_jax.results.forecast import quick_downscale, quick_flags
-from a2tg_jax.results.output import check_output
+from a2tg_jax.results.output_checks import check_output
 from a2tg_jax.results.preflight import check_apart
 
 

@@ -11,16 +11,17 @@ import jax
 import tyro
 from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
+from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli.arguments import check_path, defaulting_to, flag_of, flag_with_value
-from a2tg_jax.cli.place import HEARTBEAT_TIMEOUT, place_of
+from a2tg_jax.cli.process_flags import HEARTBEAT_TIMEOUT, place_of
 from a2tg_jax.cli.view import in_browser
-from a2tg_jax.core.display import counted
 from a2tg_jax.data.lenses import LensUse
 from a2tg_jax.data.mask_files import AlphaMeaning
 from a2tg_jax.host.memory import tidy_memory
-from a2tg_jax.host.processes import Place, Team, joined
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import counted, shortened
 from a2tg_jax.io.config_json import flatten_config
+from a2tg_jax.mcmc import Mcmc
+from a2tg_jax.parallel.processes import ProcessPlace, Team, joined
 from a2tg_jax.results.first_stage import given_splats, number_given
 from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
 from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs, tell_forecast
@@ -40,12 +41,11 @@ from a2tg_jax.results.record import (
     scene_place,
     write_record,
 )
+from a2tg_jax.results.several_processes import follow_first_process
 from a2tg_jax.results.summary import RunResult, summary_text
 from a2tg_jax.results.tensorboard import check_tensorboard
-from a2tg_jax.results.together import follow
 from a2tg_jax.results.whole_run import begin_run, go_on, unseen
-from a2tg_jax.systems.a2tg import A2tg, TextureConfig
-from a2tg_jax.systems.stage1 import McmcConfig
+from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import SYSTEMS, Session, System, find_system
 
 BASELINE = "gaussians-2d-mcmc"
@@ -53,8 +53,9 @@ DEFAULT_PRESET = "paper"
 DEMO_SYSTEM = A2tg(
     stage1_iterations=400,
     stage2_iterations=250,
-    densify=McmcConfig(cap=1_500),
-    texture=TextureConfig(fraction=0.5, upscale_at=(0.1, 0.2), rate=1e-2),
+    densify=Mcmc(cap=1_500),
+    texture=Upscale(fraction=0.5, at=(0.1, 0.2)),
+    texel_rate=1e-2,
 )
 """System of the demo. It has few iterations, so textures grow early and learn fast."""
 
@@ -172,7 +173,7 @@ class Train:
                 self._follow(team)
 
     @property
-    def place(self) -> Place | None:
+    def place(self) -> ProcessPlace | None:
         """Place of this process among those that train together; None if it is the only one.
 
         Raises:
@@ -188,7 +189,7 @@ class Train:
         team.advice = lambda: f"continue with: {resuming_command(run, session.devices)}"
         record = self._resumed(open_run(self.out), is_written=False) if self.resume else self.record
         scene = record.scene.load(room_for_photographs(bytes_allowed(self.max_memory)), is_divided=True)
-        follow(record, scene, session)
+        follow_first_process(record, scene, session)
 
     def _run(self) -> None:
         weights, most = self.lpips_weights, bytes_allowed(self.max_memory)

@@ -96,7 +96,7 @@ def check_is_camera(camera: Camera, name: str = "camera") -> None:
     check_kind(name, camera, Camera, _hint(camera))
 
 
-def _hint(value: Any) -> str:
+def _hint(value: object) -> str:
     return "use view.camera" if hasattr(value, "camera") else ""
 
 

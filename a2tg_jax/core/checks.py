@@ -4,13 +4,16 @@ Checks of arrays read only `shape` and `dtype`, so that tracers pass and nothing
 value of a scalar array that is no tracer.
 """
 
+import contextlib
 import dataclasses
 import numbers
+from collections.abc import Iterator
 from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 LARGEST_NUMBER = 1e12
 """Largest magnitude of a number that geometry in float32 carries: products of it with focal lengths, and their
@@ -19,6 +22,15 @@ FLOATS = ("float32", "float64")
 """Names of the dtypes that models may have."""
 Wanted = tuple[int | str, ...]
 """Sizes of the axes of an array: numbers, or letters for any size, such as ("N", 16, 3)."""
+
+
+@contextlib.contextmanager
+def fields_of(path: str) -> Iterator[None]:
+    """Put a path and a dot before an error of the block, which begins with the name of a field."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{path}.{error}") from error
 
 
 def check_kind(name: str, value: Any, kind: type | tuple[type, ...], hint: str = "") -> None:
@@ -34,7 +46,7 @@ def check_kind(name: str, value: Any, kind: type | tuple[type, ...], hint: str =
     raise ValueError(f"{name} must be {' or '.join(map(_noun, kinds))}; got {kind_of(value)}{hint and f': {hint}'}")
 
 
-def check_literal(name: str, value: Any, literal: Any) -> None:
+def check_literal(name: str, value: object, literal: object) -> None:
     """Raise ValueError unless a value is one of those of a `Literal`."""
     if value not in get_args(literal):
         raise ValueError(f"{name} must be one of {', '.join(get_args(literal))}; got {value!r}")
@@ -72,13 +84,13 @@ def check_number(
         raise ValueError(f"{name} must be {wanted or 'a number'}; got {value!r}")
 
 
-def check_numeric(name: str, value: Any) -> None:
+def check_numeric(name: str, value: object) -> None:
     """Raise ValueError unless a value is a number or an array of numbers of any shape; none is read."""
     if not _is_numeric(value):
         raise ValueError(f"{name} must be a number, or an array of numbers; got {described(value)}")
 
 
-def _is_numeric(value: Any) -> bool:
+def _is_numeric(value: object) -> bool:
     """Return whether a value is a real number, or an array or a tracer of numbers."""
     if hasattr(value, "dtype"):
         return bool(jnp.issubdtype(value.dtype, jnp.number))
@@ -93,14 +105,14 @@ def _is_within(
     return is_low_enough and is_high_enough and number == number
 
 
-def check_array(name: str, x: Any, hint: str = "") -> None:
+def check_array(name: str, x: object, hint: str = "") -> None:
     """Raise ValueError, with an optional hint, unless a value is an array or a tracer."""
     if not (hasattr(x, "shape") and hasattr(x, "dtype")):
         hint = hint or ("use jnp.asarray" if isinstance(x, list | tuple) else "")
         raise ValueError(f"{name} must be an array; got {kind_of(x)}{hint and f': {hint}'}")
 
 
-def plain(name: str, value: Any, dtype: Any = None) -> Any:
+def plain_array(name: str, value: Any, dtype: DTypeLike | None = None) -> Any:
     """Return nested lists of numbers, and NumPy's special arrays, as arrays that JAX takes; other values unchanged.
 
     Args:
@@ -126,25 +138,25 @@ def plain(name: str, value: Any, dtype: Any = None) -> Any:
     return value
 
 
-def check_unmasked(name: str, value: Any) -> None:
+def check_unmasked(name: str, value: object) -> None:
     """Raise ValueError if a value is a masked array with masked entries, which would be read as if they were not."""
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise ValueError(f"{name} has masked entries: replace them, as in array.filled(0), or drop their rows")
 
 
-def make_plain(instance: Any, name: str, *fields: str, dtype: Any = None) -> None:
-    """Replace fields of a frozen dataclass by what `plain` makes of them; lists get the dtype of the first array."""
+def make_plain(instance: object, name: str, *fields: str, dtype: DTypeLike | None = None) -> None:
+    """Replace fields of a frozen dataclass by `plain_array` of them; lists get the dtype of the first array."""
     values = {field: getattr(instance, field) for field in fields}
     dtypes = [value.dtype for value in values.values() if hasattr(value, "dtype")]
     for field, value in values.items():
         if type(value) is tuple:  # Trees of shapes have tuples where arrays were.
             continue
-        changed = plain(f"{name}.{field}", value, dtype or next(iter(dtypes), None))
+        changed = plain_array(f"{name}.{field}", value, dtype or next(iter(dtypes), None))
         if changed is not value:
             object.__setattr__(instance, field, changed)
 
 
-def _holds_numbers(values: Any) -> bool:
+def _holds_numbers(values: object) -> bool:
     """Return whether the first entry of nested sequences is a number; JAX puts no such sequence into a pytree."""
     while isinstance(values, list | tuple) and values:
         values = values[0]
@@ -157,7 +169,7 @@ def _noun(kind: type) -> str:
     return f"{article}{kind.__name__}"
 
 
-def kind_of(value: Any) -> str:
+def kind_of(value: object) -> str:
     """Return the class of a value in errors; a class itself by its name."""
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
@@ -176,14 +188,14 @@ def check_shape(name: str, x: Any, wanted: Wanted) -> None:
         raise ValueError(f"{name} must be {_written(wanted)}; got {_written(shape) if is_array else kind_of(x)}")
 
 
-def check_floats(name: str, x: Any, wanted: Wanted) -> None:
+def check_floats(name: str, x: object, wanted: Wanted) -> None:
     """Raise ValueError unless x has the wanted shape, as in `check_shape`, and holds floats."""
     check_shape(name, x, wanted)
     if not jnp.issubdtype(dtype_of(x), jnp.floating):
         raise ValueError(f"{name} must be floats; got {dtype_of(x)}")
 
 
-def check_mask(name: str, x: Any, wanted: Wanted) -> None:
+def check_mask(name: str, x: object, wanted: Wanted) -> None:
     """Raise ValueError unless x has the wanted shape, as in `check_shape`, and holds bools."""
     check_shape(name, x, wanted)
     if dtype_of(x) != np.bool_:
@@ -195,7 +207,7 @@ def dtype_of(x: Any) -> Any:
     return x.dtype if hasattr(x, "dtype") else np.asarray(x).dtype
 
 
-def described(value: Any) -> str:
+def described(value: object) -> str:
     """Describe a value in a few characters: arrays by dtype and shape, as in float32[7, 3]."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{value.dtype}{_written(value.shape)}"
@@ -210,6 +222,12 @@ def short_repr(value: Any) -> str:
     left_out = {field.name for field in dataclasses.fields(value) if field.default is None}
     fields = (f"{name}={described(own)}" for name, own in found.items() if own is not None or name not in left_out)
     return f"{type(value).__name__}({', '.join(fields)})"
+
+
+def short_tuple_repr(value: Any) -> str:
+    """Return the `repr` of a named tuple, with arrays by dtype and shape."""
+    fields = ", ".join(f"{name}={described(field)}" for name, field in zip(value._fields, value, strict=True))
+    return f"{type(value).__name__}({fields})"
 
 
 def _fits(shape: tuple[int, ...], wanted: Wanted) -> bool:

@@ -23,7 +23,7 @@ from a2tg_jax.core.checks import (
     check_number,
     dtype_of,
     make_plain,
-    plain,
+    plain_array,
     short_repr,
 )
 from a2tg_jax.core.forks import check_process
@@ -190,7 +190,7 @@ def init_from_points(
     check_int("num", 2 if num is None else num, 2)
     check_int("sh_degree", sh_degree, 0, len(NUM_BASES) - 1)
     check_number("opacity", opacity, above=0, below=1)
-    points, colors = plain("points", points), plain("colors", colors)
+    points, colors = plain_array("points", points), plain_array("colors", colors)
     check_unit_colors("colors", colors)
     points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:

@@ -11,7 +11,7 @@ from jax.typing import DTypeLike
 from a2tg_jax.core.checks import check_floats, check_shape
 from a2tg_jax.core.numerics import safe_divide, safe_norm
 from a2tg_jax.core.pytree import pytree
-from a2tg_jax.core.spread_arrays import zeros_beside
+from a2tg_jax.parallel.rows import zeros_beside
 
 
 def read_probe(found: Array, statistic: str, width: int, height: int) -> tuple[Array, Array]:

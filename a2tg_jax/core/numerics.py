@@ -9,6 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+Integer = Array | int
+"""An integer, traced or not."""
+
 
 def safe_divide(numerator: Array, denominator: Array, fallback: float = 0.0) -> Array:
     """Return numerator / denominator, or `fallback` with zero gradient where the denominator is 0."""
@@ -62,9 +65,11 @@ def pixel_sum(x: Array) -> Array:
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
-def spread(x: Array, num: int) -> Array:
+def spread_to_pixels(x: Array, num: int) -> Array:
     """Broadcast x [...] over a new last axis of `num` pixels; the gradient is a `pixel_sum`."""
     return jnp.broadcast_to(x[..., None], (*x.shape, num))
 
 
-spread.defvjp(lambda x, num: (spread(x, num), None), lambda num, _, cotangent: (pixel_sum(cotangent),))
+spread_to_pixels.defvjp(
+    lambda x, num: (spread_to_pixels(x, num), None), lambda num, _, cotangent: (pixel_sum(cotangent),)
+)

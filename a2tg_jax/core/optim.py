@@ -133,7 +133,7 @@ def _one_each(rates: Any, params: Any) -> Any:
     return found
 
 
-def _check_floats(params: Any) -> None:
+def _check_floats(params: object) -> None:
     """Raise ValueError, naming the leaf, unless all leaves of the parameters are arrays of floats."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         name = f"params{jax.tree_util.keystr(path)}"
@@ -141,7 +141,7 @@ def _check_floats(params: Any) -> None:
         check_floats(name, leaf, leaf.shape)
 
 
-def _check_like(name: str, tree: Any, params: Any) -> None:
+def _check_like(name: str, tree: object, params: object) -> None:
     """Raise ValueError, naming the leaf, unless the pytree has the structure and the shapes of the parameters."""
     found, wanted = str(jax.tree.structure(tree)), str(jax.tree.structure(params))
     if found != wanted:

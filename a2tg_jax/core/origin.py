@@ -1,4 +1,4 @@
-"""The origin of a model: its training cameras, the transform from the original world, and the background.
+"""The origin of a model: its training cameras, and the transform from the original world.
 
 With an origin, a model can be rendered, flown past and moved without the photographs.
 """
@@ -35,8 +35,6 @@ class Origin:
     """[V] whether the photograph was held out for testing."""
     transform: Similarity
     """Transform from the original world to that of the cameras."""
-    background: Color = BLACK
-    """RGB behind all splats."""
     corrections: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """[V, ...] learned values of each photograph (`training.corrections`), by the correction's name, in the world of
     the training. `viewmats` are corrected already."""
@@ -48,7 +46,6 @@ class Origin:
         *,
         is_test: Sequence[bool] | None = None,
         transform: Similarity | None = None,
-        background: Color = BLACK,
     ) -> "Origin":
         """Make an origin of cameras; by default named by number, none held out, in their original world."""
         num = len(cameras)
@@ -59,7 +56,6 @@ class Origin:
             names=tuple(str(index) for index in range(num)) if names is None else tuple(names),
             is_test=np.zeros(num, bool) if is_test is None else np.array(is_test, bool),
             transform=transform or Similarity(1.0, np.eye(3), np.zeros(3)),
-            background=background,
         )
 
     @property
@@ -87,7 +83,7 @@ class Origin:
         arrays = (self.viewmats, self.Ks, self.sizes, self.is_test, self.transform.rotation, self.transform.translation)
         texts = tuple(np.ascontiguousarray(array).tobytes() for array in arrays)
         learned = tuple((name, rows.shape, rows.tobytes()) for name, rows in sorted(self.corrections.items()))
-        return texts, self.names, float(self.transform.scale), self.background, learned
+        return texts, self.names, float(self.transform.scale), learned
 
     def __eq__(self, other: object) -> bool:
         return self is other or (isinstance(other, Origin) and self._content == other._content)

@@ -6,7 +6,7 @@ their own functions are told apart.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar, dataclass_transform, overload
 
 import jax
@@ -15,33 +15,23 @@ T = TypeVar("T")
 MARK = "_registered_pytree"
 
 
-def static(*, default: Any = dataclasses.MISSING, is_addition: bool = False) -> Any:
-    """Return a field that chooses shapes or code, and is not traced. Its values must be hashable.
-
-    Args:
-      default: default of the field.
-      is_addition: whether trainings of earlier versions, which lack the field, equal those with its default.
-    """
-    return dataclasses.field(default=default, metadata={"static": True, "is_addition": is_addition})
+def static(*, default: Any = dataclasses.MISSING) -> Any:
+    """Return a field that chooses shapes or code, and is not traced. Its values must be hashable."""
+    return dataclasses.field(default=default, metadata={"static": True})
 
 
-def beside(*, default: Any = None) -> Any:
+def beside(*, default: Any) -> Any:
     """Return a field that is no part of the pytree: whatever a transformation returns has the default instead."""
     return dataclasses.field(default=default, metadata={"beside": True})
 
 
-def is_addition(field: dataclasses.Field[Any]) -> bool:
-    """Return whether trainings of earlier versions, which lack a field, equal those with its default."""
-    return bool(field.metadata.get("is_addition", False))
-
-
 @overload
+@dataclass_transform(frozen_default=True, field_specifiers=(static, beside, dataclasses.field))
 def pytree(cls: type[T], /) -> type[T]: ...
 @overload
 def pytree(*, kw_only: bool = False, repr: bool = True) -> Callable[[type[T]], type[T]]: ...
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(static, beside, dataclasses.field))
 def pytree(cls: Any = None, /, **options: Any) -> Any:
     """Decorate a class: make it a frozen dataclass and a pytree of its fields, but for static ones.
 
@@ -71,7 +61,7 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
         children, values = flatten(node)
         return tuple(zip(keys, children, strict=True)), values
 
-    def unflatten(values: tuple[Any, ...], children: tuple[Any, ...]) -> Any:
+    def unflatten(values: tuple[Any, ...], children: Iterable[Any]) -> Any:
         node = object.__new__(made)
         node.__dict__.update(zip(dynamic, children, strict=True))
         node.__dict__.update(zip(fixed, values, strict=True))
@@ -83,9 +73,9 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     return made
 
 
-def check_pytree(name: str, value: Any) -> None:
+def check_pytree(name: str, value: object) -> None:
     """Raise ValueError unless `pytree` decorates the class of a value and of each dataclass in it."""
-    ahead = [jax.tree.structure(value)]
+    ahead: list[Any] = [jax.tree.structure(value)]
     kinds = {type(leaf) for leaf in jax.tree.leaves(value) if leaf is value or dataclasses.is_dataclass(leaf)}
     while ahead:
         node = ahead.pop()

@@ -5,14 +5,15 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from a2tg_jax.core.capture import nearest_point
+from a2tg_jax.core.capture_geometry import nearest_point
 from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
-from a2tg_jax.data.observations import before_camera, observed_points, projected
+from a2tg_jax.data.observations import before_camera, observed_points, pinhole_pixels
 from a2tg_jax.data.photo_store import Picture, how_to_convert
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.data.splits import check_test_every, every_kth
@@ -30,15 +31,15 @@ PRECISIONS = 0.2, 0.01
 
 def scene_from_arrays(
     images: Sequence[np.ndarray],
-    viewmats: Any,
-    Ks: Any,
-    points: Any = None,
-    colors: Any = None,
+    viewmats: ArrayLike,
+    Ks: ArrayLike,
+    points: ArrayLike | None = None,
+    colors: ArrayLike | None = None,
     *,
     names: Sequence[str] | None = None,
     masks: Sequence[np.ndarray | None] | None = None,
     depths: Sequence[np.ndarray | None] | None = None,
-    observed: Sequence[Any] | None = None,
+    observed: Sequence[ArrayLike] | None = None,
     test_every: int = 8,
     name: str = "arrays",
 ) -> Scene:
@@ -76,8 +77,8 @@ def scene_from_arrays(
     for argument, values in given.items():
         if values is not None and len(values) != num:
             raise ValueError(f"{argument} must hold one item for each of {num} images; got {len(values)}")
-    for argument, values in (("colors", colors), ("observed", observed)):
-        if values is not None and points is None:
+    for argument, of_points in (("colors", colors), ("observed", observed)):
+        if of_points is not None and points is None:
             raise ValueError(f"{argument} needs points")
     cloud = None if points is None else _cloud(points, colors)
 
@@ -89,7 +90,7 @@ def scene_from_arrays(
         if observed is not None and cloud is not None:
             chosen = _chosen(cloud.points, observed[index], f"observed[{index}]")
             ahead = before_camera(chosen, viewmat)
-            points = observed_points(projected(ahead, Ks[index]), ahead[:, 2], picture.size)
+            points = observed_points(pinhole_pixels(ahead, Ks[index]), ahead[:, 2], picture.size)
         mask, depth = (
             None if values is None or values[index] is None
             else _converted(f"{argument}[{index}]", kind, values[index], picture.size)
@@ -108,7 +109,7 @@ def scene_from_arrays(
     return assemble_scene(name, *every_kth(shots, test_every), cloud, source=f"the scene {name}")
 
 
-def _told_of_values(images: Sequence[Any], colors: Any) -> Iterator[str]:
+def _told_of_values(images: Sequence[object], colors: ArrayLike | None) -> Iterator[str]:
     """Yield a warning if colours are only 0 and 1 of 255: colours of [0, 1] whose factor of 255 is missing."""
     given = {"images": [image for image in images if not isinstance(image, Picture)]}
     given |= {} if colors is None else {"colors": [colors]}
@@ -173,7 +174,7 @@ def _share_seen(shots: Sequence[Shot], viewmats: np.ndarray, points: np.ndarray)
     """Return the share of all points, averaged over the views, that lie in an image."""
     shares = []
     for shot, viewmat in zip(shots, viewmats, strict=True):
-        xy = projected(before_camera(points, viewmat), shot.K)
+        xy = pinhole_pixels(before_camera(points, viewmat), shot.K)
         shares.append(np.count_nonzero(((xy >= 0) & (xy < shot.pixels.shape[1::-1])).all(axis=1)) / len(points))
     return float(np.mean(shares))
 
@@ -186,7 +187,7 @@ def _share_that_meet(viewmats: np.ndarray, precision: float) -> float:
     return float(np.mean((depths > 0) & (np.linalg.norm(np.cross(offsets, axes), axis=1) < precision * depths)))
 
 
-def _matrices(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _matrices(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """Return matrices as float64 after checking their shape."""
     check_shape(name, values, shape)
     check_unmasked(name, values)
@@ -205,7 +206,7 @@ def _converted(name: str, kind: Callable[[Any], Any], values: Any, size: tuple[i
     return made
 
 
-def _cloud(points: Any, colors: Any) -> PointCloud:
+def _cloud(points: ArrayLike, colors: ArrayLike | None) -> PointCloud:
     """Return points and their colours, grey without."""
     check_unmasked("points", points)
     check_unmasked("colors", colors)
@@ -218,7 +219,7 @@ def _cloud(points: Any, colors: Any) -> PointCloud:
     return PointCloud(points, colors)
 
 
-def _chosen(points: np.ndarray, indices: Any, what: str) -> np.ndarray:
+def _chosen(points: np.ndarray, indices: ArrayLike, what: str) -> np.ndarray:
     """Return some of the points."""
     check_unmasked(what, indices)
     indices = np.asarray(indices)

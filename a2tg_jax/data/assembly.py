@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
-from a2tg_jax.core.display import counted
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
@@ -19,6 +18,7 @@ from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.data.start_points import NUM_RANDOM_POINTS, Sight, random_points, unseeing
 from a2tg_jax.data.world import normalizing_similarity, scene_scale
+from a2tg_jax.host.text import counted
 
 RANDOM_COLOR = 128
 """Mid-grey of random points."""

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from a2tg_jax.core.display import counted
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
 from a2tg_jax.data.colmap_binary import count_binary, read_binary
@@ -28,6 +27,7 @@ from a2tg_jax.data.scene import Scene, scene_name
 from a2tg_jax.data.smaller_copies import find_copies
 from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
+from a2tg_jax.host.text import counted
 
 SUFFIXES = (".bin", ".txt")
 """Suffixes of a model's files, in order of preference."""
@@ -41,7 +41,7 @@ SAME_PLACE = 1e-3
 """Largest distance between the cameras of a panorama, in units of the distance between neighbouring frames."""
 
 
-class Model(NamedTuple):
+class SparseModel(NamedTuple):
     """Sparse model."""
 
     cameras: dict[int, Any]
@@ -233,7 +233,7 @@ def _observed_points(
     return observed_points(lens.projected(places, read.K, size[::-1]), places[:, 2], size)
 
 
-def _panoramas(model: Model) -> dict[int, int]:
+def _panoramas(model: SparseModel) -> dict[int, int]:
     """Return the number of the frame of each image whose rig looks around from one point, by the image's id.
 
     A rig's cameras are at one point if they are within `SAME_PLACE` of it, which is what a refinement of the rig leaves
@@ -273,7 +273,7 @@ def _num_images(model: Path) -> int:
     return count_binary(file) if file.suffix.lower() == ".bin" else count_text_images(file)
 
 
-def _read_model(model: Path) -> Model:
+def _read_model(model: Path) -> SparseModel:
     """Return the model in a folder; without a points3D file, it has no points.
 
     Raises:
@@ -302,7 +302,7 @@ def _read_model(model: Path) -> Model:
             )
     points = found.get("points3D", np.empty(0, POINT))
     points = points[np.argsort(points["id"], kind="stable")]
-    return Model(cameras, found["images"], points, found.get("rigs", []), found.get("frames", []))
+    return SparseModel(cameras, found["images"], points, found.get("rigs", []), found.get("frames", []))
 
 
 def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downscale: int) -> tuple[Path, Path]:

@@ -12,8 +12,8 @@ import jax
 
 from a2tg_jax.data.images import map_in_threads
 from a2tg_jax.data.masks import Mask
-from a2tg_jax.host.processes import gather, is_of_collectives
 from a2tg_jax.host.text import shortened
+from a2tg_jax.parallel.processes import gather, is_of_collectives
 
 ERRORS = {"FileNotFoundError": FileNotFoundError, "OSError": OSError, "ValueError": ValueError}
 """Errors of which all processes are told."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
-from a2tg_jax.host.bars import progress_over
+from a2tg_jax.host.progress_bars import progress_over
 
 CHUNK_BYTES = 1 << 20
 TIMEOUT_SECONDS = 60

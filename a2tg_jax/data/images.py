@@ -12,10 +12,9 @@ from typing import TypeVar
 import numpy as np
 from PIL import Image
 
-from a2tg_jax.core.display import counted
 from a2tg_jax.host.regular_files import is_regular, names_in
 from a2tg_jax.host.remote_files import is_remote
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import counted, shortened
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
 """Suffixes of photographs; capital letters do as well."""

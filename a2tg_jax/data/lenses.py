@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 from a2tg_jax.core.cameras import check_intrinsics
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.images import downscaled_size, resize_pixels, scaled_intrinsics
-from a2tg_jax.data.observations import projected
+from a2tg_jax.data.observations import pinhole_pixels
 
 PINHOLE_TOLERANCE = 1e-3
 """Largest deviation in pixels of a camera that still counts as a pinhole."""
@@ -131,7 +131,7 @@ class Lens:
 
     def projected(self, points: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """Return x and y [P, 2] in pixels of points [P, 3] before the camera, in a view of a K and (width, height)."""
-        return projected(points, K)
+        return pinhole_pixels(points, K)
 
     def view_plane(self, plane: np.ndarray) -> np.ndarray:
         """Return numbers [h, w] float32 of each pixel of a photograph as its view, a pinhole's, sees them, at their

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import zoom
 
-from a2tg_jax.data.surfaces import Shape, Surface, nearest_hits
+from a2tg_jax.data.surfaces import ParametricSurface, Surface, nearest_hits
 
 LAMP = np.array([[-1.7], [-1.9], [3.1]], np.float32)
 """Centre of a spherical lamp."""
@@ -16,7 +16,7 @@ TEXELS_PER_SAMPLE = 8
 """Factor by which the grid of light is coarser than a surface's image."""
 
 
-def light(colored: list[tuple[Shape, np.ndarray]], rng: np.random.Generator) -> list[Surface]:
+def light(colored: list[tuple[ParametricSurface, np.ndarray]], rng: np.random.Generator) -> list[Surface]:
     """Return surfaces with images of the given colours, lit by a lamp with soft shadows and by the sky.
 
     Args:
@@ -27,7 +27,9 @@ def light(colored: list[tuple[Shape, np.ndarray]], rng: np.random.Generator) -> 
     return [Surface(shape, _shaded(shape, colors, shapes, rng)) for shape, colors in colored]
 
 
-def _shaded(shape: Shape, colors: np.ndarray, shapes: list[Shape], rng: np.random.Generator) -> np.ndarray:
+def _shaded(
+    shape: ParametricSurface, colors: np.ndarray, shapes: list[ParametricSurface], rng: np.random.Generator
+) -> np.ndarray:
     """Return the image [rows, columns, 3] uint8 of one shape: its colours times its light, clipped at 1."""
     rows, columns = (max(2, -(-size // TEXELS_PER_SAMPLE)) for size in colors.shape[:2])
     u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
@@ -41,7 +43,9 @@ def _shaded(shape: Shape, colors: np.ndarray, shapes: list[Shape], rng: np.rando
     return pixels
 
 
-def _lamp_light(shapes: list[Shape], points: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _lamp_light(
+    shapes: list[ParametricSurface], points: np.ndarray, normals: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
     """Return the cosine of the lamp's direction times the visible share of the lamp, [P]."""
     total = np.zeros(points.shape[1], np.float32)
     for offset in _unit_vectors(rng, NUM_LAMP_RAYS):
@@ -52,7 +56,9 @@ def _lamp_light(shapes: list[Shape], points: np.ndarray, normals: np.ndarray, rn
     return total / NUM_LAMP_RAYS
 
 
-def _sky_light(shapes: list[Shape], points: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _sky_light(
+    shapes: list[ParametricSurface], points: np.ndarray, normals: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
     """Return the share of the cosine-weighted hemisphere with nothing nearer than SKY_REACH, [P]."""
     total = np.zeros(points.shape[1], np.float32)
     for offset in _unit_vectors(rng, NUM_SKY_RAYS):

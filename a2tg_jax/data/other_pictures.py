@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from a2tg_jax.core.display import first_names
 from a2tg_jax.data.decoding import upright_thumbnail
 from a2tg_jax.data.images import PHOTO_SUFFIXES, map_in_threads
 from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.host.text import first_names
 
 CAMERA_PICTURE = "cameras.png"
 """Picture of the cameras that `a2tg sfm` puts beside `sparse`."""

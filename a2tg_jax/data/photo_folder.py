@@ -6,11 +6,10 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from a2tg_jax.core.display import counted
 from a2tg_jax.data.images import PHOTO_SUFFIXES
 from a2tg_jax.data.other_pictures import other_pictures
 from a2tg_jax.data.unread_captures import told_of_capture
-from a2tg_jax.host.text import as_argument
+from a2tg_jax.host.text import as_argument, counted
 
 FOREIGN_SUFFIXES = (
     ".jxl", ".jp2", ".j2k", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".gif",

@@ -28,7 +28,7 @@ SHARE_OF_DISK = 0.5
 """Share of the free disk for undistorted or resized photographs of object storage."""
 
 
-def how_to_convert(values: Any, name: str) -> str:
+def how_to_convert(values: object, name: str) -> str:
     """Return how to make uint8 of colours in [0, 1], [0, 255] or 16 bits, which their values tell apart; else ""."""
     values = np.asarray(values)
     is_float, is_integer = (np.issubdtype(values.dtype, kind) for kind in (np.floating, np.integer))

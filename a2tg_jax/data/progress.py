@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from tqdm import tqdm
 
-from a2tg_jax.host.bars import has_terminal
+from a2tg_jax.host.progress_bars import has_terminal
 
 TICK = 0.5
 """Seconds between two readings of the clock of a phase without countable progress."""

@@ -12,14 +12,15 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera, check_is_camera
 from a2tg_jax.core.checks import check_array, check_kind, check_number, check_shape
-from a2tg_jax.core.display import THUMBNAIL, counted, enlarged, html_image, in_bytes, png
-from a2tg_jax.core.origin import BLACK, Color, Origin
+from a2tg_jax.core.notebook_display import THUMBNAIL, enlarged, html_image, png
+from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.host.remote_files import is_remote
+from a2tg_jax.host.text import counted, in_bytes
 
 MANY_LENSES = 8
 """Number of lenses beyond which it is likely that each photograph was calibrated alone."""
@@ -151,7 +152,7 @@ def check_are_views(views: Sequence[View], call: str) -> None:
         raise ValueError(f"views must be views, such as scene.train; got {type(odd).__name__}: say {call}")
 
 
-def origin_of_scene(scene: Scene, background: Color = BLACK) -> Origin:
+def origin_of_scene(scene: Scene) -> Origin:
     """Return the cameras and the world of a scene, training views first."""
     views = [*scene.train, *scene.test]
     return Origin.of_cameras(
@@ -159,7 +160,6 @@ def origin_of_scene(scene: Scene, background: Color = BLACK) -> Origin:
         [view.name for view in views],
         is_test=[False] * len(scene.train) + [True] * len(scene.test),
         transform=scene.transform,
-        background=background,
     )
 
 

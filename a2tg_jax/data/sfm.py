@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from a2tg_jax.core.checks import check_literal
-from a2tg_jax.core.display import counted, first_names
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
 from a2tg_jax.data.progress import clock
@@ -25,7 +24,8 @@ from a2tg_jax.data.sfm_database import (
 )
 from a2tg_jax.data.staging import Panorama, Staged, stage
 from a2tg_jax.data.video import DEFAULT_FRAMES
-from a2tg_jax.host.bars import counting
+from a2tg_jax.host.progress_bars import counting
+from a2tg_jax.host.text import counted, first_names
 
 MAX_EXHAUSTIVE = 200
 """Number of photographs beyond which "auto" matches only neighbours in name order."""

@@ -14,12 +14,12 @@ from typing import Literal, NamedTuple
 
 from PIL import Image
 
-from a2tg_jax.core.display import counted
 from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
 from a2tg_jax.data.images import map_in_threads
 from a2tg_jax.data.panoramas import Direction, cut_view, directions, is_panorama, view_size
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS, find_photos, is_video
 from a2tg_jax.data.video import extract_frames
+from a2tg_jax.host.text import counted
 
 Panorama = Literal["auto", "yes", "no"]
 """Whether pictures twice as wide as high are panoramas: those whose edges join (auto), all of them, or none."""

@@ -1,11 +1,12 @@
 """Points to start from: whether views see them, and random ones where the cameras look. All in the normalised world."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from a2tg_jax.core.capture import LEAST_FACING
+from a2tg_jax.core.capture_geometry import LEAST_FACING
 from a2tg_jax.core.pixel_sizes import NEAR_PLANE
 from a2tg_jax.core.similarity import camera_centers
 
@@ -34,7 +35,7 @@ class Sight(NamedTuple):
     """[2] largest ones."""
 
     @staticmethod
-    def of(viewmat: np.ndarray, K: np.ndarray, size: tuple[int, ...], rays: Any) -> "Sight":
+    def of(viewmat: np.ndarray, K: np.ndarray, size: tuple[int, ...], rays: ArrayLike | None) -> "Sight":
         """Return what a view of (height, width) shows, with `rays` as `Camera.rays` has them."""
         if rays is None:
             return Sight(viewmat, K, np.zeros(2), np.array(size[::-1], np.float64))

@@ -16,7 +16,7 @@ NEAR = 1e-3
 Vector = tuple[float, float, float]
 
 
-class Shape(Protocol):
+class ParametricSurface(Protocol):
     """A parametrised surface."""
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -157,12 +157,14 @@ class Block:
 class Surface:
     """A shape with its image."""
 
-    shape: Shape
+    shape: ParametricSurface
     image: np.ndarray
     """[rows, columns, 3] uint8."""
 
 
-def nearest_hits(shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearest_hits(
+    shapes: Sequence[ParametricSurface], origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (t, index of the shape), both [P], of the first hit of each ray; t is infinite if it misses all."""
     nearest = np.full(directions.shape[1], np.inf, np.float32)
     index = np.zeros(directions.shape[1], np.int8)
@@ -173,7 +175,9 @@ def nearest_hits(shapes: Sequence[Shape], origins: np.ndarray, directions: np.nd
     return nearest, index
 
 
-def trace(surfaces: Sequence[Surface], origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def trace_rays(
+    surfaces: Sequence[Surface], origin: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the colours and positions of the hits of rays from one point.
 
     Args:
@@ -190,11 +194,11 @@ def trace(surfaces: Sequence[Surface], origin: np.ndarray, directions: np.ndarra
     index[~np.isfinite(t)] = -1
     for number, surface in enumerate(surfaces):
         hits = np.flatnonzero(index == number)
-        colors[hits] = look_up(surface.image, *surface.shape.locate(points[:, hits]))
+        colors[hits] = nearest_texels(surface.image, *surface.shape.locate(points[:, hits]))
     return colors, points
 
 
-def look_up(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def nearest_texels(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return the texels [P, 3] nearest to (u, v)."""
     rows, columns = image.shape[:2]
     row = np.clip((v * rows).astype(np.int32), 0, rows - 1)

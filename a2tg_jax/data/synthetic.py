@@ -13,11 +13,11 @@ from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import patterns
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene
 from a2tg_jax.data.lighting import light
-from a2tg_jax.data.observations import before_camera, observed_points, projected
+from a2tg_jax.data.observations import before_camera, observed_points, pinhole_pixels
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.data.splits import check_test_every, every_kth
-from a2tg_jax.data.surfaces import Ball, Block, Disc, Shape, Surface, Tube, nearest_hits, trace
+from a2tg_jax.data.surfaces import Ball, Block, Disc, ParametricSurface, Surface, Tube, nearest_hits, trace_rays
 
 TARGET = np.array([0.0, 0.1, 0.45])
 """Point that all cameras look at."""
@@ -68,7 +68,7 @@ def synthetic_scene(
     surfaces = light(still_life(rng), rng)
     size = round(width / downscale), round(height / downscale)
     K = intrinsics(*size, FIELD_OF_VIEW)
-    viewmats = [look_at(center) for center in camera_path(num_views)]
+    viewmats = [viewmat_to_target(center) for center in camera_path(num_views)]
     shots = [
         Shot(f"view_{index:03d}.png", viewmat, K, render(surfaces, viewmat, K, *size))
         for index, viewmat in enumerate(viewmats)
@@ -78,7 +78,7 @@ def synthetic_scene(
     return assemble_scene("synthetic", *every_kth(shots, test_every), cloud, source="the synthetic scene")
 
 
-def still_life(rng: np.random.Generator) -> list[tuple[Shape, np.ndarray]]:
+def still_life(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.ndarray]]:
     """Return shapes and their colours: a room, a round podium, and the objects on it. Lengths are about metres."""
     wall = patterns.bricks(rng, 320, 2560, (14, 33))
     motto = "A2TG - ADAPTIVE ANISOTROPIC TEXTURED GAUSSIANS -"
@@ -108,7 +108,7 @@ def camera_path(num_views: int) -> np.ndarray:
     return TARGET + DISTANCE * np.stack(outward, axis=-1)
 
 
-def look_at(center: np.ndarray) -> np.ndarray:
+def viewmat_to_target(center: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4] of a camera at `center` that looks at the target, +z up."""
     return looking(center, TARGET - center, DOWN)
 
@@ -127,7 +127,7 @@ def render(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, width: i
     for candidates, is_member in groups:
         directions = _directions(viewmat, K, x[is_member], y[is_member])
         shifts = _directions(viewmat, K, *(K[:2, 2:] + SAMPLE_OFFSETS)) - _directions(viewmat, K, *K[:2, 2:])
-        samples = [trace(candidates, center, directions + shift[:, None])[0] for shift in shifts.T]
+        samples = [trace_rays(candidates, center, directions + shift[:, None])[0] for shift in shifts.T]
         image[is_member] = np.rint(np.sum(samples, axis=0, dtype=np.uint16) / len(samples))
     return image.reshape(height, width, 3)
 
@@ -141,16 +141,16 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
         height, width = pixels.shape[:2]
         column, row = rng.integers(width, size=share), rng.integers(height, size=share)
         directions = _directions(shot.viewmat, shot.K, column + 0.5, row + 0.5)
-        points.append(trace(surfaces, _center(shot.viewmat), directions)[1].T)
+        points.append(trace_rays(surfaces, _center(shot.viewmat), directions)[1].T)
         colors.append(pixels[row, column])
     is_hit = np.isfinite(np.concatenate(points)).all(axis=1)
     return PointCloud(np.concatenate(points)[is_hit], np.concatenate(colors)[is_hit])
 
 
-def observing(shot: Shot, points: np.ndarray, shapes: Sequence[Shape]) -> Shot:
+def observing(shot: Shot, points: np.ndarray, shapes: Sequence[ParametricSurface]) -> Shot:
     """Return a shot that observed those of the points [P, 3] that no shape hides from it."""
     own = before_camera(points, shot.viewmat)
-    xy, depths = projected(own, shot.K), own[:, 2]
+    xy, depths = pinhole_pixels(own, shot.K), own[:, 2]
     hits, _ = nearest_hits(shapes, _center(shot.viewmat), _directions(shot.viewmat, shot.K, *xy.T))
     is_seen = depths <= (1 + SAME_SURFACE) * hits
     height, width = Picture.of(shot.pixels).size

@@ -143,7 +143,7 @@ def _read_json(file: Path) -> dict[str, Any]:
     return checked
 
 
-def check_meta(file: Path, meta: Any) -> None:
+def check_meta(file: Path, meta: object) -> None:
     """Raise ValueError unless there is a non-empty list `frames` of objects, and file names are texts."""
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
         raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is expected")

@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.ndimage import laplace
 
 from a2tg_jax.data.decoding import MAX_PIXELS
-from a2tg_jax.host.bars import counting
+from a2tg_jax.host.progress_bars import counting
 
 DEFAULT_FRAMES = 150
 SHARPNESS_WIDTH, MOTION_WIDTH = 640, 128

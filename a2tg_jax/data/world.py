@@ -6,7 +6,7 @@ c is a camera centre, d its optical axis (unit), R a rotation, s a scale; all of
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.core.capture import nearest_point
+from a2tg_jax.core.capture_geometry import nearest_point
 from a2tg_jax.core.similarity import Similarity, camera_centers
 
 MIN_UP_LENGTH = 1e-3

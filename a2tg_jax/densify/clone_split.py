@@ -6,22 +6,22 @@ move up over pruned ones, and copies are appended while there is room.
 
 import dataclasses
 import math
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.appearance.copies import shared_opacities
 from a2tg_jax.core.budget import number_to_reach
-from a2tg_jax.core.gaussians import Gaussians, logit, rotation_matrices
+from a2tg_jax.core.checks import check_number
+from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.partition import partition
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.events import (
     Change,
     EventInfo,
-    FieldError,
     Now,
     Seen,
     Statistic,
@@ -57,20 +57,27 @@ class CloneSplitPrune(StepEvent):
     """
 
     cap: int = static(default=500_000)
-    """Largest number of Gaussians. Beyond it the largest gradients go first and the others are counted."""
+    """Largest number of Gaussians and of allocated rows; a memory_budget takes its place. Beyond it the largest
+    gradients go first and the others are counted."""
     threshold: float = 2e-4
-    """Smallest average gradient that is densified, by the position on the screen in units of half an image."""
+    """Smallest average gradient that is densified, by the position on the screen in units of half an image. With a
+    memory_budget the largest gradients are densified, however small."""
     dense_share: float = 0.01
     """Share of scene_scale above which Gaussians are split; smaller ones are cloned."""
     least_opacity: float = 0.05
     """Smallest opacity; fainter Gaussians are pruned."""
     largest_share: float = 0.1
     """Largest size as a share of scene_scale; larger Gaussians are pruned after the first reset of opacities."""
-    shares_opacity: bool = static(default=False, is_addition=True)
-    """Whether a Gaussian and its clone share the opacity, 1 − √(1 − o) each (Rota Bulò et al., 2024)."""
 
-    impossible: ClassVar[str] = "adaptive density control would prune every Gaussian: lower {least_opacity}"
-    refused: ClassVar[str] = "raise {cap}"
+    prunes_large = True
+    limited_by = "cap"
+    impossible: ClassVar[str] = "adaptive density control would prune every Gaussian; a lower least_opacity keeps some"
+
+    def check_options(self) -> None:
+        check_number("cap", self.cap, least=2)
+        for name in ("threshold", "dense_share", "largest_share"):
+            check_number(name, getattr(self, name), least=0)
+        check_number("least_opacity", self.least_opacity, least=0, most=0.99)
 
     @property
     def statistic(self) -> Statistic:
@@ -94,8 +101,6 @@ class CloneSplitPrune(StepEvent):
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
         edit, num_refused = self.plan(now, model, state.average())
-        if self.shares_opacity:
-            model = with_shared_opacities(model, edit.is_cloned)
         model, moments = apply_edit(now.keys[0], edit, model, moments)
         return Change(model, moments, self.init(model), EventInfo(jnp.any(edit.is_kept), num_refused))
 
@@ -114,7 +119,7 @@ class CloneSplitPrune(StepEvent):
 
     def _is_pruned(self, now: Now, model: Model) -> Array:
         """Return a mask [N] of rows that are too faint or too large."""
-        opacities = model.appearance.opacities(model.gaussians, model.params, model.layout)
+        opacities = model.appearance.opacities(model.gaussians)
         between = reset_interval(now.num_iterations)
         is_late, since_reset = now.iteration > between, now.iteration % between
         is_faint = (opacities < self.least_opacity) & ~(is_late & (since_reset < RECOVERY))
@@ -137,10 +142,9 @@ class FillingDensity(CloneSplitPrune):
     def num_rows(self, num: int, num_iterations: int) -> int:
         count = self.times(num_iterations).num_times
         if num * 2.0**count < self.cap:
-            raise FieldError(
-                self,
-                f"{{cap}} has room for {self.cap:,} Gaussians, but {num:,} Gaussians at most double in each of the "
-                f"{count} densifications of {num_iterations} iterations",
+            raise ValueError(
+                f"cap has room for {self.cap:,} Gaussians, but {num:,} Gaussians at most double in each of the "
+                f"{count} densifications of {num_iterations} iterations"
             )
         return max(num, self.cap)
 
@@ -151,7 +155,7 @@ class FillingDensity(CloneSplitPrune):
         reached = number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
         reached = jnp.minimum(reached, 2 * num_live)
         is_kept = is_there & ~self._is_pruned(now, model)
-        opacities = model.appearance.opacities(model.gaussians, model.params, model.layout)
+        opacities = model.appearance.opacities(model.gaussians)
         # Those that would stay anyway come first.
         place = _ranks(jnp.where(is_kept, jnp.inf, opacities), is_there)
         is_kept = is_kept | (is_there & jnp.any(is_kept) & (place < (reached + 1) // 2))
@@ -193,22 +197,13 @@ def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tupl
     rows = jnp.where(is_copy, doubled_first[jnp.maximum(index - num_kept, 0)], kept_first)
     is_live = index < num_kept + num_copies
     is_half = edit.is_split[rows] & is_live
-    moments = clear_moments(model, gather_moments(model, moments, rows), is_copy | is_half | ~is_live)
+    moments = clear_moments(model, gather_moments(moments, rows), is_copy | is_half | ~is_live)
     model = gather_rows(model, rows)
-    gaussians = halved(key, model.gaussians, is_half)
+    gaussians = split_in_half(key, model.gaussians, is_half)
     return dataclasses.replace(model, gaussians=gaussians, num_live=num_kept + num_copies), moments
 
 
-def with_shared_opacities(model: Model, is_cloned: Array) -> Model:
-    """Return the model whose marked rows [N] are as opaque as before once there are two of them."""
-    logits = model.gaussians.logit_opacities
-    shared = logit(shared_opacities(logits, jnp.full_like(logits, 2.0)))
-    # What is below the least opacity of a copy keeps its own.
-    logits = jnp.where(is_cloned, jnp.minimum(shared, logits), logits)
-    return dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, logit_opacities=logits))
-
-
-def halved(key: Array, gaussians: Gaussians, is_half: Array) -> Gaussians:
+def split_in_half(key: Array, gaussians: Gaussians, is_half: Array) -> Gaussians:
     """Return marked rows [N] at a point drawn from their Gaussian, 1.6 times smaller."""
     drawn = jax.random.normal(key, gaussians.scales.shape, gaussians.means.dtype) * gaussians.scales
     axes = rotation_matrices(gaussians.quats)[:, :, :2]
@@ -220,7 +215,7 @@ def halved(key: Array, gaussians: Gaussians, is_half: Array) -> Gaussians:
     )
 
 
-def reset_interval(num_iterations: Any) -> Array:
+def reset_interval(num_iterations: Array | int) -> Array:
     """Return the iterations between two resets of opacities: 3,000 of 30,000 as published, scaled, at least 500."""
     return jnp.maximum(num_iterations // 10, LEAST_BETWEEN_RESETS)
 
@@ -230,22 +225,28 @@ class OpacityReset(StepEvent):
     """Event that resets opacities above `most` to `most`: every max(500, n/10) of n iterations, until n/2."""
 
     most: float = 0.01
-    """Largest opacity after a reset."""
+    """Largest opacity after a reset, every max(500, n/10) of n iterations until n/2."""
 
-    reads_whole = False
     num_keys: ClassVar[int] = 0
+
+    def check_options(self) -> None:
+        check_number("most", self.most, above=0, below=1)
 
     def times(self, num_iterations: int) -> Times:
         every = int(reset_interval(num_iterations))
         return Times(every, num_iterations // 2 - 1, every)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
-        before = model.gaussians, model.params
-        after = model.appearance.limit_opacities(*before, model.layout, jnp.asarray(self.most))
+        gaussians, appearance = model.appearance.limit_opacities(model.gaussians, jnp.asarray(self.most))
+        limited = dataclasses.replace(model, gaussians=gaussians, appearance=appearance)
+        (before, _), (after, _) = partition(model), partition(limited)
 
-        def cleared(moment: Any) -> Any:
+        def cleared(moment: Model) -> Model:
             # Adam forgets whatever was changed.
-            return jax.tree.map(lambda x, old, new: x if new is old else jnp.zeros_like(x), moment, before, after)
+            kept: Model = jax.tree.map(
+                lambda x, old, new: x if new is old else jnp.zeros_like(x), moment, before, after
+            )
+            return kept
 
         moments = dataclasses.replace(moments, mu=cleared(moments.mu), nu=cleared(moments.nu))
-        return Change(dataclasses.replace(model, gaussians=after[0], params=after[1]), moments, state)
+        return Change(limited, moments, state)

@@ -7,18 +7,14 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.data import View
-from a2tg_jax.densify.pruning import pruning_times, shown_in
-from a2tg_jax.events import LEAST_LEFT, Change, Due, FieldError, HostEvent, keep_rows
+from a2tg_jax.densify.pruning import shown_in
+from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, iterations_at, keep_rows
 from a2tg_jax.model import Model
-
-NEAREST = 0.02
-"""Quantile of the depths in a picture that counts as the nearest."""
-SURE_VIEWS = 3
-"""Number of training views in which a Gaussian must show to count as a part of the scene."""
+from a2tg_jax.parallel.rows import on_host
 
 
 @pytree
@@ -30,78 +26,63 @@ class PruneFloaters(HostEvent):
     """
 
     min_views: int = static(default=2)
-    """Least number of views in which a Gaussian must show, by Σ α·T of `least`, at least 2; 0: none."""
+    """Least number of training views in which a Gaussian must show, at least 2; others are pruned. 0: off."""
     near: float = static(default=0.0)
-    """Least depth before every camera that sees it, in units of the normalised world; 0: none."""
-    near_share: float = static(default=0.0, is_addition=True)
-    """The same as a share of the depth of what stands nearest in its picture (`nearest_depths`), below 1; 0: none."""
+    """Least depth of a Gaussian before each camera that sees it, in units of the normalised world, in which cameras are
+    about 1 from what they see, such as 0.2. 0: off."""
     least: float = static(default=1.0)
-    """Least Σ α·T in a view, in pixels."""
+    """Least Σ α·T, in pixels, with which a Gaussian counts as shown in a view."""
     at: tuple[float, ...] = static(default=(0.4, 0.6, 0.8))
-    """Fractions of the stage at which Gaussians are pruned; 1: at its end."""
+    """Fractions of the stage at which Gaussians are pruned; 1: at its end. In a system, those after the last growth are
+    left out."""
 
-    reads_whole = False
+    def check_options(self) -> None:
+        if self.min_views:
+            check_number("min_views", self.min_views, least=2)
+        check_number("near", self.near, least=0)
+        check_number("least", self.least, least=0)
+        if not self.at:
+            raise ValueError("at must hold at least one fraction of the stage; got none")
+        self.iterations(1)
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        if self.min_views < 0 or self.min_views == 1:
-            raise FieldError(self, f"{{min_views}} must be at least 2 views, or 0 for off; got {self.min_views}")
-        if self.near < 0:
-            raise FieldError(self, f"{{near}} must be at least 0; got {self.near}")
-        if not 0 <= self.near_share < 1:
-            raise FieldError(self, f"{{near_share}} must lie in [0, 1); got {self.near_share}")
-        if not self.at:
-            raise FieldError(self, "{at} must hold at least one fraction of the stage; got none")
-        return pruning_times(self, self.at, num_iterations)
+        return iterations_at(self.at, num_iterations, with_end=True)
 
     def num_programs(self, num_iterations: int) -> int:
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
         num, means = model.num, on_host(model.gaussians.means)[: model.num]
-        is_kept, limits, most = np.ones(num, bool), np.full(len(due.views), self.near), len(due.views)
-        if self.min_views or self.near_share:
-            num_views = due.agreed(shown_in(model, due.views, self.least).num_views)[:num]
-            is_kept = num_views >= min(self.min_views, most)
-        if self.near_share:
-            nearest = nearest_depths(means[num_views >= min(SURE_VIEWS, most)], due.views)
-            limits = np.maximum(limits, self.near_share * nearest)
-        if self.near or self.near_share:
-            is_kept &= ~are_near(means, due.views, limits)
+        is_kept = np.ones(num, bool)
+        if self.min_views:
+            num_views = shown_in(model, due.views, self.least).num_views[:num]
+            is_kept = num_views >= min(self.min_views, len(due.views))
+        if self.near:
+            is_kept &= ~are_near(means, due.views, self.near)
         if is_kept.sum() < LEAST_LEFT:
             warnings.warn(
                 f"no floaters are pruned, for {is_kept.sum()} of {num:,} Gaussians would be left, and training needs "
-                f"{LEAST_LEFT}: lower --floaters.near, --floaters.near-share or --floaters.min-views",
+                f"{LEAST_LEFT}: lower near or min_views",
                 stacklevel=2,
             )
             is_kept[:] = True
         return keep_rows(model, moments, state, is_kept)
 
 
-def are_near(means: np.ndarray, views: Sequence[View], near: np.ndarray) -> np.ndarray:
-    """Return [N] whether a point lies within the picture of a view, at a smaller depth than its limit.
+def are_near(means: np.ndarray, views: Sequence[View], near: float) -> np.ndarray:
+    """Return [N] whether a point lies within the picture of a view, at a smaller depth than `near`.
 
     The picture of a lens that is no pinhole is the smallest rectangle in the image plane that holds all its rays.
 
     Args:
       means: [N, 3] points.
       views: V views.
-      near: [V] limits of the depth.
+      near: limit of the depth.
     """
     found = np.zeros(len(means), bool)
-    for view, limit in zip(views, near, strict=True):
-        found |= depths_in_picture(means, view.camera) < limit
+    for view in views:
+        found |= depths_in_picture(means, view.camera) < near
     return found
-
-
-def nearest_depths(means: np.ndarray, views: Sequence[View]) -> np.ndarray:
-    """Return [V] the depth in each picture that 2 % of the points there are nearer than; 0 without points.
-
-    Args:
-      means: [N, 3] points of the scene, a few of which may be floaters.
-      views: V views.
-    """
-    found = [depths[np.isfinite(depths)] for depths in (depths_in_picture(means, view.camera) for view in views)]
-    return np.asarray([np.quantile(depths, NEAREST) if len(depths) else 0.0 for depths in found])
 
 
 def depths_in_picture(means: np.ndarray, camera: Camera) -> np.ndarray:

@@ -16,19 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import GivenColors
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.display import counted
+from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.data import View, counted_pixels, views_by_kind
-from a2tg_jax.events import LEAST_LEFT, Change, Due, FieldError, HostEvent, Times, keep_rows
-from a2tg_jax.host.text import shortened
+from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, iterations_at, keep_rows
+from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.capacity import room_of_view
-from a2tg_jax.rasterize.exchange import exchange_of, spread
-from a2tg_jax.rasterize.placement import everywhere
+from a2tg_jax.parallel.exchange import exchange_of
+from a2tg_jax.parallel.room import room_of_view
+from a2tg_jax.parallel.rows import everywhere, mesh_of, of_first, on_host, spread
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
@@ -42,21 +40,21 @@ class Prune(HostEvent):
     """
 
     share: float = 0.1
-    """Share of the Gaussians removed each time, in [0, 1); ignored if `keep` is given. If fewer than 2 would be left,
-    none is removed, with a warning."""
+    """Share of the Gaussians to prune each time, in [0, 1); ignored if `keep` is given. If fewer than 2 would be left,
+    none is pruned, with a warning."""
     keep: int | None = static(default=None)
     """Largest number of Gaussians left each time, at least 2."""
     at: tuple[float, ...] = static(default=(1.0,))
     """Fractions of the stage at which Gaussians are pruned; 1: at its end."""
 
-    reads_whole = False
+    def check_options(self) -> None:
+        check_number("share", self.share, least=0, below=1)
+        if self.keep is not None:
+            check_number("keep", self.keep, least=LEAST_LEFT)
+        self.iterations(1)
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        if self.keep is not None and self.keep < LEAST_LEFT:
-            raise FieldError(self, f"{{keep}} must be at least {LEAST_LEFT} Gaussians; got {self.keep}")
-        if self.keep is None and not 0 <= self.share < 1:
-            raise FieldError(self, f"{{share}} must lie in [0, 1); got {self.share}")
-        return pruning_times(self, self.at, num_iterations)
+        return iterations_at(self.at, num_iterations, with_end=True)
 
     def num_after(self, num: int, num_iterations: int) -> int:
         return num if self.keep is None else min(num, self.keep)
@@ -66,7 +64,7 @@ class Prune(HostEvent):
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
         num, left = model.num, self._num_left(model.num)
-        weights = due.agreed(blending_weights(model, due.views))
+        weights = blending_weights(model, due.views)
         is_kept = np.zeros(num, bool)
         is_kept[np.argsort(-weights[:num], kind="stable")[:left]] = True
         return keep_rows(model, moments, state, is_kept)
@@ -79,21 +77,10 @@ class Prune(HostEvent):
             return left
         warnings.warn(
             f"nothing is pruned, for {left} of {counted(num, 'Gaussian')} would be left, and training needs "
-            f"{LEAST_LEFT}: lower --prune.share",
+            f"{LEAST_LEFT}: lower the share",
             stacklevel=3,
         )
         return num
-
-
-def pruning_times(of: HostEvent, at: tuple[float, ...], num_iterations: int) -> tuple[int, ...]:
-    """Return the iterations at fractions of a stage, its end included.
-
-    Raises:
-      FieldError: if the fractions, the event's field `at`, are not ascending or not in (0, 1].
-    """
-    if any(not 0 < fraction <= 1 for fraction in at) or list(at) != sorted(set(at)):
-        raise FieldError(of, f"{{at}} must be ascending fractions above 0, up to 1; got {shortened(at)}")
-    return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in at))
 
 
 def during_growth(at: tuple[float, ...], num_iterations: int, growth: Times) -> tuple[float, ...]:
@@ -101,7 +88,7 @@ def during_growth(at: tuple[float, ...], num_iterations: int, growth: Times) -> 
     return tuple(fraction for fraction in at if round(fraction * num_iterations) < growth.last_time)
 
 
-class Shown(NamedTuple):
+class Contributions(NamedTuple):
     """Contribution of N Gaussians to some views."""
 
     weights: np.ndarray
@@ -123,11 +110,11 @@ def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
     return shown_in(model, views).weights
 
 
-def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Shown:
+def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contributions:
     """Return how much each Gaussian shows, and in how many views it shows as much as `least` pixels (host).
 
     The devices over which the model's rows are spread draw each view together. If they are of several processes, all
-    of these call it; their numbers may differ by rounding (`Due.agreed`).
+    of these call it, and get the numbers of the first one, since GPUs may round sums differently each time.
 
     Args, Raises: as of `blending_weights`.
     """
@@ -135,31 +122,30 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Shown:
         raise ValueError("views must hold at least one view; got none")
     total, num_views = np.zeros(model.gaussians.num), np.zeros(model.gaussians.num, np.int64)
     if not len(total):
-        return Shown(total, num_views)
+        return Contributions(total, num_views)
     settings, dtype = _planned(model, [view.camera for view in views]), model.gaussians.means.dtype
+    mesh = mesh_of(model.gaussians.means)
     for own in views_by_kind(views):
         rays = own[0].camera.rays
         rays = None if rays is None else jnp.asarray(rays, dtype)
         cameras = [dataclasses.replace(view.camera, rays=None) for view in own]
         stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves), dtype), *cameras)
         counted = jnp.asarray(counted_pixels(own), dtype)
-        arrays: Any = stacked, rays, counted, jnp.asarray(least, dtype)
-        if settings.exchange is not None:
-            arrays = jax.tree.map(functools.partial(everywhere, settings.exchange), arrays)
+        arrays: Any = everywhere(mesh, (stacked, rays, counted, jnp.asarray(least, dtype)))
         weights, num = _jitted()(model, *arrays, settings)
         total += on_host(weights).astype(np.float64)
         num_views += on_host(num)
-    return Shown(total, num_views)
+    return Contributions(*of_first(mesh, (total, num_views)))
 
 
 def _planned(model: Model, cameras: Sequence[Camera]) -> RenderSettings:
     """Return settings with room for all cameras, rounded up, because programs are compiled for a room: for few of
     them."""
-    settings, rule = RenderSettings(exchange=exchange_of(model.gaussians.means)), model.rule
+    settings, appearance = RenderSettings(exchange=exchange_of(model.gaussians.means)), model.appearance
     if settings.exchange is None:
         capacity = plan_render(model, cameras, settings=settings).capacity
         return dataclasses.replace(settings, capacity=_rounded_up(capacity or 1))
-    rooms = [room_of_view(model.gaussians, camera, rule, settings, model.num_live) for camera in cameras]
+    rooms = [room_of_view(model.gaussians, camera, appearance, settings, model.num_live) for camera in cameras]
     capacity = _rounded_up(max(room.pairs for room in rooms))
     rows_per_pair = _rounded_up(max(room.rows for room in rooms)) / capacity
     exchange = dataclasses.replace(settings.exchange, rows_per_pair=rows_per_pair)
@@ -188,9 +174,9 @@ def _weights(
         camera = dataclasses.replace(camera, rays=rays)
 
         def draw(colors: Array) -> Array:
-            rule = GivenColors(model.rule, colors)
+            appearance = dataclasses.replace(model.appearance, given_colors=colors)
             output, _ = render_traced(
-                model.gaussians, camera, rule, jnp.zeros_like(colors[0]), settings,
+                model.gaussians, camera, appearance, jnp.zeros_like(colors[0]), settings,
                 has_geometry=False, num_live=model.num_live,
             )  # fmt: skip
             return output.color
@@ -202,5 +188,5 @@ def _weights(
 
     none = jnp.zeros(len(nothing), jnp.int32)
     found, _ = jax.lax.scan(of_view, (nothing[:, 0], none), (cameras, counted))
-    shown: tuple[Array, Array] = spread(settings.exchange, found)
+    shown: tuple[Array, Array] = spread(None if settings.exchange is None else settings.exchange.mesh, found)
     return shown

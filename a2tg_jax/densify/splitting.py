@@ -26,11 +26,11 @@ from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.pytree import pytree
-from a2tg_jax.core.spread_arrays import zeros_beside
-from a2tg_jax.densify.clone_split import SPLIT_SHRINK, halved
+from a2tg_jax.densify.clone_split import SPLIT_SHRINK, split_in_half
 from a2tg_jax.events import Change, EventInfo, Now, Seen, Statistic, clear_moments, gather_rows
 from a2tg_jax.mcmc import FillingMcmc, Moves, plan_growth, plan_relocation
 from a2tg_jax.model import Model
+from a2tg_jax.parallel.rows import zeros_beside
 
 LEAST_WEIGHT = 1e-12
 """Weight of a host that no view has seen."""
@@ -80,7 +80,7 @@ class SplitByGradient(FillingMcmc):
 
     @staticmethod
     def _opacities(model: Model) -> Array:
-        return model.appearance.opacities(model.gaussians, model.params, model.layout)
+        return model.appearance.opacities(model.gaussians)
 
 
 def draw_weights(model: Model, state: SplitStatistics) -> Array:
@@ -120,7 +120,7 @@ def split_rows(
     moments = clear_moments(model, moments, is_split)
     num_live = model.live_count + moves.info.num_added
     model = dataclasses.replace(gather_rows(model, moves.rows), num_live=num_live)
-    gaussians = halved(key, model.gaussians, is_split)
+    gaussians = split_in_half(key, model.gaussians, is_split)
     if model.appearance.has_low_pass:
         logits = logits_of_halves(gaussians.logit_opacities, pixels)
         logits = jnp.where(is_split, logits, gaussians.logit_opacities)

@@ -4,6 +4,7 @@ The image is linear in the coefficients. So the gradient of a coefficient that a
 over views of ∂L/∂colour · Y(direction). Residuals that many views share add up in it, others cancel.
 """
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -11,15 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance.sh_bands import MAX_DEGREE, BandLayout, Bands, floats_of_band, reallocate_bands
+from a2tg_jax.appearance import in_words
+from a2tg_jax.appearance.bands import MAX_DEGREE, Coefficients, degrees_of_sizes, floats_of_band, sizes_of_degrees
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, MOST_ROOM, bytes_of, event_budget, within_budget
+from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, sh_basis
-from a2tg_jax.core.spread_arrays import on_host, zeros_beside
+from a2tg_jax.core.table import Shape, bucket_capacity, resize
 from a2tg_jax.events import Change, Due, HostEvent, Seen, iterations_at
 from a2tg_jax.model import Model
+from a2tg_jax.parallel.rows import on_host, zeros_beside
 
 
 @pytree
@@ -64,7 +68,7 @@ BAND_SLICES = tuple(slice(NUM_BASES[degree - 1], NUM_BASES[degree]) for degree i
 class AdaptDegrees(HostEvent):
     """Event that lowers idle degrees and raises others by one where the gradient per byte is largest, within a budget.
 
-    It needs `appearance.Banded`.
+    It needs an appearance with `Bands`.
     """
 
     budget_mb: float = 0.0
@@ -77,10 +81,15 @@ class AdaptDegrees(HostEvent):
     """Smallest change of a colour by a band (root mean square over all directions); bands below it are removed."""
 
     observes = True
-    reads_whole = False
+
+    def check_options(self) -> None:
+        check_number("budget_mb", self.budget_mb, least=0)
+        check_number("highest", self.highest, least=0, most=MAX_DEGREE)
+        check_number("idle", self.idle, least=0)
+        self.iterations(1)
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
-        return iterations_at(self.at, num_iterations, of=self)
+        return iterations_at(self.at, num_iterations)
 
     def num_programs(self, num_iterations: int) -> int:
         return 0  # Tables have room, unless degrees may take more than half of the budget.
@@ -91,18 +100,17 @@ class AdaptDegrees(HostEvent):
     def with_room(
         self, model: Model, moments: AdamState, num_bytes: float, num_iterations: int
     ) -> tuple[Model, AdamState]:
-        if model.bands is None:
+        table, base = model.appearance.coefficients, model.gaussians.sh_degree
+        if table is None:
             return model, moments
-        bands, layout = model.bands
         budget = bytes_of(self.budget_mb)
-        left = budget - model.num_bytes + BYTES_PER_FLOAT * layout.count_floats(model.num)
-        highest = min(self.highest, layout.base_degree + len(self.iterations(num_iterations)))
-        room = most_rows(left, layout.base_degree, highest, model.num)
-        floats = sum(rows * floats_of_band(band) for rows, band in zip(room, layout.bands, strict=True))
-        if BYTES_PER_FLOAT * floats > MOST_ROOM * budget:
+        left = budget - model.num_bytes + BYTES_PER_FLOAT * table.count_floats(model.num)
+        highest = min(self.highest, base + len(self.iterations(num_iterations)))
+        room = most_blocks(left, base, highest, model.num, table)
+        if BYTES_PER_FLOAT * len(table.padding) * room.num_elements > MOST_ROOM * budget:
             return model, moments
-        bands, layout, moments = reallocate_bands(bands, layout, layout.degrees, moments, room)
-        return model.with_bands(bands, layout), moments
+        table, moments = resize(table, table.sizes, moments, room=room)
+        return dataclasses.replace(model, appearance=model.appearance.with_coefficients(table)), moments
 
     def init(self, model: Model) -> ViewDependence:
         return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
@@ -112,54 +120,64 @@ class AdaptDegrees(HostEvent):
         return state.observe(model.gaussians.means, centers, seen.colors)
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: ViewDependence) -> Change:
-        if model.bands is None:
-            raise ValueError(f"{type(model.appearance).__name__} has no degrees that could rise; Banded has")
-        (bands, layout), num = model.bands, model.num
-        degrees = without_idle(bands, layout, self.idle)
-        used = model.num_bytes - saved_bytes(layout, degrees, num)
+        table, base, num = model.appearance.coefficients, model.gaussians.sh_degree, model.num
+        if table is None:
+            raise ValueError(
+                f"{in_words(model.appearance)} cannot raise degrees: the stage needs Appearance(bands=Bands())"
+            )
+        degrees = without_idle(table, base, self.idle)
+        used = model.num_bytes - saved_bytes(model.degrees[:num], degrees[:num])
         budget = event_budget(bytes_of(self.budget_mb), used, due.index, due.count)
-        degrees[:num] = raised(degrees[:num], state.strengths()[:num], budget, self.highest)
-        room = [len(owners) for owners in layout.owners]
-        bands, layout, moments = reallocate_bands(bands, layout, degrees, moments, room)
-        model = model.with_bands(bands, layout)
+        degrees[:num] = raised_degrees(degrees[:num], state.strengths()[:num], budget, self.highest)
+        table, moments = resize(table, sizes_of_degrees(degrees, base), moments, room=table.shape)
+        model = dataclasses.replace(model, appearance=model.appearance.with_coefficients(table))
         return Change(model, moments, self.init(model))
 
 
-def most_rows(num_bytes: float, base_degree: int, highest: int, num: int) -> list[int]:
-    """Return the largest number of rows that the table of each band above `base_degree` can need within some bytes.
+def most_blocks(num_bytes: float, base_degree: int, highest: int, num: int, table: Coefficients) -> Shape:
+    """Return a shape with room for all blocks that `num` Gaussians can have within some bytes (host).
 
-    A row of a band comes with one of each band below it. Bands above `highest` need none.
+    Args:
+      num_bytes: of all blocks, at most.
+      base_degree: degree of all Gaussians.
+      highest: highest degree that is reached.
+      num: number of Gaussians that exist.
+      table: present blocks, of as many rows as are allocated.
     """
-    rows, cost = [], 0
-    for degree in range(base_degree + 1, MAX_DEGREE + 1):
-        cost += BYTES_PER_FLOAT * floats_of_band(degree)
-        rows.append(min(num, max(0, int(num_bytes // cost))) if degree <= highest else 0)
-    return rows
+    counts = {(0,): bucket_capacity(table.num)}
+    for degree in range(base_degree + 1, highest + 1):
+        size = NUM_BASES[degree] - NUM_BASES[base_degree]
+        count = min(num, max(0, int(num_bytes // (BYTES_PER_FLOAT * 3 * size))))
+        if count:
+            counts[size,] = bucket_capacity(count)
+    return Shape(tuple(counts), tuple(counts.values()))
 
 
-def without_idle(bands: Bands, layout: BandLayout, idle: float) -> np.ndarray:
+def without_idle(table: Coefficients, base_degree: int, idle: float) -> np.ndarray:
     """Return [N] degrees, one less if the highest band changes the colour by less than `idle` (host).
 
     Spherical harmonics are orthonormal. So the mean square of a band, over all directions and three channels, is the
     sum of its squared coefficients divided by 12π.
     """
-    degrees = layout.degrees
-    highest = degrees.copy()
-    for band, table, owners in zip(layout.bands, bands.tables, layout.owners, strict=True):
-        rows = on_host(owners)[on_host(owners) < layout.num]
-        energy = np.square(on_host(table)[: len(rows)]).sum(axis=(1, 2)) / (12 * np.pi)
-        is_idle = (energy < idle**2) & (degrees[rows] == band)
-        highest[rows[is_idle]] -= 1
-    return highest
+    degrees = degrees_of_sizes(table.sizes, base_degree)
+    for blocks, owners in zip(table.buckets, table.owners, strict=True):
+        if blocks.size:
+            rows, values = on_host(owners), on_host(blocks)
+            is_used = rows < table.num
+            rows, values = rows[is_used], values[is_used]
+            last = floats_of_band(int(degrees[rows[0]])) // 3 if len(rows) else 0
+            energy = np.square(values[:, values.shape[1] - last :]).sum(axis=(1, 2)) / (12 * np.pi)
+            degrees[rows[energy < idle**2]] -= 1
+    return degrees
 
 
-def saved_bytes(layout: BandLayout, degrees: np.ndarray, num: int) -> int:
-    """Return the bytes that the first `num` Gaussians save at lower degrees (host)."""
+def saved_bytes(degrees: np.ndarray, lower: np.ndarray) -> int:
+    """Return the bytes that Gaussians of some degrees [N] save at lower degrees [N] (host)."""
     floats = np.asarray([3 * NUM_BASES[degree] for degree in range(MAX_DEGREE + 1)])
-    return BYTES_PER_FLOAT * int((floats[layout.degrees[:num]] - floats[degrees[:num]]).sum())
+    return BYTES_PER_FLOAT * int((floats[degrees] - floats[lower]).sum())
 
 
-def raised(degrees: np.ndarray, strengths: np.ndarray, budget: float, highest: int = MAX_DEGREE) -> np.ndarray:
+def raised_degrees(degrees: np.ndarray, strengths: np.ndarray, budget: float, highest: int = MAX_DEGREE) -> np.ndarray:
     """Return [N] degrees, raised by one in descending order of gradient per added byte within a budget (host).
 
     Args:

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Plain
+from a2tg_jax.appearance.bands import MAX_DEGREE
+from a2tg_jax.appearance.exponents import curves_of, falloff_of
+from a2tg_jax.appearance.lookup import texel_coordinates
 from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
-from a2tg_jax.appearance.shaped import curves_of, falloff_of
-from a2tg_jax.appearance.textured import shown_textures, texel_coordinates
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, floats_per_gaussian, logit, rotation_matrices
@@ -62,8 +62,8 @@ def bake(
     """Return a plain model that looks like a textured one (host).
 
     Args:
-      model: of any appearance. `Textured`, and `Shaped` or `Banded` around it, becomes a splat per texel or fewer; of
-        others the Gaussians are taken, those nearest to kernels of other shapes.
+      model: of any appearance. Textures become a splat per texel or fewer; of other appearances the Gaussians are
+        taken, those nearest to kernels of other shapes.
       cameras: views that the new model is trained on.
       growth: largest ratio of the bytes of all floats to those of the model. If the Gaussians differ in their degree,
         the common one is lowered until one splat for each fits.
@@ -88,16 +88,17 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
         degree = fitting_degree(model, whole.sh_degree, growth)
         return as_plain(dataclasses.replace(whole, sh=whole.sh[:, : NUM_BASES[degree]]), model)
     degree = fitting_degree(model, least_degree(model, cameras), growth)
-    shown = shown_textures(*model.textures, options)
+    assert model.appearance.texture is not None
     weights = texel_weights_of(model, cameras, model.background)
-    tables = fewest_texels(shown, model.textures[1], weights, most_splats(model, degree, growth))
+    shown = model.appearance.texture.shown()
+    tables = fewest_texels(shown, weights, most_splats(model, degree, growth))
     whole = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh[:, : NUM_BASES[degree]]))
-    return as_plain(_split(whole, model.appearance.shapes(model.params), tables, options.uv), model)
+    return as_plain(_split(whole, model.appearance.shapes, tables, options.uv), model)
 
 
 def as_plain(gaussians: Gaussians, model: Model) -> Model:
-    """Return a plain model of Gaussians with the origin of another."""
-    return Model(gaussians, appearance=Plain(), origin=model.origin)
+    """Return a plain model of Gaussians with background and origin of another."""
+    return Model(gaussians, background=model.background, origin=model.origin)
 
 
 def most_splats(model: Model, degree: int, growth: float) -> int:
@@ -115,7 +116,7 @@ def fitting_degree(model: Model, highest: int, growth: float) -> int:
 
 def least_degree(model: Model, cameras: Sequence[Camera]) -> int:
     """Return the lowest degree of spherical harmonics with which pictures stay about the same (host)."""
-    highest = model.gaussians.sh_degree if model.bands is None else 3
+    highest = model.gaussians.sh_degree if model.appearance.bands is None else MAX_DEGREE
     if highest == 0:
         return 0
     wanted = list(pictures(model, cameras))

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Color
@@ -109,7 +110,7 @@ def loss_beside_renders(
 
 
 def _drawing(
-    model: Model, cameras: Sequence[Camera], background: Any, settings: RenderSettings
+    model: Model, cameras: Sequence[Camera], background: ArrayLike | None, settings: RenderSettings
 ) -> Callable[[Model], Iterator[np.ndarray]]:
     """Draw models like the given one for cameras, clipped to [0, 1]; compiled once while the capacity suffices."""
     if not cameras:

@@ -27,7 +27,7 @@ def distill(
     Both are drawn over black or white, whichever is nearer to the other model's background.
 
     Args:
-      model: of `Plain`, in the world of the other.
+      model: of plain Gaussians, in the world of the other.
       wanted: any model.
       cameras: views to draw, at least one.
       iterations: each draws one view.

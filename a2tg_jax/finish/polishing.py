@@ -17,8 +17,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from a2tg_jax.appearance import GivenColors
-from a2tg_jax.appearance.layers import layer_without
+from a2tg_jax.appearance import in_words
+from a2tg_jax.appearance.base import color_sums
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.optim import solve_cg
@@ -28,7 +28,6 @@ from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
-from a2tg_jax.texture import Textures
 
 HIGHEST_DEGREE = 3
 
@@ -58,12 +57,12 @@ class Targets(NamedTuple):
 
 
 def polish(
-    model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background: Any = None
+    model: Model, views: Sequence[View], *, num_steps: int = 5, ridge: float = 1.0, background: ArrayLike | None = None
 ) -> Model:
     """Return the model with colours that lower the squared error over the views.
 
     Args:
-      model: of `Plain`, of `Textured` with signed RGB, or of `Banded` around one of these.
+      model: of Gaussians with or without textures of signed RGB, exponents and bands.
       views: training views.
       num_steps: number of steps of conjugate gradients; each draws every view forwards and backwards. Few steps
         regularise, many overfit the training views.
@@ -126,18 +125,18 @@ def _solve(
 
 
 def _drawn(model: Model, camera: Camera, background: Array, settings: RenderSettings) -> Array:
-    output, _ = render_traced(model.gaussians, camera, model.rule, background, settings, has_geometry=False)
+    output, _ = render_traced(model.gaussians, camera, model.appearance, background, settings, has_geometry=False)
     return output.color
 
 
 def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSettings) -> Array:
     """Return the change [H, W, 3] of a picture by a change of the colours, a linear function."""
-    is_shown = model.rule.own_color_sums(model.gaussians, camera, HIGHEST_DEGREE) + 0.5 > 0
+    is_shown = color_sums(model.appearance, model.gaussians, camera, HIGHEST_DEGREE) + 0.5 > 0
     changed = with_colors(model, change)
-    sums = changed.rule.own_color_sums(changed.gaussians, camera, HIGHEST_DEGREE)
-    rule = GivenColors(changed.rule, jnp.where(is_shown, sums, 0.0))
+    sums = color_sums(changed.appearance, changed.gaussians, camera, HIGHEST_DEGREE)
+    appearance = dataclasses.replace(changed.appearance, given_colors=jnp.where(is_shown, sums, 0.0))
     black = jnp.zeros(3, model.gaussians.means.dtype)
-    output, _ = render_traced(model.gaussians, camera, rule, black, settings, has_geometry=False)
+    output, _ = render_traced(model.gaussians, camera, appearance, black, settings, has_geometry=False)
     return output.color
 
 
@@ -151,22 +150,23 @@ def _transpose(model: Model, camera: Camera, settings: RenderSettings, image: Ar
 
 def colors_of(model: Model) -> Colors:
     """Return the colours, in which a picture of the model is linear."""
-    bands = () if model.bands is None else model.bands[0]
-    buckets = model.textures[0].buckets if model.textures else ()
-    return Colors(model.gaussians.sh, bands, tuple(bucket[..., :3] for bucket in buckets))
+    tables = model.appearance.coefficients, model.textures
+    bands, textures = (() if table is None else table.buckets for table in tables)
+    return Colors(model.gaussians.sh, bands, tuple(bucket[..., :3] for bucket in textures))
 
 
 def with_colors(model: Model, colors: Colors) -> Model:
     """Return the model with other colours; alpha textures stay."""
     gaussians = dataclasses.replace(model.gaussians, sh=colors.sh)
     model = dataclasses.replace(model, gaussians=gaussians)
-    if model.bands is not None:
-        model = model.with_bands(colors.bands, model.bands[1])
+    if (coefficients := model.appearance.coefficients) is not None:
+        appearance = model.appearance.with_coefficients(dataclasses.replace(coefficients, buckets=colors.bands))
+        model = dataclasses.replace(model, appearance=appearance)
     if model.textures is None:
         return model
-    textures, layout = model.textures
-    pairs = zip(colors.rgb, textures.buckets, strict=True)
-    return model.with_textures(Textures(tuple(jnp.concatenate([rgb, old[..., 3:]], -1) for rgb, old in pairs)), layout)
+    pairs = zip(colors.rgb, model.textures.buckets, strict=True)
+    buckets = tuple(jnp.concatenate([rgb, old[..., 3:]], -1) for rgb, old in pairs)
+    return model.with_textures(dataclasses.replace(model.textures, buckets=buckets))
 
 
 def _check(model: Model, views: Sequence[View]) -> None:
@@ -175,10 +175,9 @@ def _check(model: Model, views: Sequence[View]) -> None:
     if not views:
         raise ValueError("views must hold at least one view; got none")
     if not model.appearance.is_linear:
-        kind = layer_without(model.appearance, lambda layer: layer.is_linear)
         raise ValueError(
-            f"a picture is not linear in what {kind} shows: Plain, Textured with signed RGB, or Shaped or Banded "
-            "around one of these can be polished"
+            f"a picture is not linear in the colours of {in_words(model.appearance)}: Gaussians with or without "
+            "textures of signed RGB can be polished"
         )
 
 

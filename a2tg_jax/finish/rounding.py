@@ -15,17 +15,17 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.appearance.sh_bands import Bands
-from a2tg_jax.appearance.shaped import LARGEST_LOG_EXPONENT, MOST_SHARE
+from a2tg_jax.appearance.bands import MAX_DEGREE
+from a2tg_jax.appearance.exponents import LARGEST_LOG_EXPONENT, MOST_SHARE
 from a2tg_jax.core.gaussians import Gaussians, logit
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.partition import combine, partition
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import Change, Now, StepEvent
 from a2tg_jax.io.compact import LEAST_OPACITY, CompactChoices, Grids
-from a2tg_jax.model import Model, Parameters
-from a2tg_jax.texture import Textures
+from a2tg_jax.model import Model
 
 LAST_ROUNDED = 0.95
 """Share of a training after which all numbers are rounded."""
@@ -70,7 +70,7 @@ class ContractedSteps(NamedTuple):
 
 @pytree
 class GridRounding:
-    """Rounding to the grids of a compact file, for models as `half_turned` gives them: no splat is half-turned anew."""
+    """Rounding to the grids of a compact file, for models that `half_turned` made: no splat is turned again."""
 
     steps: dict[str, Any]
     """Steps by the name of the part of the file; a part kept as floats has none. Means have those of each axis."""
@@ -88,17 +88,25 @@ class GridRounding:
     def __call__(self, model: Model) -> Model:
         """Return the model that the file holds, its rows in their order; traced."""
         model = dataclasses.replace(model, gaussians=self._gaussians(model.gaussians))
-        if model.bands is not None:
-            bands, owners = model.bands
-            pairs = zip(owners.bands, bands.tables, strict=True)
-            model = model.with_bands(Bands(tuple(self._nearest(f"sh_{d}", table) for d, table in pairs)), owners)
-        if model.textures is not None:
-            textures, layout = model.textures
-            model = model.with_textures(Textures(tuple(map(self._texels, textures.buckets))), layout)
-        shapes = model.appearance.shapes(model.params)
-        if shapes is None or "shapes" not in self.steps:
-            return model
-        return dataclasses.replace(model, params=model.appearance.with_shapes(model.params, self._shapes(shapes)))
+        shown = model.appearance
+        if (table := shown.coefficients) is not None:
+            buckets = tuple(self._bands(blocks, model.gaussians.sh_degree + 1) for blocks in table.buckets)
+            shown = shown.with_coefficients(dataclasses.replace(table, buckets=buckets))
+        if (textures := shown.textures) is not None:
+            buckets = tuple(map(self._texels, textures.buckets))
+            shown = shown.with_textures(dataclasses.replace(textures, buckets=buckets))
+        if shown.shapes is not None and "shapes" in self.steps:
+            shown = shown.with_shapes(self._shapes(shown.shapes))
+        return dataclasses.replace(model, appearance=shown)
+
+    def _bands(self, blocks: Array, first: int) -> Array:
+        """Return blocks [M, K, 3] of the bands from degree `first` on."""
+        rounded, start = [blocks[:, :0]], 0
+        for degree in range(first, MAX_DEGREE + 1):
+            if start < blocks.shape[1]:
+                rounded.append(self._nearest(f"sh_{degree}", blocks[:, start : start + 2 * degree + 1]))
+                start += 2 * degree + 1
+        return jnp.concatenate(rounded, axis=1)
 
     def _nearest(self, name: str, values: Array) -> Array:
         return self.steps[name].nearest(values) if name in self.steps else values
@@ -170,32 +178,32 @@ class GradualRounding(StepEvent):
 
     num_keys = 0
 
-    def init(self, model: Model) -> Parameters:
+    def init(self, model: Model) -> Model:
         """Return the time of each number, as a share of the iterations before all are rounded."""
-        leaves, tree = jax.tree.flatten(model.parameters)
+        leaves, tree = jax.tree.flatten(partition(model)[0])
         keys = jax.random.split(jax.random.key(KEY_OF_TIMES), len(leaves))
         times = [jax.random.uniform(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
-        parameters: Parameters = jax.tree.unflatten(tree, times)
-        return parameters
+        of_numbers: Model = jax.tree.unflatten(tree, times)
+        return of_numbers
 
-    def apply(self, now: Now, model: Model, moments: AdamState, state: Parameters) -> Change:
+    def apply(self, now: Now, model: Model, moments: AdamState, state: Model) -> Change:
         share = now.iteration.astype(float) / (LAST_ROUNDED * now.num_iterations.astype(float))
         is_rounded = jax.tree.map(lambda time: time < share, state)
         return Change(partly_rounded(self.rounding, model, is_rounded), moments, state)
 
 
-def partly_rounded(rounding: GridRounding, model: Model, is_rounded: Parameters) -> Model:
+def partly_rounded(rounding: GridRounding, model: Model, is_rounded: Model) -> Model:
     """Return the model with some numbers rounded; traced.
 
     Args:
       rounding: of all numbers.
       model: as `half_turned` gives it, with numbers that may have changed since.
-      is_rounded: bool, in the shapes of `model.parameters`; w of a quaternion follows from its other numbers.
+      is_rounded: bool, in the shapes of the model's floats; w of a quaternion follows from its other numbers.
     """
-    rounded, before = rounding(model).parameters, model.parameters
-    chosen: Parameters = jax.tree.map(jnp.where, is_rounded, rounded, before)
+    (rounded, _), (before, rest) = partition(rounding(model)), partition(model)
+    chosen: Model = jax.tree.map(jnp.where, is_rounded, rounded, before)
     if "quats" in rounding.steps:
         pair = _xyz(rounded.gaussians.quats), _xyz(before.gaussians.quats)
         quats = _with_w(jnp.where(is_rounded.gaussians.quats[:, 1:], *pair))
-        chosen = chosen._replace(gaussians=dataclasses.replace(chosen.gaussians, quats=quats))
-    return model.with_parameters(chosen)
+        chosen = dataclasses.replace(chosen, gaussians=dataclasses.replace(chosen.gaussians, quats=quats))
+    return combine(chosen, rest)

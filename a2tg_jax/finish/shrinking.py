@@ -10,18 +10,19 @@ of random signs for each view. Changing texels by δ then changes the squared er
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
-from a2tg_jax.appearance import Appearance
-from a2tg_jax.appearance.layers import layer_without
+from a2tg_jax.appearance import in_words
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
+from a2tg_jax.core.origin import Color
 from a2tg_jax.data import View
 from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.finish.compaction import loss_on_views
@@ -29,7 +30,7 @@ from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
-from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, AtlasLayout, Textures, plan_layout
+from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, Textures, allocate_textures
 
 LEAST_OPACITY = 1e-4
 """Largest opacity of a Gaussian after absorbing a texel's alpha: its logit must be finite."""
@@ -37,11 +38,13 @@ LEAST_SAVED = 0.005
 """Smallest share of a model's bytes that a round must save for another one."""
 
 
-def shrink_textures(model: Model, views: Sequence[View], *, max_loss: float = 0.02, background: Any = None) -> Model:
+def shrink_textures(
+    model: Model, views: Sequence[View], *, max_loss: float = 0.02, background: Color | None = None
+) -> Model:
     """Return the model with smaller textures and as many Gaussians as before (host).
 
     Args:
-      model: of `Textured` with signed RGB, or of `Shaped` or `Banded` around it.
+      model: with textures of signed RGB.
       views: views to measure the loss on, such as the training views.
       max_loss: largest loss of PSNR in dB, as a mean over the views.
       background: [3] colour; None is the model's own.
@@ -66,11 +69,7 @@ def shrink_textures(model: Model, views: Sequence[View], *, max_loss: float = 0.
 
 def can_shrink(model: Model) -> bool:
     """Return whether the model has textures that can shrink: signed RGB and projected alpha."""
-    return _has_such_textures(model.appearance)
-
-
-def _has_such_textures(appearance: Appearance) -> bool:
-    options = appearance.texture_options if appearance.is_portable else None
+    options = model.appearance.texture_options if model.appearance.is_portable else None
     return options is not None and options.rgb == "signed" and options.alpha == "projected"
 
 
@@ -83,14 +82,15 @@ def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
     if not can_shrink(model):
         raise ValueError(
-            f"{layer_without(model.appearance, _has_such_textures)} has no textures that can shrink: Textured with "
-            "signed RGB and projected alpha, or Shaped or Banded around it, has"
+            f"{in_words(model.appearance)} cannot shrink: only textures with signed RGB and projected alpha can"
         )
 
 
-def _shrunk_once(model: Model, views: Sequence[View], background: Any, is_allowed: Any) -> Model:
+def _shrunk_once(
+    model: Model, views: Sequence[View], background: ArrayLike | None, is_allowed: Callable[[Model], bool]
+) -> Model:
     """Return the model after the cheapest allowed steps, at most one for each texture."""
-    step = halved(model, texel_weights(model, views, background))
+    step = halve_textures(model, texel_weights(model, views, background))
     saved = step.saved
     order = np.argsort(step.cost / np.maximum(saved, 1), kind="stable")
     order = order[saved[order] > 0]
@@ -120,14 +120,13 @@ class Step(NamedTuple):
     gaussians: Gaussians
     """Gaussians after absorbing their 1×1 textures."""
     textures: Textures
-    layout: AtlasLayout
     cost: np.ndarray
     """[N] estimated growth of the squared error."""
     saved: np.ndarray
     """[N] bytes."""
 
 
-def halved(model: Model, weights: Textures) -> Step:
+def halve_textures(model: Model, weights: Textures) -> Step:
     """Return all textures halved along the cheaper side, and single texels merged (host).
 
     Args:
@@ -135,13 +134,13 @@ def halved(model: Model, weights: Textures) -> Step:
       weights: h of every texel, in the layout of the model.
     """
     assert model.textures is not None
-    textures, layout = model.textures
-    old_sizes, cost = layout.sizes, np.zeros(layout.num)
+    textures = model.textures
+    old_sizes, cost = textures.sizes, np.zeros(textures.num)
     sizes = old_sizes.copy()
     pieces = []
-    for index, (tv, tu) in enumerate(layout.resolutions):
-        ids = np.flatnonzero(np.asarray(layout.bucket) == index)
-        rows = np.asarray(layout.row)[ids]
+    for index, (tv, tu) in enumerate(textures.bucket_sizes):
+        ids = np.flatnonzero(np.asarray(textures.bucket) == index)
+        rows = np.asarray(textures.row)[ids]
         old, own = (np.asarray(tree.buckets[index])[rows] for tree in (textures, weights))
         choices = [_halved_along(old, own, axis) for axis, side in ((1, tv), (2, tu)) if side > 1 and side % 2 == 0]
         if (tv, tu) == (1, 1):
@@ -156,9 +155,9 @@ def halved(model: Model, weights: Textures) -> Step:
                 pieces.append((ids[is_own], smaller[is_own]))
         else:
             pieces.append((ids, old))
-    new, new_layout = _filled(sizes, pieces, np.asarray(textures.buckets[0]).dtype)
+    new = _filled(sizes, pieces, textures.buckets[0].dtype)
     saved = BYTES_PER_TEXEL * (old_sizes.prod(axis=1) - sizes.prod(axis=1))
-    return Step(_with_single_texels(model), new, new_layout, cost, saved)
+    return Step(_with_single_texels(model), new, cost, saved)
 
 
 def _halved_along(texels: np.ndarray, weights: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
@@ -172,13 +171,13 @@ def _halved_along(texels: np.ndarray, weights: np.ndarray, axis: int) -> tuple[n
 
 def _with_single_texels(model: Model) -> Gaussians:
     """Return the Gaussians after absorbing the colour and opacity of textures of one texel."""
-    textures, layout = model.textures  # type: ignore[misc]
-    gaussians = model.gaussians
-    texels = np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (layout.num, 1))
-    if (1, 1) in layout.resolutions:
-        index = layout.resolutions.index((1, 1))
-        ids = np.flatnonzero(np.asarray(layout.bucket) == index)
-        texels[ids] = np.asarray(textures.buckets[index])[np.asarray(layout.row)[ids], 0, 0]
+    gaussians, textures = model.gaussians, model.textures
+    assert textures is not None
+    texels = np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
+    if (1, 1) in textures.bucket_sizes:
+        index = textures.bucket_sizes.index((1, 1))
+        ids = np.flatnonzero(np.asarray(textures.bucket) == index)
+        texels[ids] = np.asarray(textures.buckets[index])[np.asarray(textures.row)[ids], 0, 0]
     sh = np.array(gaussians.sh, np.float64)
     sh[:, 0] += texels[:, :3] / SH_C0
     opacities = np.clip(np.asarray(gaussians.opacities, np.float64) * texels[:, 3], LEAST_OPACITY, 1 - LEAST_OPACITY)
@@ -189,42 +188,39 @@ def _with_single_texels(model: Model) -> Gaussians:
 
 def taken(model: Model, step: Step, is_chosen: np.ndarray) -> Model:
     """Return the model in which the chosen Gaussians [N] have taken their step (host)."""
-    old, old_layout = model.textures  # type: ignore[misc]
-    sizes = np.where(is_chosen[:, None], step.layout.sizes, old_layout.sizes)
+    old = model.textures
+    assert old is not None
+    sizes = np.where(is_chosen[:, None], step.textures.sizes, old.sizes)
     pieces = []
-    for textures, layout, is_from in ((old, old_layout, ~is_chosen), (step.textures, step.layout, is_chosen)):
+    for textures, is_from in ((old, ~is_chosen), (step.textures, is_chosen)):
         for index, bucket in enumerate(textures.buckets):
-            ids = np.flatnonzero(is_from & (np.asarray(layout.bucket) == index))
-            pieces.append((ids, np.asarray(bucket)[np.asarray(layout.row)[ids]]))
-    textures, layout = _filled(sizes, pieces, np.asarray(old.buckets[0]).dtype)
+            ids = np.flatnonzero(is_from & (np.asarray(textures.bucket) == index))
+            pieces.append((ids, np.asarray(bucket)[np.asarray(textures.row)[ids]]))
+    textures = _filled(sizes, pieces, old.buckets[0].dtype)
 
     def chosen(before: Array, after: Array) -> Array:
         return jnp.where(is_chosen.reshape(-1, *[1] * (before.ndim - 1)), after, before)
 
     gaussians = jax.tree.map(chosen, model.gaussians, step.gaussians)
-    return dataclasses.replace(model, gaussians=gaussians).with_textures(textures, layout)
+    return dataclasses.replace(model, gaussians=gaussians).with_textures(textures)
 
 
-def _filled(
-    sizes: np.ndarray, pieces: Sequence[tuple[np.ndarray, np.ndarray]], dtype: Any
-) -> tuple[Textures, AtlasLayout]:
+def _filled(sizes: np.ndarray, pieces: Sequence[tuple[np.ndarray, np.ndarray]], dtype: np.dtype[Any]) -> Textures:
     """Return textures of the given sizes [N, 2] from pieces: Gaussians and their texels [n, Tv, Tu, 4] of one size."""
-    layout, capacities = plan_layout(sizes)
-    shapes = zip(capacities, layout.resolutions, strict=True)
-    buckets = [np.tile(np.asarray(NEUTRAL_TEXEL, dtype), (capacity, *size, 1)) for capacity, size in shapes]
-    rows = np.asarray(layout.row)
+    empty = allocate_textures(sizes, dtype=dtype)
+    buckets, rows = [np.array(bucket) for bucket in empty.buckets], np.asarray(empty.row)
     for ids, texels in pieces:
         if len(ids):
-            buckets[layout.resolutions.index(texels.shape[1:3])][rows[ids]] = texels
-    return Textures(tuple(map(jnp.asarray, buckets))), layout
+            buckets[empty.bucket_sizes.index(texels.shape[1:3])][rows[ids]] = texels
+    return dataclasses.replace(empty, buckets=tuple(map(jnp.asarray, buckets)))
 
 
-def texel_weights(model: Model, views: Sequence[View], background: Any) -> Textures:
+def texel_weights(model: Model, views: Sequence[View], background: ArrayLike | None) -> Textures:
     """Return h of every texel in some views, whose photographs are not used. Arguments as in `texel_weights_of`."""
     return texel_weights_of(model, [view.camera for view in views], background)
 
 
-def texel_weights_of(model: Model, cameras: Sequence[Camera], background: Any) -> Textures:
+def texel_weights_of(model: Model, cameras: Sequence[Camera], background: ArrayLike | None) -> Textures:
     """h of every texel, in the layout of the model (host).
 
     Args:
@@ -235,10 +231,10 @@ def texel_weights_of(model: Model, cameras: Sequence[Camera], background: Any) -
     assert model.textures is not None
     settings = plan_render(model, cameras)
     background = jnp.asarray(background, model.gaussians.means.dtype)
-    total: Textures = jax.tree.map(jnp.zeros_like, model.textures[0])
+    total = tuple(map(jnp.zeros_like, model.textures.buckets))
     for index, camera in enumerate(cameras):
         total = jax.tree.map(jnp.add, total, _jitted()(model, camera, background, jax.random.key(index), settings))
-    return total
+    return dataclasses.replace(model.textures, buckets=total)
 
 
 @functools.cache
@@ -246,16 +242,18 @@ def _jitted() -> jax.stages.Wrapped:
     return jax.jit(_weights_in, static_argnums=(4,))
 
 
-def _weights_in(model: Model, camera: Camera, background: Array, key: Array, settings: RenderSettings) -> Textures:
-    """Return the weights from one view."""
-    textures, layout = model.textures  # type: ignore[misc]
+def _weights_in(
+    model: Model, camera: Camera, background: Array, key: Array, settings: RenderSettings
+) -> tuple[Array, ...]:
+    """Return the weights from one view, bucket by bucket."""
+    textures = model.textures
+    assert textures is not None
 
-    def draw(textures: Textures) -> Array:
-        shown = model.with_textures(textures, layout)
-        output, _ = render_traced(shown.gaussians, camera, shown.rule, background, settings, has_geometry=False)
+    def draw(buckets: tuple[Array, ...]) -> Array:
+        shown = model.with_textures(dataclasses.replace(textures, buckets=buckets))
+        output, _ = render_traced(shown.gaussians, camera, shown.appearance, background, settings, has_geometry=False)
         return output.color
 
-    color, back = jax.vjp(draw, textures)
+    color, back = jax.vjp(draw, textures.buckets)
     (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
-    squares: Textures = jax.tree.map(jnp.square, slopes)
-    return squares
+    return tuple(map(jnp.square, slopes))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from a2tg_jax.texture import NEUTRAL_TEXEL, AtlasLayout, Textures
+from a2tg_jax.texture import NEUTRAL_TEXEL, Textures
 
 Tables = list[tuple[np.ndarray, np.ndarray]]
 """Indices [n] of Gaussians, and their textures [n, Tv, Tu, C]; one table for each size."""
@@ -25,34 +25,33 @@ class Halvings(NamedTuple):
     saved: np.ndarray
 
 
-def fewest_texels(textures: Textures, layout: AtlasLayout, weights: Textures, most: int) -> Tables:
+def fewest_texels(textures: Textures, weights: Textures, most: int) -> Tables:
     """Return textures that have `most` texels at most in all, at least one each (host).
 
     Args:
       textures: of N Gaussians; empty ones become a neutral texel.
-      layout: theirs.
       weights: the visibility of each texel, as `shrinking.texel_weights_of` gives it.
       most: at least N.
     """
-    tables = _tables(textures, layout, weights)
-    steps = _all_halvings(tables, layout.num)
+    tables = _tables(textures, weights)
+    steps = _all_halvings(tables, textures.num)
     order = np.lexsort((steps.rounds, steps.costs))
     total = sum(texels[..., 0].size for _, texels in tables)
     count = int(np.searchsorted(np.cumsum(steps.saved[order]), total - most)) + 1 if total > most else 0
-    rounds = np.bincount(steps.ids[order[:count]], minlength=layout.num)
+    rounds = np.bincount(steps.ids[order[:count]], minlength=textures.num)
     for index in range(int(rounds.max(initial=0))):
         tables = _merged([part for table in tables for part in _halved_some(table, rounds > index)])
     return [(ids, texels[..., :4]) for ids, texels in tables]
 
 
-def _tables(textures: Textures, layout: AtlasLayout, weights: Textures) -> Tables:
+def _tables(textures: Textures, weights: Textures) -> Tables:
     """Return textures [n, Tv, Tu, 5] by size, with the visibility as fifth channel."""
     tables: Tables = []
-    for index, size in enumerate(layout.resolutions):
-        ids = np.flatnonzero(np.asarray(layout.bucket) == index)
+    for index, size in enumerate(textures.bucket_sizes):
+        ids = np.flatnonzero(np.asarray(textures.bucket) == index)
         own = np.tile(np.asarray([*NEUTRAL_TEXEL, LEAST_WEIGHT]), (len(ids), 1, 1, 1))
         if min(size) > 0:
-            rows = np.asarray(layout.row)[ids]
+            rows = np.asarray(textures.row)[ids]
             texels, squares = (np.asarray(tree.buckets[index], np.float64)[rows] for tree in (textures, weights))
             own = np.concatenate([texels, squares.sum(axis=-1, keepdims=True) + LEAST_WEIGHT], axis=-1)
         tables.append((ids, own))

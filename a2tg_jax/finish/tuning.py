@@ -15,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.appearance import in_words, template_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.finish.compaction import LADDER, Ladder, Loss, TooMuchLostError, Trial, smallest_within
 from a2tg_jax.finish.rounding import GradualRounding, GridRounding
 from a2tg_jax.io.compact import CompactChoices, Grids, decode_model, encode_model, grids_of, half_turned
-from a2tg_jax.io.rows import check_encodable
+from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.training import DivergedError, Stage, System, fit_stage
 from a2tg_jax.training.corrections import Correction
@@ -122,11 +123,11 @@ class _Tuning(System):
 
 
 def _tuning(system: System, stage: Stage) -> _Tuning:
-    """Return the options of a system with a stage whose rates fall, whose corrections stay, and without jitter."""
-    rates = dataclasses.replace(stage.rates, means=RATE_OF_MEANS * stage.rates.means, cooldown=1.0)
+    """Return the options of a system with a stage whose rates fall and whose corrections stay."""
+    rates = dataclasses.replace(stage.rates, means=RATE_OF_MEANS * stage.rates.means)
     corrections = tuple(map(_Constant, stage.corrections))
     stage = dataclasses.replace(
-        stage, name="tuning", rates=rates, corrections=corrections, raises_sh_degree=False, jitter=0.0
+        stage, name="tuning", rates=rates, corrections=corrections, raises_sh_degree=False, cools_down=True
     )
     shared = {field.name: getattr(system, field.name) for field in dataclasses.fields(System)}
     return _Tuning(**shared | {"memory_budget": None}, stage=stage)
@@ -164,10 +165,11 @@ def _check(model: Model, stage: Stage, iterations: int) -> None:
     check_encodable(model.appearance)
     if iterations < 1:
         raise ValueError(f"iterations must be at least 1; got {iterations}")
-    if model.appearance != stage.appearance:
+    if template_of(model.appearance) != stage.appearance:
+        wanted, shown = in_words(stage.appearance), in_words(model.appearance)
+        shown = f"{shown} with other options" if shown == wanted else shown
         raise ValueError(
-            f"model must show what the last stage of the system, {stage.name!r}, trains: {stage.appearance}; it shows "
-            f"{model.appearance}"
+            f"model must show what the last stage of the system, {stage.name!r}, trains, {wanted}; it shows {shown}"
         )
     learned = {} if model.origin is None else model.origin.corrections
     if missing := [correction.name for correction in stage.corrections if correction.name not in learned]:

@@ -131,7 +131,7 @@ def _check_brackets(outside: np.ndarray) -> None:
         raise ValueError(f"its brackets are nested too deeply, more than {DEEPEST} deep")
 
 
-def _check_depth(value: Any) -> None:
+def _check_depth(value: object) -> None:
     """Raise ValueError if lists and mappings, by brackets or dots, are nested more than `DEEPEST` deep."""
     level = [value]
     for _ in range(DEEPEST):

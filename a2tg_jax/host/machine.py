@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 from jaxlib.version import __version__ as jaxlib_version
 
 from a2tg_jax.host.cores import VARIABLE, num_threads
@@ -49,6 +50,13 @@ class Devices:
 
 ALONE = Devices()
 """One device of one process."""
+
+
+def default_platform() -> str:
+    """Return JAX's platform of the device on which new arrays are placed ("cpu" or "gpu")."""
+    (device,) = jnp.zeros(()).devices()
+    platform: str = device.platform
+    return platform
 
 
 def this_machine() -> Machine:

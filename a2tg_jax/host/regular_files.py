@@ -4,6 +4,7 @@ Links are followed, because their owner makes them on purpose. Their target must
 and a pipe waits for a writer. Remote files (`host.remote_files`) are fetched to temporary ones.
 """
 
+import hashlib
 import os
 import stat
 from io import BufferedReader
@@ -80,6 +81,12 @@ def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:
     """Read the bytes of a regular file, up to the size that it has when it is opened. Raises as `open_regular`."""
     with open_regular(path, most_bytes) as file:
         return file.read(os.fstat(file.fileno()).st_size)
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with open_regular(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _open_remote(path: Path, most_bytes: int) -> BufferedReader:

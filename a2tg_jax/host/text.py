@@ -2,15 +2,14 @@
 
 import difflib
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 SLACK = 10
 """Number of letters to read for each printed letter, because runs of spaces print as one."""
 
 
-def shortened(value: Any, most: int = 80) -> str:
+def shortened(value: object, most: int = 80) -> str:
     """Return a value as errors print it: one line of bounded length, without quotes around texts or terminal control
     characters."""
     text = (value if isinstance(value, str) else repr(value))[: SLACK * most]  # Words of it all would take memory.
@@ -29,3 +28,24 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return "; did you mean KNOWN?" for the known name nearest to a misspelt one; empty if none is near."""
     close = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {close[0]}?" if close else ""
+
+
+def counted(num: int, noun: str) -> str:
+    """Return a number with its noun, as in "1 view" and "8,412 points"."""
+    return f"{num:,} {noun}{'' if num == 1 else 's'}"
+
+
+def first_names(names: Sequence[str], most: int = 5) -> str:
+    """Return the first few of some names, and an ellipsis if there are more."""
+    return ", ".join([*names[:most], *["…"] * (len(names) > most)])
+
+
+def in_bytes(num: float) -> str:
+    """Return a number of bytes with three digits in a unit that suits it: bytes, kB, MB or GB (10^9 bytes)."""
+    size, told = float(num), counted(round(num), "byte")
+    for unit in ("kB", "MB", "GB"):
+        if size < 999.5:
+            break
+        size /= 1e3
+        told = f"{size:,.{2 if size < 9.995 else 1 if size < 99.95 else 0}f} {unit}"
+    return told

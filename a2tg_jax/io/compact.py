@@ -20,8 +20,8 @@ from typing import Any, Self
 import numpy as np
 
 from a2tg_jax.appearance import Appearance
-from a2tg_jax.appearance.sh_bands import MAX_DEGREE
-from a2tg_jax.appearance.shaped import log_exponents_of, shapes_of
+from a2tg_jax.appearance.bands import MAX_DEGREE
+from a2tg_jax.appearance.exponents import log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.host.atomic import replacing
@@ -34,13 +34,14 @@ from a2tg_jax.io.model_file import (
     LONGEST_REASON,
     appearance_from_dict,
     appearance_to_dict,
+    background_of,
     origin_arrays,
     origin_of,
     origin_to_dict,
 )
+from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, ordered, rows_of_model
 from a2tg_jax.io.quantise import Precision, check_precision, with_w
-from a2tg_jax.io.rows import Rows, check_encodable, model_of, ordered, rows_of
-from a2tg_jax.io.streams import Layout, Reader, Writer
+from a2tg_jax.io.streams import ColumnReader, ColumnWriter, Layout
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
@@ -126,7 +127,7 @@ def save_compact(
 
     Args:
       path: the file, by custom *.a2tgz; an older one is replaced once the new one is whole.
-      model: one that shows Plain, Textured, Shaped of these, or Banded of any of these.
+      model: of Gaussians with or without textures, exponents and bands.
       choices: how finely its numbers are kept.
       grids: grids of the groups kept in bits, with which the model was tuned (`tune_compact`); None: those between the
         smallest and the largest of the model's own numbers.
@@ -207,7 +208,7 @@ def bytes_by_part(data: bytes) -> dict[str, int]:
 
 def _encoded(model: Model, choices: CompactChoices, grids: Grids | None) -> tuple[bytes, int]:
     """Return the file, and how many bytes it unpacks to."""
-    writer, rows = Writer(choices.coder, grids or {}), rows_of(model)
+    writer, rows = ColumnWriter(choices.coder, grids or {}), rows_of_model(model)
     rows = ordered(rows, writer.means("means", rows.means.T, choices.means), turns=grids is None)
     writer.numbers("log_scales", rows.log_scales.T, choices.log_scales)
     writer.numbers("quats", rows.quats[:, 1:].T, choices.quats)
@@ -236,6 +237,7 @@ def _encoded(model: Model, choices: CompactChoices, grids: Grids | None) -> tupl
     else:
         is_bits = isinstance(choices.shapes, int)
         writer.numbers("shapes", (log_exponents_of(rows.shapes) if is_bits else rows.shapes)[None], choices.shapes)
+    header["background"] = list(model.background)
     if model.origin is not None:
         header["origin"] = origin_to_dict(model.origin)
         for name, array in origin_arrays(model.origin).items():
@@ -264,11 +266,11 @@ def _decoded(data: bytes) -> Model:
     choices = config_from_dict(CompactChoices, header["choices"], "choices").check()
     appearance = appearance_from_dict(header["appearance"], ())
     check_encodable(appearance)
-    reader = Reader(body, Layout(header["lengths"], header["coders"], header["ends"]), _room(data))
+    reader = ColumnReader(body, Layout(header["lengths"], header["coders"], header["ends"]), _room(data))
     rows = _rows_of(reader, header, choices, appearance)
     origin = _origin_of(reader, header["origin"]) if "origin" in header else None
     reader.end()
-    return model_of(rows, header["base_degree"], appearance, origin)
+    return model_of(rows, header["base_degree"], appearance, origin, background_of(header))
 
 
 def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -295,7 +297,7 @@ def _room(data: bytes) -> int:
     return FREE_ROOM + LARGEST_RATIO * len(data)
 
 
-def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices, appearance: Appearance) -> Rows:
+def _rows_of(reader: ColumnReader, header: Mapping[str, Any], choices: CompactChoices, appearance: Appearance) -> Rows:
     """Return the tables of a file, of no more rows than it can hold."""
     num, base, table = header["num"], header["base_degree"], header["degrees"]
     if type(num) is not int or num < 0 or type(base) is not int or not 0 <= base <= MAX_DEGREE:
@@ -304,7 +306,7 @@ def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices,
     log_scales = reader.numbers("log_scales", 2, num, choices.log_scales).T
     quats = with_w(reader.numbers("quats", 3, num, choices.quats))
     opacities = reader.numbers("opacities", 1, num, choices.opacities)[0]
-    highest = MAX_DEGREE if appearance.has_degrees else base
+    highest = MAX_DEGREE if appearance.bands is not None else base
     if not set(table) <= set(range(base, highest + 1)):
         raise ValueError(f"degrees must lie in {base}..{highest}; got {table}")
     degrees = np.asarray(table, np.int64)[reader.indices("degrees", num, len(table))]
@@ -318,14 +320,14 @@ def _rows_of(reader: Reader, header: Mapping[str, Any], choices: CompactChoices,
     if "sizes" in header:
         sizes, texels = _textures_of(reader, header["sizes"], num, choices)
     shapes = None
-    if appearance.shapes_name is not None:
+    if appearance.exponents is not None:
         shapes = reader.numbers("shapes", 1, num, choices.shapes)[0]
         shapes = shapes_of(shapes) if isinstance(choices.shapes, int) else shapes
     logits = _logits(opacities) if isinstance(choices.opacities, int) else opacities
     return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)
 
 
-def _origin_of(reader: Reader, data: Mapping[str, Any]) -> Origin:
+def _origin_of(reader: ColumnReader, data: Mapping[str, Any]) -> Origin:
     """Return the origin that the file holds."""
     num = len(data["names"])
     shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
@@ -335,7 +337,7 @@ def _origin_of(reader: Reader, data: Mapping[str, Any]) -> Origin:
     return origin_of(data, arrays)
 
 
-def _textures_of(reader: Reader, table: Any, num: int, choices: CompactChoices) -> tuple[np.ndarray, np.ndarray]:
+def _textures_of(reader: ColumnReader, table: Any, num: int, choices: CompactChoices) -> tuple[np.ndarray, np.ndarray]:
     """Return sizes [N, 2] and texels [T, 4]."""
     if not all(type(side) is int and 0 <= side <= MAX_SIDE for size in table for side in size):
         raise ValueError(f"texture sides must lie in 0..{MAX_SIDE}; got {table}")

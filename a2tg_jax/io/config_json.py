@@ -86,7 +86,7 @@ def check_config(config: Any, prefix: str = "") -> None:
             _from_json(hint, _to_json(value), name)
 
 
-def _is_plain(hint: Any) -> bool:
+def _is_plain(hint: object) -> bool:
     """Return whether a type is one of numbers, texts and choices, None, or a union or tuple of them."""
     if typing.get_origin(hint) is typing.Literal or hint is ...:
         return True

@@ -39,7 +39,7 @@ ORIGIN_KINDS = {"sizes": np.int64, "is_test": bool}
 Result = TypeVar("Result")
 
 
-class Splats(NamedTuple):
+class Ellipsoids(NamedTuple):
     """N ellipsoids as a renderer wants them; float32 on the host."""
 
     means: np.ndarray
@@ -54,7 +54,7 @@ class Splats(NamedTuple):
     """[N, K, 3] coefficients, as in `Gaussians`."""
 
 
-def splats_of(model: Model, *, keeps_shapes: bool = False) -> Splats:
+def splats_of(model: Model, *, keeps_shapes: bool = False) -> Ellipsoids:
     """Return the splats of a model of which all rows exist, with a third axis of a thousandth of the shorter.
 
     If splats have degrees of their own, coefficients go up to the highest of these. `keeps_shapes` is as in
@@ -67,18 +67,18 @@ def splats_of(model: Model, *, keeps_shapes: bool = False) -> Splats:
     logits = np.clip(np.asarray(gaussians.logit_opacities, np.float64), -80, 80)
     log_scales = np.asarray(gaussians.log_scales, np.float64)
     scales = np.exp(np.concatenate([log_scales, third_log_scales(log_scales)], axis=1))
-    sh = gaussians.sh if model.bands is None else gaussians.sh[:, : NUM_BASES[model.bands[1].degrees.max(initial=0)]]
+    sh = gaussians.sh[:, : NUM_BASES[model.degrees.max(initial=0)]]
     numbers = (gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), sh)
-    return Splats(*(np.asarray(values, np.float32) for values in numbers))
+    return Ellipsoids(*(np.asarray(values, np.float32) for values in numbers))
 
 
-def whole_splats(splats: Splats, path: str | os.PathLike[str]) -> Splats:
+def whole_splats(splats: Ellipsoids, path: str | os.PathLike[str]) -> Ellipsoids:
     """Return the splats whose numbers are finite; the others are counted in a warning that names the file."""
     kept = whole_rows(os.fspath(path), splats.scales, splats.means, splats.quats, splats.opacities, splats.sh)
-    return Splats(*(values[kept] for values in splats))
+    return Ellipsoids(*(values[kept] for values in splats))
 
 
-def gaussians_of(splats: Splats, path: str | os.PathLike[str], *, is_flat: bool) -> Gaussians:
+def gaussians_of(splats: Ellipsoids, path: str | os.PathLike[str], *, is_flat: bool) -> Gaussians:
     """Return the Gaussians of splats.
 
     Args:
@@ -141,7 +141,7 @@ def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
     return Similarity(largest, u @ v, matrix[:3, 3])
 
 
-def placed(parts: Sequence[tuple[Model, Similarity]], up: Up) -> Model:
+def joined_parts(parts: Sequence[tuple[Model, Similarity]], up: Up) -> Model:
     """Return the parts of a file as one model in its own world, which has +z up (host).
 
     A part stays as it is where its file places it as it was written. Else it moves, and its origin along. Positions

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from a2tg_jax.core.display import counted
+from a2tg_jax.host.text import counted
 
 THICKNESS = 1e-3
 """Ratio of the third scale of a flat Gaussian in a file to its shorter one."""

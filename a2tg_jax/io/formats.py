@@ -185,7 +185,7 @@ def file_bytes(path: Path) -> int:
 
 def beside_gaussians(model: Model) -> str:
     """Return in words what a model shows beside plain splats, of what baking turns into these; "" if nothing."""
-    has_textures, has_shapes = model.textures is not None, model.appearance.shapes_name is not None
+    has_textures, has_shapes = model.textures is not None, model.appearance.exponents is not None
     return " and ".join(["textures"] * has_textures + ["shapes of kernels"] * has_shapes)
 
 
@@ -197,10 +197,9 @@ def _bakeable(model: Model) -> str:
 
 def _lost_appearance(model: Model) -> list[str]:
     """Return in words what plain splats do not keep of what a model shows."""
-    base, lost = model.appearance.base, [_bakeable(model)]
-    kind = type(getattr(base, "inner", base).base if base.shapes_name is not None else base).__name__
-    if kind != "Plain" and model.textures is None:
-        lost.append(f"what {kind} shows beside Gaussians")
+    lost = [_bakeable(model)]
+    if not model.appearance.is_portable and model.textures is None:
+        lost.append(f"what {type(model.appearance).__name__} shows besides Gaussians")
     return [found for found in lost if found]
 
 
@@ -214,7 +213,7 @@ def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     into, lost = format_of(path), list[str]()
     if not into.keeps_appearance:
         lost += _lost_appearance(model)
-    degree = model.gaussians.sh_degree if model.bands is None else 3
+    degree = model.gaussians.sh_degree if model.appearance.bands is None else 3
     if degree > into.highest_degree:
         lost.append(f"spherical harmonics above degree {into.highest_degree}")
     if into.name in RANGES:

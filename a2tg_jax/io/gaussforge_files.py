@@ -55,7 +55,7 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
       ValueError: if gaussforge is not installed or cannot write them, there are none, or the format cannot hold their
         positions.
     """
-    kind = kind_of(path)
+    kind = gaussforge_format(path)
     gaussians, offset, _ = world_gaussians(model, kind=kind)
     if not gaussians.num:
         raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
@@ -79,7 +79,7 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
       FileNotFoundError: if there is no such file.
       ValueError: if gaussforge is not installed or cannot read the file, or a number is not finite.
     """
-    kind, path = kind_of(path), Path(path)
+    kind, path = gaussforge_format(path), Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such file")
     with open_regular(path) as file:
@@ -103,7 +103,7 @@ def import_gaussforge(path: Path) -> Any:
         raise ValueError(f"{path}: needs gaussforge: pip install 'a2tg-jax[formats]'") from error
 
 
-def kind_of(path: str | os.PathLike[str]) -> str:
+def gaussforge_format(path: str | os.PathLike[str]) -> str:
     """Return gaussforge's name of the format of a file. Raises ValueError if it writes none of this suffix."""
     name = Path(path).name.lower()
     for suffix, kind in SUFFIXES.items():

@@ -13,19 +13,19 @@ from typing import Any, get_args
 
 import numpy as np
 
-from a2tg_jax.appearance import Plain
+from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.gaussians import SH_C0, check_gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.exchange import (
-    Splats,
+    Ellipsoids,
     gaussians_of,
+    joined_parts,
     linear_colors,
     matrix_of,
     origin_from_json,
     origin_to_json,
-    placed,
     reading,
     similarity_of,
     splats_of,
@@ -34,10 +34,10 @@ from a2tg_jax.io.exchange import (
 )
 from a2tg_jax.io.gltf_nodes import mesh_nodes
 from a2tg_jax.io.gltf_reader import Document
-from a2tg_jax.io.gltf_textures import EXTENSION, Shown, TexelKind, add_textures, kept_appearance, shown_of
+from a2tg_jax.io.gltf_textures import EXTENSION, SplatTextures, TexelKind, add_textures, kept_appearance, shown_of
 from a2tg_jax.io.gltf_writer import Builder
-from a2tg_jax.io.model_file import appearance_to_dict
-from a2tg_jax.io.rows import Rows, check_encodable, model_of, rows_of
+from a2tg_jax.io.model_file import appearance_to_dict, background_of
+from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
 from a2tg_jax.io.sh_degrees import HIGHEST_DEGREE, degree_to_read
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
@@ -74,7 +74,7 @@ def save_gltf(
     Args:
       path: the file. *.gltf has its numbers in a *.bin beside it, any other name is one *.glb. Older ones are replaced
         once the new ones are whole.
-      model: any model without textures, or one that shows Plain, Textured, Shaped of these, or Banded of any of these.
+      model: of Gaussians with or without textures, exponents and bands.
       textures: write textures, degrees and shapes of kernels, too, as the extension A2TG_splat_textures. False writes
         plain splats of any model, as `save_ply` does.
       texels: what keeps them, "float32" exactly or "uint8" in a quarter of the bytes.
@@ -124,14 +124,14 @@ def _primitive(builder: Builder, model: Model, texels: TexelKind | None) -> dict
             attributes[coefficient(degree, order)] = builder.add(splats.sh[:, index])
     described: dict[str, Any] = dict(DESCRIBED)
     if texels is not None:
-        rows = rows_of(model)
+        rows = rows_of_model(model)
         shown = add_textures(builder, rows, model.appearance, model.gaussians.sh_degree, texels)
         described |= {"extensions": {EXTENSION: shown}} if shown else {}
     primitive = {"attributes": attributes, "mode": POINTS, "extensions": {SPLATS: described}}
     return primitive | _extras(model, has_appearance=texels is not None)
 
 
-def _point_colors(splats: Splats) -> np.ndarray:
+def _point_colors(splats: Ellipsoids) -> np.ndarray:
     """Return linear RGB and opacity [N, 4] as bytes, for programs that show points."""
     shown = np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0)
     colors = np.concatenate([linear_colors(shown), splats.opacities[:, None]], axis=1)
@@ -142,6 +142,7 @@ def _point_colors(splats: Splats) -> np.ndarray:
 def _extras(model: Model, *, has_appearance: bool) -> dict[str, Any]:
     """Return what only this program reads."""
     kept: dict[str, Any] = {"appearance": appearance_to_dict(model.appearance)} if has_appearance else {}
+    kept["background"] = list(model.background)
     if model.origin is not None:
         kept["origin"] = origin_to_json(model.origin)
     return {"extras": {OWN: kept}} if kept else {}
@@ -174,7 +175,7 @@ def _loaded(path: str | os.PathLike[str]) -> Model:
             raise ValueError(f"holds more than {MOST_PRIMITIVES} sets of splats")
     if not parts:
         raise ValueError(f"holds no splats ({SPLATS})")
-    return placed(parts, "y")
+    return joined_parts(parts, "y")
 
 
 def _primitives(document: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
@@ -197,17 +198,17 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
     extended = described.get("extensions", {}).get(EXTENSION)
     if extended is None:
         gaussians = gaussians_of(whole_splats(splats, document.path), document.path, is_flat=False)
-        appearance = kept_appearance(kept, Plain(), is_told=False)
-        model = Model(gaussians, appearance=appearance, origin=origin)
+        appearance = kept_appearance(kept, Appearance(), is_told=False)
+        model = Model(gaussians, appearance, background=background_of(kept), origin=origin)
         check_model(model)
         return model
     shown = shown_of(document, extended, len(splats.means), degree)
     rows = _rows(splats, shown, document.path)
     appearance = kept_appearance(kept, shown.appearance, is_told=True)
-    return model_of(rows, shown.base_degree, appearance, origin)
+    return model_of(rows, shown.base_degree, appearance, origin, background_of(kept))
 
 
-def _splats(document: Document, primitive: Mapping[str, Any]) -> Splats:
+def _splats(document: Document, primitive: Mapping[str, Any]) -> Ellipsoids:
     attributes = primitive["attributes"]
 
     def numbers(name: str, kind: str) -> np.ndarray:
@@ -224,10 +225,10 @@ def _splats(document: Document, primitive: Mapping[str, Any]) -> Splats:
     columns = [means, quats, scales, opacities, *(numbers(name, "VEC3") for name in names)]
     if len({len(column) for column in columns}) > 1:
         raise ValueError("the attributes of its splats differ in length")
-    return Splats(means, quats, scales, opacities, np.stack(columns[4:], axis=1))
+    return Ellipsoids(means, quats, scales, opacities, np.stack(columns[4:], axis=1))
 
 
-def _rows(splats: Splats, shown: Shown, path: Path) -> Rows:
+def _rows(splats: Ellipsoids, shown: SplatTextures, path: Path) -> Rows:
     """Return the tables of splats that show textures or have degrees."""
     gaussians = gaussians_of(splats, path, is_flat=shown.sizes is not None or shown.shapes is not None)
     num, highest = splats.sh.shape[:2]

@@ -9,16 +9,16 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
-from a2tg_jax.appearance.sh_bands import MAX_DEGREE
-from a2tg_jax.appearance.shaped import log_exponents_of, shapes_of
-from a2tg_jax.appearance.textured import EXTENT
+from a2tg_jax.appearance.bands import MAX_DEGREE
+from a2tg_jax.appearance.exponents import log_exponents_of, shapes_of
+from a2tg_jax.appearance.lookup import EXTENT
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.gltf_reader import Document
 from a2tg_jax.io.gltf_writer import Builder
 from a2tg_jax.io.model_file import appearance_from_dict
+from a2tg_jax.io.model_rows import Rows
 from a2tg_jax.io.quantise import LARGEST_FLOAT, Ends, dequantised, ends_of, quantised
-from a2tg_jax.io.rows import Rows
 from a2tg_jax.texture import MAX_SIDE
 
 EXTENSION = "A2TG_splat_textures"
@@ -29,7 +29,7 @@ RANGES = {"rgb": slice(0, 3), "alpha": slice(3, 4)}
 """Columns of texels that share ends."""
 
 
-class Shown(NamedTuple):
+class SplatTextures(NamedTuple):
     """Textures, degrees and kernels of splats, beside their own colours."""
 
     appearance: Appearance
@@ -56,13 +56,13 @@ def add_textures(
         described["sizes"] = builder.add(rows.sizes.astype(np.uint8), is_attribute=False)
         if len(rows.texels):
             described |= _add_texels(builder, rows.texels, kind)
-    if appearance.has_degrees:
+    if appearance.bands is not None:
         described["baseDegree"] = base_degree
         described["degrees"] = builder.add(rows.degrees.astype(np.uint8), is_attribute=False)
     if rows.shapes is not None:
         described["shapes"] = builder.add(log_exponents_of(rows.shapes).astype(np.float32), is_attribute=False)
     if described:
-        described.setdefault("maxAlpha", appearance.max_alpha)
+        described["maxAlpha"] = appearance.alpha_limit
     return described
 
 
@@ -75,7 +75,7 @@ def _add_texels(builder: Builder, texels: np.ndarray, kind: TexelKind) -> dict[s
     return {"texels": index, "texelRanges": {name: list(ends) for name, ends in ranges.items()}}
 
 
-def shown_of(document: Document, described: Mapping[str, Any], num: int, sh_degree: int) -> Shown:
+def shown_of(document: Document, described: Mapping[str, Any], num: int, sh_degree: int) -> SplatTextures:
     """Return what `num` splats show, from the object of the extension.
 
     Raises:
@@ -90,7 +90,7 @@ def shown_of(document: Document, described: Mapping[str, Any], num: int, sh_degr
     sizes, texels = _textures(document, described, num) if has_textures else (None, None)
     degrees, base = _degrees(document, described, num, sh_degree) if has_degrees else (None, sh_degree)
     shapes = _shapes(document, described["shapes"], num) if has_shapes else None
-    return Shown(appearance, sizes, texels, degrees, base, shapes)
+    return SplatTextures(appearance, sizes, texels, degrees, base, shapes)
 
 
 def _textures(document: Document, described: Mapping[str, Any], num: int) -> tuple[np.ndarray, np.ndarray]:
@@ -151,9 +151,12 @@ def kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_told: bool
     appearance = appearance_from_dict(kept["appearance"], ())
     own, told = appearance.texture_options, shown.texture_options
     is_same = appearance.is_portable and (own is None) == (told is None)
-    is_same &= appearance.has_degrees == shown.has_degrees and appearance.shapes_name == shown.shapes_name
+    is_same &= (appearance.bands is None, appearance.exponents is None) == (
+        shown.bands is None,
+        shown.exponents is None,
+    )
     if is_same and is_told:
-        is_same = appearance.max_alpha == shown.max_alpha and all(
-            getattr(own, field, None) == getattr(told, field, None) for field in OPTIONS.values()
+        is_same = appearance.alpha_limit == shown.alpha_limit and all(
+            getattr(own, field, None) == getattr(told, field, None) for field in ("uv", "outside", "rgb", "alpha")
         )
     return appearance if is_same else shown

@@ -19,7 +19,7 @@ from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
-from a2tg_jax.io.exchange import Splats, gaussians_of, splats_of, whole_splats
+from a2tg_jax.io.exchange import Ellipsoids, gaussians_of, splats_of, whole_splats
 from a2tg_jax.io.number_ranges import warn_of_offset
 from a2tg_jax.io.ply import world_gaussians
 from a2tg_jax.io.validate import check_model
@@ -90,7 +90,7 @@ def load_ksplat(path: str | os.PathLike[str]) -> Gaussians:
     return gaussians
 
 
-def _read(data: bytes) -> Splats:
+def _read(data: bytes) -> Ellipsoids:
     """Return the splats of all sections."""
     if len(data) < HEADER_BYTES:
         raise ValueError(
@@ -116,12 +116,12 @@ def _read(data: bytes) -> Splats:
     ]
     if not sum(len(splats.means) for splats in found):
         raise ValueError("holds no splats")
-    return Splats(*(np.concatenate(columns) for columns in zip(*padded, strict=True)))
+    return Ellipsoids(*(np.concatenate(columns) for columns in zip(*padded, strict=True)))
 
 
 def _read_section(
     data: bytes, start: int, section: tuple[Any, ...], level: int, ends: tuple[float, float]
-) -> tuple[Splats, int]:
+) -> tuple[Ellipsoids, int]:
     """Return the splats of a section that begins at a byte, and the byte after it."""
     num, most, size, num_buckets, side, centre_bytes, reach, _, num_full, num_partial, degree = section
     if degree >= len(NUM_BASES) or num > most or num_full + num_partial != num_buckets:
@@ -157,7 +157,7 @@ def _read_section(
         low, high = band**2, (band + 1) ** 2
         sh[:, low:high] = rest[:, 3 * (low - 1) : 3 * (high - 1)].reshape(num, 3, high - low).transpose(0, 2, 1)
     numbers = (means, rows["quats"], rows["scales"], colors[:, 3], sh)
-    return Splats(*(values.astype(np.float32) for values in numbers)), stop
+    return Ellipsoids(*(values.astype(np.float32) for values in numbers)), stop
 
 
 def _row_type(level: int, degree: int) -> np.dtype:

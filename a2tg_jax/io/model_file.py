@@ -16,10 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax import appearance as built_in
-from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
+from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOptions, appearance_for
+from a2tg_jax.appearance.base import PARTS, template_of
+from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.checks import check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.archive import read_archive, read_archive_array, write_archive
@@ -53,9 +55,10 @@ def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, 
     model = model.live
     check_model(model)
     arrays = {name: np.asarray(getattr(model.gaussians, name)) for name in FIELDS}
-    shown = model.appearance.arrays(model.params, model.layout)
+    shown = arrays_of(model.appearance, model.gaussians.sh_degree)
     arrays |= {APPEARANCE + name: np.asarray(array) for name, array in shown.items()}
     described = {**(header or {}), "appearance": appearance_to_dict(model.appearance)}
+    described["background"] = list(model.background)
     if model.origin is not None:
         described["origin"] = origin_to_dict(model.origin)
         arrays |= {ORIGIN + name: array for name, array in origin_arrays(model.origin).items()}
@@ -113,10 +116,10 @@ def _model_of(
     else:
         shown = {name: arrays[name] for name in ("sizes", "texels") if name in arrays}
         appearance = appearance_for(TextureOptions(), has_textures=bool(shown))
-    params, layout = appearance.from_arrays(shown)
+    shown_by = with_arrays(appearance, shown, gaussians.sh_degree)
     of_origin = {name.removeprefix(ORIGIN): array for name, array in arrays.items() if name.startswith(ORIGIN)}
     origin = origin_of(header["origin"], of_origin) if "origin" in header else None
-    model = Model(gaussians, params, layout, appearance=appearance, origin=origin)
+    model = Model(gaussians, shown_by, background=background_of(header), origin=origin)
     check_model(model)
     return model
 
@@ -124,33 +127,58 @@ def _model_of(
 # Appearances
 
 
+PART_CLASSES: dict[str, type] = {"texture": Texture, "exponents": Exponents, "bands": Bands}
+OLD_PARTS: dict[str, Any] = {"Shaped": {"exponents": Exponents()}, "Banded": {"bands": Bands()}}
+"""Wrappers of version 0.2, and the parts that took their place."""
+
+
 def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
-    """Return the class and options of an appearance, and of those it holds."""
+    """Return the class and options of an appearance, and the options of its parts."""
     kind = type(appearance)
-    held = _held_appearances(appearance)
-    described: dict[str, Any] = {"module": kind.__module__, "name": kind.__qualname__}
-    if held:
-        described["held"] = {name: appearance_to_dict(inner) for name, inner in held.items()}
-    options = {name: value for name, value in config_to_dict(appearance).items() if name not in held}
+    parts = {name: _options_of(part) for name in PARTS if (part := getattr(appearance, name)) is not None}
+    described = {
+        "module": kind.__module__,
+        "name": kind.__qualname__,
+        "options": _options_of(appearance),
+        "parts": parts,
+    }
     try:
-        back = config_from_dict(kind, json.loads(json.dumps(options, allow_nan=False)), given=held)
+        back = _appearance_of(kind, json.loads(json.dumps(described, allow_nan=False)))
     except (TypeError, ValueError) as error:
         raise ValueError(f"the options of {kind.__name__} cannot be kept in a file: {error}") from error
-    if back != appearance:
-        raise ValueError(f"the options of {kind.__name__} do not survive JSON: {options}")
-    return {**described, "options": options}
-
-
-def _held_appearances(appearance: Appearance) -> dict[str, Appearance]:
-    values = {field.name: getattr(appearance, field.name) for field in dataclasses.fields(appearance)}
-    return {name: value for name, value in values.items() if isinstance(value, Appearance)}
+    if back != template_of(appearance):
+        raise ValueError(f"the options of {kind.__name__} do not survive JSON: {described['options']}")
+    return described
 
 
 def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]]) -> Appearance:
-    """Return the appearance that `appearance_to_dict` was given. ValueError: its class is not known here."""
-    kind = _known_class(data["module"], data["name"], appearances)
-    held = {name: appearance_from_dict(inner, appearances) for name, inner in data.get("held", {}).items()}
-    return config_from_dict(kind, data["options"], f"options of {kind.__name__}", given=held)
+    """Return the template that `appearance_to_dict` described, or version 0.2. ValueError: its class is not known
+    here."""
+    name, options = data["name"], data["options"]
+    if data["module"].partition(".")[0] == built_in.__name__.partition(".")[0] and "parts" not in data:
+        if name in OLD_PARTS:
+            return dataclasses.replace(appearance_from_dict(data["held"]["inner"], appearances), **OLD_PARTS[name])
+        if name == "Textured":
+            return Appearance(texture=config_from_dict(Texture, options, "options of Textured", given={"texels": None}))
+        if name == "Plain":
+            return appearance_for(config_from_dict(TextureOptions, options, "options of Plain"), has_textures=False)
+    return _appearance_of(_known_class(data["module"], name, appearances), data)
+
+
+def _options_of(node: Any) -> dict[str, Any]:
+    """Return the static fields of an appearance, or of a part."""
+    names = [field.name for field in dataclasses.fields(node) if field.metadata.get("static")]
+    return {name: value for name, value in config_to_dict(template_of(node)).items() if name in names}
+
+
+def _appearance_of(kind: type[Appearance], data: Mapping[str, Any]) -> Appearance:
+    def read(kind: type, options: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
+        arrays = {field.name: None for field in dataclasses.fields(kind) if not field.metadata.get("static")}
+        return config_from_dict(kind, options, f"options of {kind.__name__}", given={**arrays, **parts})
+
+    parts = {name: read(PART_CLASSES[name], own, {}) for name, own in data.get("parts", {}).items()}
+    read_appearance: Appearance = read(kind, data["options"], parts)
+    return read_appearance
 
 
 def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]) -> type[Appearance]:
@@ -162,7 +190,7 @@ def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]
         found = getattr(built_in, name, None)
     if found is None:
         found = getattr(sys.modules.get(module), name, None)
-    if isinstance(found, type) and issubclass(found, Appearance) and dataclasses.is_dataclass(found):
+    if isinstance(found, type) and issubclass(found, Appearance):
         return found
     raise ValueError(
         f"shows the appearance {name} of the module {module}, which is not known here: import that module first, or "
@@ -173,9 +201,15 @@ def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]
 # Origins
 
 
+def background_of(header: Mapping[str, Any]) -> Color:
+    """Return the background of a model in a file; version 0.2 kept it in the origin."""
+    red, green, blue = header.get("background") or header.get("origin", {}).get("background", BLACK)
+    return float(red), float(green), float(blue)
+
+
 def origin_to_dict(origin: Origin) -> dict[str, Any]:
     """Return the fields of an origin that are not arrays."""
-    return {"names": list(origin.names), "background": list(origin.background)}
+    return {"names": list(origin.names)}
 
 
 def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
@@ -195,7 +229,7 @@ def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
 def origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Origin:
     """Return the origin that `origin_to_dict` and `origin_arrays` were given. ValueError: a shape or a number is
     wrong."""
-    names, (red, green, blue) = data["names"], data["background"]
+    names = data["names"]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"origin/names must be texts; got {shortened(names)}")
     num = len(names)
@@ -214,6 +248,5 @@ def origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Orig
         names=tuple(names),
         is_test=is_test,
         transform=Similarity(float(scale), rotation, translation),
-        background=(float(red), float(green), float(blue)),
         corrections={name.removeprefix(CORRECTIONS): arrays[name] for name in learned},
     )

@@ -6,10 +6,10 @@ import warnings
 
 import numpy as np
 
-from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.host.text import counted
 from a2tg_jax.io.validate import check_origin
 
 SPZ_STEP = 2.0**-12
@@ -88,13 +88,13 @@ def warn_of_offset(kind: str, offset: np.ndarray, name: str) -> None:
     if offset.any():
         place = OFFSET_PLACES.get(kind, "the file has no place to say so: write this down")
         message = (
-            f"{name}: positions are relative to {in_words(offset)}, because the format would round such large "
+            f"{name}: positions are relative to {place_in_words(offset)}, because the format would round such large "
             f"coordinates too far; {place}"
         )
         warnings.warn(message, stacklevel=4)
 
 
-def in_words(offset: np.ndarray) -> str:
+def place_in_words(offset: np.ndarray) -> str:
     """Return an offset [3] as "(431233, 5411222, 312)"."""
     return f"({', '.join(offset_words(offset))})"
 

@@ -31,7 +31,7 @@ from a2tg_jax.data.ply_header import OFFSET, header_lines, offset_of, read_verte
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io.flattening import flattened, third_log_scales, whole_rows
-from a2tg_jax.io.number_ranges import in_words, offset_for, offset_words, origin_at, warn_of_offset
+from a2tg_jax.io.number_ranges import offset_for, offset_words, origin_at, place_in_words, warn_of_offset
 from a2tg_jax.io.ply_packed import is_packed, read_packed
 from a2tg_jax.io.sh_degrees import degree_to_read
 from a2tg_jax.io.suffixes import check_suffix
@@ -182,14 +182,13 @@ def offset_comment(offset: np.ndarray) -> str:
 
 def _as_plain(model: Model, keeps_shapes: bool) -> Gaussians:
     """Return the Gaussians of a model, opaque by themselves, with all spherical harmonics that they have."""
-    shown = model.gaussians, model.params, model.layout
     gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh))
-    shapes = model.appearance.shapes(model.params)
+    shapes = model.appearance.shapes
     if shapes is not None and not keeps_shapes:
         gaussians = nearest_gaussians(gaussians, np.asarray(shapes))
     if model.appearance.has_own_opacities:
         return gaussians
-    opacities = jnp.clip(model.appearance.opacities(*shown), LEAST_OPACITY, LARGEST_OPACITY)
+    opacities = jnp.clip(model.appearance.opacities(model.gaussians), LEAST_OPACITY, LARGEST_OPACITY)
     return dataclasses.replace(gaussians, logit_opacities=logit(opacities))
 
 
@@ -216,7 +215,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     check_suffix(path, "load_ply")
     model = load_ply_model(path)
     if model.origin is not None:
-        offset = in_words(-model.origin.transform.translation)
+        offset = place_in_words(-model.origin.transform.translation)
         warnings.warn(f"{path}: positions are relative to {offset}; load_splats keeps this offset", stacklevel=2)
     return model.gaussians
 

@@ -31,7 +31,7 @@ class Layout:
     """Smallest and largest of each group kept in bits; for each axis of the means, centre and spread come first."""
 
 
-class Writer:
+class ColumnWriter:
     """Writer of coded columns, one after the other.
 
     Args:
@@ -109,8 +109,8 @@ class Writer:
         return order
 
 
-class Reader:
-    """Reads what a `Writer` wrote, in the same order.
+class ColumnReader:
+    """Reads what a `ColumnWriter` wrote, in the same order.
 
     Args:
       body: the coded bytes.

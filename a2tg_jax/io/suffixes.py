@@ -2,7 +2,6 @@
 
 import os
 from pathlib import Path
-from typing import Any
 
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import check_is_model
@@ -26,7 +25,7 @@ def check_suffix(path: str | os.PathLike[str], function: str) -> None:
         )
 
 
-def check_saved(path: str | os.PathLike[str], model: Any, function: str) -> None:
+def check_saved(path: str | os.PathLike[str], model: object, function: str) -> None:
     """Raise ValueError unless a value is a model, and the suffix is not that of another format."""
     check_suffix(path, function)
     check_is_model(model)

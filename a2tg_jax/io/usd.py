@@ -23,19 +23,20 @@ from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.exchange import (
-    Splats,
+    Ellipsoids,
     Up,
     gaussians_of,
+    joined_parts,
     matrix_of,
     origin_from_json,
     origin_to_json,
-    placed,
     reading,
     similarity_of,
     splats_of,
     upright,
     whole_splats,
 )
+from a2tg_jax.io.model_file import background_of
 from a2tg_jax.io.sh_degrees import degree_to_read
 from a2tg_jax.io.suffixes import check_saved, check_suffix
 from a2tg_jax.io.validate import check_model
@@ -113,11 +114,13 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
         corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
         field.CreateExtentAttr(usd.Vt.Vec3fArray.FromNumpy(corners))
     if model.origin is not None:
-        prim.SetCustomDataByKey(ORIGIN, json.dumps(origin_to_json(model.origin), allow_nan=False))
+        prim.SetCustomDataByKey(
+            ORIGIN, json.dumps(origin_to_json(model.origin) | {"background": list(model.background)}, allow_nan=False)
+        )
     return stage
 
 
-def _set_numbers(usd: Any, prim: Any, splats: Splats) -> None:
+def _set_numbers(usd: Any, prim: Any, splats: Ellipsoids) -> None:
     """Set the attributes of a particle field; coefficients go particle by particle."""
     volume, arrays = usd.UsdVol, usd.Vt
     xyzw = np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])
@@ -176,7 +179,7 @@ def _loaded(usd: Any, path: Path) -> Model:
             raise ValueError(f"holds more than {MOST_FIELDS} particle fields")
     if not parts:
         raise ValueError("holds no splats (ParticleField)")
-    return placed(parts, up)
+    return joined_parts(parts, up)
 
 
 def _fields(usd: Any, stage: Any) -> Iterator[Any]:
@@ -193,13 +196,15 @@ def _model_of(usd: Any, field: Any, path: Path) -> Model:
         raise ValueError(f"its particle field {shortened(str(prim.GetPath()))} must have a kernel of Gaussians")
     gaussians = gaussians_of(whole_splats(_splats(usd, prim, path), path), path, is_flat=SURFLET in kernels)
     kept = prim.GetCustomDataByKey(ORIGIN)
-    origin = origin_from_json(parse_json(kept)) if isinstance(kept, str) else None
-    model = Model(gaussians, origin=origin)
+    described = parse_json(kept) if isinstance(kept, str) else None
+    origin = None if described is None else origin_from_json(described)
+    background = background_of({} if described is None else {"origin": described})
+    model = Model(gaussians, background=background, origin=origin)
     check_model(model)
     return model
 
 
-def _splats(usd: Any, prim: Any, path: Path) -> Splats:
+def _splats(usd: Any, prim: Any, path: Path) -> Ellipsoids:
     """Return the numbers of a particle field.
 
     Attributes that are too long are cut, and those that are missing or too short have the values of the schema.
@@ -221,7 +226,7 @@ def _splats(usd: Any, prim: Any, path: Path) -> Splats:
         return np.tile(np.asarray(default, np.float32), (num, 1)) if values is None else values
 
     quats = column("orientations", (0.0, 0.0, 0.0, 1.0))[:, [3, 0, 1, 2]]
-    return Splats(means, quats, column("scales", (1.0, 1.0, 1.0)), column("opacities", (1.0,))[:, 0], sh)
+    return Ellipsoids(means, quats, column("scales", (1.0, 1.0, 1.0)), column("opacities", (1.0,))[:, 0], sh)
 
 
 def _numbers(usd: Any, prim: Any, name: str, columns: int, wanted: int | None = None) -> np.ndarray | None:

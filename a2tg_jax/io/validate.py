@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.core.cameras import check_calibration
 from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, check_shape, dtype_of
 from a2tg_jax.core.gaussians import check_gaussians
@@ -29,9 +30,11 @@ def check_model(model: Model) -> None:
     """
     gaussians = model.gaussians
     check_gaussians(gaussians)
-    model.appearance.check(model.params, model.layout, gaussians)
+    check_appearance(model.appearance, gaussians)
     check_bounded("gaussians", gaussians)
-    check_bounded("params", model.params)
+    check_bounded("appearance", model.appearance)
+    if not (np.abs(model.background) <= LARGEST_NUMBER).all():  # False for NaN.
+        raise ValueError(f"background must be finite, within ±{LARGEST_NUMBER:g}; got {model.background}")
     if (largest := np.asarray(gaussians.log_scales).max(initial=-np.inf)) > LARGEST_LOG_SCALE:
         raise ValueError(
             f"gaussians.log_scales must be logarithms of finite scales, up to {LARGEST_LOG_SCALE:.2f}, of scales up to "
@@ -48,15 +51,13 @@ def check_origin(origin: Origin) -> None:
     cameras = zip(origin.names, origin.viewmats, origin.Ks, origin.sizes.tolist(), strict=True)
     for name, viewmat, K, (width, height) in cameras:
         check_calibration(viewmat, K, width, height, f"origin, camera {shortened(name)}")
-    if not (np.abs(origin.background) <= LARGEST_NUMBER).all():  # False for NaN.
-        raise ValueError(f"origin.background must be finite, within ±{LARGEST_NUMBER:g}; got {origin.background}")
     check_similarity(origin.transform, "origin.transform")
     for name, rows in origin.corrections.items():
         check_floats(f"origin.corrections.{name}", rows, (len(origin.names), *np.shape(rows)[1:]))
         check_bounded(f"origin.corrections.{name}", rows)
 
 
-def check_finite(name: str, tree: Any, *, is_signed: bool = True) -> None:
+def check_finite(name: str, tree: object, *, is_signed: bool = True) -> None:
     """Raise ValueError, naming the leaf, if a float of a pytree is NaN or infinite or, unsigned, NaN or negative."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         values = np.asarray(leaf)
@@ -67,7 +68,7 @@ def check_finite(name: str, tree: Any, *, is_signed: bool = True) -> None:
             raise ValueError(f"{name}{jax.tree_util.keystr(path)} must be {wanted}; some are {found}")
 
 
-def check_bounded(name: str, tree: Any) -> None:
+def check_bounded(name: str, tree: object) -> None:
     """Raise ValueError, naming the leaf and the number, if a float is not finite or too large."""
     check_finite(name, tree)
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
@@ -80,14 +81,14 @@ def check_bounded(name: str, tree: Any) -> None:
                 raise ValueError(f"{label} must lie within ±{LARGEST_NUMBER:g}; got {value:g}")
 
 
-def check_count(name: str, value: Any, most: int) -> None:
+def check_count(name: str, value: object, most: int) -> None:
     """Raise ValueError unless a value is one integer in 0..most."""
     number = np.asarray(value)
     if number.shape or number.dtype.kind not in "iu" or not 0 <= int(number) <= most:
         raise ValueError(f"{name} must be a whole number in 0..{most}; got {shortened(value)}")
 
 
-def check_like(name: str, tree: Any, wanted: Any) -> None:
+def check_like(name: str, tree: object, wanted: object) -> None:
     """Raise ValueError, naming the leaf, unless two pytrees of one structure have the same shapes and dtypes."""
     pairs: Iterable[Any] = zip(jax.tree_util.tree_leaves_with_path(tree), jax.tree.leaves(wanted), strict=True)
     for (path, leaf), like in pairs:

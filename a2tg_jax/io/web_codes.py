@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax.appearance.shaped import log_exponents_of, shapes_of
+from a2tg_jax.appearance.exponents import log_exponents_of, shapes_of
 from a2tg_jax.io import quantise
+from a2tg_jax.io.model_rows import Rows
 from a2tg_jax.io.quantise import Contraction, Ends
-from a2tg_jax.io.rows import Rows
 from a2tg_jax.texture import MAX_SIDE
 
 BITS: Mapping[str, int] = {
@@ -108,7 +108,7 @@ def codes_of(rows: Rows) -> Codes:
 
 def rows_of_body(header: Mapping[str, Any], body: bytes) -> Rows:
     """Return the tables of a whole file."""
-    reader, num, num_bands = Reader(header, body), header["num"], header["num_bands"]
+    reader, num, num_bands = ChunkReader(header, body), header["num"], header["num_bands"]
     chunks = [reader.chunk(min(header["chunk"], num - start)) for start in range(0, num, header["chunk"])]
     reader.end()
 
@@ -162,7 +162,7 @@ def signed_square(x: np.ndarray) -> np.ndarray:
     return square
 
 
-class Reader:
+class ChunkReader:
     """Takes the chunks of a body one after the other, and never more than there is."""
 
     def __init__(self, header: Mapping[str, Any], body: bytes):

@@ -19,17 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
-from a2tg_jax.appearance.layers import layer_without
-from a2tg_jax.appearance.sh_bands import MAX_DEGREE
-from a2tg_jax.appearance.textured import shown_textures
-from a2tg_jax.core.capture import central_camera
+from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for, in_words
+from a2tg_jax.appearance.bands import MAX_DEGREE
+from a2tg_jax.core.capture_geometry import central_camera
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.io.config_json import config_from_dict
-from a2tg_jax.io.rows import Rows, model_of, ordered, rows_of
+from a2tg_jax.io.model_rows import Rows, model_of, ordered, rows_of_model
 from a2tg_jax.io.web_codes import codes_of, has_shapes, rows_of_body
 from a2tg_jax.model import Model
 
@@ -67,8 +65,10 @@ def is_viewable(appearance: Appearance) -> bool:
 def check_viewable(appearance: Appearance) -> None:
     """Raise ValueError, naming what the splats show, unless a browser can show it."""
     if not is_viewable(appearance):
-        kind = layer_without(appearance, is_viewable)
-        raise ValueError(f"the viewer cannot show {kind}: it shows Gaussians with or without textures")
+        raise ValueError(
+            f"the viewer cannot show {in_words(appearance)}: it shows Gaussians with or without textures, exponents "
+            "and bands"
+        )
 
 
 def encode_web_scene(
@@ -77,7 +77,7 @@ def encode_web_scene(
     """Return the bytes of a file.
 
     Args:
-      model: one that shows Plain, Textured, Shaped of these, or Banded of any of these.
+      model: of Gaussians with or without textures, exponents and bands.
       title: what the page is called.
       note: what the viewer says about the scene.
       near_plane: hits nearer than this do not show.
@@ -89,7 +89,7 @@ def encode_web_scene(
     check_gaussians(model.gaussians, "model.gaussians")
     check_viewable(model.appearance)
     model = _as_shown(model.live)
-    rows = rows_of(model)
+    rows = rows_of_model(model)
     if max(len(rows.means), 0 if rows.texels is None else len(rows.texels)) > MOST_ROWS:
         raise ValueError(f"model has more Gaussians or texels than the {MOST_ROWS:,} that a web scene may hold")
     rows = ordered(rows, np.argsort(-importance(rows, model.origin), kind="stable"))
@@ -108,7 +108,7 @@ def encode_web_scene(
         "near_plane": near_plane,
         **_appearance_to_dict(model.appearance),
         **codes.ends,
-        **_origin_to_dict(model.origin),
+        **_origin_to_dict(model),
     }
     return _framed(header, body, level)
 
@@ -123,7 +123,8 @@ def decode_web_scene(data: bytes, where: str = "the web scene") -> WebScene:
         header, body = _unframed(data)
         rows = rows_of_body(header, body)
         model = model_of(rows, header["base_degree"], _appearance_of(header), _origin_of(header))
-        return WebScene(model, header)
+        red, green, blue = (float(number) for number in header["background"])
+        return WebScene(dataclasses.replace(model, background=(red, green, blue)), header)
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"{where}: the web scene is damaged or of another version ({error!r})") from error
     except ValueError as error:
@@ -145,16 +146,13 @@ def importance(rows: Rows, origin: Origin | None) -> np.ndarray:
 
 
 def _as_shown(model: Model) -> Model:
-    """Return the model with texels as they are seen; of their rule, only the lookup remains."""
-    options = model.appearance.texture_options
-    if options is None or model.textures is None or not model.num:
+    """Return the model with texels as they are seen; of their options, only the lookup remains."""
+    texture = model.appearance.texture
+    if texture is None or not model.num:
         return model
-    textures, layout = model.textures
-    model = model.with_textures(shown_textures(textures, layout, options), layout)
-    seen = dataclasses.replace(options, rgb="signed", alpha="projected")
-    shown = model.appearance
-    same = {"has_degrees": shown.has_degrees, "has_shapes": shown.shapes_name is not None}
-    return dataclasses.replace(model, appearance=appearance_for(seen, has_textures=True, **same))
+    seen = dataclasses.replace(texture.options, rgb="signed", alpha="projected")
+    shown = dataclasses.replace(texture, texels=texture.shown(), options=seen)
+    return dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=shown))
 
 
 # The frame
@@ -198,7 +196,7 @@ def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
     return header, body
 
 
-def _check_counts(header: Any, num_coded: int) -> None:
+def _check_counts(header: object, num_coded: int) -> None:
     """Raise ValueError unless no more is announced than such a file can hold."""
     if not isinstance(header, dict):
         raise ValueError("has no header")
@@ -220,10 +218,10 @@ def _check_counts(header: Any, num_coded: int) -> None:
 def _appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
     options = appearance.texture_options or TextureOptions()
     return {
-        "banded": appearance.has_degrees,
+        "banded": appearance.bands is not None,
         "uv": options.uv,
         "outside": options.outside,
-        "max_alpha": appearance.max_alpha,
+        "max_alpha": appearance.alpha_limit,
     }
 
 
@@ -240,9 +238,10 @@ def _appearance_of(header: Mapping[str, Any]) -> Appearance:
     )
 
 
-def _origin_to_dict(origin: Origin | None) -> dict[str, Any]:
+def _origin_to_dict(model: Model) -> dict[str, Any]:
+    origin = model.origin
     if origin is None:
-        return {"background": [0.0, 0.0, 0.0], "cameras": None}
+        return {"background": list(model.background), "cameras": None}
 
     def as_floats(x: ArrayLike) -> list[float]:
         return [float(str(number)) for number in np.asarray(x, np.float32).ravel()]
@@ -259,7 +258,7 @@ def _origin_to_dict(origin: Origin | None) -> dict[str, Any]:
             origin.names, origin.is_test, origin.sizes, origin.viewmats, origin.Ks, strict=True
         )
     ]
-    return {"background": as_floats(origin.background), "cameras": cameras, "first": _first_camera(origin)}
+    return {"background": as_floats(model.background), "cameras": cameras, "first": _first_camera(origin)}
 
 
 def _first_camera(origin: Origin) -> int:
@@ -273,7 +272,6 @@ def _origin_of(header: Mapping[str, Any]) -> Origin | None:
     cameras = header["cameras"]
     if cameras is None:
         return None
-    red, green, blue = (float(number) for number in header["background"])
     return Origin(
         viewmats=np.array([camera["viewmat"] for camera in cameras], np.float64).reshape(-1, 4, 4),
         Ks=np.array([camera["K"] for camera in cameras], np.float64).reshape(-1, 3, 3),
@@ -281,5 +279,4 @@ def _origin_of(header: Mapping[str, Any]) -> Origin | None:
         names=tuple(str(camera["name"]) for camera in cameras),
         is_test=np.array([camera["is_test"] for camera in cameras], bool),
         transform=Similarity(1.0, np.eye(3), np.zeros(3)),
-        background=(red, green, blue),
     )

@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
-from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_mask, check_shape
 from a2tg_jax.core.gaussians import Gaussians
@@ -36,7 +37,7 @@ exponentially, and all steps together lead some 2.5°."""
 HEAD_ROOM = 1.5
 
 
-def color_fit(image: Any, target: Any, mask: Any = None) -> np.ndarray:
+def color_fit(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> np.ndarray:
     """Return the affine map of colours [3, 4] = [A | b] of least squared error |A·image + b − target|² (host).
 
     Args:
@@ -68,7 +69,7 @@ def align_poses(
     views: Sequence[View],
     model: Model,
     *,
-    background: Any = None,
+    background: ArrayLike | None = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     num_steps: int = NUM_STEPS,
 ) -> tuple[View, ...]:
@@ -110,7 +111,7 @@ def _aligned(view: View, model: Model, background: Array, settings: RenderSettin
     target = jnp.asarray(view_image(view, np.asarray(background)), dtype)
     mask = None if view.mask is None else jnp.asarray(view.mask.read())
     camera = jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera)
-    best = _jitted_descent()(model.gaussians, model.rule, camera, target, mask, background, settings, num_steps)
+    best = _jitted_descent()(model.gaussians, model.appearance, camera, target, mask, background, settings, num_steps)
     if bool(best.overflow):
         assert settings.capacity is not None
         more = dataclasses.replace(settings, capacity=2 * settings.capacity)
@@ -126,7 +127,7 @@ def _jitted_descent() -> jax.stages.Wrapped:
 
 def _descent(
     gaussians: Gaussians,
-    rule: AppearanceRule,
+    appearance: Appearance,
     camera: Camera,
     target: Array,
     mask: Array | None,
@@ -140,7 +141,7 @@ def _descent(
 
     def loss(twist: Array) -> Any:
         moved = dataclasses.replace(camera, viewmat=moved_viewmat(twist, camera.viewmat))
-        output, _ = render_traced(gaussians, moved, rule, background, settings, has_geometry=False)
+        output, _ = render_traced(gaussians, moved, appearance, background, settings, has_geometry=False)
         color = output.color if mask is None else jnp.where(mask[..., None], output.color, 0.0)
         return photometric_loss(color, shown, ssim_weight=ssim_weight), output.overflow
 

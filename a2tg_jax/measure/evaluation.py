@@ -10,18 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.display import counted
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import Color
 from a2tg_jax.data import View, view_image
 from a2tg_jax.data.scene import check_are_views
+from a2tg_jax.host.text import counted
 from a2tg_jax.measure.alignment import color_fit
 from a2tg_jax.measure.metrics import load_lpips, lpips, psnr, ssim
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.render import appearance_of
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.texture import AtlasLayout, Textures
+from a2tg_jax.texture import Textures
 from a2tg_jax.training.corrections import exposed
 from a2tg_jax.training.learning import flat_psnr, has_learned
 
@@ -94,7 +94,6 @@ def evaluate(
     views: Sequence[View],
     gaussians: Gaussians | Model,
     textures: Textures | None = None,
-    layout: AtlasLayout | None = None,
     *,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     background: Color | None = None,
@@ -106,7 +105,7 @@ def evaluate(
 
     Args:
       views: at least one.
-      gaussians, textures, layout, settings: what `render_image` takes; the capacity is found here. Or a model, alone.
+      gaussians, textures, settings: what `render_image` takes; the capacity is found here. Or a model, alone.
       background: RGB behind the Gaussians, and behind photographs with an alpha channel; None is the model's own, or
         black.
       lpips_weights: a weights file for LPIPS; None leaves it out.
@@ -122,7 +121,7 @@ def evaluate(
     if not views:
         raise ValueError("there are no views to evaluate; load the scene with a test_every that leaves some")
     weights = None if lpips_weights is None else load_lpips(lpips_weights)
-    model = _model_of(gaussians, textures, layout, settings)
+    model = _model_of(gaussians, textures, settings)
     background = model.background if background is None else background
     cameras = [view.camera for view in views]
     renderer = Renderer(model, cameras=cameras, background=background, settings=settings, has_geometry=False)
@@ -145,19 +144,14 @@ def evaluate(
     return Evaluation(tuple(per_view), network, 1.0 / float(np.median(seconds)), tuple(renders))
 
 
-def _model_of(
-    gaussians: Gaussians | Model, textures: Textures | None, layout: AtlasLayout | None, settings: RenderSettings
-) -> Model:
+def _model_of(gaussians: Gaussians | Model, textures: Textures | None, settings: RenderSettings) -> Model:
     """Return the model that the arguments describe."""
     if isinstance(gaussians, Model):
-        if textures is not None or layout is not None:
-            raise ValueError("textures and layout are part of a model: give the model alone")
+        if textures is not None:
+            raise ValueError("textures are part of a model: give the model alone")
         return gaussians
     check_gaussians(gaussians)
-    appearance = appearance_of(gaussians, textures, layout, settings)
-    if textures is None:
-        return Model(gaussians, appearance=appearance)
-    return Model(gaussians, textures, layout, appearance=appearance)
+    return Model(gaussians, appearance_of(gaussians, textures, settings))
 
 
 def _seconds_to_draw(renderer: Renderer, camera: Camera) -> float:

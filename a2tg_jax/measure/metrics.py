@@ -15,15 +15,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.checks import check_kind, check_shape, plain
+from a2tg_jax.core.checks import check_kind, check_shape, plain_array
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.host.npz import read_npz
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.texture import BYTES_PER_TEXEL, AtlasLayout
+from a2tg_jax.texture import BYTES_PER_TEXEL, Textures
 from a2tg_jax.training import losses
 
 LPIPS_MIN_SIDE = 32
@@ -112,20 +113,20 @@ def lpips(
     return jnp.sum(jnp.stack(distances))
 
 
-def parameter_bytes(gaussians: Gaussians, layout: AtlasLayout | None = None) -> int:
+def parameter_bytes(gaussians: Gaussians, textures: Textures | None = None) -> int:
     """Reported memory in bytes: 232 a Gaussian (of degree 3) and 16 a texel, 1×1 textures counted, padding not.
 
     Args:
       gaussians: the live Gaussians only.
-      layout: of their textures; None when there are none.
+      textures: their textures; None without textures.
 
     Raises:
       ValueError: if one is of another kind.
     """
     check_kind("gaussians", gaussians, Gaussians, "say model.num_bytes" if hasattr(gaussians, "num_bytes") else "")
-    if layout is not None:
-        check_kind("layout", layout, AtlasLayout)
-    texels = 0 if layout is None else layout.num_texels
+    if textures is not None:
+        check_kind("textures", textures, Textures)
+    texels = 0 if textures is None else textures.num_texels
     return BYTES_PER_FLOAT * gaussians.floats_per_row * gaussians.num + BYTES_PER_TEXEL * texels
 
 
@@ -136,7 +137,7 @@ def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[
     image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
     if mask is None:
         return image, target
-    mask = plain("mask", mask)
+    mask = plain_array("mask", mask)
     check_shape("mask", mask, image.shape[:2])
     counts = jnp.asarray(mask)[..., None]
     return jnp.where(counts, image, 0.0), jnp.where(counts, target, 0.0)
@@ -144,11 +145,11 @@ def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[
 
 def _converted(name: str, image: Any) -> Any:
     """Return arrays of other libraries and nested lists as arrays of JAX, and all else as it is."""
-    image = plain(name, image)
+    image = plain_array(name, image)
     return jnp.asarray(image) if hasattr(image, "__array__") or type(image) in (list, tuple) else image
 
 
-def _share_of_windows(mask: Array, dtype: Any) -> Array:
+def _share_of_windows(mask: Array, dtype: DTypeLike) -> Array:
     """Return the share of SSIM's windows in which at least one pixel counts."""
     window = (losses.SSIM_WINDOW, losses.SSIM_WINDOW)
     counts = jax.lax.reduce_window(mask.astype(dtype), -jnp.inf, jax.lax.max, window, (1, 1), "VALID")

@@ -1,7 +1,8 @@
 """Texture atlases: a mesh unwrapped into charts, and the place in the world of each texel (host)."""
 
 import importlib
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +27,7 @@ class Texels(NamedTuple):
     """[T, 3] float32 colour in [0, 1] between those of the vertices; grey without them."""
 
 
-def check_texture(size: int) -> Any:
+def check_texture(size: int) -> ModuleType:
     """Return the library xatlas.
 
     Raises:

@@ -20,7 +20,7 @@ LEAST_ALPHA = 0.5
 """Smallest alpha of a pixel that has a depth."""
 
 
-class DepthMap(NamedTuple):
+class RenderedDepth(NamedTuple):
     """Depths and colours of one view."""
 
     camera: Camera
@@ -37,7 +37,7 @@ class DepthMap(NamedTuple):
     """[H, W, 3] in [0, 1]."""
 
 
-def depth_map(output: RenderOutput, camera: Camera) -> DepthMap:
+def rendered_depth(output: RenderOutput, camera: Camera) -> RenderedDepth:
     """Return the depths of a render.
 
     Args:
@@ -50,7 +50,7 @@ def depth_map(output: RenderOutput, camera: Camera) -> DepthMap:
     spread = jnp.sqrt(jnp.maximum(output.distortion, 0.0)) / alpha
     slant, facing = _seen_at(normalize(output.normal), camera)
     color = jnp.clip(jnp.nan_to_num(output.color), 0.0, 1.0)
-    return DepthMap(camera, jnp.where(is_opaque & (depth > 0), depth, 0.0), spread, slant, facing, color)
+    return RenderedDepth(camera, jnp.where(is_opaque & (depth > 0), depth, 0.0), spread, slant, facing, color)
 
 
 def _seen_at(normal: Array, camera: Camera) -> tuple[Array, Array]:

@@ -3,16 +3,16 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.display import counted
-from a2tg_jax.host.bars import progress_over
+from a2tg_jax.host.progress_bars import progress_over
+from a2tg_jax.host.text import counted
 from a2tg_jax.mesh.blocks import BlockGrid, GridFullError
-from a2tg_jax.mesh.depth_maps import DepthMap, depth_map
+from a2tg_jax.mesh.depth_maps import RenderedDepth, rendered_depth
 from a2tg_jax.mesh.fusion import fuse
 from a2tg_jax.mesh.marching import surface_of
 from a2tg_jax.mesh.space import RADII, Space, common_sphere
@@ -177,7 +177,7 @@ def check_lengths(resolution: int | None, voxel: float | None, radius: float | N
             raise ValueError(f"{name} must be positive and finite; got {value}")
 
 
-def _depths(renderer: Renderer, camera: Camera) -> DepthMap:
+def _depths(renderer: Renderer, camera: Camera) -> RenderedDepth:
     return _jitted_depths()(renderer(camera), camera)
 
 
@@ -198,5 +198,5 @@ def _sphere(
 
 
 @functools.cache
-def _jitted_depths() -> jax.stages.Wrapped:
-    return jax.jit(depth_map)
+def _jitted_depths() -> Callable[..., RenderedDepth]:
+    return jax.jit(rendered_depth)

@@ -13,7 +13,7 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.mesh.blocks import LOCAL, SIDE, VOXELS, BlockGrid, unique_blocks
-from a2tg_jax.mesh.depth_maps import DepthMap
+from a2tg_jax.mesh.depth_maps import RenderedDepth
 from a2tg_jax.mesh.space import TRUNCATION, Space
 from a2tg_jax.training.losses import back_project
 
@@ -30,7 +30,7 @@ Voxels = tuple[Array, Array, Array, Array]
 """Distances, weights, colours and colour weights of some blocks."""
 
 
-def fuse(grid: BlockGrid, depths: DepthMap, space: Space) -> None:
+def fuse(grid: BlockGrid, depths: RenderedDepth, space: Space) -> None:
     """Fuse one view into the blocks around its depths.
 
     Raises:
@@ -47,7 +47,7 @@ def fuse(grid: BlockGrid, depths: DepthMap, space: Space) -> None:
             array[chosen] = np.asarray(values)[: len(chosen)]
 
 
-def blocks_near(depths: DepthMap, space: Space) -> np.ndarray:
+def blocks_near(depths: RenderedDepth, space: Space) -> np.ndarray:
     """Return the blocks [B, 3] within a truncation of the depths, along their rays."""
     return unique_blocks(np.asarray(_jitted_near()(depths, space)))
 
@@ -57,7 +57,7 @@ def _jitted_near() -> jax.stages.Wrapped:
     return jax.jit(_near)
 
 
-def _near(depths: DepthMap, space: Space) -> Array:
+def _near(depths: RenderedDepth, space: Space) -> Array:
     """Return blocks [P, 3] around the depths, with repetitions; NOWHERE where there is no depth."""
     points = back_project(depths.depth, depths.camera).reshape(-1, 3)
     rays = points - depths.camera.center[None]
@@ -74,12 +74,12 @@ def _jitted_fuse() -> jax.stages.Wrapped:
     return jax.jit(_fused)
 
 
-def _fused(voxels: Voxels, blocks: Array, depths: DepthMap, space: Space) -> Voxels:
+def _fused(voxels: Voxels, blocks: Array, depths: RenderedDepth, space: Space) -> Voxels:
     """Return the voxels of blocks [B, 3] after one more view."""
     distance, weight, color, color_weight = voxels
     points = space.positions((blocks[:, None] * SIDE + LOCAL[None]).reshape(-1, 3))
     truncation = TRUNCATION * space.voxel * space.scale(points)
-    x, y, z = projected(points, depths.camera)
+    x, y, z = pixels_and_depths(points, depths.camera)
     seen, is_seen = _depths_at(depths.depth, x, y, truncation)
     pixel = _pixels(x, y, *depths.depth.shape)
     spread, slant, facing = (image.reshape(-1)[pixel] for image in (depths.spread, depths.slant, depths.facing))
@@ -106,7 +106,7 @@ def _mixed(color: Array, share: Array, image: Array, pixel: Array) -> Array:
     return jnp.stack(mixed, -1).astype(jnp.float16)
 
 
-def projected(points: Array, camera: Camera) -> tuple[Array, Array, Array]:
+def pixels_and_depths(points: Array, camera: Camera) -> tuple[Array, Array, Array]:
     """Return pixel coordinates x and y, and the depth z, of points [P, 3]; x and y are far out behind the camera."""
     # Written out: XLA is tens of times slower at products of many rows with a 3 × 3 matrix.
     across, down, z = (_affine(camera.viewmat[row, :3], points, camera.viewmat[row, 3]) for row in range(3))

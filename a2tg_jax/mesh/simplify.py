@@ -1,7 +1,7 @@
 """Meshes of fewer triangles, by quadric decimation (host)."""
 
 import importlib
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,7 +12,7 @@ LEAST_FACES = 4
 """Smallest number of faces to simplify to, that of a closed mesh."""
 
 
-def check_simplifying(num_faces: int) -> Any:
+def check_simplifying(num_faces: int) -> ModuleType:
     """Return the library fast-simplification.
 
     Raises:

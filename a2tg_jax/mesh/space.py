@@ -5,13 +5,13 @@ Voxel i [3] lies at y = voxel·i, relative to the centre. Within the radius R, x
 """
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
-from a2tg_jax.core.capture import nearest_point
+from a2tg_jax.core.capture_geometry import nearest_point
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.similarity import camera_centers
 
@@ -75,7 +75,7 @@ class Space:
         return ratio
 
 
-def common_sphere(viewmats: Any) -> tuple[np.ndarray, float]:
+def common_sphere(viewmats: ArrayLike) -> tuple[np.ndarray, float]:
     """Return centre [3] and radius of the sphere that cameras [V, 4, 4] look at.
 
     The centre is the point nearest to all optical axes, the radius twice the median distance of the cameras from it.

@@ -1,23 +1,21 @@
-"""Room that a view needs: pairs of splat and tile, and rows that travel between devices, counted on the host."""
+"""Room that a view needs: pairs of splat and tile, counted on the host."""
 
 import dataclasses
 import functools
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import AppearanceRule, check_rule
+from a2tg_jax.appearance import Appearance, check_is_appearance
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.geometry import homographies, screen_bounds
-from a2tg_jax.rasterize.exchange import Travel, share_of_a_band, travel
-from a2tg_jax.rasterize.image_bands import BorderRoom
+from a2tg_jax.core.geometry import screen_bounds
+from a2tg_jax.parallel.room import room_of_view
 from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.rasterize.splats import drawn_splats
 from a2tg_jax.rasterize.supersampling import finer
 from a2tg_jax.rasterize.tile_pixels import pixels_of
 from a2tg_jax.rasterize.tiles import TileGrid, count_pairs
@@ -31,7 +29,7 @@ def capacity_for(pairs: int, head_room: float = HEAD_ROOM) -> int:
 
 
 def with_capacity(
-    settings: RenderSettings, gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any = None
+    settings: RenderSettings, gaussians: Gaussians, camera: Camera, appearance: Appearance, num_live: Any = None
 ) -> RenderSettings:
     """Return the settings; if they lack a capacity, with one for this view, which an eager call can find.
 
@@ -39,16 +37,16 @@ def with_capacity(
       ValueError: under jit or vmap without a capacity.
     """
     check_kind("settings", settings, RenderSettings)
-    check_rule(rule)
+    check_is_appearance(appearance)
     if settings.capacity is not None:
         return settings
-    gaussians, camera, rule, num_live = jax.tree.map(_primal_value, (gaussians, camera, rule, num_live))
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, rule, num_live))):
+    gaussians, camera, appearance, num_live = jax.tree.map(_primal_value, (gaussians, camera, appearance, num_live))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, appearance, num_live))):
         raise ValueError(
             "settings.capacity is needed under jit and vmap, where shapes are fixed: "
             "settings = plan_render(model, cameras) outside, then pass settings=settings"
         )
-    pairs = pairs_to_draw(gaussians, camera, rule, settings, num_live)
+    pairs = pairs_to_draw(gaussians, camera, appearance, settings, num_live)
     return dataclasses.replace(settings, capacity=capacity_for(pairs))
 
 
@@ -66,47 +64,27 @@ def _primal_value(x: Any) -> Any:
 
 
 def pairs_of_view(
-    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
+    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: Any = None
 ) -> int:
     """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
-    check_rule(rule)
+    check_is_appearance(appearance)
+    if not gaussians.num:
+        return 0
     camera = finer(camera, settings.supersample)
     try:
-        return int(_jitted_count()(gaussians, camera, rule, settings.tile_size, settings.near_plane, num_live))
+        return int(_jitted_count()(gaussians, camera, appearance, settings.tile_size, settings.near_plane, num_live))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 
 
 def pairs_to_draw(
-    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
+    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: Any = None
 ) -> int:
     """Return the least capacity for a view (host): its pairs or, on several devices, what the fullest band needs."""
-    pairs = pairs_of_view(gaussians, camera, rule, settings, num_live)
+    pairs = pairs_of_view(gaussians, camera, appearance, settings, num_live)
     if settings.exchange is None or not pairs:
         return pairs
-    return max(pairs, room_of_view(gaussians, camera, rule, settings, num_live).pairs)
-
-
-class RoomOfView(NamedTuple):
-    """Room that devices need to draw a view together."""
-
-    rows: int
-    """Rows that a device must be able to send to another one."""
-    borders: BorderRoom
-    """Room for the borders between bands."""
-    pairs: int
-    """Capacity of which every band's share holds its pairs."""
-
-
-def room_of_view(
-    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any = None
-) -> RoomOfView:
-    """Return the room that the devices of `settings.exchange` need in a view (host)."""
-    assert settings.exchange is not None
-    camera = finer(camera, settings.supersample)
-    rows, above, below, pairs = map(int, _jitted_travel()(gaussians, camera, rule, settings, num_live))
-    share = share_of_a_band(settings.exchange.num // settings.exchange.views_at_once)
-    return RoomOfView(rows, BorderRoom(above, below), math.ceil(pairs / share))
+    return max(pairs, room_of_view(gaussians, camera, appearance, settings, num_live).pairs)
 
 
 @functools.cache
@@ -115,33 +93,9 @@ def _jitted_count() -> jax.stages.Wrapped:
 
 
 def _count_pairs(
-    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, tile_size: int, near_plane: float, num_live: Any
+    gaussians: Gaussians, camera: Camera, appearance: Appearance, tile_size: int, near_plane: float, num_live: Any
 ) -> Array:
-    M, cutoff = _drawn(gaussians, camera, rule, num_live)
+    M, cutoff = drawn_splats(gaussians, camera, appearance, num_live)
     pixels = pixels_of(camera, tile_size)
     bounds = screen_bounds(M, cutoff, near_plane)
     return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size), pixels)
-
-
-@functools.cache
-def _jitted_travel() -> jax.stages.Wrapped:
-    return jax.jit(_travel, static_argnums=(3,))
-
-
-def _travel(
-    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, settings: RenderSettings, num_live: Any
-) -> Travel:
-    M, cutoff = _drawn(gaussians, camera, rule, num_live)
-    assert settings.exchange is not None
-    grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    return travel(settings.exchange, M, cutoff, settings.near_plane, grid, camera.rays)
-
-
-def _drawn(gaussians: Gaussians, camera: Camera, rule: AppearanceRule, num_live: Any) -> tuple[Array, Array]:
-    """Return homographies [N, 3, 3] and squared distances [N] of visibility, not positive for rows that do not
-    exist."""
-    M, _ = homographies(gaussians, camera)
-    cutoff = rule.cutoff(rule.opacities(gaussians))
-    if num_live is not None:
-        cutoff = jnp.where(jnp.arange(gaussians.num, dtype=jnp.int32) < num_live, cutoff, -1.0)
-    return M, cutoff

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import AppearanceRule
+from a2tg_jax.appearance import Elementwise
 from a2tg_jax.core.bilinear import Lookup, follow
 
 MIN_ALPHA = 1 / 255
@@ -43,7 +43,7 @@ class Splat(NamedTuple):
     normal: Triple | None
     """Normal in the world, facing the camera; None if only colour is composited."""
     numbers: tuple[Array, ...] = ()
-    """Numbers of its appearance rule (`AppearanceRule.numbers`)."""
+    """Numbers of its appearance (`Appearance.numbers`)."""
 
 
 class Planes(NamedTuple):
@@ -164,35 +164,35 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pas
     return Hit(u, v, jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, planes.depth), is_ray)
 
 
-def values_at(rule: AppearanceRule, lookup: Lookup | None, hit: Hit, values: tuple[Array, ...]) -> tuple[Array, ...]:
+def values_at(functions: Elementwise, lookup: Lookup | None, hit: Hit, values: tuple[Array, ...]) -> tuple[Array, ...]:
     """Return the values of a lookup, differentiable in themselves and in the hit."""
     if lookup is None:
         return ()
-    return follow(lookup.sample._replace(values=values), *rule.texel_position(lookup.region, hit.u, hit.v))
+    return follow(lookup.sample._replace(values=values), *functions.texel_position(lookup.region, hit.u, hit.v))
 
 
 def show(
-    rule: AppearanceRule, splat: Splat, hit: Hit, values: tuple[Array, ...], rho_probe: Array | None = None
+    functions: Elementwise, splat: Splat, hit: Hit, values: tuple[Array, ...], rho_probe: Array | None = None
 ) -> Shown:
-    """Return α = min(rule.max_alpha, o·falloff(ρ)·T_A), or 0 below 1/255, and the channels that it weighs.
+    """Return α = min(functions.max_alpha, o·falloff(ρ)·T_A), or 0 below 1/255, and the channels that it weighs.
 
     Args:
-      rule: the appearance rule.
+      functions: the functions of the appearance.
       splat: the splat; its homography is not read.
       hit: hit of the ray with the splat.
       values: interpolated values of the splat's texture.
       rho_probe: zero, added to ρ of the falloff to read the gradient there; or None.
     """
-    residual, factor = rule.shade(splat.numbers, values, hit.u, hit.v)
+    residual, factor = functions.shade(splat.numbers, values, hit.u, hit.v)
     # The slope of a falloff at infinity may be NaN.
-    rho = hit.rho if rule.has_low_pass else jnp.where(hit.is_ray, hit.rho, 0.0)
+    rho = hit.rho if functions.has_low_pass else jnp.where(hit.is_ray, hit.rho, 0.0)
     rho = rho if rho_probe is None else rho + rho_probe
-    a = splat.opacity * rule.falloff(splat.numbers, rho)
+    a = splat.opacity * functions.falloff(splat.numbers, rho)
     a = a if factor is None else a * factor
     # NaN must stay NaN, here and in `absorb`.
-    is_hidden = a < MIN_ALPHA if rule.has_low_pass else (a < MIN_ALPHA) | ~hit.is_ray
+    is_hidden = a < MIN_ALPHA if functions.has_low_pass else (a < MIN_ALPHA) | ~hit.is_ray
     # Not >=: an alpha on its cap has a gradient, so that what starts or is projected there can fade.
-    alpha = jnp.where(is_hidden, 0.0, jnp.where(a > rule.max_alpha, rule.max_alpha, a))
+    alpha = jnp.where(is_hidden, 0.0, jnp.where(a > functions.max_alpha, functions.max_alpha, a))
     channels: tuple[Array, ...] = splat.color
     if residual is not None:
         channels = tuple(base + extra for base, extra in zip(splat.color, residual, strict=True))
@@ -248,17 +248,17 @@ class Cotangents(NamedTuple):
 
 
 def blend(
-    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, values: tuple[Array, ...], x: Array,
+    functions: Elementwise, near_plane: float, planes: Planes, splat: Splat, values: tuple[Array, ...], x: Array,
     y: Array, transmittance: Array, is_live: Array,
 ) -> tuple[tuple[Array, ...], Array, Array]:  # fmt: skip
     """Return the contribution of one splat at one pixel to the channels, and transmittance and liveness behind it."""
-    shown = show(rule, splat, intersect(planes, x, y, near_plane, rule.has_low_pass), values)
+    shown = show(functions, splat, intersect(planes, x, y, near_plane, functions.has_low_pass), values)
     weight, transmittance, is_live = absorb(shown.alpha, transmittance, is_live)
     return tuple(weight * channel for channel in shown.channels), transmittance, is_live
 
 
 def blend_vjp(
-    rule: AppearanceRule, near_plane: float, planes: Planes, splat: Splat, lookup: Lookup | None, x: Array, y: Array,
+    functions: Elementwise, near_plane: float, planes: Planes, splat: Splat, lookup: Lookup | None, x: Array, y: Array,
     transmittance: Array, is_live: Array, suffix_sum: Array, g: Sequence[Array], has_rho: bool,
 ) -> tuple[State, Array, Cotangents]:  # fmt: skip
     """Differentiate `blend`; `suffix_sum` and `g` are those of `absorb_vjp`, g channel by channel.
@@ -272,9 +272,9 @@ def blend_vjp(
         planes: Planes, opacity: Array, color: Triple, normal: Triple | None, numbers: tuple[Array, ...],
         values: tuple[Array, ...], rho_probe: Array | None,
     ) -> Shown:  # fmt: skip
-        hit = intersect(planes, x, y, near_plane, rule.has_low_pass)
-        values = values_at(rule, lookup, hit, values)
-        return show(rule, Splat(splat.M, opacity, color, normal, numbers), hit, values, rho_probe)
+        hit = intersect(planes, x, y, near_plane, functions.has_low_pass)
+        values = values_at(functions, lookup, hit, values)
+        return show(functions, Splat(splat.M, opacity, color, normal, numbers), hit, values, rho_probe)
 
     rho_probe = jnp.zeros_like(transmittance) if has_rho else None
     values = () if lookup is None else lookup.sample.values

@@ -1,24 +1,19 @@
 """Options of a rendering and its images: what `render_image` takes and returns."""
 
 import dataclasses
-from typing import Any, NamedTuple
 
 import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import TextureOptions
-from a2tg_jax.core.checks import check_int, check_kind, check_number
-from a2tg_jax.core.display import as_bytes, enlarged, png, short_tuple_repr
+from a2tg_jax.core.checks import check_int, check_kind, check_number, short_repr
+from a2tg_jax.core.notebook_display import as_bytes, enlarged, png
 from a2tg_jax.core.pixel_sizes import NEAR_PLANE
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.rasterize.exchange import Exchange
+from a2tg_jax.parallel.exchange import Exchange
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
 from a2tg_jax.rasterize.splats import Wanted
-
-IMAGES = ("color", "alpha", "depth", "normal", "distortion")
-"""Fields of `RenderOutput` that are images."""
-GEOMETRY = IMAGES[2:]
-"""Images that are rendered on demand (`has_geometry`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,14 +30,14 @@ class RenderSettings:
     texture: TextureOptions = dataclasses.field(default_factory=TextureOptions)
     """Texture options for Gaussians and textures given apart (`render_image`, `plan_render`, `evaluate`).
 
-    A `Model` and a rule have their own options; this field is then not used."""
+    A `Model` and an appearance have their own options; this field is then not used."""
     capacity: int | None = None
     """Largest number of (splat, tile) pairs, at least 1, as `plan_render` finds it. None: an eager call finds it, jit
     raises. If it is too small, the image is only the background and `overflow` is True; an eager call then warns."""
     compositor: Wanted = "auto"
-    """Native loops (CPUs, with llvmlite), CUDA kernels (NVIDIA GPUs) or XLA. "auto" takes the first available one,
-    and XLA with a warning if the others do not support the appearance rule. These are differentiated once, in reverse
-    mode; "autodiff", slower and by XLA, in any mode and to any order."""
+    """Native loops (CPUs, with llvmlite), CUDA kernels (NVIDIA GPUs) or XLA. "auto" takes the first one that runs where
+    the arrays are, and XLA with a warning if it does not support the appearance. These are differentiated once, in
+    reverse mode; "autodiff", slower and by XLA, in any mode and to any order."""
     tile_batch: int | None = None
     """Number of tiles that XLA composites at once; 0: all. None: 1 on CPUs, 4096 elsewhere."""
     supersample: int = 1
@@ -77,42 +72,60 @@ class RenderSettings:
         return RenderSettings(texture=TextureOptions.official())
 
 
-class NotRenderedError(ValueError, AttributeError):
-    """Depth, normal or distortion of a render without geometry was read; for `hasattr` there is no such attribute."""
+@pytree
+class Geometry:
+    """Depth, normal and distortion of a view: weighted sums, not divided by alpha, without the background."""
+
+    depth: Array
+    """[H, W] Σ z·α·T."""
+    normal: Array
+    """[H, W, 3] Σ n·α·T, in the world, facing the camera."""
+    distortion: Array
+    """[H, W] the depth distortion of 2DGS, Σ_ij w_i w_j (z_i − z_j)² / 2, in world units squared."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
-class RenderOutput(NamedTuple):
-    """Images of a view. Depth and normal are weighted sums, not divided by alpha, without the background.
-
-    A render with `has_geometry=False` has None in place of depth, normal and distortion, and reading them raises
-    `NotRenderedError`, a ValueError.
-    """
+@pytree
+class RenderOutput:
+    """Images of a view."""
 
     color: Array
     """[H, W, 3], background included, not clipped; or [H, W, D] features."""
     alpha: Array
     """[H, W] in [0, 1], 1 − the final transmittance."""
-    depth: Array
-    """[H, W] Σ z·α·T."""
-    normal: Array
-    """[H, W, 3] Σ n·α·T, in the world, facing the camera."""
     overflow: Array
     """Whether the capacity was too small; the image is then only the background and must not be used. Eager calls
     warn of it (`CapacityWarning`), jitted ones cannot."""
-    distortion: Array
-    """[H, W] the depth distortion of 2DGS, Σ_ij w_i w_j (z_i − z_j)² / 2, in world units squared."""
+    geometry: Geometry | None = None
+    """Depth, normal and distortion; None after a render with `has_geometry=False`."""
 
-    def __getattribute__(self, name: str) -> Any:
-        value = tuple.__getattribute__(self, name)
-        if value is None and name in GEOMETRY:
-            raise NotRenderedError(
-                f"{name} was not rendered: say has_geometry=True, as in Term(function, has_geometry=True) for a loss "
-                "term of your own"
+    @property
+    def depth(self) -> Array:
+        """[H, W] Σ z·α·T, not divided by alpha. Raises ValueError if there is no geometry."""
+        return self._rendered("depth").depth
+
+    @property
+    def normal(self) -> Array:
+        """[H, W, 3] Σ n·α·T, not divided by alpha, in the world. Raises ValueError if there is no geometry."""
+        return self._rendered("normal").normal
+
+    @property
+    def distortion(self) -> Array:
+        """[H, W] the depth distortion of 2DGS. Raises ValueError if there is no geometry."""
+        return self._rendered("distortion").distortion
+
+    def _rendered(self, name: str) -> Geometry:
+        if self.geometry is None:
+            raise ValueError(
+                f"{name} was not rendered: say has_geometry=True, as in Term(function, has_geometry=True) for a custom "
+                "loss term"
             )
-        return value
+        return self.geometry
 
     def __repr__(self) -> str:
-        return short_tuple_repr(self)
+        return short_repr(self)
 
     def _repr_png_(self) -> bytes | None:
         """Return the colour as a PNG file for notebooks; None for several views, or under a transformation."""

@@ -5,7 +5,6 @@ modes name neither the renderer nor a remedy. (Under `vmap` of tangents, as in `
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any, NoReturn
 
 import jax
@@ -50,17 +49,3 @@ def _identity(compositor: str, x: Any) -> Any:
 @_identity.defjvp
 def _identity_jvp(compositor: str, primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
     return primals[0], tangent_p.bind(tangents[0], compositor=compositor)
-
-
-def once(compositor: str, function: Callable[..., Any], *arrays: Any) -> Any:
-    """Call a function of arrays that is not differentiated itself; if JAX tries to, raise ValueError."""
-
-    @jax.custom_jvp
-    def called(*arrays: Any) -> Any:
-        return function(*arrays)
-
-    @called.defjvp
-    def _(primals: Any, tangents: Any) -> NoReturn:
-        _refuse(compositor)
-
-    return called(*arrays)

@@ -3,6 +3,7 @@
 `compositor` and all kernels share these two types.
 """
 
+import dataclasses
 import functools
 from typing import Any, Literal, NamedTuple
 
@@ -11,18 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import AppearanceRule, Arguments, StaticRule, check_shading
+from a2tg_jax.appearance import Appearance, Arguments, StaticShading, check_shading
+from a2tg_jax.appearance.base import colors_in_view, cutoff_of, num_colors_of, numbers_in_view
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.geometry import homographies
+from a2tg_jax.core.numerics import Integer
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.tiles import TileGrid
 
 Compositor = Literal["cuda", "native", "xla", "autodiff"]
 """CUDA kernels (NVIDIA GPUs), native loops (CPUs), XLA (everywhere), or XLA without a gradient of its own."""
 Wanted = Literal["auto", "cuda", "native", "xla", "autodiff"]
-"""A compositor, or the first of native loops, CUDA kernels and XLA that runs here."""
+"""A compositor, or the first of native loops, CUDA kernels and XLA that runs on the platform that JAX compiles for."""
 
 
 class Splats(NamedTuple):
@@ -37,29 +40,43 @@ class Splats(NamedTuple):
     normals: Array
     """[N, 3] normals in the world, facing the camera."""
     numbers: Array
-    """[N, K] numbers of the appearance rule (`AppearanceRule.numbers`)."""
+    """[N, K] numbers of the appearance (`Appearance.numbers`)."""
 
 
-class CompositingSettings(NamedTuple):
-    """Static options of a compositing pass."""
+@dataclasses.dataclass(frozen=True)
+class KernelSpec:
+    """Specification of the passes over one pixel, for which kernels are compiled; hashable."""
 
-    grid: TileGrid
-    """Tiles of the image."""
+    static: StaticShading
+    """Appearance without its arrays."""
+    num_own_numbers: int
+    """Number K of numbers per splat of the appearance."""
+    num_columns: int
+    """Number C of numbers per texel; 0 without textures."""
+    dtype: str
+    """Dtype of all computations: "float32" or "float64"."""
+    tile_size: int
+    """Side of a tile in pixels."""
     near_plane: float
     """Least depth of visible hits."""
     has_geometry: bool
     """Whether depth, squared depth and normals are composited beside the colour."""
     statistic: Statistic | None
-    """Statistic that densification reads from the backward pass, if any."""
-    compositor: Compositor
-    """Native loops, CUDA kernels, or XLA with or without a gradient of its own."""
-    tile_batch: int
-    """Number of tiles that XLA composites at once; 1 with native loops and CUDA kernels."""
-
+    """Statistic that the backward pass computes for densification, if any."""
     num_colors: int = 3
     """Number D of colours of a splat."""
     has_rays: bool = False
     """Whether pixels have rays of their own (`tile_pixels`)."""
+
+    @property
+    def arguments(self) -> Arguments:
+        """Arguments of the element-wise functions of the appearance."""
+        return Arguments(self.num_own_numbers, self.num_columns, self.num_colors, self.dtype)
+
+    @property
+    def num_tile_numbers(self) -> int:
+        """Number of `rasterize.pixel.TileNumbers`."""
+        return 6 if self.has_rays else 2
 
     @property
     def num_channels(self) -> int:
@@ -67,9 +84,32 @@ class CompositingSettings(NamedTuple):
         return num_channels(self.has_geometry, self.num_colors)
 
     @property
+    def num_floats(self) -> int:
+        """Number S of floats per splat: its numbers, and the squared distance beyond which it is invisible."""
+        return num_numbers(self.has_geometry, self.num_colors) + self.num_own_numbers + 1
+
+    def gradient_shapes(self, splats: Splats, texels: Array, probe: Array) -> tuple[tuple[int, ...], ...]:
+        """Return the shapes of a kernel's gradients of packed splats, texels and probe; without a statistic [1, 4]."""
+        return (len(splats.M), self.num_floats), texels.shape, probe.shape if self.statistic else (1, 4)
+
+
+class CompositingSettings(NamedTuple):
+    """Static options of a compositing pass."""
+
+    kernel: KernelSpec
+    """What is computed at each pixel."""
+    grid: TileGrid
+    """Tiles of the image."""
+    compositor: Wanted
+    """Native loops, CUDA kernels, or XLA with or without a gradient of its own; "auto": one for the platform."""
+    tile_batch: Any
+    """Number of tiles that XLA composites at once; 0: all. None: one for the platform, set where that is known."""
+
+    @property
     def num_groups(self) -> int:
         """Number of batches of tiles in the image."""
-        return -(-self.grid.num // self.tile_batch)
+        num: int = -(-self.grid.num // self.tile_batch)
+        return num
 
 
 def num_channels(has_geometry: bool, num_colors: int) -> int:
@@ -77,8 +117,18 @@ def num_channels(has_geometry: bool, num_colors: int) -> int:
     return num_colors + 5 if has_geometry else num_colors
 
 
+def num_numbers(has_geometry: bool, num_colors: int) -> int:
+    """Return the numbers per splat: the 9 entries of M, opacity, colours, and with geometry the normal."""
+    return 10 + num_colors + (3 if has_geometry else 0)
+
+
 def project_gaussians(
-    gaussians: Gaussians, camera: Camera, rule: AppearanceRule, near_plane: float, sh_degree: Any, num_live: Any = None
+    gaussians: Gaussians,
+    camera: Camera,
+    appearance: Appearance,
+    near_plane: float,
+    sh_degree: Integer,
+    num_live: Integer | None = None,
 ) -> tuple[Splats, Array]:
     """Return the N splats, and the squared distances [N] within which they are visible.
 
@@ -87,24 +137,23 @@ def project_gaussians(
     Args:
       gaussians: N Gaussians.
       camera: the view.
-      rule: appearance rule.
+      appearance: what they show.
       near_plane: least depth of visible splats.
       sh_degree: highest degree of spherical harmonics used; may be traced.
       num_live: number of rows that exist; may be traced.
 
     Raises:
-      ValueError: if the rule gives opacities, numbers or colours of another shape, or a `max_alpha` outside (0, 1),
-        or if its element-wise functions return something else than they must.
+      ValueError: if the appearance gives opacities, numbers or colours of another shape.
     """
     M, normals = homographies(gaussians, camera)
-    opacities, numbers = rule.opacities(gaussians), rule.numbers(gaussians, camera)
-    colors = rule.own_colors(gaussians, camera, sh_degree)
-    _check_rule(rule, opacities, numbers, colors, gaussians.num)
+    opacities, numbers = appearance.peak_opacities(gaussians), numbers_in_view(appearance, gaussians, camera)
+    colors = colors_in_view(appearance, gaussians, camera, sh_degree)
+    _check_given(appearance, opacities, numbers, colors, gaussians.num)
     # Not >=: a NaN depth counts as drawn, so that it is reported.
     is_drawn = ~(M[:, 2, 2] < near_plane)
     if num_live is not None:
         is_drawn &= jnp.arange(gaussians.num, dtype=jnp.int32) < num_live
-    cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(rule.cutoff(opacities)), -1.0)
+    cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(cutoff_of(appearance, opacities)), -1.0)
     is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors, numbers)
     cutoff = jnp.where(is_broken, jnp.nan, cutoff)
     is_shown = (cutoff > 0)[:, None]
@@ -114,30 +163,70 @@ def project_gaussians(
     return Splats(M, colors, opacities, normals, numbers), cutoff
 
 
-def _check_rule(rule: AppearanceRule, opacities: Array, numbers: Array, colors: Array, num: int) -> None:
-    name = type(rule).__name__
+def drawn_splats(
+    gaussians: Gaussians, camera: Camera, appearance: Appearance, num_live: Integer | None
+) -> tuple[Array, Array]:
+    """Return homographies [N, 3, 3] and squared distances [N] of visibility, not positive for rows that do not
+    exist."""
+    M, _ = homographies(gaussians, camera)
+    cutoff = cutoff_of(appearance, appearance.peak_opacities(gaussians))
+    if num_live is not None:
+        cutoff = jnp.where(jnp.arange(gaussians.num, dtype=jnp.int32) < num_live, cutoff, -1.0)
+    return M, cutoff
+
+
+def _check_given(appearance: Appearance, opacities: Array, numbers: Array, colors: Array, num: int) -> None:
+    name, num_colors = type(appearance).__name__, num_colors_of(appearance)
     if opacities.shape != (num,) or numbers.shape[:-1] != (num,):
         raise ValueError(
-            f"a rule gives opacities [N] and numbers [N, K] of N = {num} gaussians; {name} "
+            f"an appearance gives opacities [N] and numbers [N, K] of N = {num} gaussians; {name} "
             f"gave {opacities.shape} and {numbers.shape}"
         )
-    if colors.shape != (num, rule.num_colors):
-        wanted = f"[N, {rule.num_colors}] of N = {num} gaussians, by its num_colors"
-        raise ValueError(f"a rule gives own_colors {wanted}; {name} gave {colors.shape}")
-    places = {} if rule.regions is None else rule.regions._asdict()
-    for field, numbers_of_textures in places.items():
-        if numbers_of_textures.shape != (num,):
-            given = numbers_of_textures.shape
-            raise ValueError(f"a rule gives regions.{field} [N] of N = {num} gaussians; {name} gave {given}")
-    if not 0 < rule.max_alpha < 1:
-        raise ValueError(f"max_alpha of a rule must lie in (0, 1); that of {name} is {rule.max_alpha}")
-    check_shading(StaticRule.of(rule), shading_arguments(rule.texels, rule.regions, numbers, colors))
+    if colors.shape != (num, num_colors):
+        wanted = f"[N, {num_colors}] of N = {num} gaussians, by its num_colors"
+        raise ValueError(f"an appearance gives own_colors {wanted}; {name} gave {colors.shape}")
 
 
-def shading_arguments(texels: Array, regions: TextureRegion | None, numbers: Array, colors: Array) -> Arguments:
-    """Return what the element-wise functions of a rule are called with, from the arrays of its splats."""
-    num_values = 0 if regions is None else texels.shape[1]
-    return Arguments(numbers.shape[1], num_values, colors.shape[1], np.dtype(colors.dtype).name)
+def kernel_of(
+    appearance: Appearance,
+    splats: Splats,
+    *,
+    tile_size: int,
+    near_plane: float,
+    has_geometry: bool,
+    statistic: Statistic | None = None,
+    has_rays: bool = False,
+) -> tuple[KernelSpec, Array, TextureRegion | None]:
+    """Return what is computed at each pixel, and the texels [T, C] and texture regions [N] of N splats.
+
+    Keyword arguments are fields of `KernelSpec`.
+
+    Raises:
+      ValueError: if the appearance gives texture regions of another number of splats or a `max_alpha` outside (0, 1),
+        or if its element-wise functions return something else than they must.
+    """
+    (texels, regions), name, num = appearance.atlas(), type(appearance).__name__, splats.opacities.shape[0]
+    for field, given in {} if regions is None else regions._asdict().items():
+        if given.shape != (num,):
+            raise ValueError(
+                f"an appearance gives regions.{field} [N] of N = {num} gaussians; {name} gave {given.shape}"
+            )
+    if not 0 < appearance.alpha_limit < 1:
+        raise ValueError(f"max_alpha of an appearance must be in (0, 1); that of {name} is {appearance.alpha_limit}")
+    kernel = KernelSpec(
+        static=StaticShading.of(appearance),
+        num_own_numbers=splats.numbers.shape[1],
+        num_columns=0 if regions is None else texels.shape[1],
+        dtype=np.dtype(splats.M.dtype).name,
+        tile_size=tile_size,
+        near_plane=near_plane,
+        has_geometry=has_geometry,
+        statistic=statistic,
+        num_colors=splats.colors.shape[1],
+        has_rays=has_rays,
+    )
+    check_shading(kernel.static, kernel.arguments)
+    return kernel, texels, regions
 
 
 def _are_finite(M: Array, colors: Array, numbers: Array) -> Array:

@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
-from a2tg_jax.core.display import in_bytes
 from a2tg_jax.data import Scene
 from a2tg_jax.finish.compaction import (
     ASSUMED_PSNR,
@@ -22,12 +21,13 @@ from a2tg_jax.finish.compaction import (
 from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tune, Tuned, TunedFiles, smallest_tuned, tune_compact
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.io.rows import check_encodable
+from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.results.corrected import refined_views
+from a2tg_jax.results.corrected_metrics import refined_views
 from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of

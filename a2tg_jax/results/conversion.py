@@ -5,12 +5,11 @@ import math
 import time
 from pathlib import Path
 
-from a2tg_jax.appearance import Plain
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake
 from a2tg_jax.finish.distilling import likeness, pictures
+from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.formats import (
     file_bytes,
     files_of,
@@ -23,7 +22,7 @@ from a2tg_jax.io.formats import (
 )
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
-from a2tg_jax.results.output import check_new, check_output
+from a2tg_jax.results.output_checks import check_new, check_output
 from a2tg_jax.results.viewing import open_source
 
 
@@ -130,7 +129,8 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
     """Return a plain model, and what was done in words."""
     if model.origin is None or not model.origin.cameras:
         raise ValueError(f"--bake needs a model that knows its cameras; {source} has none")
-    if type(model.appearance.base) is Plain:
+    shown = model.appearance
+    if shown.is_portable and shown.texture is None and shown.exponents is None:
         return model, "baked: nothing, for the model is plain"
     training, held_out = cameras_apart(model.origin)
     plain = bake(model, training, growth=options.growth, iterations=options.iterations, progress=True)

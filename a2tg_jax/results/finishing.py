@@ -10,14 +10,13 @@ from a2tg_jax.data import Scene
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
 from a2tg_jax.host.atomic import final_of, replacing
-from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.regular_files import is_regular, sha256_of
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.results.corrected import refined_views
+from a2tg_jax.results.corrected_metrics import refined_views
 from a2tg_jax.results.finish_options import FinishOptions
 from a2tg_jax.results.folder import RunFolder, check_free, read_json, resuming_command, write_json
-from a2tg_jax.results.kept_lpips import sha256_of
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import RunRecord, read_record, write_record

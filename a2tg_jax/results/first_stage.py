@@ -22,7 +22,7 @@ from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import RunRecord
 from a2tg_jax.training import History
 from a2tg_jax.training.fitting import BACKGROUNDS
-from a2tg_jax.training.start import new_parameters
+from a2tg_jax.training.start import new_appearance
 
 
 class GivenSplats:
@@ -79,22 +79,21 @@ def write_first_stage(run: RunFolder, planned: PlannedStage, given: GivenSplats,
       scene: the scene of the run.
     """
     splats, appearance, system = given.taken().live, planned.stage.appearance, planned.system
-    shapes = splats.appearance.shapes(splats.params) if are_shapes_taken(splats, appearance) else None
+    shapes = splats.appearance.shapes if are_shapes_taken(splats, appearance) else None
     to_scene = scene.transform if splats.origin is None else splats.origin.transform.inverse().then(scene.transform)
     gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=shapes is not None), to_scene)
     gaussians = _of_degree(gaussians, system.initial_sh_degree)
-    params, layout = new_parameters(appearance, gaussians, system)
+    appearance = new_appearance(appearance, gaussians, system)
     if shapes is not None:
-        params = appearance.with_shapes(params, shapes)
-    origin = origin_of_scene(scene, BACKGROUNDS[system.background])
-    model = Model(gaussians, params, layout, appearance=appearance, origin=origin)
+        appearance = appearance.with_shapes(shapes)
+    model = Model(gaussians, appearance, background=BACKGROUNDS[system.background], origin=origin_of_scene(scene))
     save_model(run.own(run.model(planned.name)), model, {"init": str(given.file)})
     write_history(run.own(run.history(planned.name)), History.empty())
 
 
 def are_shapes_taken(splats: Model, appearance: Appearance) -> bool:
     """Return whether splats have shapes of kernels that a stage with this appearance takes over."""
-    return splats.appearance.shapes_name is not None and appearance.shapes_name is not None
+    return splats.appearance.exponents is not None and appearance.exponents is not None
 
 
 def _of_degree(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -292,12 +292,12 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def json_text(data: Any) -> str:
+def json_text(data: object) -> str:
     """Return indented JSON."""
     return json.dumps(data, indent=2, ensure_ascii=False)
 
 
-def write_json(path: Path, data: Any) -> None:
+def write_json(path: Path, data: object) -> None:
     """Write indented JSON atomically."""
     with replacing(path) as temporary:
         temporary.write_text(f"{json_text(data)}\n", encoding="utf-8")

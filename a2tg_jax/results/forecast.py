@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 import jax
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
-from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.data import Scene
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.host.cores import num_threads
+from a2tg_jax.host.machine import default_platform
 from a2tg_jax.host.memory import memory_limit
+from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import RunRecord
 from a2tg_jax.training import System
@@ -50,16 +51,16 @@ QUICK = "quick"
 QUICK_SIDE = 640
 """Longer side of the photographs, in pixels, with which `quick` takes minutes on two cores."""
 OPTIONS = {
-    "photographs": "--downscale, or --batch-size",
-    "model": "{limits}, --memory-budget or --sh-degree",
-    "gradients": "{limits}, --memory-budget, --batch-size or --sh-degree",
+    "photographs": "--downscale, or batch_size",
+    "model": "{limits}, memory_budget or sh_degree",
+    "gradients": "{limits}, memory_budget, batch_size or sh_degree",
     "pixels": "--downscale",
-    "corrections": "--corrections.grid-size or --downscale",
+    "corrections": "corrections.grid.size or --downscale",
 }
 """Options to change, by what needs most of the memory; `limits` are those of the systems' number of Gaussians."""
 OPTIONS_OF_FILES = {
-    "model": "--sh-degree, or a smaller --init file",
-    "gradients": "--batch-size, --sh-degree, or a smaller --init file",
+    "model": "sh_degree, or a smaller --init file",
+    "gradients": "batch_size, sh_degree, or a smaller --init file",
 }
 """Options to change where a file decides on the number of Gaussians."""
 
@@ -129,7 +130,7 @@ class RunForecast:
         )
 
     def check_one_device(self, limit: float) -> None:
-        """Raise if one of several devices has no room for the finished model, or for the state that an event reads.
+        """Raise if one of several devices has no room for the finished model besides its share of the state.
 
         Raises:
           ValueError: naming the options to change.
@@ -137,16 +138,15 @@ class RunForecast:
         phase, needed = max(self.whole.items(), key=lambda item: item[1], default=("", 0.0))
         if needed > limit:
             raise ValueError(
-                f"the model of {phase}, or the state that its events read whole, must fit on one device: that takes "
-                f"about {in_bytes(needed)}, and {in_bytes(limit)} may be used: change "
-                f"{self._told_options('model', phase)}"
+                f"the model of {phase} must fit on one device: that takes about {in_bytes(needed)}, and "
+                f"{in_bytes(limit)} may be used: change {self._told_options('model', phase)}"
             )
 
     def _told_options(self, largest: str, phase: str) -> str:
         """Return the options to change if this part of a phase's memory is the largest."""
         if phase in self.of_file and largest in OPTIONS_OF_FILES:
             return OPTIONS_OF_FILES[largest]
-        own = (f"--{name.replace('_', '-')}" for name in self.limits if name != "memory_budget")
+        own = (name for name in self.limits if name != "memory_budget")
         return OPTIONS[largest].format(limits=", ".join(own)).removeprefix(", ")
 
 
@@ -159,7 +159,7 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
       num_given: Gaussians of the file in place of the main system's first stage; None without one.
       num_devices: number of devices that train together; memory is that of all of them.
     """
-    is_host = jax.default_backend() == "cpu"
+    is_host = default_platform() == "cpu"
     stages = _stages(scene, plan, num_given, num_devices)
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
     for name, stage in stages.items():

@@ -11,9 +11,9 @@ from typing import Literal, get_args
 from PIL import Image
 
 from a2tg_jax.core.cameras import Camera, crop_camera
-from a2tg_jax.core.capture import turntable
+from a2tg_jax.core.capture_geometry import turntable
 from a2tg_jax.core.paths import path_through, smooth_path
-from a2tg_jax.host.bars import progress_over
+from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.path_file import load_views

@@ -12,7 +12,6 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import jax
 import matplotlib
 import numpy as np
 from matplotlib import colormaps
@@ -20,11 +19,11 @@ from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
-from a2tg_jax.core.display import enlarged
 from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.core.notebook_display import enlarged
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.model import Model
-from a2tg_jax.texture import AtlasLayout
+from a2tg_jax.texture import Textures
 
 ERROR_GAIN = 4
 CHECKER = (0.75, 0.55)
@@ -169,9 +168,9 @@ def level_colors(num_levels: int) -> np.ndarray:
     return colormaps["viridis"](np.linspace(0.0, 1.0, max(2, num_levels)))[:num_levels, :3]
 
 
-def texel_levels(layout: AtlasLayout) -> np.ndarray:
+def texel_levels(textures: Textures) -> np.ndarray:
     """Return [N] integers log₂(Tu·Tv), rounded; 0 for an empty texture."""
-    levels: np.ndarray = np.rint(np.log2(np.maximum(layout.sizes.prod(axis=1), 1))).astype(int)
+    levels: np.ndarray = np.rint(np.log2(np.maximum(textures.sizes.prod(axis=1), 1))).astype(int)
     return levels
 
 
@@ -186,12 +185,12 @@ def colored_by_level(model: Model, levels: np.ndarray) -> Model:
     """
     colors = (level_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
     if model.textures is not None:
-        textures, layout = model.textures
-        model = model.with_textures(jax.tree.map(lambda bucket: bucket.at[..., :3].set(0.0), textures), layout)
-    return with_colors(model, np.ones(model.gaussians.num, bool), colors)
+        buckets = tuple(bucket.at[..., :3].set(0.0) for bucket in model.textures.buckets)
+        model = model.with_textures(dataclasses.replace(model.textures, buckets=buckets))
+    return with_flat_colors(model, np.ones(model.gaussians.num, bool), colors)
 
 
-def with_colors(model: Model, is_chosen: np.ndarray, colors: np.ndarray) -> Model:
+def with_flat_colors(model: Model, is_chosen: np.ndarray, colors: np.ndarray) -> Model:
     """Return a model whose marked Gaussians have coefficients of degree 0 only: `colors`, one for all or [N, 3]."""
     sh = np.where(is_chosen[:, None, None], 0, model.sh)
     sh[:, 0] = np.where(is_chosen[:, None], colors, sh[:, 0])

@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax.core.display import in_bytes
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import in_bytes, shortened
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.results.folder import RunFolder, iteration_of, read_json, resuming_command
 from a2tg_jax.results.record import read_record, repeating_command
-from a2tg_jax.results.replacement import old_run
+from a2tg_jax.results.run_replacement import old_run
 
 SPLITS = ("test", "validation", "train")
 
@@ -111,10 +110,10 @@ def _stage_facts(run: RunFolder, name: str) -> dict[str, Any]:
     except ValueError as error:
         return {"state": "damaged", "damage": str(error)}
     facts = {"state": "finished", "model": str(path), "num_gaussians": model.num, "num_bytes": model.num_bytes}
-    if model.bands is not None:
-        facts["degrees"] = np.bincount(model.bands[1].degrees).tolist()
+    if model.appearance.bands is not None:
+        facts["degrees"] = np.bincount(model.degrees).tolist()
     if model.textures is not None:
-        sizes, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)
+        sizes, counts = np.unique(model.textures.sizes, axis=0, return_counts=True)
         facts["textures"] = {f"{tv}×{tu}": int(num) for (tv, tu), num in zip(sizes, counts, strict=True)}
     return facts
 

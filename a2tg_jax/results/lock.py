@@ -8,7 +8,7 @@ from pathlib import Path
 from a2tg_jax.host.atomic import left_over
 from a2tg_jax.host.operating_system import try_lock
 from a2tg_jax.results.folder import RunFolder, open_run
-from a2tg_jax.results.replacement import is_unfinished, undo_unfinished
+from a2tg_jax.results.run_replacement import is_unfinished, undo_unfinished
 
 
 @contextlib.contextmanager

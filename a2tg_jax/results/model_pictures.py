@@ -10,7 +10,6 @@ from jax import Array
 from matplotlib import colormaps
 from PIL import Image
 
-from a2tg_jax.appearance.textured import shown_textures
 from a2tg_jax.core.cameras import Camera, resize_camera
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.paths import smooth_path
@@ -41,12 +40,10 @@ def learned_textures(model: Model) -> np.ndarray | None:
     Returns:
       uint8 [H, W, 4], transparent between the textures; None if no Gaussian has more than one texel.
     """
-    options = model.appearance.texture_options
-    if model.textures is None or options is None:
+    texture = model.appearance.texture
+    if texture is None:
         return None
-    textures, layout = model.textures
-    texels = [np.asarray(own) for own in texture_arrays(shown_textures(textures, layout, options), layout)]
-    texels = texels[: model.num]
+    texels = texture_arrays(texture.shown())[: model.num]
     areas = np.exp(np.asarray(model.gaussians.log_scales)[: model.num].sum(axis=1))
     spread = np.asarray([own.reshape(-1, 4).var(axis=0).sum() if own.size > 4 else 0.0 for own in texels])
     order = [index for index in np.argsort(-areas * spread)[:NUM_TEXTURES] if spread[index] > 0]

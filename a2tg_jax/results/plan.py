@@ -7,13 +7,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.core.pytree import is_addition
 from a2tg_jax.training import Stage, System
 
 PACKAGE = "a2tg_jax"
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Largest number of iterations between checkpoints."""
-STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections", "floaters", "jitter")
+STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
 """Options of every system that reach training only through its stages."""
 
 
@@ -29,10 +28,8 @@ class PlannedStage:
     """Index of the stage in its system, from 0."""
     start: str | None
     """Name of the stage whose model it starts from; None for a first stage."""
-
-    @property
-    def stage(self) -> Stage:
-        return self.system.stages()[self.index]
+    stage: Stage = dataclasses.field(repr=False, compare=False)
+    """The stage itself."""
 
     @property
     def checkpoint_every(self) -> int:
@@ -94,7 +91,7 @@ def plan_run(systems: Mapping[str, System]) -> RunPlan:
     for label, system in systems.items():
         chain: list[str] = []
         for index, stage in enumerate(system.stages()):
-            wanted = PlannedStage(f"{label}-{stage.name}", system, index, chain[-1] if chain else None)
+            wanted = PlannedStage(f"{label}-{stage.name}", system, index, chain[-1] if chain else None, stage)
             shared = next((known for known in planned if _is_same(known, wanted)), None)
             if shared is None:
                 if wanted.name in {known.name for known in planned}:
@@ -108,24 +105,22 @@ def plan_run(systems: Mapping[str, System]) -> RunPlan:
 def _is_same(known: PlannedStage, wanted: PlannedStage) -> bool:
     """Return whether training both would give the same model, bit for bit."""
     same_place = (known.index, known.start) == (wanted.index, wanted.start)
-    return same_place and _trains_alike(known.system, wanted.system, wanted.index)
+    same_options = _common_options(known.system) == _common_options(wanted.system)
+    return same_place and same_options and _is_equal(known.stage, wanted.stage)
 
 
 def is_same_so_far(made: System, wanted: System, index: int) -> bool:
     """Return whether two systems train their stages up to `index` alike, whatever follows."""
-    return all(_trains_alike(made, wanted, at) for at in range(index + 1))
-
-
-def _trains_alike(a: System, b: System, index: int) -> bool:
-    """Return whether a stage of two systems gives the same model from the same start, bit for bit."""
-    return _common_options(a) == _common_options(b) and _is_equal(a.stages()[index], b.stages()[index])
+    if _common_options(made) != _common_options(wanted):
+        return False
+    stages, others = made.stages(), wanted.stages()
+    return all(_is_equal(stages[at], others[at]) for at in range(index + 1))
 
 
 def _common_options(system: System) -> list[Any]:
-    """Return the options that training reads from the system itself; additions not asked for are left out."""
-    own = [(field, getattr(system, field.name)) for field in dataclasses.fields(System)]
-    asked = [(field, value) for field, value in own if field.name not in STAGE_OPTIONS and not _is_absent(field, value)]
-    return [(field.name, value) if is_addition(field) else value for field, value in asked]
+    """Return the options that training reads from the system itself."""
+    names = [field.name for field in dataclasses.fields(System)]
+    return [getattr(system, name) for name in names if name not in STAGE_OPTIONS]
 
 
 def _is_equal(a: Stage, b: Stage) -> bool:
@@ -152,9 +147,7 @@ def _described(value: Any) -> Any:
     if value is None or isinstance(value, str | bool | int | float):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        named = ((field, getattr(value, field.name)) for field in dataclasses.fields(value))
-        # What is optional and absent says nothing, so that a new option does not make all that was trained another.
-        told = tuple((field.name, _described(own)) for field, own in named if not _is_absent(field, own))
+        told = tuple((field.name, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
         return _name_of(type(value)), told
     if isinstance(value, tuple | list):
         return _name_of(type(value)), *map(_described, value)
@@ -165,12 +158,6 @@ def _described(value: Any) -> Any:
     if isinstance(value, type) or callable(value):
         return _name_of(value)
     raise ValueError(f"a stage holds {value!r}, which cannot be told from others in another process")
-
-
-def _is_absent(field: dataclasses.Field[Any], value: Any) -> bool:
-    """Return whether it is a tuple that is empty, as it is by default, or an addition not asked for."""
-    is_empty = isinstance(value, tuple) and not value and field.default == ()
-    return is_empty or (is_addition(field) and value == field.default)
 
 
 def _name_of(value: Any) -> str:

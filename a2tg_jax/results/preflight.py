@@ -5,10 +5,10 @@ import shutil
 import warnings
 from pathlib import Path
 
-from a2tg_jax.core.display import in_bytes
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data import Scene
 from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.formats import format_of
 from a2tg_jax.measure.metrics import load_lpips
@@ -16,7 +16,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.results.first_stage import GivenSplats, are_shapes_taken
 from a2tg_jax.results.folder import KEPT_CHECKPOINTS, RunFolder, check_free
 from a2tg_jax.results.forecast import quicker_text, room_for_photographs, tell_forecast
-from a2tg_jax.results.output import check_output
+from a2tg_jax.results.output_checks import check_output
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, RunRecord
 from a2tg_jax.training import System
@@ -92,13 +92,11 @@ def check_init(given: GivenSplats, out: Path, system: System) -> None:
 
 def _left_out(splats: Model, system: System) -> list[str]:
     """Return, in words, what a first stage cannot take of splats."""
-    base, degree, lost = splats.appearance.base, system.initial_sh_degree, []
-    if base.shapes_name is not None:
-        if not are_shapes_taken(splats, system.stages()[0].appearance):
-            lost.append("the shapes of its kernels (the nearest Gaussians take their place)")
-        base = getattr(base, "inner", base).base
-    if type(base).__name__ != "Plain":
-        lost.append("what its splats show beside " + ("kernels" if splats.appearance.shapes_name else "Gaussians"))
+    shown, degree, lost = splats.appearance, system.initial_sh_degree, []
+    if shown.exponents is not None and not are_shapes_taken(splats, system.stages()[0].appearance):
+        lost.append("the shapes of its kernels (the nearest Gaussians take their place)")
+    if not shown.is_portable or shown.texture is not None:
+        lost.append("what its splats show besides " + ("kernels" if shown.exponents is not None else "Gaussians"))
     if splats.sh.shape[1] > NUM_BASES[degree]:
         lost.append(f"its spherical harmonics above degree {degree}")
     return lost
@@ -145,7 +143,7 @@ def gaussian_bytes(planned: PlannedStage, scene: Scene, num_given: int | None = 
     """Return the largest number of bytes of Gaussians that a system's first stage, or a file in its place, can
     leave."""
     system, first = planned.system, planned.system.stages()[0]
-    num = num_rows(first, initial_number(scene, system)) if num_given is None else num_given
+    num = num_rows(first, initial_number(scene, system, first)) if num_given is None else num_given
     if system.budget_bytes is not None:
         return system.budget_bytes
     return int(num * system.initial_bytes)
@@ -155,3 +153,23 @@ def _existing(path: Path) -> Path:
     """Return the folder, or the nearest above it that there is."""
     path = Path(os.path.abspath(path))
     return next(folder for folder in (path, *path.parents) if folder.is_dir())
+
+
+def check_held_out(model: Model, scene: Scene, path: Path) -> None:
+    """Raise ValueError if a model was trained on views that its scene holds out: their figures would be too good.
+
+    Args:
+      model: a model of a run; without an origin its views are unknown, and it passes.
+      scene: the scene of the run, as it is read now.
+      path: the file of the model.
+    """
+    if model.origin is None:
+        return
+    trained = {name for name, is_test in zip(model.origin.names, model.origin.is_test, strict=True) if not is_test}
+    leaked = sorted(trained & {view.name for view in scene.test} - {view.name for view in scene.train})
+    if leaked:
+        raise ValueError(
+            f"{path} was trained on {counted(len(leaked), 'view')} that {scene.name} now holds out, such as "
+            f"{leaked[0]}: the photographs have changed, or views of panoramas, which are held out together since, are "
+            "among them; train in a new folder"
+        )

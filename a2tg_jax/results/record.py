@@ -41,8 +41,8 @@ from a2tg_jax.results.finish_options import read_finish
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.plan import RunPlan, plan_run
 from a2tg_jax.training import System, find_system, like
-from a2tg_jax.training.options import BUDGET_OPTIONS, own_options
-from a2tg_jax.training.registry import differences, with_changes, with_earlier_options
+from a2tg_jax.training.options import own_options
+from a2tg_jax.training.registry import differences, with_changes
 
 SYNTHETIC = "synthetic"
 SYNTHETIC_SIZE = (208, 156)
@@ -207,12 +207,10 @@ class RunFile:
           ValueError: if there is no such system or preset, or an option is unknown or of another type.
         """
         system = chosen_system(self.system, self.preset)
-        return with_changes(system, with_earlier_options(type(system), self.options), f"{where}: options")
+        return with_changes(system, self.options, f"{where}: options")
 
     def compared(self, main: System, where: str) -> dict[str, Mapping[str, Any]]:
         """Return the options of compared systems, as `RunRecord.compare_options` has them.
-
-        Run folders of older versions lack options that were added since; these have their values of then.
 
         Args:
           main: the system that `chosen` returns.
@@ -233,18 +231,8 @@ class RunFile:
             if not isinstance(given, Mapping):
                 raise ValueError(f"{label} must be a table of options; got {shortened(given)}")
             with_changes(beside, given, label)
-            earlier = {} if self.version is None else _common(beside.earlier_options, own_options(beside, main))
-            found[name] = merged(earlier, given)
+            found[name] = given
         return found
-
-
-def _common(options: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of nested options that others have, too."""
-    found: dict[str, Any] = {}
-    for name in options.keys() & others.keys():
-        is_group = isinstance(options[name], Mapping) and isinstance(others[name], Mapping)
-        found[name] = _common(options[name], others[name]) if is_group else options[name]
-    return found
 
 
 def label_of(name: str) -> str:
@@ -353,10 +341,9 @@ def _options_beside(record: RunRecord) -> dict[str, Any]:
 
 def _budget_note(system: System) -> str:
     """Return a comment that names the options without effect beside a memory budget; empty if there are none."""
-    replaced = [name for name, value in flatten_config(system).items() if name in BUDGET_OPTIONS and value is not None]
-    if system.memory_budget is None or not replaced:
+    if system.memory_budget is None or not (caps := system.caps()):
         return ""
-    return f"# options.memory_budget decides in place of {', '.join(f'options.{name}' for name in replaced)}\n"
+    return f"# options.memory_budget decides in place of {', '.join(f'options.{name}' for name in caps)}\n"
 
 
 def read_record(run: RunFolder) -> RunRecord:

@@ -4,20 +4,21 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from a2tg_jax.core.origin import Color
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import encode_web_scene, is_viewable
-from a2tg_jax.measure.evaluation import evaluate
+from a2tg_jax.measure.evaluation import Evaluation, evaluate
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.corrected import measure_corrected, write_corrections
-from a2tg_jax.results.folder import RunFolder, resuming_command, write_json
-from a2tg_jax.results.held_out import check_held_out
+from a2tg_jax.results.corrected_metrics import measure_corrected, write_corrections
+from a2tg_jax.results.folder import RunFolder, read_json, resuming_command, write_json
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.images import (
     ERROR_GAIN,
@@ -28,8 +29,8 @@ from a2tg_jax.results.images import (
     side_by_side,
     to_uint8,
 )
-from a2tg_jax.results.kept_lpips import sha256_of, with_kept_lpips
 from a2tg_jax.results.plan import RunPlan
+from a2tg_jax.results.preflight import check_held_out
 from a2tg_jax.results.record import HeldOut, read_record
 from a2tg_jax.results.report import Comparison, ShownComparison, write_report
 from a2tg_jax.results.run_figures import write_figures
@@ -134,7 +135,7 @@ def _measure(
         train=found[len(scene.test) :],
         test=found[: len(scene.test)] if scene.test else None,
         num_gaussians=model.num,
-        num_texels=model.textures[1].num_texels if model.textures else 0,
+        num_texels=0 if model.textures is None else model.textures.num_texels,
         num_bytes=model.num_bytes,
         num_published_bytes=model.num_published_bytes,
         num_padding_bytes=model.num_padding_bytes,
@@ -179,3 +180,29 @@ def _write_sheet(path: Path, run: RunFolder, comparison: Comparison) -> None:
     error = error_picture(comparison.images[-1], comparison.images[0])
     sheet = side_by_side([*comparison.images, error], [*comparison.captions, f"error, {ERROR_GAIN} times"])
     save_picture(run.own(path), sheet)
+
+
+def with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dict[str, ModelResult]:
+    """Return the metrics with the LPIPS of metrics.json for every model file that has not changed since."""
+    try:
+        metrics, per_view = read_json(run.metrics), read_json(run.per_view)
+        network, models = metrics["lpips_network"], metrics["models"]
+        unchanged = {name for name, found in measured.items() if models.get(name, {}).get("sha256") == found.sha256}
+        return {
+            name: _with_lpips(found, per_view[name], network) if network and name in unchanged else found
+            for name, found in measured.items()
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return dict(measured)  # none was measured, or it cannot be read
+
+
+def _with_lpips(found: ModelResult, kept: Mapping[str, Any], network: str) -> ModelResult:
+    test = None if found.test is None else _merged(found.test, kept[found.held_out], network)
+    corrected = {key: _merged(evaluation, kept[key], network) for key, evaluation in found.corrected.items()}
+    train = _merged(found.train, kept["train"], network)
+    return dataclasses.replace(found, train=train, test=test, corrected=corrected)
+
+
+def _merged(found: Evaluation, kept: Mapping[str, Any], network: str) -> Evaluation:
+    per_view = tuple(dataclasses.replace(view, lpips=float(kept[view.name]["lpips"])) for view in found.per_view)
+    return dataclasses.replace(found, per_view=per_view, lpips_network=network)

@@ -69,7 +69,7 @@ def level_maps(model: Model) -> list[LevelMap]:
     if _vary(texels):
         names = ["1 or none", *(str(2**level) for level in range(1, texels.max() + 1))]
         maps.append(LevelMap("resolutions.png", "the number of its texels", texels, names))
-    degrees = np.zeros(0, int) if model.bands is None else model.bands[1].degrees
+    degrees = np.zeros(0, int) if model.appearance.bands is None else model.degrees
     if _vary(degrees):
         names = [str(degree) for degree in range(degrees.max() + 1)]
         maps.append(LevelMap("degrees.png", "the degree of its view dependence", degrees, names))
@@ -80,7 +80,7 @@ def _texel_levels(model: Model) -> np.ndarray:
     """Return [N] log₂ of the texels; none without textures."""
     if model.textures is None or model.appearance.texture_options is None:
         return np.zeros(0, int)
-    return texel_levels(model.textures[1])
+    return texel_levels(model.textures)
 
 
 def _vary(levels: np.ndarray) -> bool:
@@ -126,7 +126,7 @@ def _textures(run: RunFolder, model: Model) -> list[ReportFigure]:
         told = "Some textures that add much to the picture, in their Gaussians' colours; chequered where transparent."
         found.append(ReportFigure(path, told, "texels"))
     path = run.own(run.figures / "sizes.png")
-    save_figure(path, sizes_figure(model.textures[1].sizes))
+    save_figure(path, sizes_figure(model.textures.sizes))
     return [*found, ReportFigure(path, "How many Gaussians have a texture of each resolution.", "chart")]
 
 

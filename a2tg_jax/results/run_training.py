@@ -12,13 +12,13 @@ from a2tg_jax.io.model_file import FORMAT, load_model, save_model
 from a2tg_jax.model import Model
 from a2tg_jax.results.first_stage import GivenSplats, given_splats, write_first_stage
 from a2tg_jax.results.folder import RunFolder, iteration_of
-from a2tg_jax.results.held_out import check_held_out
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.plan import PlannedStage, is_same_so_far
+from a2tg_jax.results.preflight import check_held_out
 from a2tg_jax.results.record import OnNan, RunRecord, read_record, write_record
-from a2tg_jax.results.replacement import set_aside
+from a2tg_jax.results.run_replacement import set_aside
+from a2tg_jax.results.several_processes import tell_end, tell_stage
 from a2tg_jax.results.tensorboard import EventWriter
-from a2tg_jax.results.together import tell_end, tell_stage
 from a2tg_jax.training import (
     Checkpoint,
     DivergedError,

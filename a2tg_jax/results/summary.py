@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from a2tg_jax.measure.evaluation import Evaluation
-from a2tg_jax.results.corrected import corrected_title
+from a2tg_jax.results.corrected_metrics import corrected_title
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import HeldOut, RunRecord
 
@@ -47,7 +47,7 @@ class ModelResult:
     sha256: str = ""
     """SHA-256 of the model's file."""
     corrected: Mapping[str, Evaluation] = dataclasses.field(default_factory=dict)
-    """Metrics up to exposure and pose (`results.corrected`), if a system of the run learns these."""
+    """Metrics up to exposure and pose (`results.corrected_metrics`), if a system of the run learns these."""
     held_out: HeldOut = "test"
     """Kind of the held-out views."""
 

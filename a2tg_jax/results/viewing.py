@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.host.regular_files import is_regular
@@ -43,7 +43,7 @@ class Source:
     title: str
     note: str = ""
     """Note that the viewer shows."""
-    settings: RenderSettings = RenderSettings()  # noqa: RUF009 - frozen
+    settings: RenderSettings = RenderSettings()
     """Render settings."""
     load_scene: Callable[[], Scene | None] = lambda: None
     """Loader of the photographs; None if they are missing. Raises ValueError or OSError if they cannot be read."""
@@ -142,12 +142,13 @@ def scene_or_warning(load_scene: Callable[[], Scene | None]) -> Scene | None:
 class ServedPhotographs:
     """Photographs of a model's cameras, served as JPEG and read on demand."""
 
-    def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None]):
+    def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None], background: Color = BLACK):
         """Args:
-        origin: the cameras, and the background behind photographs that are transparent; None without cameras.
+        origin: the cameras; None without cameras.
         load_scene: finds the photographs, or None.
+        background: RGB behind photographs that are transparent.
         """
-        self._origin, self._load_scene = origin, load_scene
+        self._origin, self._load_scene, self._background = origin, load_scene, background
         self._lock = threading.Lock()
         self._views: dict[int, View] | None = None
 
@@ -165,7 +166,7 @@ class ServedPhotographs:
         if view is None or self._origin is None:
             return None
         buffer = io.BytesIO()
-        pixels = to_uint8(view_image(view, self._origin.background))
+        pixels = to_uint8(view_image(view, self._background))
         Image.fromarray(pixels).save(buffer, format="JPEG", quality=QUALITY)
         return buffer.getvalue()
 
@@ -195,7 +196,7 @@ def routes_of(source: Source) -> dict[str, Route]:
     return {
         "/": Route("text/html; charset=utf-8", viewer_html().encode()),
         f"/{SCENE_NAME}": Route("application/octet-stream", source.encoded),
-        **ServedPhotographs(source.model.origin, load_scene).routes,
+        **ServedPhotographs(source.model.origin, load_scene, source.model.background).routes,
     }
 
 

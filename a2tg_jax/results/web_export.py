@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_on_views
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.folder import read_json
-from a2tg_jax.results.output import check_new
-from a2tg_jax.results.replacement import remove_if_empty
+from a2tg_jax.results.output_checks import check_new
+from a2tg_jax.results.run_replacement import remove_if_empty
 from a2tg_jax.results.viewing import ServedPhotographs, Source, middle_of, scene_or_warning
 from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html, viewer_html_with
 
@@ -104,7 +104,7 @@ def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]
     files = {out / SCENE_NAME: source.encoded}
     views: list[int] = []
     if photographs:
-        found = ServedPhotographs(source.model.origin, source.load_scene)
+        found = ServedPhotographs(source.model.origin, source.load_scene, source.model.background)
         if not found.views:
             raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
         files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in found.views}

@@ -9,22 +9,22 @@ from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import Devices
-from a2tg_jax.host.processes import team
+from a2tg_jax.parallel.processes import team
 from a2tg_jax.results.first_stage import GivenSplats, given_splats
 from a2tg_jax.results.folder import RunFolder, check_free, create_run, resuming_command
 from a2tg_jax.results.lock import claimed
 from a2tg_jax.results.preflight import check_new_run
 from a2tg_jax.results.record import RunRecord, read_record, write_record
-from a2tg_jax.results.replacement import drop_old
 from a2tg_jax.results.run_evaluation import evaluate_run
+from a2tg_jax.results.run_replacement import drop_old
 from a2tg_jax.results.run_training import train_run
+from a2tg_jax.results.several_processes import check_alike
 from a2tg_jax.results.summary import RunResult
-from a2tg_jax.results.together import check_alike
 from a2tg_jax.training import Session
 from a2tg_jax.training.loop import Watch, unwatched
 
 LESS_MEMORY = (
-    "close other programs, or start another run with a larger --downscale, or a smaller --memory-budget or --batch-size"
+    "close other programs, or start another run with a larger --downscale, or a smaller memory_budget or batch_size"
 )
 """Advice of the command line for trainings that have run out of memory."""
 Watched = Callable[[Scene], AbstractContextManager[Watch]]

@@ -10,7 +10,6 @@ from a2tg_jax.training.fitting import FitResult as FitResult
 from a2tg_jax.training.fitting import StageResult as StageResult
 from a2tg_jax.training.fitting import fit as fit
 from a2tg_jax.training.fitting import fit_stage as fit_stage
-from a2tg_jax.training.option_groups import FloaterConfig as FloaterConfig
 from a2tg_jax.training.option_groups import LossConfig as LossConfig
 from a2tg_jax.training.options import System as System
 from a2tg_jax.training.options import like as like

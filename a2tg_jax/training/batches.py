@@ -16,8 +16,9 @@ from a2tg_jax.data.observations import ObservedPoints, check_observed_points, st
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.cores import num_threads
 from a2tg_jax.host.text import shortened
-from a2tg_jax.rasterize.exchange import Exchange
-from a2tg_jax.rasterize.placement import are_drawn_here, asked_by_any, everywhere, spread_pixels, spread_views
+from a2tg_jax.parallel.exchange import Exchange
+from a2tg_jax.parallel.pictures import are_drawn_here, on_devices
+from a2tg_jax.parallel.rows import asked_by_any, everywhere
 from a2tg_jax.training.losses import SSIM_WINDOW
 
 HOST_SHARE = 2**30
@@ -166,7 +167,8 @@ class PhotoStore:
         self._views, self._order, self._last, self._exchange = views, order, last, exchange
         self._extras = extras
         plan = plan_batches(views, len(order.indices(1)), room, extras)
-        self.is_resident, self.num_ahead = not asked_by_any(exchange, not plan.is_resident), plan.num_ahead
+        self._mesh = None if exchange is None else exchange.mesh
+        self.is_resident, self.num_ahead = not asked_by_any(self._mesh, not plan.is_resident), plan.num_ahead
         self._keeps_rays = plan.keeps_rays
         self._rays: dict[tuple[int, int, int], Array] = {}
         self._stacks: dict[tuple[int, int, int], tuple[Photographs, dict[int, int]]] = {}
@@ -186,7 +188,7 @@ class PhotoStore:
             following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
             batch = self._ahead.first({key: self._order.indices(key) for key in following})
             batch = batch._replace(rays=self._rays_of(kind, batch.rays))
-            return on_devices(batch, self._exchange, spread_views), None
+            return batch if self._exchange is None else on_devices(self._exchange, batch, is_batch=True), None
         stack, places = self._stack(kind)
         return stack, np.asarray([places[index] for index in indices], np.int32)
 
@@ -195,9 +197,11 @@ class PhotoStore:
         if kind not in self._stacks:
             found = [index for index, own in enumerate(self._order.kinds) if own == kind]
             stack = self._stacked(found)
-            stack = on_devices(stack._replace(rays=self._rays_of(kind, stack.rays)), self._exchange, spread_pixels)
+            stack = stack._replace(rays=self._rays_of(kind, stack.rays))
             if self._exchange is None:
                 stack = jax.device_put(stack)
+            else:
+                stack = on_devices(self._exchange, stack, is_batch=False)
             self._stacks[kind] = stack, {index: place for place, index in enumerate(found)}
         return self._stacks[kind]
 
@@ -207,8 +211,7 @@ class PhotoStore:
         if rays is None:
             return None
         if kind not in self._rays:
-            exchange = self._exchange
-            placed = jax.device_put(rays) if exchange is None else everywhere(exchange, rays)
+            placed: Array = jax.device_put(rays) if self._mesh is None else everywhere(self._mesh, rays)
             if not self._keeps_rays:
                 return placed
             self._rays[kind] = placed
@@ -226,26 +229,6 @@ class PhotoStore:
     def close(self) -> None:
         """Ends the threads."""
         self._ahead.close()
-
-
-def on_devices(
-    photographs: Photographs, exchange: Exchange | None, spread: Callable[[Exchange, Array], Array]
-) -> Photographs:
-    """Return photographs with their pictures spread over the devices by a function, and their points on every device;
-    without an exchange they stay. The rays of their lens stay in any case."""
-    if exchange is None:
-        return photographs
-    on_all, in_parts = (functools.partial(place, exchange) for place in (everywhere, spread))
-    return Photographs(
-        viewmats=on_all(photographs.viewmats),
-        Ks=on_all(photographs.Ks),
-        images=in_parts(photographs.images),
-        alphas=None if photographs.alphas is None else in_parts(photographs.alphas),
-        masks=None if photographs.masks is None else in_parts(photographs.masks),
-        depths=None if photographs.depths is None else in_parts(photographs.depths),
-        rays=photographs.rays,
-        points=None if photographs.points is None else ObservedPoints(*map(on_all, photographs.points)),
-    )
 
 
 class Ahead:
@@ -283,16 +266,16 @@ def check_loss_data(views: tuple[View, ...], extras: Extras, has_ssim: bool) -> 
             height, width = view.picture.size
             raise ValueError(
                 f"view {view.name} has {width} by {height} pixels, but the loss has SSIM, which needs {SSIM_WINDOW} by "
-                f"{SSIM_WINDOW}: lower --downscale, or set --loss.ssim-weight to 0"
+                f"{SSIM_WINDOW}: take larger photographs, or set loss.ssim_weight to 0"
             )
     if extras.depths and all(view.depth is None for view in views):
         raise ValueError(
-            "--loss.depth-weight, or a term of your own, wants depth maps, but no training view has one: put them as "
+            "loss.depth_weight, or a custom term, needs depth maps, but no training view has one: put them as "
             "NAME.npy or NAME.png into the folder depths beside images, or leave it out"
         )
     if extras.points and all(view.points is None for view in views):
         raise ValueError(
-            "--loss.points-weight, or a term of your own, wants points that photographs observed, but no training view "
+            "loss.points_weight, or a custom term, needs points that photographs observed, but no training view "
             "has any: load a COLMAP model whose images list them (in Python, say scene_from_arrays(…, observed=…)), or "
             "leave it out"
         )

@@ -10,15 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.training.corrections import Correction
+from a2tg_jax.training.corrections import FadingCorrection
 
 LUMINANCE = (0.299, 0.587, 0.114)
 """Weights of red, green and blue (BT.601)."""
+LARGEST_GRID = 64
+"""Largest number of nodes of a grid along each of its axes."""
 
 
 @pytree
-class BilateralGrid(Correction):
+class BilateralGrid(FadingCorrection):
     """An affine map of colours per view, position and luminance, [L, Gy, Gx, 3, 4]; see `sliced`.
 
     Each node is on average over the views the identity. Cameras look at one subject, so that a change which all views
@@ -26,23 +29,27 @@ class BilateralGrid(Correction):
     """
 
     size: tuple[int, int, int] = static(default=(4, 4, 4))
-    """Numbers (Gx, Gy, L) of nodes along x, along y, and of luminances."""
+    """Numbers (Gx, Gy, L) of nodes along x, along y, and of luminances, each up to 64."""
     rate: float = 5e-3
+    """Adam's learning rate of the grids."""
     final_factor: float = 0.1
-    """Factor of the rate at the end of a stage."""
+    """Factor of the rate at the end of a stage; a system's later stages keep the rate of the first one's end."""
     smoothness: float = 10.0
-    """Weight of the total variation of the grid in the loss."""
+    """Weight of the total variation of the grids in the loss."""
 
     name = "bilateral_grid"
     bytes_per_pixel = 89  # as XLA reports for the gradient of `sliced`
+
+    def check_options(self) -> None:
+        super().check_options()
+        if not all(1 <= number <= LARGEST_GRID for number in self.size):
+            raise ValueError(f"size must be numbers in 1..{LARGEST_GRID}; got {self.size}")
+        check_number("smoothness", self.smoothness, least=0)
 
     @property
     def neutral(self) -> np.ndarray:
         columns, rows, levels = self.size
         return np.tile(np.eye(3, 4), (levels, rows, columns, 1, 1))
-
-    def learning_rate(self, progress: Array) -> Array:
-        return self.rate * self.final_factor**progress
 
     def color(self, row: Array, color: Array) -> Array:
         return sliced(row, color)

@@ -9,13 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.core.display import counted
+from a2tg_jax.appearance import Appearance
+from a2tg_jax.appearance.base import check_appearance
+from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.core.table import Table
 from a2tg_jax.host.machine import ALONE, Devices, Machine, this_machine
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import counted, shortened
 from a2tg_jax.io.archive import read_archive, write_archive
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.io.model_file import LONGEST_REASON
 from a2tg_jax.io.validate import check_count
 from a2tg_jax.model import Model
@@ -199,7 +203,7 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> Non
         "num_refused": checkpoint.num_refused,
         "terms": [*checkpoint.history.terms],
     }
-    shown = model.appearance.arrays(model.params, model.layout)
+    shown = arrays_of(model.appearance, model.gaussians.sh_degree)
     arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
     state = dataclasses.replace(state, moments=_packed(model, state.moments))
     rest = _rest(state), dataclasses.asdict(checkpoint.history)
@@ -240,17 +244,17 @@ def _checkpoint_of(
     (gaussians,) = _filled((Gaussians(*range(5)),), arrays)
     check_gaussians(gaussians)
     shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}
-    params, layout = stage.appearance.from_arrays(shown)
+    appearance = with_arrays(stage.appearance, shown, gaussians.sh_degree)
     gaussians = jax.tree.map(jnp.asarray, gaussians)
-    stage.appearance.check(params, layout, gaussians)
-    wanted = _wanted(stage, gaussians, params, layout, is_ahead)
+    check_appearance(appearance, gaussians)
+    wanted = _wanted(stage, gaussians, appearance, is_ahead)
     terms = header.get("terms", [])  # no history of an older version has them
     if not isinstance(terms, list) or not all(isinstance(name, str) for name in terms):
         raise ValueError(f"terms must be a list of names; got {shortened(terms)}")
     kept = _rest(wanted), dict.fromkeys(COLUMNS, 0) | {"terms": dict.fromkeys(terms, 0)}
     _, (rest, columns) = _filled((gaussians, kept), arrays)
     moments, num_live, *others = jax.tree.map(jnp.asarray, rest)
-    model = Model(gaussians, params, layout, num_live, appearance=stage.appearance)
+    model = Model(gaussians, appearance, num_live)
     state, history = TrainState(model, moments, *others), History(**columns)
     check_state(state, wanted, stage)
     check_history(history)
@@ -273,11 +277,17 @@ def _rest(state: TrainState) -> tuple[Any, ...]:
 
 
 def _packed(model: Model, moments: AdamState) -> AdamState:
-    """Return moments at the capacity that parameters get when they are loaded, which may be less than in training."""
+    """Return moments at the capacity that tables get when they are loaded, which may be less than in training."""
+    _, rest = partition(model.appearance)
+    rows = np.arange(model.gaussians.num)
 
-    def packed(moment: Any) -> Any:
-        gaussians, params = moment
-        return gaussians, model.appearance.first_rows(params, model.layout, model.gaussians.num)[0]
+    def smaller(leaf: Any) -> Any:
+        return leaf.take(rows, padding=(0.0,) * len(leaf.padding)) if isinstance(leaf, Table) else leaf
+
+    def packed(moment: Model) -> Model:
+        whole = combine(moment.appearance, rest)
+        whole = jax.tree.map(smaller, whole, is_leaf=lambda leaf: isinstance(leaf, Table))
+        return dataclasses.replace(moment, appearance=partition(whole)[0])
 
     return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))
 
@@ -294,9 +304,54 @@ def _filled(template: Any, arrays: dict[str, np.ndarray]) -> Any:
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
-def _wanted(stage: Stage, gaussians: Gaussians, params: Any, layout: Any, is_ahead: Sequence[bool]) -> TrainState:
+def _wanted(stage: Stage, gaussians: Gaussians, appearance: Appearance, is_ahead: Sequence[bool]) -> TrainState:
     """Return the shapes and dtypes of a state of a stage, some of whose events may be past."""
-    model = Model(gaussians, params, layout, jnp.zeros((), jnp.int32), appearance=stage.appearance)
+    model = Model(gaussians, appearance, jnp.zeros((), jnp.int32))
     state: TrainState = jax.eval_shape(lambda: initial_state(stage, model, [""]))
     events = (event if ahead else None for event, ahead in zip(state.events, is_ahead, strict=True))
     return dataclasses.replace(state, events=tuple(events))
+
+
+def check_resume(resume: Checkpoint, system: System, index: int) -> None:
+    """Raise ValueError unless the checkpoint is of that stage of that system."""
+    if resume.stage != index:
+        raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to go on")
+    if resume.system != system:
+        raise ValueError(
+            f"the checkpoint was made with another configuration ({_differing(resume.system, system)}): resume with "
+            f"checkpoint.system{_or_anew(resume.system, system)}"
+        )
+    found, wanted = resume.state.model.gaussians.sh_degree, system.initial_sh_degree
+    if found != wanted:
+        raise ValueError(
+            f"the checkpoint's Gaussians are of degree {found}, but the system's of {wanted}: it was made by an older "
+            "version, so train anew"
+        )
+
+
+def _is_defined_anew(before: System, now: System) -> bool:
+    """Return whether the classes of two systems are of one name and module, as when a notebook's cell runs twice."""
+    kinds = type(before), type(now)
+    return kinds[0] is not kinds[1] and len({(kind.__module__, kind.__qualname__) for kind in kinds}) == 1
+
+
+def _or_anew(before: System, now: System) -> str:
+    """Return what leads to the new class, for advice; empty if it is the same one."""
+    if not _is_defined_anew(before, now):
+        return ""
+    return f", or with load_checkpoint(path, {type(now).__name__}) of what save_checkpoint wrote, for the new class"
+
+
+def _differing(before: System, now: System) -> str:
+    """Return the options in which two systems differ, in a few words."""
+    if _is_defined_anew(before, now):
+        return f"the class {type(now).__name__} as it was before it was defined anew"
+    if type(before) is not type(now):
+        return f"{type(before).__name__}, not {type(now).__name__}"
+    values, others = flatten_config(before), flatten_config(now)
+    pairs = ((name, value, others[name]) for name, value in values.items() if value != others[name])
+    return shortened(", ".join(f"{name} {value!r}, not {other!r}" for name, value, other in pairs), MOST_TOLD)
+
+
+MOST_TOLD = 300
+"""Largest number of characters of the options that differ from a checkpoint's."""

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import pytree
@@ -32,6 +33,13 @@ class Correction:
     """Name, unique in its stage; files use it for the rows."""
     bytes_per_pixel: ClassVar[float] = 0
     """Bytes of a step's own buffers for each pixel, gradients included, for forecasts."""
+
+    def check_options(self) -> None:
+        """Check the ranges of the fields (host). A stage calls it.
+
+        Raises:
+          ValueError: beginning with the name of the field.
+        """
 
     @property
     def neutral(self) -> np.ndarray:
@@ -59,25 +67,37 @@ class Correction:
         return rows
 
 
+class FadingCorrection(Correction):
+    """Base class of corrections with a learning rate `rate` that falls by `final_factor` over a stage."""
+
+    rate: float
+    final_factor: float
+
+    def check_options(self) -> None:
+        check_number("rate", self.rate, least=0)
+        check_number("final_factor", self.final_factor, above=0)  # The decay is exponential.
+
+    def learning_rate(self, progress: Array) -> Array:
+        return self.rate * self.final_factor**progress
+
+
 @pytree
-class Exposure(Correction):
+class Exposure(FadingCorrection):
     """An affine map of colours per view, [3, 4], c ↦ A·c + b; on average over the views it changes nothing.
 
     A change shared by all views would only shift the model, and leave test views without an exposure.
     """
 
     rate: float = 1e-2
+    """Adam's learning rate of the affine maps of colours."""
     final_factor: float = 0.1
-    """Factor of the rate at the end of a stage."""
+    """Factor of the rate at the end of a stage; a system's later stages keep the rate of the first one's end."""
 
     name = "exposure"
 
     @property
     def neutral(self) -> np.ndarray:
         return np.eye(3, 4)
-
-    def learning_rate(self, progress: Array) -> Array:
-        return self.rate * self.final_factor**progress
 
     def color(self, row: Array, color: Array) -> Array:
         return exposed(row, color)
@@ -87,22 +107,20 @@ class Exposure(Correction):
 
 
 @pytree
-class PoseRefinement(Correction):
+class PoseRefinement(FadingCorrection):
     """A small rigid motion per view, a twist [6] in the camera's frame (`core.rigid.moved_viewmat`)."""
 
     rate: float = 1e-3
-    """Learning rate in radians and in units of the normalised world; cameras are about 1 from what they see."""
+    """Adam's learning rate of the camera motions, in radians and in units of the normalised world, in which cameras are
+    about 1 from what they see."""
     final_factor: float = 0.01
-    """Factor of the rate at the end of a stage."""
+    """Factor of the rate at the end of a stage; a system's later stages keep the rate of the first one's end."""
 
     name = "pose"
 
     @property
     def neutral(self) -> np.ndarray:
         return np.zeros(6)
-
-    def learning_rate(self, progress: Array) -> Array:
-        return self.rate * self.final_factor**progress
 
     def camera(self, row: Array, camera: Camera) -> Camera:
         return dataclasses.replace(camera, viewmat=moved_viewmat(row, camera.viewmat))

@@ -10,13 +10,12 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import jax
-
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.data.scene import Scene, View, ray_bytes
 from a2tg_jax.events import HostEvent, StepEvent
 from a2tg_jax.host.cores import num_threads
+from a2tg_jax.host.machine import default_platform
 from a2tg_jax.training.batches import NO_EXTRAS, Extras, plan_batches, view_bytes
 from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.options import System
@@ -32,8 +31,6 @@ COMPILER = 240 * MB
 """Memory of the compiler during a step's compilation."""
 STATES = 3
 """Parameters and the two moments of Adam."""
-WHOLE_STATES = 2
-"""States on one of several devices while an event changes them that reads all rows (`Event.reads_whole`)."""
 STEP_PER_MODEL, STEP_PER_ROW, STEP_PER_PIXEL, STEP_PER_PAIR = 2.9, 300, 123, 4
 """Bytes of a step's own buffers: for each byte of the model (gradients and the new state), row (splats), pixel
 (colours, loss, and the gradients of both) and pair (tile lists)."""
@@ -91,8 +88,7 @@ class StageForecast:
     seconds: float
     """All its iterations, on CPUs, roughly."""
     whole_bytes: float
-    """Bytes that one of several devices must have room for: its share, and the finished model, or the state if an event
-    reads it whole."""
+    """Bytes that one of several devices must have room for: its share, and the finished model."""
 
     @property
     def is_trained(self) -> bool:
@@ -111,8 +107,8 @@ def forecast_stages(
       num_given: Gaussians of a file in place of the first stage, which takes nothing then; None: it is trained.
       num_devices: number of devices that train together; bytes are of all of them.
     """
-    num, floats, shown = initial_number(scene, system), 0.0, None
     stages = system.stages()
+    num, floats, shown = initial_number(scene, system, stages[0]), 0.0, None
     if num_given is not None:
         num, stages = num_given, stages[1:]
         yield _given_stage(system, num)
@@ -127,8 +123,7 @@ def forecast_stages(
         floats = model_bytes / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
-        is_read = any(event.reads_whole and event.iterations(stage.iterations) for event in on_host)
-        whole = (max(1, WHOLE_STATES * STATES * is_read) + (STATES + 1) / num_devices) * model_bytes
+        whole = (1 + (STATES + 1) / num_devices) * model_bytes
         seconds = stage.iterations * system.batch_size * iteration_seconds(scene.train, num)
         needed = stage_bytes(scene, system, stage, num, model_bytes, num_devices)
         yield StageForecast(needed, model_bytes, num, programs, seconds, whole)
@@ -159,7 +154,7 @@ def stage_bytes(
       num_devices: number of devices that train together; bytes are of all of them.
     """
     at_once = math.gcd(system.batch_size, num_devices)
-    images = at_once * (num_devices if jax.default_backend() == "cpu" else 1)
+    images = at_once * (num_devices if default_platform() == "cpu" else 1)
     is_changed = any(isinstance(event, HostEvent) and event.iterations(stage.iterations) for event in stage.events)
     largest, batch = largest_view(scene.train), system.batch_size
     per_pixel = STEP_PER_PIXEL + GEOMETRY_PER_PIXEL * stage.has_geometry

@@ -10,8 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.rasterize.exchange import spread
-from a2tg_jax.rasterize.placement import readable
+from a2tg_jax.parallel.rows import readable, spread
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.step import Attempt, StepSettings, attempt
 
@@ -46,13 +45,15 @@ def jitted_attempt() -> jax.stages.Wrapped:
 
 
 def _spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:
-    # Else XLA may choose shardings that JAX cannot name, as where it has divided the devices among views.
     tried, exchange = attempt(settings, *arguments), settings.render.exchange
+    if exchange is None:
+        return tried
+    # Else XLA may choose shardings that JAX cannot name, as where it has divided the devices among views.
     of_views = tried.views.grads, tried.views.statistic
     nothing: Any = None
     views = tried.views._replace(grads=nothing, statistic=nothing)
-    rest: Attempt = spread(exchange, tried._replace(views=views))
-    grads, statistic = spread(exchange, of_views, axis=1)
+    rest: Attempt = spread(exchange.mesh, tried._replace(views=views))
+    grads, statistic = spread(exchange.mesh, of_views, axis=1)
     return rest._replace(views=rest.views._replace(grads=grads, statistic=statistic))
 
 
@@ -68,13 +69,13 @@ def what_diverged(arguments: tuple[Any, ...], names: Sequence[str]) -> str:
     found = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
     found += [f"the gradient by {told}" for told in _not_finite(tried.grads)]
     model, corrections = tried.state.model, tuple(known.rows for known in tried.state.corrections)
-    found += [f"after the step, {told}" for told in _not_finite((model.gaussians, model.params, corrections))]
+    found += [f"after the step, {told}" for told in _not_finite((model.gaussians, model.appearance, corrections))]
     return "; ".join(found) or f"the loss of {', '.join(names)} is {np.mean(losses):.4g}"
 
 
 def _not_finite(parameters: tuple[Any, ...]) -> Iterator[str]:
-    """Yield each leaf of (gaussians, params, corrections) with such numbers, and their rows."""
-    for prefix, part in zip(("", "params", "corrections"), parameters, strict=True):
+    """Yield each leaf of (gaussians, appearance, corrections) with such numbers, and their rows."""
+    for prefix, part in zip(("", "appearance", "corrections"), parameters, strict=True):
         for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
             numbers = np.asarray(leaf)
             is_bad = ~np.isfinite(numbers).all(axis=tuple(range(1, numbers.ndim)))  # There may be 0 rows.

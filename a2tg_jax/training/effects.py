@@ -7,9 +7,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.core.display import counted
-from a2tg_jax.core.spread_arrays import on_host
 from a2tg_jax.events import Change, Event, HostEvent, StepEvent
+from a2tg_jax.host.text import counted
+from a2tg_jax.parallel.rows import on_host
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
 from a2tg_jax.training.step import TrainState
@@ -134,7 +134,7 @@ class StageEffects:
             if not own.has_changed:
                 told.append(f"{type(event).__name__} changed nothing, though it happened {own.num_applied:,} times")
             elif own.unused:
-                told.append(self._system.told(event, own.unused))
+                told.append(f"{self._system.path_of(event)}.{own.unused}")
         if told:
             warnings.warn(f"stage {self._stage.name!r}: {'; '.join(told)}", stacklevel=2)
 

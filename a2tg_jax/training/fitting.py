@@ -3,22 +3,21 @@
 import dataclasses
 import os
 import warnings
+from typing import Any
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind
-from a2tg_jax.core.display import counted, in_bytes
 from a2tg_jax.core.forks import check_process
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.host import signals
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import counted, in_bytes, shortened
 from a2tg_jax.model import Model
 from a2tg_jax.training.batches import check_loss_data, check_views
-from a2tg_jax.training.checkpoint import Checkpoint, History
+from a2tg_jax.training.checkpoint import Checkpoint, History, check_resume
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, StageRun, Watch, never, unwatched
 from a2tg_jax.training.options import System
-from a2tg_jax.training.resume import check_resume
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import check_start, initial_model
@@ -117,34 +116,30 @@ def fit(
       DivergedError: if the loss or a gradient is not finite, or the loss explodes; the error holds the state before.
       ValueError: if options contradict each other, the scene or the checkpoint.
     """
-    _check_arguments(scene, system, resume)
+    _check_arguments(scene, system, resume, checkpoint_every)
+    stages, first = system.stages(), 0
     if resume is None:
         check_start(scene, system)
     else:
-        check_resume(resume, system, resume.stage)
+        first = resume.stage
+        check_resume(resume, system, first)
+        for stage in stages[first:]:
+            check_loss_data(scene.train, stage.extras, stage.has_ssim)
     session = Session() if session is None else session
-    first = 0 if resume is None else resume.stage
     results: list[StageResult] = []
     with signals.ctrl_c_noted() as is_interrupted:
-        for index in range(first, len(system.stages())):
-            result = fit_stage(
-                scene,
-                system,
-                index,
-                results[-1].model if results else None,
-                resume=resume if index == first else None,
-                on_checkpoint=on_checkpoint,
-                checkpoint_every=checkpoint_every,
-                on_log=on_log,
-                progress=progress,
-                is_stopped=lambda: is_interrupted() or is_stopped(),
-                session=session,
-            )
+        for index in range(first, len(stages)):
+            start = results[-1].model if results else None
+            result = _train_stage(
+                scene, system, index, start, resume if index == first else None, None, session, on_log,
+                is_last=index == len(stages) - 1, on_checkpoint=on_checkpoint, checkpoint_every=checkpoint_every,
+                progress=progress, is_stopped=lambda: is_interrupted() or is_stopped(),
+            )  # fmt: skip
             results.append(result)
     return FitResult(system, tuple(results))
 
 
-def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None) -> None:
+def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None, checkpoint_every: int | None) -> None:
     """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
     check_process()
     is_path = str, os.PathLike
@@ -159,6 +154,8 @@ def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None) ->
     check_kind("system", system, System, example)
     if resume is not None:
         check_kind("resume", resume, Checkpoint, "say load_checkpoint(path)" if isinstance(resume, is_path) else "")
+    if checkpoint_every is not None and checkpoint_every < 1:
+        raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
     system.check()
     check_views(scene.train)
     check_scene(scene)
@@ -191,23 +188,42 @@ def fit_stage(
         views. None: that of the checkpoint, or 0.
       watch: called between steps with the stage under way (`training.loop.Watch`).
     """
-    _check_arguments(scene, system, resume)
-    if not 0 <= index < len(system.stages()):
-        raise ValueError(f"index must be that of one of the {len(system.stages())} stages, from 0; got {index}")
-    if checkpoint_every is not None and checkpoint_every < 1:
-        raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
-    stage = system.stages()[index]
-    check_loss_data(scene.train, stage.extras, stage.has_ssim)
+    _check_arguments(scene, system, resume, checkpoint_every)
+    stages = system.stages()
+    if not 0 <= index < len(stages):
+        raise ValueError(f"index must be that of one of the {len(stages)} stages, from 0; got {index}")
+    if resume is not None:
+        check_resume(resume, system, index)
+    check_loss_data(scene.train, stages[index].extras, stages[index].has_ssim)
+    return _train_stage(
+        scene, system, index, start, resume, num_restored, session, on_log,
+        is_last=index == len(stages) - 1, on_checkpoint=on_checkpoint, checkpoint_every=checkpoint_every,
+        progress=progress, title=title, is_stopped=is_stopped, watch=watch,
+    )  # fmt: skip
+
+
+def _train_stage(
+    scene: Scene,
+    system: System,
+    index: int,
+    start: Model | None,
+    resume: Checkpoint | None,
+    num_restored: int | None,
+    session: Session | None,
+    on_log: OnLog | None,
+    *,
+    is_last: bool,
+    **how: Any,
+) -> StageResult:
+    """Train a stage, given checked arguments as in `fit_stage`; `how` as in `StageRun.train`."""
     if start is None and resume is None:
         start = initial_model(scene, system)
-    with system.naming_options():
-        run = StageRun(scene, system, index, start, resume, num_restored, session)
-        run.on_log = on_log
-        run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch)
-    origin = origin_of_scene(scene, BACKGROUNDS[system.background])
-    origin = corrected_origin(origin, run.stage.corrections, run.state.corrections)
-    model = dataclasses.replace(run.model, origin=origin)
-    if index == len(system.stages()) - 1:
+    run = StageRun(scene, system, index, start, resume, num_restored, session)
+    run.on_log = on_log
+    run.train(**how)
+    origin = corrected_origin(origin_of_scene(scene), run.stage.corrections, run.state.corrections)
+    model = dataclasses.replace(run.model, background=BACKGROUNDS[system.background], origin=origin)
+    if is_last:
         warn_of_budget(system, model)
     return StageResult(run.stage.name, model, run.history, run.seconds, run.num_regrown)
 
@@ -224,4 +240,4 @@ def warn_of_budget(system: System, model: Model) -> None:
     else:
         advice = f"raise {system.more_growth()}"
     share = f"{used / budget:.1%} of the memory_budget of {budget:,}"
-    warnings.warn(f"the model takes {used:,} bytes, {share}: {advice}", stacklevel=3)
+    warnings.warn(f"the model takes {used:,} bytes, {share}: {advice}", stacklevel=4)

@@ -8,17 +8,19 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.appearance import Appearance, check_is_appearance
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_kind, check_literal
-from a2tg_jax.core.display import short_tuple_repr
+from a2tg_jax.core.checks import check_kind, check_literal, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.numerics import safe_norm
-from a2tg_jax.model import Model, Parameters, check_is_model
+from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.model import Model, check_is_model
+from a2tg_jax.parallel import views_at_once
 from a2tg_jax.rasterize.capacity import with_capacity
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.rasterize.views import render_together, render_traced
+from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.render import check_background
 from a2tg_jax.training.corrections import Correction, corrected_camera
 
@@ -28,10 +30,8 @@ class ViewGradients(NamedTuple):
 
     value: Array
     """The loss, a scalar."""
-    gaussians: Gaussians
-    """Its gradient in the Gaussians."""
-    params: Any
-    """Its gradient in what they show."""
+    gradient: Model
+    """Its gradient in all floats of the model, with None in place of integers (`partition`)."""
     norms: Array
     """[N] norms of Σ_pixels |∂L/∂mean|, through the Gaussian factor alone (A²TG, gradient-driven selection). Other
     statistics differentiate by the position on the screen, in units of half an image."""
@@ -65,7 +65,7 @@ def view_gradients(
 
     Args:
       loss: of the model, for regularisers, and of the view; a scalar.
-      model: differentiated in its Gaussians and parameters.
+      model: differentiated in all its floats.
       camera: the view.
       background: [3] colour; None is the model's own.
       settings: with a capacity under jit (`plan_render`); an eager call finds its own.
@@ -81,49 +81,50 @@ def view_gradients(
     check_is_model(model)
     background = model.background if background is None else background
     check_gaussians(model.gaussians, "model.gaussians")
+    check_is_appearance(model.appearance, model.gaussians)
     check_camera(camera)
     check_background(background)
     dtype = model.gaussians.means.dtype
-    settings = with_capacity(settings, model.gaussians, camera, model.rule, model.num_live)
+    settings = with_capacity(settings, model.gaussians, camera, model.appearance, model.num_live)
 
-    def of_view(shown: Model, view: View, output: RenderOutput) -> tuple[Array, RenderOutput]:
+    def of_view(shown: Model, view: TracedView, output: RenderOutput) -> tuple[Array, RenderOutput]:
         return loss(shown, output), output
 
     found = differentiate(
-        of_view, model, View(camera, jnp.asarray(background, dtype)), settings,
+        of_view, model, TracedView(camera, jnp.asarray(background, dtype)), settings,
         has_geometry=has_geometry, sh_degree=sh_degree, statistic=statistic, has_probe=True,
     )  # fmt: skip
     statistics, is_visible = read_probe(found.probe, statistic, camera.width, camera.height)
-    return ViewGradients(
-        found.value, found.gaussians, found.params, safe_norm(statistics), is_visible, found.told, found.num_pairs
-    )
+    floats, _ = partition(model)
+    gradient = dataclasses.replace(floats, gaussians=found.gaussians, appearance=found.appearance)
+    return ViewGradients(found.value, gradient, safe_norm(statistics), is_visible, found.told, found.num_pairs)
 
 
-def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callable[..., tuple[Any, Parameters]]:
+def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callable[..., tuple[Any, Model]]:
     """Return a function of a model that gives a loss and its gradient in all floats of the model.
 
-    `jax.value_and_grad` refuses a model with integers, such as the layout of textures. The gradient is a `Parameters`
-    as `model.parameters` is: an optimizer updates these, and `model.with_parameters` puts them back.
+    `jax.value_and_grad` refuses a model with integers, such as the places of textures. The gradient is a model with
+    None in place of these: the floats of `partition(model)`, which an optimizer updates and `combine` puts back.
 
     Args:
       loss: of a model, and of any further arguments, which are not differentiated; a scalar.
       has_aux: whether the loss returns (scalar, anything) instead.
     """
 
-    def of_parameters(parameters: Parameters, model: Model, *args: Any, **kwargs: Any) -> Any:
-        return loss(model.with_parameters(parameters), *args, **kwargs)
+    def of_floats(floats: Model, rest: Model, *args: Any, **kwargs: Any) -> Any:
+        return loss(combine(floats, rest), *args, **kwargs)
 
-    differentiate = jax.value_and_grad(of_parameters, has_aux=has_aux)
+    differentiate = jax.value_and_grad(of_floats, has_aux=has_aux)
 
-    def of_model(model: Model, *args: Any, **kwargs: Any) -> tuple[Any, Parameters]:
+    def of_model(model: Model, *args: Any, **kwargs: Any) -> tuple[Any, Model]:
         check_kind("model", model, Model, "jax.value_and_grad differentiates in arrays")
-        return differentiate(model.parameters, model, *args, **kwargs)
+        return differentiate(*partition(model), *args, **kwargs)
 
     return of_model
 
 
-class View(NamedTuple):
-    """View that `differentiate` renders, with its corrections, which are differentiated."""
+class TracedView(NamedTuple):
+    """TracedView that `differentiate` renders, with its corrections, which are differentiated."""
 
     camera: Camera
     background: Array
@@ -135,19 +136,19 @@ class View(NamedTuple):
     """Arrays that the loss compares the render with."""
 
     @property
-    def corrected(self) -> "View":
+    def corrected(self) -> "TracedView":
         """The view from its corrected camera."""
         return self._replace(camera=corrected_camera(self.corrections, self.rows, self.camera))
 
 
-def _axes_of(views: View) -> View:
+def _axes_of(views: TracedView) -> TracedView:
     """Return the axes of several views in one, for `jax.vmap`: they share the corrections, and the rays of the lens."""
     cameras = dataclasses.replace(views.camera, viewmat=0, K=0, rays=None)  # type: ignore[arg-type]
-    return View(cameras, background=0, corrections=None, rows=0, target=0)  # type: ignore[arg-type]
+    return TracedView(cameras, background=0, corrections=None, rows=0, target=0)  # type: ignore[arg-type]
 
 
 class Differentiated(NamedTuple):
-    """Result of `differentiate`, or of `differentiate_together`, of G views [G, ...]."""
+    """Result of `differentiate`; of G views that are drawn at once [G, ...]."""
 
     value: Array
     """The loss, a scalar."""
@@ -157,8 +158,8 @@ class Differentiated(NamedTuple):
     """Number of pairs, the least capacity."""
     gaussians: Gaussians
     """Gradient in the Gaussians."""
-    params: Any
-    """Gradient in what they show; of several views their sum."""
+    appearance: Appearance
+    """Gradient in the floats of the appearance; of several views their mean."""
     rows: tuple[Array, ...]
     """Gradient in the view's row of each correction."""
     probe: Any
@@ -166,9 +167,9 @@ class Differentiated(NamedTuple):
 
 
 def differentiate(
-    loss: Callable[[Model, View, RenderOutput], tuple[Array, Any]],
+    loss: Callable[[Model, TracedView, RenderOutput], tuple[Array, Any]],
     model: Model,
-    view: View,
+    view: TracedView,
     settings: RenderSettings,
     *,
     has_geometry: bool,
@@ -178,10 +179,12 @@ def differentiate(
 ) -> Differentiated:
     """Render a view and differentiate its loss: the core of `view_gradients` and of the training step.
 
+    If several devices draw G views at once, it does so for these.
+
     Args:
       loss: function of the model, the corrected view and its render; returns a scalar and any auxiliary value.
-      model: differentiated in its Gaussians and parameters.
-      view: differentiated in its rows.
+      model: differentiated in all its floats.
+      view: differentiated in its rows. G views have a leading axis, but for the corrections and the camera's rays.
       settings: with a capacity under jit.
       has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
       sh_degree: overrides the settings'; may be traced.
@@ -189,60 +192,25 @@ def differentiate(
       has_probe: gather the statistic.
     """
 
-    def of_parameters(
-        gaussians: Gaussians, params: Any, rows: tuple[Array, ...], probe: Array | None
+    floats, rest = partition(model.appearance)
+
+    def of_floats(
+        gaussians: Gaussians, floats: Appearance, rows: tuple[Array, ...], probe: Array | None, view: TracedView
     ) -> tuple[Array, tuple[Any, Array]]:
         seen = view._replace(rows=rows).corrected
-        shown = dataclasses.replace(model, gaussians=gaussians, params=params)
+        shown = dataclasses.replace(model, gaussians=gaussians, appearance=combine(floats, rest))
         output, num_pairs = render_traced(
-            gaussians, seen.camera, shown.rule, view.background, settings,
+            gaussians, seen.camera, shown.appearance, view.background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, probe=probe, statistic=statistic,
         )  # fmt: skip
         value, told = loss(shown, seen, output)
         return value, (told, num_pairs)
 
     probe = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if has_probe else None
-    with_gradients = jax.value_and_grad(of_parameters, argnums=(0, 1, 2, 3), has_aux=True)
-    (value, (told, num_pairs)), gradients = with_gradients(model.gaussians, model.params, view.rows, probe)
+    with_gradients = jax.value_and_grad(of_floats, argnums=(0, 1, 2, 3), has_aux=True)
+    if settings.exchange is not None and settings.exchange.views_at_once > 1:
+        with_gradients = views_at_once.value_and_grad_of_views(
+            of_floats, settings.exchange.views_at_once, _axes_of(view)
+        )
+    (value, (told, num_pairs)), gradients = with_gradients(model.gaussians, floats, view.rows, probe, view)
     return Differentiated(value, told, num_pairs, *gradients)
-
-
-def differentiate_together(
-    loss: Callable[[Model, View, RenderOutput], tuple[Array, Any]],
-    model: Model,
-    views: View,
-    settings: RenderSettings,
-    *,
-    has_geometry: bool,
-    sh_degree: Any,
-    statistic: Statistic | None,
-    has_probe: bool,
-) -> Differentiated:
-    """Do what `differentiate` does for G views at once, on the devices of `settings.exchange`.
-
-    Args:
-      loss, model, settings, has_geometry, sh_degree, statistic, has_probe: as for `differentiate`.
-      views: with a leading axis G, but for the corrections and the camera's rays.
-    """
-    num_views, axes = views.background.shape[0], _axes_of(views)
-
-    def of_parameters(
-        gaussians: Gaussians, params: Any, rows: tuple[Array, ...], probe: Array | None
-    ) -> tuple[Array, tuple[Any, ...]]:
-        seen: View = jax.vmap(lambda view: view.corrected, in_axes=(axes,), out_axes=axes)(views._replace(rows=rows))
-        outputs, num_pairs = render_together(
-            gaussians, seen.camera, dataclasses.replace(model, params=params).rule, views.background, settings,
-            has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, probe=probe, statistic=statistic,
-        )  # fmt: skip
-
-        def of_view(gaussians: Gaussians, view: View, output: RenderOutput) -> tuple[Array, Any]:
-            return loss(dataclasses.replace(model, gaussians=gaussians, params=params), view, output)
-
-        values, told = jax.vmap(of_view, in_axes=(0, axes, 0))(gaussians, seen, outputs)
-        return jnp.sum(values), (values, told, num_pairs)
-
-    copies: Gaussians = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_views, *x.shape)), model.gaussians)
-    probe = jnp.zeros((num_views, model.gaussians.num, 4), copies.means.dtype) if has_probe else None
-    with_gradients = jax.value_and_grad(of_parameters, argnums=(0, 1, 2, 3), has_aux=True)
-    (_, (values, told, num_pairs)), gradients = with_gradients(copies, model.params, views.rows, probe)
-    return Differentiated(values, told, num_pairs, *gradients)

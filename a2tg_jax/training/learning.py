@@ -23,7 +23,7 @@ NEARLY_FLAT = 40.0
 ADVICE = (
     "Look whether the points and cameras fit (cameras.png of a2tg sfm; in a2tg view RUN, photographs beside the render "
     "from their cameras), then try fewer initial_gaussians, a lower initial_opacity or "
-    "lower learning rates, and --refine-poses if poses may be wrong"
+    "lower learning rates, and refine_poses if poses may be wrong"
 )
 FLAT_BACKGROUNDS: dict[Background, float] = {"black": 0.0, "white": 1.0, "random": 0.5}
 

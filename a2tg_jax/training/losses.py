@@ -11,11 +11,10 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera, check_is_camera
-from a2tg_jax.core.checks import check_array, check_floats, check_number, check_shape, plain
+from a2tg_jax.core.checks import check_array, check_floats, check_number, check_shape, plain_array
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import normalize, safe_divide
-from a2tg_jax.rasterize.kernels import windows
-from a2tg_jax.rasterize.kernels.choice import has_native
+from a2tg_jax.rasterize.kernels import scores, windows
 
 SSIM_SIGMA = 1.5
 SSIM_RADIUS = 5
@@ -42,7 +41,7 @@ def photometric_loss(image: Array, target: Array, *, ssim_weight: float | Array 
 
 def photometric_parts(image: Array, target: Array, *, ssim_weight: float | Array = 0.2) -> dict[str, Array]:
     """Return the summands of `photometric_loss`, weighted, as "l1" and "ssim"; without "ssim" if its weight is 0."""
-    image, target = plain("image", image), plain("target", target)
+    image, target = plain_array("image", image), plain_array("target", target)
     check_same_shape(image, target)
     l1 = jnp.mean(jnp.abs(image - target))
     if not isinstance(ssim_weight, Array):
@@ -68,7 +67,7 @@ def mean_ssim(image: Array, target: Array) -> Array:
     Raises:
       ValueError: if the shapes differ or a side is shorter than the window.
     """
-    image, target = plain("image", image), plain("target", target)
+    image, target = plain_array("image", image), plain_array("target", target)
     check_same_shape(image, target)
     if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(
@@ -77,13 +76,7 @@ def mean_ssim(image: Array, target: Array) -> Array:
         )
     x, y = jnp.moveaxis(image, -1, 0), jnp.moveaxis(target, -1, 0)
     score = windows.Score(_similarity, SSIM_TAPS)
-    if has_native():
-        from a2tg_jax.rasterize.kernels.native.ssim import least_width, mean_score
-
-        is_supported = x.dtype == y.dtype and x.dtype in (jnp.float32, jnp.float64)
-        if is_supported and x.shape[2] >= least_width(x.dtype, SSIM_WINDOW):
-            return mean_score(score, x, y)
-    return windows.mean_score(score, x, y)
+    return scores.mean_score(score, x, y)
 
 
 def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product: Array) -> Array:

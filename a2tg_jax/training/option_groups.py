@@ -1,15 +1,11 @@
-"""Groups of the options that every system has: loss weights, corrections of photographs, pruning of floaters."""
+"""Groups of the options that every system has: loss weights and corrections of photographs."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Literal
 
-from a2tg_jax.densify.floaters import PruneFloaters
-from a2tg_jax.densify.pruning import during_growth
-from a2tg_jax.events import Event, FieldError, StepEvent, from_options
-from a2tg_jax.host.text import shortened
+from a2tg_jax.core.checks import check_number, fields_of
 from a2tg_jax.training.bilateral import BilateralGrid
-from a2tg_jax.training.corrections import Exposure, PoseRefinement
+from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
 from a2tg_jax.training.depth_prior import DepthKind, DepthPrior, PointDepths
 from a2tg_jax.training.robust import RobustPhotometric
 from a2tg_jax.training.stage import LossTerm
@@ -43,6 +39,14 @@ class LossConfig:
     points_weight: float = 0.0
     """Rendered inverse depth against that of the points that COLMAP observed in each photograph."""
 
+    def check_options(self) -> None:
+        """Raise ValueError, beginning with the name of the field, if a number is out of range."""
+        for field in dataclasses.fields(self):
+            if field.name != "depth_kind":
+                check_number(field.name, getattr(self, field.name), least=0)
+        check_number("ssim_weight", self.ssim_weight, most=1)
+        check_number("robust_share", self.robust_share, most=1)
+
     def terms(self, is_first: bool = True) -> tuple[LossTerm, ...]:
         """Return the loss terms whose weight is not 0.
 
@@ -68,70 +72,37 @@ class LossConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class CorrectionConfig:
+class Corrections:
     """Options of what `exposure` and `refine_poses` learn."""
 
     exposure_kind: Literal["affine", "grid"] = "affine"
     """Exposure of a photograph: an affine map of its colours, or in addition a bilateral grid of such maps, which
     follows vignettes and local tone mapping."""
-    exposure_rate: float = Exposure.rate
-    """Adam's learning rate of the affine maps of colours."""
-    grid_size: tuple[int, int, int] = BilateralGrid.size
-    """Numbers of nodes of a bilateral grid along x, along y, and of luminances, each up to 64."""
-    grid_rate: float = BilateralGrid.rate
-    """Adam's learning rate of the bilateral grids."""
-    grid_smoothness: float = BilateralGrid.smoothness
-    """Weight of the total variation of the bilateral grids in the loss."""
-    pose_rate: float = PoseRefinement.rate
-    """Adam's learning rate of the camera motions, in radians and in units of the normalised world."""
-    final_factor: float = Exposure.final_factor
-    """Factor of these rates at the end of the first stage, and in later stages."""
+    affine: Exposure = Exposure()
+    grid: BilateralGrid = BilateralGrid()
+    pose: PoseRefinement = PoseRefinement(final_factor=0.1)
 
+    def check_options(self) -> None:
+        """Raise ValueError, beginning with the path of the field, if a number is out of range."""
+        for name in ("affine", "grid", "pose"):
+            with fields_of(name):
+                getattr(self, name).check_options()
 
-@dataclasses.dataclass(frozen=True)
-class FloaterConfig:
-    """Pruning of floaters in the first stage (`PruneFloaters`)."""
-
-    min_views: int = 0
-    """Least number of training views in which a Gaussian must show, at least 2; others are pruned. 0: off."""
-    near: float = 0.0
-    """Least depth of a Gaussian before each camera that sees it, in units of the normalised world, in which cameras are
-    about 1 from what they see, such as 0.2. 0: off."""
-    near_share: float = dataclasses.field(default=0.0, metadata={"is_addition": True})
-    """Least depth of a Gaussian before each camera that sees it, as a share, below 1, of the depth of the nearest 2 %
-    in its picture, such as 0.7. A small foreground that is nearer goes, too. 0: off."""
-    at: tuple[float, ...] = PruneFloaters.at
-    """Fractions of the first stage at which floaters are pruned. Those after the last growth are left out."""
-
-    @property
-    def is_asked(self) -> bool:
-        """Whether floaters are to be pruned."""
-        return bool(self.min_views or self.near or self.near_share)
-
-    def events(self, num_iterations: int, others: Sequence[Event] = ()) -> tuple[Event, ...]:
-        """Return the event; none if nothing is asked for.
+    def of_stage(self, stage: int, *, exposure: bool, poses: bool) -> tuple[Correction, ...]:
+        """Return the corrections of a stage; later stages keep the rates of the first one's end.
 
         Args:
-          num_iterations: length of the stage.
-          others: events of the stage, some of which may add Gaussians.
-
-        Raises:
-          ValueError: if no fraction is left.
+          stage: index of the stage, from 0.
+          exposure: whether exposures are learned.
+          poses: whether poses are learned.
         """
-        if not self.is_asked:
-            return ()
-        event = from_options(PruneFloaters, self)
-        event.iterations(num_iterations)
-        growing = (each for each in others if isinstance(each, StepEvent) and each.most_gaussians is not None)
-        times = [found for each in growing if (found := each.times(num_iterations)).num_times]
-        if not times:
-            return (event,)
-        last = max(times, key=lambda found: found.last_time)
-        at = during_growth(self.at, num_iterations, last)
-        if not at:
-            raise FieldError(
-                event,
-                f"{{at}} must hold a fraction before the last growth, which is at iteration {last.last_time:,} of "
-                f"{num_iterations:,}, for others grow in the place of what is pruned; got {shortened(self.at)}",
-            )
-        return (dataclasses.replace(event, at=at),)
+        found: list[Exposure | BilateralGrid | PoseRefinement] = []
+        if poses:
+            found.append(self.pose)
+        if exposure:
+            found.append(self.affine)
+        if exposure and self.exposure_kind == "grid":
+            found.append(self.grid)
+        if stage:
+            found = [dataclasses.replace(one, rate=one.rate * one.final_factor, final_factor=1.0) for one in found]
+        return tuple(found)

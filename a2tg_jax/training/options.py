@@ -1,48 +1,46 @@
 """Options that every system has: views, initial Gaussians, loss, learning rates, the seed."""
 
-import contextlib
 import dataclasses
 import math
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
-from a2tg_jax.densify.clone_split import CloneSplitPrune
-from a2tg_jax.densify.floaters import PruneFloaters
-from a2tg_jax.events import Event, FieldError, with_names
+from a2tg_jax.core.checks import check_int, check_number, fields_of
+from a2tg_jax.events import Event
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, check_config, config_to_dict, flatten_config
 from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
-from a2tg_jax.training.bilateral import BilateralGrid
-from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement
-from a2tg_jax.training.option_groups import CorrectionConfig, FloaterConfig, LossConfig
+from a2tg_jax.training.corrections import Correction
+from a2tg_jax.training.option_groups import Corrections, LossConfig
 from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.stage import Stage
 
-Ranges = dict[str, tuple[float, float]]
-"""Smallest and largest values of options by name, both included; None is in any range."""
+FEW_GAUSSIANS = 100
+"""Number of Gaussians below which a memory budget is likely to be a mistake."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class System:
     """A method of training as a value: its fields are its options, `stages` says what happens.
 
-    Derive your own system from this class, add fields and compose its stages; the command line takes it as
-    `--system package.module:NAME`. Fields are numbers, texts, tuples of them, and dataclasses of such fields.
+    Derive a custom system from this class, add fields and compose its stages; the command line takes it as
+    package.module:NAME. Fields are numbers, texts, tuples of them, and dataclasses of such fields, such as events. The
+    path of a field is its name everywhere: `densify.cap` in errors and configuration files.
     """
 
     batch_size: int = 1
     """Views per iteration."""
     initial_gaussians: int | None = None
     """Number of Gaussians to start from; None: one per point, at most the cap."""
-    sky_gaussians: int = dataclasses.field(default=0, metadata={"is_addition": True})
+    sky_gaussians: int = 0
     """Number of the initial Gaussians that start as the sky of an outdoor capture, on a sphere around the cameras,
     where training views see no points; 0: none. Its radius is 10 times the distance of the farthest points, 1 % of them
-    left out. `gaussians-2d` and `supergaussians` refuse it: they prune splats of that size."""
+    left out. Systems that prune splats of that size refuse it."""
     initial_opacity: float = 0.1
-    """Opacity of the Gaussians that training starts from. The pictures of `bbsplat` start as their authors' do, half
-    opaque in the middle, whatever it is."""
+    """Opacity of the Gaussians that training starts from; pictures with an alpha of their own start half opaque in the
+    middle, whatever it is."""
     memory_budget: float | str | None = None
     """Memory budget of the model: 1.5MB, 800kB, 2GB, or a number of MB (10^6 bytes). The model stays within it at every
     iteration and ends within 0.5 % of it. It sets the number of Gaussians and texels, in place of densify.cap."""
@@ -54,9 +52,6 @@ class System:
     """Seed of all random numbers."""
     tile_size: int = 8
     """Side of a tile in pixels. Results do not depend on it."""
-    jitter: float = dataclasses.field(default=0.0, metadata={"is_addition": True})
-    """Standard deviation of random displacements of the Gaussians in each step of the first stage, as a share of their
-    sizes, such as 0.1, against overfitting where views are few; 0: none."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     exposure: bool = False
@@ -64,19 +59,12 @@ class System:
     changes."""
     refine_poses: bool = False
     """Learn a small rigid motion of each training camera, for captures whose poses are not exact."""
-    corrections: CorrectionConfig = dataclasses.field(default_factory=CorrectionConfig)
-    floaters: FloaterConfig = dataclasses.field(default_factory=FloaterConfig)
+    corrections: Corrections = dataclasses.field(default_factory=Corrections)
 
     name: ClassVar[str] = ""
     """Name on the command line."""
     version: ClassVar[int] = 1
     """Version of the method. Raise it when the same options train another model."""
-    earlier_options: ClassVar[Mapping[str, Any]] = {}
-    """Values that options had before there were such options, as records of older versions mean them."""
-    ranges: ClassVar[Ranges] = {}
-    """Ranges of the system's own options."""
-    event_options: ClassVar[Mapping[str, str]] = {}
-    """Option that sets a field of an event, such as {"Mcmc.cap": "densify.cap"}; messages name the option."""
 
     def __post_init__(self) -> None:
         """Convert the memory budget to a number of MB."""
@@ -134,15 +122,7 @@ class System:
         Args:
           stage: index of the stage, from 0; later stages keep the rates of the first one's end.
         """
-        rates, last = self.corrections, self.corrections.final_factor
-        start, end = (1.0, last) if stage == 0 else (last, 1.0)
-        poses = (PoseRefinement(rate=rates.pose_rate * start, final_factor=end),) if self.refine_poses else ()
-        if not self.exposure:
-            return poses
-        affine = Exposure(rate=rates.exposure_rate * start, final_factor=end)
-        if rates.exposure_kind == "affine":
-            return *poses, affine
-        return *poses, affine, BilateralGrid(rates.grid_size, rates.grid_rate * start, end, rates.grid_smoothness)
+        return self.corrections.of_stage(stage, exposure=self.exposure, poses=self.refine_poses)
 
     def stages(self) -> tuple[Stage, ...]:
         """Return the stages, in the order of training.
@@ -182,11 +162,37 @@ class System:
         """Refuse invalid options before training.
 
         Raises:
-          ValueError: naming the option, what was wanted and what came.
+          ValueError: beginning with the path of the option, then what was wanted and what came.
         """
-        self._check_numbers()
-        with self.naming_options():
-            self._check_stages()
+        self.check_options()
+        self._check_stages()
+
+    def check_options(self) -> None:
+        """Refuse options of another type or out of range; each group that has a method `check_options`, such as an
+        event, checks its own. Extend it for further options.
+
+        Raises:
+          ValueError: beginning with the path of the option.
+        """
+        check_config(self)
+        for name, value in flatten_config(self).items():
+            held = value if isinstance(value, tuple) else (value,)
+            if not all(math.isfinite(number) for number in held if isinstance(number, float)):
+                wanted = "finite numbers" if isinstance(value, tuple) else "a finite number"
+                raise ValueError(f"{name} must be {wanted}; got {shortened(value)}")
+        for field in dataclasses.fields(self):
+            check = getattr(getattr(self, field.name), "check_options", None)
+            if check is not None:
+                with fields_of(field.name):
+                    check()
+        check_number("batch_size", self.batch_size, least=1)
+        if self.initial_gaussians is not None:
+            check_number("initial_gaussians", self.initial_gaussians, least=2)
+        check_number("sky_gaussians", self.sky_gaussians, least=0)
+        check_number("initial_opacity", self.initial_opacity, above=0, below=1)
+        check_number("sh_degree", self.sh_degree, least=0, most=3)
+        check_int("seed", self.seed, 0, 2**31 - 1)
+        check_number("tile_size", self.tile_size, least=1, most=MAX_TILE_SIZE)
 
     def _check_stages(self) -> None:
         stages = self.stages()
@@ -204,10 +210,11 @@ class System:
 
     def _check_sky(self, stages: Sequence[Stage]) -> None:
         """Refuse a sky that would be pruned for its size, or that leaves no room for the Gaussians at points."""
-        if self.sky_gaussians and any(isinstance(e, CloneSplitPrune) for stage in stages for e in stage.events):
+        pruning = next((event for stage in stages for event in stage.events if event.prunes_large), None)
+        if self.sky_gaussians and pruning is not None:
             raise ValueError(
-                "sky_gaussians are as large as what adaptive density control prunes: leave out sky_gaussians, or take "
-                f"a system that grows otherwise: {', '.join(SKY_SYSTEMS)}"
+                f"sky_gaussians are as large as what {type(pruning).__name__} prunes: leave out sky_gaussians, or take "
+                "a system without this event"
             )
         caps = [most for event in stages[0].events if (most := event.most_gaussians) is not None]
         room = min([*caps, self.initial_gaussians or math.inf])
@@ -219,7 +226,7 @@ class System:
             )
 
     def _check_learned(self, stages: Sequence[Stage]) -> None:
-        """Refuse corrections and pruning that are asked for and would do nothing."""
+        """Refuse corrections that are asked for and would do nothing."""
         if self.corrections.exposure_kind != "affine" and not self.exposure:
             raise ValueError(
                 f"corrections.exposure_kind is {self.corrections.exposure_kind!r}, but nothing is learned of it: "
@@ -231,50 +238,28 @@ class System:
                 f"{name} is asked for, but no stage of {type(self).__name__} learns it: compose its stages with "
                 "corrections=self.corrections_of(0), (1), …"
             )
-        if self.jitter and not any(stage.jitter for stage in stages):
-            raise ValueError(
-                f"jitter is {self.jitter}, but no stage of {type(self).__name__} displaces Gaussians: compose its "
-                "stages with jitter=self.jitter"
-            )
-        if self.floaters.is_asked and not any(isinstance(e, PruneFloaters) for stage in stages for e in stage.events):
-            raise ValueError(
-                f"floaters are to be pruned, but no stage of {type(self).__name__} does so: give its first stage the "
-                "events self.floaters.events(iterations, events) too"
-            )
 
-    def option_of(self, event: Event, field: str) -> str | None:
-        """Return the name of the option that sets a field of an event; None if the system does not tell."""
-        classes = (f"{kind.__name__}.{field}" for kind in type(event).__mro__)
-        options = {**SHARED_OPTIONS, **self.event_options}
-        name = next((options[known] for known in classes if known in options), None)
-        return "memory_budget" if self.memory_budget is not None and name in BUDGET_OPTIONS else name
-
-    def told(self, event: Event, message: str) -> str:
-        """Return an event's message with option names in place of the field names in braces."""
-        return with_names(message, lambda field: self.option_of(event, field) or f"{field} of {type(event).__name__}")
-
-    @contextlib.contextmanager
-    def naming_options(self) -> Iterator[None]:
-        """Name the option in place of the field in errors of events.
-
-        Raises:
-          ValueError: in place of a `FieldError`.
-        """
-        try:
-            yield
-        except FieldError as error:
-            raise ValueError(self.told(error.event, error.message)) from error
+    def path_of(self, event: Event) -> str:
+        """Return the path of the option that an event of a stage was made from, such as "densify"; the name of the
+        event's class if there is none."""
+        groups = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        found = [name for name, group in groups.items() if isinstance(group, Event) and isinstance(event, type(group))]
+        return next(iter(found), type(event).__name__)
 
     def more_growth(self) -> str:
         """Return the names of the options that make more Gaussians, for advice."""
         names = [field.name for field in dataclasses.fields(self)]
         return " or ".join(name for name in ("stage1_iterations", "initial_gaussians") if name in names)
 
+    def caps(self) -> tuple[str, ...]:
+        """Return the paths of the options that limit the number of Gaussians without a memory budget."""
+        events = [event for stage in self.stages() for event in stage.events if event.limited_by]
+        paths = dict.fromkeys(f"{self.path_of(event)}.{event.limited_by}" for event in events)
+        return tuple(path for path in paths if path in flatten_config(self))
+
     def limits(self) -> tuple[str, ...]:
-        """Return the names of the options that limit the number of Gaussians, for advice."""
-        events = (event for stage in self.stages() for event in stage.events if event.most_gaussians is not None)
-        names = (self.option_of(event, "cap") for event in events)
-        return tuple(dict.fromkeys(name for name in names if name is not None)) or ("initial_gaussians",)
+        """Return the paths of the options that limit the number of Gaussians, for advice."""
+        return ("memory_budget",) if self.memory_budget is not None else self.caps() or ("initial_gaussians",)
 
     def check_number(self, num: int) -> None:
         """Refuse options that cannot be trained from this number of Gaussians at the start.
@@ -307,59 +292,6 @@ class System:
                     f"Gaussians of {size:,.0f} bytes when the stage {stage.name!r} begins, and {num:,} are given: "
                     "raise it, leave it out, or give fewer"
                 )
-
-    def _check_numbers(self) -> None:
-        """Refuse values of another type, and numbers that are not finite or outside their range."""
-        check_config(self)
-        numbers = flatten_config(self)
-        for name, value in numbers.items():
-            held = value if isinstance(value, tuple) else (value,)
-            if not all(math.isfinite(number) for number in held if isinstance(number, float)):
-                wanted = "finite numbers" if isinstance(value, tuple) else "a finite number"
-                raise ValueError(f"{name} must be {wanted}; got {shortened(value)}")
-            is_rate = name.startswith(("rates.", "loss.", "corrections.")) and isinstance(value, float | int)
-            if is_rate and value < 0:
-                raise ValueError(f"{name} must be at least 0; got {value}")
-        for name, (least, most) in {**RANGES, **self.ranges}.items():
-            if numbers[name] is not None and not least <= numbers[name] <= most:
-                wanted = f"be at least {least}" if most == math.inf else f"lie in {least}..{most}"
-                raise ValueError(f"{name} must {wanted}; got {numbers[name]}")
-        if not 0 < self.initial_opacity < 1:
-            raise ValueError(f"initial_opacity must lie between 0 and 1; got {self.initial_opacity}")
-        if self.rates.means_final_factor == 0:
-            raise ValueError("rates.means_final_factor must be larger than 0, for the decay is exponential")
-        if not all(1 <= number <= LARGEST_GRID for number in self.corrections.grid_size):
-            raise ValueError(
-                f"corrections.grid_size must be numbers in 1..{LARGEST_GRID}; got {self.corrections.grid_size}"
-            )
-        if self.corrections.final_factor == 0:
-            raise ValueError("corrections.final_factor must be larger than 0, for the decay is exponential")
-
-
-SHARED_OPTIONS = {f"PruneFloaters.{name}": f"floaters.{name}" for name in ("min_views", "near", "near_share", "at")}
-"""Options of every system that set a field of an event."""
-BUDGET_OPTIONS = ("densify.cap", "texture.budget_mb")
-"""Options whose place a memory budget takes."""
-LARGEST_GRID = 64
-"""Largest number of nodes of a bilateral grid along each of its axes."""
-SKY_SYSTEMS = "a2tg", "gaussians-2d-mcmc", "textured-gaussians", "bbsplat", "bytewise"
-"""Systems of this library that take a sky, for advice."""
-FEW_GAUSSIANS = 100
-"""Number of Gaussians below which a memory budget is likely to be a mistake."""
-RANGES = {
-    "batch_size": (1, math.inf),
-    "initial_gaussians": (2, math.inf),
-    "sky_gaussians": (0, math.inf),
-    "sh_degree": (0, 3),
-    "seed": (0, 2**31 - 1),
-    "tile_size": (1, MAX_TILE_SIZE),
-    "jitter": (0, 1),
-    "loss.ssim_weight": (0, 1),
-    "loss.robust_share": (0, 1),
-    "rates.means_by_size": (0, 1),
-    "rates.cooldown": (0, 1),
-}
-"""Smallest and largest value of options that every system has, both included."""
 
 
 def like(kind: type[System] | System, other: System) -> System:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from tqdm import tqdm
 
-from a2tg_jax.core.display import counted, in_bytes
-from a2tg_jax.host.bars import has_terminal, is_line_due
+from a2tg_jax.host.progress_bars import has_terminal, is_line_due
+from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.training.checkpoint import History
 from a2tg_jax.training.step import StepInfo
 

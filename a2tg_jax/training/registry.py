@@ -1,13 +1,12 @@
 """Systems by name: those of this library, and others as package.module:NAME."""
 
-import dataclasses
 import importlib
 import sys
 from collections.abc import Mapping
 from typing import Any
 
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict, merged
+from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict
 from a2tg_jax.training.options import System
 
 SYSTEMS = {
@@ -101,18 +100,7 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
         raise ValueError(
             f"{where}: is of the system {shortened(name)!r}, which is not known here: import its module first"
         )
-    return config_from_dict(kind, with_earlier_options(kind, options), f"{where}: options")
-
-
-def with_earlier_options(kind: type[System], options: Any) -> Any:
-    """Return the options of a record with those that it lacks because an older version wrote it, at their values of
-    then. Options given by hand lack others, too, and are returned unchanged."""
-    if not isinstance(options, Mapping) or not kind.earlier_options:
-        return options
-    shared = {field.name for field in dataclasses.fields(System)}
-    groups = {name for name, value in config_to_dict(kind()).items() if isinstance(value, Mapping)} - shared
-    is_record = groups - kind.earlier_options.keys() <= options.keys()
-    return merged(kind.earlier_options, options) if is_record else options
+    return config_from_dict(kind, options, f"{where}: options")
 
 
 def with_changes(system: System, changes: Mapping[str, Any], where: str) -> System:

@@ -10,6 +10,7 @@ import numpy as np
 from a2tg_jax.core.checks import check_kind, described, dtype_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.partition import partition
 from a2tg_jax.events import Change
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.validate import check_like
@@ -34,7 +35,7 @@ def checked_change(name: str, change: Any) -> Change:
     check_kind(f"{name}: model", change.model, Model)
     check_kind(f"{name}: moments", change.moments, AdamState)
     check_gaussians(change.model.gaussians, f"{name}: model.gaussians")
-    floats = change.model.gaussians, change.model.params
+    floats, _ = partition(change.model)
     for field in ("mu", "nu"):
         try:
             check_kept(f"{name}: moments.{field}", getattr(change.moments, field), floats)

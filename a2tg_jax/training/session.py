@@ -4,9 +4,10 @@ from collections.abc import Callable, Hashable, Sequence
 
 import jax
 
+from a2tg_jax.core.table import Shape
 from a2tg_jax.host.machine import Devices
-from a2tg_jax.rasterize.exchange import exchange_among
-from a2tg_jax.texture import Shape
+from a2tg_jax.parallel.exchange import exchange_among
+from a2tg_jax.parallel.rows import num_processes
 
 
 def _nothing() -> None:
@@ -34,9 +35,11 @@ class Session:
             raise ValueError(f"devices must be two or more; got {len(devices)}: for one say jax.default_device(device)")
         self.after_compiling = after_compiling
         self.exchange = None if devices is None else exchange_among(devices)
-        """Devices among which rows are spread; None: one."""
+        """Devices that render together; None: one."""
         self.num_devices = 1 if self.exchange is None else self.exchange.num
-        processes = 1 if self.exchange is None else self.exchange.num_processes
+        self.mesh = None if self.exchange is None else self.exchange.mesh
+        """Mesh over which rows are spread; None: one device."""
+        processes = num_processes(self.mesh)
         self.devices = Devices(self.num_devices // processes, processes)
         """Their numbers."""
         self.shapes: set[Shape] = set()

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.capture import vertical_of
+from a2tg_jax.core.capture_geometry import vertical_of
 from a2tg_jax.core.gaussians import Gaussians, sh_of_colors
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.training.directions import even_directions

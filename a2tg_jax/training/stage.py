@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance
-from a2tg_jax.core.checks import check_kind, kind_of
+from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats, in_words
+from a2tg_jax.core.checks import check_kind, fields_of, kind_of
 from a2tg_jax.core.gaussians import no_rows
 from a2tg_jax.core.pytree import check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
@@ -28,6 +28,8 @@ from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.terms import Target
 
+COOLED = 0.1
+"""Factor of learning rates at the end of a stage that cools down."""
 Background = Literal["black", "white", "random"]
 
 
@@ -52,7 +54,7 @@ class Stage:
     name: str = dataclasses.field(metadata={"static": True})
     """A short word, unique in its system."""
     appearance: Appearance = dataclasses.field(metadata={"static": True})
-    """Appearance of the splats."""
+    """Template of what the splats show: an appearance without arrays, such as `Appearance(texture=Texture())`."""
     events: tuple[Event, ...]
     """Events such as densification, noise and texture growth, in order of application."""
     losses: tuple[LossTerm, ...]
@@ -61,16 +63,15 @@ class Stage:
     """Learning rates of the Gaussians."""
     iterations: int
     """Views seen, times the batch size."""
-    params_rate: Any = None
-    """Learning rate of the appearance's parameters: a number, or the argument of `Appearance.rates`; 0: they stay as
-    they are. None: the appearance has none."""
+    appearance_rate: Any = None
+    """Learning rate of the appearance's arrays: a number for all, or a mapping by field (`Appearance.rates`); 0: they
+    stay unchanged. None: the appearance has no arrays."""
     corrections: tuple[Correction, ...] = ()
     """Corrections of each training view, such as exposures and poses."""
     raises_sh_degree: bool = dataclasses.field(default=False, metadata={"static": True})
     """Whether the stage begins with degree 0 and adds one after every thirtieth of its length."""
-    jitter: float = static(default=0.0, is_addition=True)
-    """Standard deviation of the random displacements of the Gaussians in each step, as a share of their sizes
-    (`training.jitter`), in 0..1; 0: none. A step is compiled for each value."""
+    cools_down: bool = static(default=False)
+    """Whether all learning rates also fall linearly over the stage, to a tenth at its end."""
 
     @property
     def statistic(self) -> Statistic | None:
@@ -96,8 +97,7 @@ class Stage:
     def floats_shown(self, sh_degree: int) -> float:
         """Return the floats that a Gaussian of a degree shows beside its own when the stage begins (host)."""
         few = no_rows(64, NUM_BASES[sh_degree])
-        _, layout = self.appearance.allocate(jax.random.key(0), few)
-        return self.appearance.num_floats(layout, few.num) / few.num
+        return count_floats(allocate_appearance(self.appearance, jax.random.key(0), few), few.num) / few.num
 
     def is_ahead(self, event: Event) -> bool:
         """Return whether an event happens at all (host)."""
@@ -120,13 +120,18 @@ class Stage:
             raise ValueError(
                 f"a stage must have at least 1 iteration, and fewer than 2^31; {self.name!r} has {self.iterations}"
             )
-        if not 0 <= self.jitter <= 1:
-            raise ValueError(f"jitter must lie in 0..1; that of the stage {self.name!r} is {self.jitter}")
         kinds = sorted({event.statistic for event in self.events if event.statistic is not None})
         if len(kinds) > 1:
             raise ValueError(f"the events of one stage must want one statistic; those of {self.name!r} want {kinds}")
+        with fields_of(f"stage {self.name!r}: rates"):
+            self.rates.check_options()
         for event in self.events:
+            with fields_of(f"stage {self.name!r}: {type(event).__name__}"):
+                event.check_options()
             _check_times(f"stage {self.name!r}: {type(event).__name__}", event, self.iterations)
+        for correction in self.corrections:
+            with fields_of(f"stage {self.name!r}: {type(correction).__name__}"):
+                correction.check_options()
         names = [correction.name for correction in self.corrections]
         if len(set(names)) < len(names):
             raise ValueError(f"the corrections of {self.name!r} must have different names; got {', '.join(names)}")
@@ -142,13 +147,22 @@ class Stage:
             check_kind(f"{where} {name}", several, (tuple, list), "one of them stands in (…,)")
             for index, one in enumerate(several):
                 _check_part(f"{where} {name}[{index}]", one, PARTS.get(name, ()))
-        if self.params_rate is None and jax.tree.leaves(self.appearance.allocate(jax.random.key(0), no_rows(2, 1))[0]):
+        check_pytree(f"{where} appearance", self.appearance)
+        few = allocate_appearance(self.appearance, jax.random.key(0), no_rows(2, 1))
+        if self.appearance_rate is None and jax.tree.leaves(few):
             raise ValueError(
-                f"{where} params_rate must be the learning rate of the parameters of {type(self.appearance).__name__}, "
-                "such as 1e-2, or 0 if they are to stay as they are; got none"
+                f"{where} appearance_rate must be the learning rate of the arrays of {in_words(self.appearance)}, "
+                "such as 1e-2, or 0 if they are to stay unchanged; got none"
             )
         if not self.losses:
             raise ValueError(f"{where} losses must have a term, such as Term(function)")
+
+    def cooled(self, rates: Any, progress: Array) -> Any:
+        """Return learning rates, a pytree, at a share of the stage; traced."""
+        if not self.cools_down:
+            return rates
+        factor = 1 - (1 - COOLED) * progress
+        return jax.tree.map(lambda rate: rate * factor.astype(jnp.result_type(rate, float)), rates)
 
     def clock(self) -> "Clock":
         """Return the schedule for the step (host)."""

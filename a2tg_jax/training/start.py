@@ -3,27 +3,26 @@
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Appearance
+from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
 from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
+from a2tg_jax.core.partition import combine, partition
 from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.data.start_points import Sight, unseeing
-from a2tg_jax.events import FieldError
 from a2tg_jax.model import Model
 from a2tg_jax.training.batches import check_loss_data
 from a2tg_jax.training.options import System
 from a2tg_jax.training.sky import check_sky, sky_of
 from a2tg_jax.training.stage import Stage
 
-KEY_OF_PARAMETERS = 0x7E8E1
+KEY_OF_APPEARANCE = 0x7E8E1
 LEAST_OPACITY = INITIAL_OPACITY
 """Lower bound of the reduced opacities: the initial opacity of 3DGS."""
 SMALLEST_SIDE = 1e-6
@@ -33,14 +32,15 @@ GREY, GREY_SLACK = 0.5, 0.01
 
 def initial_model(scene: Scene, system: System) -> Model:
     """Return Gaussians at the scene's points and of its sky, as many as the first stage has room for."""
-    num, degree, opacity = initial_number(scene, system), system.initial_sh_degree, system.initial_opacity
+    first = system.stages()[0]
+    num, degree, opacity = initial_number(scene, system, first), system.initial_sh_degree, system.initial_opacity
     num_sky = system.sky_gaussians
     gaussians = init_from_points(
         scene.points, start_colors(scene), num - num_sky, system.seed, opacity=opacity, sh_degree=degree
     )
     if num_sky:
         gaussians = _followed_by(gaussians, sky_of(scene, num_sky, opacity=opacity, sh_degree=degree))
-    adapted = fainter_where_dense if system.stages()[0].appearance.has_low_pass else wider_where_dense
+    adapted = fainter_where_dense if first.appearance.has_low_pass else wider_where_dense
     return Model(adapted(gaussians, [view.camera for view in scene.train]))
 
 
@@ -115,13 +115,13 @@ def check_start(scene: Scene, system: System, num_given: int | None = None) -> N
     Raises:
       ValueError: naming the options to change.
     """
-    num = initial_number(scene, system) if num_given is None else num_given
+    stages = system.stages()
+    num = initial_number(scene, system, stages[0]) if num_given is None else num_given
     if num_given is None:
         _check_seen(scene, system)
-        with system.naming_options():
-            _rows_needed(system.stages()[0], num, system)
+        _rows_needed(stages[0], num, system)
     (system.check_number if num_given is None else system.check_given_number)(num)
-    for stage in system.stages():
+    for stage in stages:
         check_loss_data(scene.train, stage.extras, stage.has_ssim)
     if system.sky_gaussians:
         check_sky(scene, system.sky_gaussians)
@@ -145,20 +145,28 @@ def _rows_needed(stage: Stage, num: int, system: System) -> int:
     """Return the rows that a stage allocates for `num` Gaussians.
 
     Raises:
-      FieldError: naming the options to change, if an event cannot reach its number.
+      ValueError: naming the options to change, if an event cannot reach its number.
     """
-    try:
-        return num_rows(stage, num)
-    except FieldError as error:
-        raise FieldError(error.event, f"{error.message}: raise {system.more_growth()}, or lower {{cap}}") from error
+    rows = num
+    for event in stage.events:
+        try:
+            rows = max(rows, event.num_rows(num, stage.iterations))
+        except ValueError as error:
+            told, field, path = str(error), event.limited_by, system.path_of(event)
+            if not (field and told.startswith(field)):
+                raise ValueError(f"{path}: {told}") from error
+            limit = f"{path}.{field}" if system.memory_budget is None else "memory_budget"
+            told = limit + told.removeprefix(field)
+            raise ValueError(f"{told}: raise {system.more_growth()}, or lower {limit}") from error
+    return rows
 
 
-def initial_number(scene: Scene, system: System) -> int:
+def initial_number(scene: Scene, system: System, first: Stage) -> int:
     """Return the number of initial Gaussians: as requested, up to one for each point beside those of the sky, and up to
     the room of the first stage."""
     room = len(scene.points) + system.sky_gaussians
     num = min(system.initial_gaussians or room, room)
-    caps = [most for event in system.stages()[0].events if (most := event.most_gaussians) is not None]
+    caps = [most for event in first.events if (most := event.most_gaussians) is not None]
     return min(num, *caps) if caps else num
 
 
@@ -170,34 +178,37 @@ def num_rows(stage: Stage, num: int) -> int:
 def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> Model:
     """Return the model with the appearance of a stage and with spare rows for its events.
 
-    If the model's appearance is the stage's, its parameters are kept; otherwise they are allocated anew, but for the
-    shapes of kernels. A stage without shapes takes the nearest Gaussians, with a warning. The number of devices divides
-    that of the rows.
+    If the model's appearance has the stage's options, its arrays are kept; otherwise new ones are allocated, but for
+    the shapes of kernels. A stage without shapes takes the nearest Gaussians, with a warning. The number of devices
+    divides that of the rows.
 
     Raises:
       ValueError: if Gaussians were to be added to a model whose textures have grown.
     """
     num = model.gaussians.num
     room = -(-_rows_needed(stage, num, system) // num_devices) * num_devices
-    gaussians = _with_rows(_shown_by(stage, model), room)
-    params, layout = model.params, model.layout
-    if model.appearance != stage.appearance or room > num:
-        params, layout = new_parameters(stage.appearance, gaussians, system)
-        params = _with_known_shapes(stage.appearance, params, model)
-    if model.appearance == stage.appearance and room > num:
-        leaves = zip(jax.tree.leaves(params), jax.tree.leaves(model.params), strict=False)
-        if _rows_of(params) != _rows_of(model.params) or any(len(new) < len(old) for new, old in leaves):
+    gaussians, appearance = _with_rows(_shown_by(stage, model), room), model.appearance
+    is_same = template_of(appearance) == stage.appearance
+    if not is_same or room > num:
+        appearance = new_appearance(stage.appearance, gaussians, system)
+        if (shapes := model.appearance.shapes) is not None and appearance.shapes is not None:
+            appearance = appearance.with_shapes(appearance.shapes.at[:num].set(shapes))
+    if is_same and room > num:
+        (new, rest), (old, _) = partition(appearance), partition(model.appearance)
+        pairs = zip(jax.tree.leaves(new), jax.tree.leaves(old), strict=False)
+        is_grown: bool = jax.tree.structure(new) != jax.tree.structure(old)  # type: ignore[operator]
+        if is_grown or any(more.shape[1:] != few.shape[1:] or len(more) < len(few) for more, few in pairs):
             raise ValueError(
                 f"stage {stage.name!r} would add Gaussians to a model whose textures or degrees have grown already"
             )
-        params = jax.tree.map(lambda new, old: new.at[:num].set(old[:num]), params, model.params)
-    return Model(gaussians, params, layout, jnp.asarray(num, jnp.int32), appearance=stage.appearance)
+        appearance = combine(jax.tree.map(lambda more, few: more.at[:num].set(few[:num]), new, old), rest)
+    return Model(gaussians, appearance, jnp.asarray(num, jnp.int32))
 
 
 def _shown_by(stage: Stage, model: Model) -> Gaussians:
     """Return the Gaussians of a model, the nearest ones to its kernels if the stage has no shapes of them."""
-    shapes = model.appearance.shapes(model.params)
-    if shapes is None or stage.appearance.shapes_name is not None:
+    shapes = model.appearance.shapes
+    if shapes is None or stage.appearance.exponents is not None:
         return model.gaussians
     warnings.warn(
         f"stage {stage.name!r} has no shapes of kernels: it takes the Gaussians nearest to those of the model",
@@ -206,20 +217,11 @@ def _shown_by(stage: Stage, model: Model) -> Gaussians:
     return nearest_gaussians(model.gaussians, np.asarray(shapes))
 
 
-def new_parameters(appearance: Appearance, gaussians: Gaussians, system: System) -> tuple[Any, Any]:
-    """Return the parameters and layout that an appearance of a system's stage begins with."""
-    return appearance.allocate(jax.random.fold_in(jax.random.key(system.seed), KEY_OF_PARAMETERS), gaussians)
-
-
-def _with_known_shapes(appearance: Appearance, params: Any, model: Model) -> Any:
-    """Return new parameters with the shapes of the model's kernels, if both have shapes."""
-    new, old = appearance.shapes(params), model.appearance.shapes(model.params)
-    return params if new is None or old is None else appearance.with_shapes(params, new.at[: len(old)].set(old))
-
-
-def _rows_of(params: Any) -> Any:
-    """Return the structure and shape of one row of the parameters."""
-    return jax.tree.structure(params), [leaf.shape[1:] for leaf in jax.tree.leaves(params)]
+def new_appearance(template: Appearance, gaussians: Gaussians, system: System) -> Appearance:
+    """Return the appearance that a stage of a system begins with, of the options of a template."""
+    key = jax.random.fold_in(jax.random.key(system.seed), KEY_OF_APPEARANCE)
+    allocated: Appearance = allocate_appearance(template, key, gaussians)
+    return allocated
 
 
 def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:

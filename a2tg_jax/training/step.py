@@ -6,30 +6,40 @@ values, and its status makes all further steps idle, so that the host may look a
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from a2tg_jax.appearance import Appearance, projected
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.partition import combine, partition
 from a2tg_jax.core.pytree import pytree
-from a2tg_jax.events import Event, EventInfo, Now, Seen, StepEvent, Times
+from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.exchange import exchange_of, spread
-from a2tg_jax.rasterize.placement import gathered
-from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.training.batch_gradients import BatchGradients, batch_gradients, drawn_backgrounds
+from a2tg_jax.parallel.rows import spread
+from a2tg_jax.parallel.views_at_once import map_views
+from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs
-from a2tg_jax.training.corrections import CorrectionState, corrected_camera, initial_corrections, rows_of, updated
-from a2tg_jax.training.jitter import jittered
-from a2tg_jax.training.returned import check_kept, checked_change
-from a2tg_jax.training.stage import Background, Clock, Stage
+from a2tg_jax.training.corrections import (
+    CorrectionState,
+    corrected_camera,
+    corrected_color,
+    initial_corrections,
+    penalties,
+    rows_of,
+    updated,
+)
+from a2tg_jax.training.gradients import TracedView, differentiate
+from a2tg_jax.training.returned import check_kept, check_scalar, checked_change
+from a2tg_jax.training.stage import Background, Clock, LossTerm, Stage
+from a2tg_jax.training.terms import Target
 
 FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE, EXPLODED = range(5)
 """Status of a state: the reason why the last step was not taken."""
@@ -41,7 +51,7 @@ class TrainState:
 
     model: Model
     moments: AdamState
-    """Adam's memory of (gaussians, params)."""
+    """Adam's moments of the model's floats."""
     events: tuple[Any, ...]
     """State of each event; None for past ones."""
     iteration: Array
@@ -92,17 +102,28 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
     """
     return TrainState(
         model=model,
-        moments=adam_init((model.gaussians, model.params)),
-        events=tuple(_initial(event, model) if stage.is_ahead(event) else None for event in stage.events),
+        moments=adam_init(partition(model)[0]),
+        events=tuple(event.init(model) if stage.is_ahead(event) else None for event in stage.events),
         iteration=jnp.zeros((), jnp.int32),
         status=jnp.zeros((), jnp.int32),
         corrections=initial_corrections(stage.corrections, names, origin, model.gaussians.means.dtype),
     )
 
 
-def _initial(event: Event, model: Model) -> Any:
-    """Return the state that an event starts from."""
-    return event.init(gathered(exchange_of(model.gaussians.means), model) if event.reads_whole else model)
+class BatchGradients(NamedTuple):
+    """Loss and gradients of the V views of a step, [V, ...]."""
+
+    loss: Array
+    psnr: Array
+    num_pairs: Array
+    is_overflow: Array
+    grads: tuple[Gaussians, Appearance, tuple[Array, ...]]
+    """Gradients in the Gaussians, in the floats of their appearance, and in the view's row of each correction. Where G
+    views are drawn at once, those in the appearance are [V/G, ...], each a mean over G views."""
+    statistic: Array | None
+    """[V, N, 4], the gradient at the probe of `render_traced`; None if no event gathers it."""
+    terms: dict[str, Array]
+    """Summands of the loss by name."""
 
 
 class Attempt(NamedTuple):
@@ -145,7 +166,8 @@ def train_step(
     status = jnp.where(state.status == FINE, _status(clock, tried), state.status)
     new, old = (dataclasses.replace(known, status=status) for known in (tried.state, state))
     chosen = jax.tree.map(lambda a, b: jnp.where(status == FINE, a, b), new, old)
-    chosen = spread(settings.render.exchange, chosen)
+    if settings.render.exchange is not None:
+        chosen = spread(settings.render.exchange.mesh, chosen)
     found = tried.views
     return chosen, StepInfo(
         loss=jnp.mean(found.loss), psnr=jnp.mean(found.psnr), num_pairs=jnp.max(found.num_pairs), status=status,
@@ -161,8 +183,7 @@ def attempt(
     """Return the outcome of one iteration. Arguments as of `train_step`, none of them donated."""
     iteration = state.iteration + 1
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
-    own_key = jax.random.fold_in(key, iteration)
-    keys = jax.random.split(own_key, 1 + num_keys)
+    keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
     dtype = state.model.gaussians.means.dtype
     batch = photographs.of(views)
     batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
@@ -172,21 +193,18 @@ def attempt(
     backgrounds = drawn_backgrounds(keys[0], settings.background, batch.viewmats.shape[0], dtype)
     own = rows_of(state.corrections, rows)
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
-    shown = state.model
-    if stage.jitter:
-        shown = dataclasses.replace(shown, gaussians=jittered(own_key, shown.gaussians, stage.jitter))
-    found = batch_gradients(settings.render, stage, clock, shown, batch, backgrounds, iteration, own, is_gathering)
+    model = state.model
+    found = batch_gradients(settings.render, stage, clock, model, batch, backgrounds, iteration, own, is_gathering)
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads[:2])
 
     progress = clock.progress(state.iteration)
     decay = jnp.exp(clock.log_decay * progress)
     rate = (stage.rates.means * decay).astype(scene_scale.dtype) * scene_scale
     step = optimized(stage, state, grads, rate, progress)
-    gaussians, params = step.params
     moments: AdamState = step.state
-    model = dataclasses.replace(state.model, gaussians=gaussians, params=stage.appearance.project(params))
-    cooled = stage.rates.cooled(rate, progress)
-    now = Now(keys[1:], iteration, cooled, jnp.asarray(clock.num_iterations), scene_scale)
+    model = combine(step.params, partition(model)[1])
+    model = dataclasses.replace(model, appearance=projected(model.appearance))
+    now = Now(keys[1:], iteration, stage.cooled(rate, progress), jnp.asarray(clock.num_iterations), scene_scale)
     seen = _seen(stage, batch, own, found)
     model, moments, events, info = _events(settings.due, stage, clock, now, seen, model, moments, state.events)
     corrections = tuple(
@@ -194,12 +212,124 @@ def attempt(
         for correction, known, grad in zip(stage.corrections, state.corrections, found.grads[2], strict=True)
     )
     after = TrainState(model, moments, events, iteration, state.status, corrections)
-    made: Any = (model.gaussians, model.params)
+    made: Any = partition(model)[0]
     if settings.due is not None:
         # Adam's steps are finite if gradients are. A check of what nothing else changed makes a GPU write it twice.
         made = _others(step.params, made)
     is_finite = _all_finite((found.loss, grads, found.grads[2], made, [known.rows for known in corrections]))
     return Attempt(found, (*grads, found.grads[2]), after, info, is_finite)
+
+
+def batch_gradients(
+    settings: RenderSettings,
+    stage: Stage,
+    clock: Clock,
+    model: Model,
+    batch: Photographs,
+    backgrounds: Array,
+    iteration: Array,
+    own: tuple[Array, ...],
+    is_gathering: bool,
+) -> BatchGradients:
+    """Return loss and gradients of every view: one after the other, or as many at once as the devices share.
+
+    Args:
+      settings: with room for each view.
+      stage: its loss terms and corrections.
+      clock: `stage.clock()`.
+      model: N rows.
+      batch: V photographs.
+      backgrounds: [V, 3].
+      iteration: from 1.
+      own: for each correction, its rows [V, ...] of these views.
+      is_gathering: whether an event still gathers the stage's statistic.
+    """
+    height, width = batch.images.shape[1:3]
+    highest = settings.sh_degree
+    degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
+    options: dict[str, Any] = {
+        "has_geometry": stage.has_geometry, "sh_degree": degree,
+        "statistic": stage.statistic, "has_probe": is_gathering,
+    }  # fmt: skip
+
+    def loss(
+        shown: Model, seen: TracedView, output: RenderOutput
+    ) -> tuple[Array, tuple[Array, Array, dict[str, Array]]]:
+        image, alpha, mask, depth, points = seen.target
+        photograph = _black_outside(mask, _over(image, alpha, seen.background))
+        target = Target(seen.camera, photograph, seen.background, mask, clock.progress(iteration - 1), depth, points)
+        color = corrected_color(seen.corrections, seen.rows, output.color)
+        output = dataclasses.replace(output, color=_black_outside(mask, color))
+        told: dict[str, Array] = {}
+        values: list[Array] = []
+        for index, term in enumerate(stage.losses):
+            parts = term_parts(term, shown, target, output)
+            for name, part in parts.items():
+                check_scalar(f"stage {stage.name!r}: losses[{index}]", part)
+                told[name if name not in told else f"{name}_{index + 1}"] = part
+            values.append(functools.reduce(jnp.add, parts.values()))
+        if added := penalties(seen.corrections, seen.rows):
+            told["corrections"] = functools.reduce(jnp.add, added)
+        value = functools.reduce(jnp.add, [*values, *added])
+        error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
+        return value, (error, output.overflow, told)
+
+    def gradients_of(arrays: tuple[Any, ...]) -> tuple[BatchGradients, Any]:
+        """Return the gradients of a view, apart from those in the appearance; or of several views that share these."""
+        viewmat, K, background, rows, pictures = arrays
+        view = TracedView(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows, pictures)
+        found = differentiate(loss, model, view, settings, **options)
+        error, overflow, terms = found.told
+        grads: Any = (found.gaussians, None, found.rows)
+        own = BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe, terms)
+        return own, found.appearance
+
+    pictures = batch.images, batch.alphas, batch.masks, batch.depths, batch.points
+    arrays = batch.viewmats, batch.Ks, backgrounds, own, pictures
+    exchange = settings.exchange
+    if exchange is None or exchange.views_at_once == 1:
+        views, appearance = jax.lax.map(gradients_of, arrays)
+    else:
+        views, appearance = map_views(gradients_of, arrays, exchange.views_at_once)
+    found: BatchGradients = views._replace(grads=(views.grads[0], appearance, views.grads[2]))
+    return found
+
+
+def term_parts(term: LossTerm, model: Model, target: Target, output: RenderOutput) -> dict[str, Array]:
+    """Return the summands of a loss term by name; most terms are one."""
+    parts: dict[str, Array]
+    if hasattr(term, "parts"):
+        parts = term.parts(model, target, output)
+    else:
+        parts = {getattr(term, "name", type(term).__name__): term(model, target, output)}
+    return parts
+
+
+def _over(image: Array, alpha: Array | None, background: Array) -> Array:
+    """Return a photograph as floats, composed over the background."""
+    color = image.astype(background.dtype) / 255
+    if alpha is None:
+        return color
+    weight = alpha.astype(background.dtype)[..., None] / 255
+    return weight * color + (1 - weight) * background[None, None, :]
+
+
+def _black_outside(mask: Array | None, color: Array) -> Array:
+    """Return an image [H, W, 3] with excluded pixels black, so that no loss term sees them."""
+    return color if mask is None else jnp.where(mask[..., None], color, jnp.zeros_like(color))
+
+
+def _mean_over(mask: Array | None, values: Array) -> Array:
+    """Return the mean of values [H, W, 3] over the pixels that count; the values of the others are 0."""
+    mean = jnp.mean(values)
+    return mean if mask is None else mean / jnp.mean(mask.astype(values.dtype))
+
+
+def drawn_backgrounds(key: Array, kind: Background, num: int, dtype: Any) -> Array:
+    """Return the colours [V, 3] behind the views of a step."""
+    if kind == "random":
+        return jax.random.uniform(key, (num, 3), dtype)
+    return jnp.full((num, 3), 1.0 if kind == "white" else 0.0, dtype)
 
 
 def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: BatchGradients) -> Seen:
@@ -216,20 +346,22 @@ def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: Batch
 
 
 def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array, progress: Array) -> OptStep:
-    """Return (gaussians, params) and moments after Adam.
+    """Return the model's floats and their moments after Adam.
 
     Args:
       stage: its rates.
       state: before the step.
-      grads: of (gaussians, params).
+      grads: of the Gaussians, and of the floats of the appearance.
       rate_of_means: present rate of the means.
       progress: share of the stage that is done.
     """
-    model = state.model
-    of_gaussians = stage.rates.of_gaussians(stage.rates.of_means(rate_of_means, model), model.gaussians.sh_degree)
-    of_params = stage.appearance.rates(0.0 if stage.params_rate is None else stage.params_rate, model.params)
-    rates = stage.rates.cooled((of_gaussians, of_params), progress)
-    return adam_update((model.gaussians, model.params), grads, state.moments, rates)
+    floats, _ = partition(state.model)
+    of_gaussians = stage.rates.of_gaussians(rate_of_means, floats.gaussians.sh_degree)
+    of_appearance = floats.appearance.rates(0.0 if stage.appearance_rate is None else stage.appearance_rate)
+    of_gaussians, of_appearance = stage.cooled((of_gaussians, of_appearance), progress)
+    rates = dataclasses.replace(floats, gaussians=of_gaussians, appearance=of_appearance)
+    grads = dataclasses.replace(floats, gaussians=grads[0], appearance=grads[1])
+    return adam_update(floats, grads, state.moments, rates)
 
 
 def _events(
@@ -237,7 +369,8 @@ def _events(
     states: Sequence[Any],
 ) -> tuple[Model, AdamState, tuple[Any, ...], EventInfo]:  # fmt: skip
     """Gather statistics for the events, and apply those inside the step."""
-    infos, left, at = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32)), [], 0
+    nothing = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
+    infos, left, at = nothing, [], 0
     known = due or (None,) * len(stage.events)
     for event, times, state, is_due in zip(stage.events, clock.times, states, known, strict=True):
         if state is not None and event.observes:
@@ -246,8 +379,12 @@ def _events(
         if isinstance(event, StepEvent):
             own = now._replace(keys=now.keys[at : at + event.num_keys], times=times)
             at += event.num_keys
-            apply = functools.partial(_applied, stage.name, event, own)
-            model, moments, state, info = _at_its_times(apply, times, is_due, own.iteration, model, moments, state)
+            apply, carry, info = functools.partial(_applied, stage.name, event, own), (model, moments, state), nothing
+            if times is None or (is_due and state is not None):  # The state of an event that is past is None.
+                model, moments, state, info = apply(carry)
+            elif is_due is None and state is not None:  # The step itself decides.
+                wait = lambda carry: (*carry, nothing)  # noqa: E731
+                model, moments, state, info = jax.lax.cond(times.is_due(now.iteration), apply, wait, carry)
             possible = infos.is_possible & info.is_possible
             infos = EventInfo(possible, infos.num_refused + info.num_refused)
         left.append(state)
@@ -255,43 +392,16 @@ def _events(
 
 
 def _applied(
-    stage_name: str, event: StepEvent, now: Now, model: Model, moments: AdamState, state: Any
+    stage_name: str, event: StepEvent, now: Now, carry: tuple[Model, AdamState, Any]
 ) -> tuple[Model, AdamState, Any, EventInfo]:
-    """Return the change by an event, which must keep all shapes."""
+    """Return the model, moments and state after an event, which must keep all shapes."""
+    model, moments, state = carry
     name = f"stage {stage_name!r}: {type(event).__name__}.apply"
     change = checked_change(name, event.apply(now, model, moments, state))
     check_kept(f"{name}: model", change.model, model)
     check_kept(f"{name}: state", change.state, state)
     info = EventInfo(jnp.asarray(change.info.is_possible), jnp.asarray(change.info.num_refused, jnp.int32))
     return change.model, change.moments, change.state, info
-
-
-def _at_its_times(
-    apply: Callable[..., tuple[Model, AdamState, Any, EventInfo]], times: Times | None, is_due: bool | None,
-    iteration: Array, model: Model, moments: AdamState, state: Any,
-) -> tuple[Model, AdamState, Any, EventInfo]:  # fmt: skip
-    """Return the change by an event if it is due; events that are past make none.
-
-    Args:
-      apply: `_applied` of the event.
-      is_due: whether it is, if the host knows.
-    """
-    if times is None:
-        return apply(model, moments, state)
-    if state is None:
-        return model, moments, state, EventInfo()
-
-    def happen(carry: tuple[Model, AdamState, Any]) -> tuple[Model, AdamState, Any, EventInfo]:
-        return apply(*carry)
-
-    def wait(carry: tuple[Model, AdamState, Any]) -> tuple[Model, AdamState, Any, EventInfo]:
-        return *carry, EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
-
-    if is_due is not None:
-        return (happen if is_due else wait)((model, moments, state))
-    changed: tuple[Model, AdamState, Any, EventInfo]
-    changed = jax.lax.cond(times.is_due(iteration), happen, wait, (model, moments, state))
-    return changed
 
 
 def _status(clock: Clock, tried: Attempt) -> Array:

@@ -5,7 +5,7 @@ A term is a frozen dataclass registered as a pytree, whose numbers are traced; `
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TypeVar
 
 import jax.numpy as jnp
 from jax import Array
@@ -18,15 +18,11 @@ from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss, photometric_parts
 from a2tg_jax.training.returned import check_scalar
 
-EXTRAS = {"depth": "has_depths", "points": "has_points"}
-"""Fields of `Target` that only some terms read, and how these say so."""
+T = TypeVar("T")
 
 
-class NotLoadedError(ValueError, AttributeError):
-    """Data of photographs that no term asked for were read; for `hasattr` there is no such attribute."""
-
-
-class Target(NamedTuple):
+@pytree
+class Target:
     """Target that a render is compared with."""
 
     camera: Camera
@@ -36,22 +32,29 @@ class Target(NamedTuple):
     """[3]."""
     mask: Array | None = None
     """[H, W] bool, True at pixels that count; None: all. Excluded pixels of photograph and render are black."""
-    depth: Array = None  # type: ignore[assignment]
-    """[H, W] depth map, divided by its largest magnitude, NaN where unknown. Unless a term of the stage has
-    `has_depths`, reading it raises ValueError."""
     progress: Array | float = 1.0
     """Share of the stage that is done."""
-    points: ObservedPoints = None  # type: ignore[assignment]
-    """Points [S] that the photograph observed. Unless a term of the stage has `has_points`, reading them raises
-    ValueError."""
+    depth_map: Array | None = None
+    """`depth`, or None unless a term of the stage has `has_depths`."""
+    observed: ObservedPoints | None = None
+    """`points`, or None unless a term of the stage has `has_points`."""
 
-    def __getattribute__(self, name: str) -> Any:
-        value = tuple.__getattribute__(self, name)
-        if value is None and name in EXTRAS:
-            flag = EXTRAS[name]
-            told = f"say {flag}=True, as in Term(function, {flag}=True) for a loss term of your own"
-            raise NotLoadedError(f"target.{name} was not loaded: {told}")
-        return value
+    @property
+    def depth(self) -> Array:
+        """[H, W] depth map, divided by its largest magnitude, NaN where unknown. Raises ValueError if not loaded."""
+        return _loaded("depth", self.depth_map, "has_depths")
+
+    @property
+    def points(self) -> ObservedPoints:
+        """Points [S] that the photograph observed. Raises ValueError if they were not loaded."""
+        return _loaded("points", self.observed, "has_points")
+
+
+def _loaded(name: str, value: T | None, flag: str) -> T:
+    if value is None:
+        advice = f"say {flag}=True, as in Term(function, {flag}=True) for a custom loss term"
+        raise ValueError(f"target.{name} was not loaded: {advice}")
+    return value
 
 
 LossFunction = Callable[[Model, Target, RenderOutput], Array]
@@ -73,9 +76,9 @@ class Term:
     has_geometry: bool = static(default=False)
     """Whether the function reads `output.depth`, `normal` or `distortion`, which are rendered only on demand: unless a
     term of the stage asks for them, reading them raises ValueError."""
-    has_depths: bool = static(default=False, is_addition=True)
+    has_depths: bool = static(default=False)
     """Whether the function reads `target.depth`, the depth map of the photograph."""
-    has_points: bool = static(default=False, is_addition=True)
+    has_points: bool = static(default=False)
     """Whether the function reads `target.points`, the points that the photograph observed."""
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
@@ -121,7 +124,7 @@ def distortion(model: Model, target: Target, output: RenderOutput) -> Array:
 
 def opacity(model: Model, target: Target, output: RenderOutput) -> Array:
     """Return the mean opacity of the live splats as their appearance has it (3DGS-MCMC; BBSplat: the mean alpha)."""
-    return mean_opacity(model.appearance.opacities(model.gaussians, model.params, model.layout), model.live_count)
+    return mean_opacity(model.appearance.opacities(model.gaussians), model.live_count)
 
 
 def scale(model: Model, target: Target, output: RenderOutput) -> Array:

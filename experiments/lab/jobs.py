@@ -99,7 +99,8 @@ def model_bytes(system: a2tg.System) -> float:
     num, bases = num_gaussians(system), NUM_BASES[system.initial_sh_degree]
     largest = 0.0
     for stage in system.stages():
-        allocate = functools.partial(_shown_by_one, stage.appearance, bases)
+        # Bands begin empty, and their places cannot be traced.
+        allocate = functools.partial(_shown_by_one, dataclasses.replace(stage.appearance, bands=None), bases)
         shown = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(jax.eval_shape(allocate)))
         size = BYTES_PER_FLOAT * num * float(floats_per_gaussian(system.initial_sh_degree) + shown)
         for event in stage.events:
@@ -109,7 +110,7 @@ def model_bytes(system: a2tg.System) -> float:
 
 
 def _shown_by_one(appearance: a2tg.Appearance, num_bases: int) -> Any:
-    return appearance.allocate(jax.random.key(0), no_rows(1, num_bases))[0]
+    return a2tg.partition(a2tg.allocate_appearance(appearance, jax.random.key(0), no_rows(1, num_bases)))[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,9 +219,9 @@ def background_of(scene: a2tg.Scene) -> tuple[float, float, float] | None:
 
 def texture_sizes(model: a2tg.Model) -> dict[str, int]:
     """Return the number of Gaussians by texture size, "2x4" being two rows (v) and four columns (u); empty without."""
-    if model.textures is None or model.appearance.texture_options is None:
+    if model.textures is None:
         return {}
-    pairs, counts = np.unique(model.textures[1].sizes, axis=0, return_counts=True)
+    pairs, counts = np.unique(model.textures.sizes, axis=0, return_counts=True)
     return {f"{rows}x{columns}": int(count) for (rows, columns), count in zip(pairs, counts, strict=True)}
 
 

@@ -7,7 +7,7 @@ from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data.assembly import Shot, assemble_scene
 from a2tg_jax.data.lighting import light
 from a2tg_jax.data.splits import every_kth
-from a2tg_jax.data.surfaces import Surface, trace
+from a2tg_jax.data.surfaces import Surface, trace_rays
 from a2tg_jax.data.synthetic import DISTANCE, DOWN, FIELD_OF_VIEW, SAMPLE_OFFSETS, TARGET, sample_points, still_life
 
 NUM_VIEWS, NUM_POINTS, TEST_EVERY = 28, 4_000, 8
@@ -50,7 +50,7 @@ def photograph(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, widt
     for dx, dy in SAMPLE_OFFSETS.T:
         pixels = np.stack([x + dx, y + dy, np.ones_like(x)])
         directions = (viewmat[:3, :3].T @ np.linalg.inv(K) @ pixels).astype(np.float32)
-        colors, points = trace(surfaces, center, directions)
+        colors, points = trace_rays(surfaces, center, directions)
         image += np.where(np.isfinite(points).all(axis=0)[:, None], colors, sky_colors(directions))
     rounded: np.ndarray = np.rint(image / SAMPLE_OFFSETS.shape[1]).astype(np.uint8).reshape(height, width, 3)
     return rounded

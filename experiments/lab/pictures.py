@@ -1,15 +1,14 @@
 """Models changed so that a render shows the effect of textures and the places of large ones."""
 
+import dataclasses
 from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import SH_C0
-from a2tg_jax.results.images import side_by_side, with_colors
+from a2tg_jax.results.images import side_by_side, with_flat_colors
 
 LEAST_WIDTH = 300
 """Least width of an image in a sheet, in pixels."""
@@ -31,26 +30,24 @@ def enlarged(image: np.ndarray, zoom: int) -> np.ndarray:
 def without_textures(model: a2tg.Model) -> a2tg.Model:
     """Return the model with RGB textures 0 and alpha textures 1, which shows spherical harmonics only."""
     assert model.textures is not None
-    textures, layout = model.textures
-    neutral = jax.tree.map(lambda bucket: jnp.zeros_like(bucket).at[..., 3].set(1.0), textures)
-    return model.with_textures(neutral, layout)
+    return model.with_textures(a2tg.allocate_textures(model.textures.sizes))
 
 
 def without_sh(model: a2tg.Model) -> a2tg.Model:
     """Return the model with the Gaussians' own colour 0, which shows textures only."""
-    return with_colors(model, np.ones(model.gaussians.num, bool), np.full(3, -0.5 / SH_C0))
+    return with_flat_colors(model, np.ones(model.gaussians.num, bool), np.full(3, -0.5 / SH_C0))
 
 
 def colored_by_shape(model: a2tg.Model) -> a2tg.Model:
     """Return the model with larger square textures in blue, others in red, the rest as they are."""
     assert model.textures is not None
-    textures, layout = model.textures
-    rows, columns = layout.sizes.T
-    buckets = zip(textures.buckets, layout.resolutions, strict=True)
+    textures = model.textures
+    rows, columns = textures.sizes.T
+    buckets = zip(textures.buckets, textures.bucket_sizes, strict=True)
     flat = [bucket if size == (1, 1) else bucket.at[..., :3].set(0.0) for bucket, size in buckets]
-    model = model.with_textures(a2tg.Textures(tuple(flat)), layout)
+    model = model.with_textures(dataclasses.replace(textures, buckets=tuple(flat)))
     for is_chosen, color in (((rows == columns) & (rows > 1), SQUARE), (rows != columns, OBLONG)):
-        model = with_colors(model, is_chosen, (np.asarray(color) - 0.5) / SH_C0)
+        model = with_flat_colors(model, is_chosen, (np.asarray(color) - 0.5) / SH_C0)
     return model
 
 
@@ -66,8 +63,8 @@ def learned_textures(model: a2tg.Model, size: tuple[int, int], num: int) -> np.n
       uint8 [2·rows + 1, num·(columns + 1) − 1, 3], white between them; without columns where there are none.
     """
     assert model.textures is not None
-    chosen = np.flatnonzero((model.textures[1].sizes == size).all(axis=1))
-    textures = a2tg.texture_arrays(*model.textures)
+    chosen = np.flatnonzero((model.textures.sizes == size).all(axis=1))
+    textures = a2tg.texture_arrays(model.textures)
     varied = sorted(chosen, key=lambda index: -float(np.std(textures[index][..., :3], axis=(0, 1)).sum()))[:num]
     rows, columns = size
     sheet = np.ones((2 * rows + 1, max(0, len(varied) * (columns + 1) - 1), 3))

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.display import in_bytes
 from a2tg_jax.events import HostEvent
+from a2tg_jax.host.text import in_bytes
 from a2tg_jax.training.cost import forecast_stages
 from lab.grid import Grid
 from lab.jobs import Folders, Job, Record, model_bytes, num_gaussians

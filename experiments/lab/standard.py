@@ -79,7 +79,6 @@ STANDARD = (
     table_experiment("texel_rate", "The texels' learning rate at two densities, without the held-out scene."),
     table_experiment("defaults", "Each open choice of the method, one at a time, without the held-out scene."),
     table_experiment("plain", "Plain Gaussians at equal bytes, by densification, degree and pruning."),
-    table_experiment("rates", "Learning rates that follow the size of Gaussians and fall at the end, at equal bytes."),
     table_experiment("where_textures_pay", "The claim over the number of Gaussians, training length and image size."),
     paper_experiment("fixed_memory", "budget_mb", "Every method in A²TG's final bytes: Table 1 of the paper."),
     paper_experiment("fixed_number", "gaussians", "Every method with one number of Gaussians: Table 2 of the paper."),

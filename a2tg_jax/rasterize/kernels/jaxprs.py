@@ -8,17 +8,23 @@ import abc
 import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, Generic, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
 from jax.extend import core
-from jax.typing import DTypeLike
+from jax.typing import ArrayLike, DTypeLike
 
 MOST_ENTRIES = 256
 """Largest number of entries of an array, and of steps of a scan over arrays, for which code is unrolled."""
 Equation = core.JaxprEqn
 Params = dict[str, Any]
 """Parameters of an equation."""
+V = TypeVar("V")
+"""What stands for a number in the code that is being made."""
+Value: TypeAlias = V | np.ndarray
+"""A number, or a small array of them."""
+Values: TypeAlias = list[Value[V]]
+Step: TypeAlias = Callable[[Values[V]], Values[V]]
 CALLS = (
     *("jit", "pjit", "closed_call", "core_call", "call", "remat", "remat2", "checkpoint"),
     *("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"),
@@ -45,14 +51,21 @@ class Untranslatable(ValueError):
         return error
 
 
-class Evaluator(abc.ABC):
+class ArrayAval(Protocol):
+    """Abstract value of an array."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+
+class Evaluator(abc.ABC, Generic[V]):
     """Base class of what makes code of jaxprs; a subclass knows numbers, element-wise primitives and loops."""
 
     target: str
     """Kind of kernels, as error messages name them."""
 
     @abc.abstractmethod
-    def literal(self, number: Any, dtype: DTypeLike) -> Any:
+    def literal(self, number: ArrayLike, dtype: DTypeLike) -> V:
         """Return the value of a number."""
 
     @abc.abstractmethod
@@ -60,46 +73,46 @@ class Evaluator(abc.ABC):
         """Raise Untranslatable unless there are values of this dtype."""
 
     @abc.abstractmethod
-    def primitive(self, name: str) -> Callable[[list[Any], Equation], Any] | None:
+    def primitive(self, name: str) -> Callable[[list[V], Equation], V] | None:
         """Return the function from values to the value of an element-wise primitive, if there is one."""
 
     @abc.abstractmethod
-    def branches(self, index: Any, branches: Sequence[Any], operands: list[Any], equation: Equation) -> list[Any]:
+    def branches(
+        self, index: Value[V], branches: Sequence[core.ClosedJaxpr], operands: Values[V], equation: Equation
+    ) -> Values[V]:
         """Emit `cond` or `switch`."""
 
     @abc.abstractmethod
-    def loop(
-        self, carry: list[Any], test: Callable[[list[Any]], Any], step: Callable[[list[Any]], list[Any]]
-    ) -> list[Any]:
+    def loop(self, carry: Values[V], test: Callable[[Values[V]], Value[V]], step: Step[V]) -> Values[V]:
         """Emit a loop that replaces `carry` by `step` of it as long as `test` of it holds."""
 
     @abc.abstractmethod
-    def counted(self, length: int, carry: list[Any], step: Callable[[list[Any]], list[Any]]) -> list[Any]:
+    def counted(self, length: int, carry: Values[V], step: Step[V]) -> Values[V]:
         """Emit a loop of a fixed number of steps."""
 
-    def run(self, jaxpr: Any, arguments: Sequence[Any]) -> list[Any]:
+    def run(self, jaxpr: core.ClosedJaxpr | core.Jaxpr, arguments: Sequence[Value[V]]) -> Values[V]:
         """Emit a jaxpr, closed or without constants, and return its values."""
         consts = getattr(jaxpr, "consts", ())
         jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
-        values: dict[core.Var, Any] = {}
+        values: dict[core.Var, Value[V]] = {}
 
-        def read(atom: Any) -> Any:
-            return self._constant(atom.val, atom.aval) if isinstance(atom, core.Literal) else values[atom]
+        def read(atom: core.Var | core.Literal) -> Value[V]:
+            return self._constant(atom.val, aval_of(atom)) if isinstance(atom, core.Literal) else values[atom]
 
         for variable, value in zip(jaxpr.constvars, consts, strict=True):
-            values[variable] = self._constant(value, variable.aval)
+            values[variable] = self._constant(value, aval_of(variable))
         values.update(zip(jaxpr.invars, arguments, strict=True))
         for equation in jaxpr.eqns:
             results = self._equation(equation, [read(atom) for atom in equation.invars])
             values.update(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
-    def _constant(self, value: Any, aval: Any) -> Any:
+    def _constant(self, value: ArrayLike, aval: ArrayAval) -> Value[V]:
         self.check_dtype(aval.dtype)
         numbers = np.asarray(value).reshape(-1)
         return array_of([self.literal(number, aval.dtype) for number in numbers], aval.shape)
 
-    def _equation(self, equation: Equation, operands: list[Any]) -> list[Any]:
+    def _equation(self, equation: Equation, operands: Values[V]) -> Values[V]:
         name, params = equation.primitive.name, equation.params
         for index in range(len(equation.outvars)):
             self.check_dtype(result_of(equation, index).dtype)
@@ -109,7 +122,7 @@ class Evaluator(abc.ABC):
             result = SHAPES[name](operands, params)
             return [array_of(entries(result), result_of(equation).shape)]
         if name in REDUCTIONS:
-            return [self._reduction(REDUCTIONS[name], operands[0], equation)]
+            return [self._reduction(REDUCTIONS[name], cast(np.ndarray, operands[0]), equation)]
         if name == "optimization_barrier":
             return operands
         if name == "cond":
@@ -120,14 +133,14 @@ class Evaluator(abc.ABC):
             return self._scan(operands, equation)
         return [map_entries(lambda numbers: self.element(name, numbers, equation), operands)]
 
-    def element(self, name: str, operands: list[Any], equation: Equation) -> Any:
+    def element(self, name: str, operands: list[V], equation: Equation) -> V:
         """Emit an element-wise primitive on scalars."""
         emit = self.primitive(name)
         if emit is None:
             raise Untranslatable.of(name, self.target)
         return emit(operands, equation)
 
-    def _reduction(self, name: str, array: np.ndarray[Any, Any], equation: Equation) -> Any:
+    def _reduction(self, name: str, array: np.ndarray, equation: Equation) -> Value[V]:
         """Reduce axes of an array by an element-wise primitive."""
         axes, result = equation.params["axes"], result_of(equation)
         kept = np.moveaxis(array, axes, range(len(axes)))
@@ -137,7 +150,7 @@ class Evaluator(abc.ABC):
         combine = lambda x, y: self.element(name, [x, y], equation)  # noqa: E731
         return array_of([functools.reduce(combine, [*first, *column]) for column in rows.T], result.shape)
 
-    def _while(self, operands: list[Any], params: Params) -> list[Any]:
+    def _while(self, operands: Values[V], params: Params) -> Values[V]:
         num_cond, num_body = params["cond_nconsts"], params["body_nconsts"]
         cond_consts, body_consts = operands[:num_cond], operands[num_cond : num_cond + num_body]
         return self.loop(
@@ -146,12 +159,13 @@ class Evaluator(abc.ABC):
             lambda carry: self.run(params["body_jaxpr"], [*body_consts, *carry]),
         )
 
-    def _scan(self, operands: list[Any], equation: Equation) -> list[Any]:
+    def _scan(self, operands: Values[V], equation: Equation) -> Values[V]:
         """Emit a loop, unrolled if it reads or writes arrays."""
         params, length = equation.params, equation.params["length"]
         num_consts, num_carry = _scan_sizes(params)
         consts, carry = operands[:num_consts], operands[num_consts : num_consts + num_carry]
-        arrays, num_written = operands[num_consts + num_carry :], len(equation.outvars) - num_carry
+        arrays = cast(list[np.ndarray], operands[num_consts + num_carry :])
+        num_written = len(equation.outvars) - num_carry
         if not arrays and not num_written:
             return self.counted(length, carry, lambda carry: self.run(params["jaxpr"], [*consts, *carry]))
         if length > MOST_ENTRIES:
@@ -169,24 +183,29 @@ class Evaluator(abc.ABC):
         return [*carry, *stacked]
 
 
-def result_of(equation: Equation, index: int = 0) -> Any:
-    """Return the abstract value of a result, which has a shape and a dtype."""
-    return equation.outvars[index].aval
+def aval_of(atom: core.Var | core.Literal) -> ArrayAval:
+    """Return the abstract value of an array."""
+    return cast(ArrayAval, atom.aval)
 
 
-def entries(value: Any) -> list[Any]:
+def result_of(equation: Equation, index: int = 0) -> ArrayAval:
+    """Return the abstract value of a result."""
+    return aval_of(equation.outvars[index])
+
+
+def entries(value: Value[V]) -> list[V]:
     """Return all entries of an array, or a scalar as the only one."""
     return list(value.flat) if isinstance(value, np.ndarray) else [value]
 
 
-def like(value: Any, new: Iterator[Any]) -> Any:
+def rebuilt_like(value: Value[V], new: Iterator[V]) -> Value[V]:
     """Make a scalar or an array of the same shape from the next values."""
     if not isinstance(value, np.ndarray):
         return next(new)
     return array_of([next(new) for _ in range(value.size)], value.shape)
 
 
-def array_of(values: Sequence[Any], shape: Sequence[int]) -> Any:
+def array_of(values: Sequence[V], shape: Sequence[int]) -> Value[V]:
     """Make an array of a shape from its entries; a scalar if the shape is ()."""
     if math.prod(shape) > MOST_ENTRIES:
         raise Untranslatable(f"kernels take functions of scalars; an array has shape {tuple(shape)}")
@@ -195,13 +214,13 @@ def array_of(values: Sequence[Any], shape: Sequence[int]) -> Any:
     return array.reshape(shape) if shape else values[0]
 
 
-def map_entries(emit: Callable[[list[Any]], Any], operands: Sequence[Any]) -> Any:
+def map_entries(emit: Callable[[list[V]], V], operands: Sequence[Value[V]]) -> Value[V]:
     """Emit an element-wise operation on scalars, or entry by entry on arrays; axes of length 1 broadcast."""
-    shapes = [operand.shape for operand in operands if isinstance(operand, np.ndarray)]
-    if not shapes:
-        return emit(list(operands))
-    shape = np.broadcast_shapes(*shapes)
-    rows = [list(np.broadcast_to(operand, shape).flat) for operand in operands]
+    scalars = [operand for operand in operands if not isinstance(operand, np.ndarray)]
+    if len(scalars) == len(operands):
+        return emit(scalars)
+    shape = np.broadcast_shapes(*(operand.shape for operand in operands if isinstance(operand, np.ndarray)))
+    rows = [list(np.broadcast_to(cast(np.ndarray, operand), shape).flat) for operand in operands]
     return array_of([emit(list(numbers)) for numbers in zip(*rows, strict=True)], shape)
 
 
@@ -213,7 +232,7 @@ def _scan_sizes(params: Params) -> tuple[int, int]:
     return len(list(consts)), len(list(carry))
 
 
-def _broadcast(operands: list[Any], params: Params) -> Any:
+def _broadcast(operands: Values[V], params: Params) -> Value[V]:
     (operand,), shape = operands, params["shape"]
     if not isinstance(operand, np.ndarray):
         return array_of([operand] * math.prod(shape), shape)
@@ -223,16 +242,17 @@ def _broadcast(operands: list[Any], params: Params) -> Any:
     return np.broadcast_to(operand.reshape(inner), shape)
 
 
-def _slice(operands: list[Any], params: Params) -> Any:
+def _slice(operands: Values[V], params: Params) -> Value[V]:
     starts, limits = params["start_indices"], params["limit_indices"]
     strides = params["strides"] or (1,) * len(starts)
-    return operands[0][tuple(map(slice, starts, limits, strides))]
+    part: np.ndarray = cast(np.ndarray, operands[0])[tuple(map(slice, starts, limits, strides))]
+    return part
 
 
-def _stack(operands: list[Any], params: Params) -> Any:
+def _stack(operands: Values[V], params: Params) -> Value[V]:
     shape = operands[0].shape if isinstance(operands[0], np.ndarray) else ()
     flat = [entry for operand in operands for entry in entries(operand)]
-    return np.moveaxis(array_of(flat, (len(operands), *shape)), 0, params["axis"])
+    return np.moveaxis(cast(np.ndarray, array_of(flat, (len(operands), *shape))), 0, params["axis"])
 
 
 SHAPES: dict[str, Callable[[list[Any], Params], Any]] = {

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.bilinear import TextureRegion
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats
+from a2tg_jax.rasterize.splats import CompositingSettings, Splats, num_numbers
 from a2tg_jax.rasterize.tiles import TileLists
 
 
@@ -22,17 +22,12 @@ def pack_inputs(
     Rays of pixels are packed apart (`native.composite`).
     """
     num, capacity = splats.M.shape[0], lists.ids.shape[0]
-    packed = pack_splats(splats, settings.has_geometry, cutoff).astype(splats.M.dtype)
+    packed = pack_splats(splats, settings.kernel.has_geometry, cutoff).astype(splats.M.dtype)
     size = jnp.asarray([settings.grid.columns, settings.grid.width, lists.height_in(settings.grid)], jnp.int32)
     # Threads divide the tiles by their starts, which must ascend. Without splats no id is valid: all lists are empty.
     starts = jax.lax.cummax(jnp.clip(lists.starts, 0, capacity if num else 0))
     ids = jnp.clip(lists.ids, 0, max(num - 1, 0))
     return ids, starts, packed, pack_regions(regions), texels.astype(splats.M.dtype), size
-
-
-def num_numbers(has_geometry: bool, num_colors: int) -> int:
-    """Return the numbers per splat: the 9 entries of M, opacity, colours, and with geometry the normal."""
-    return 10 + num_colors + (3 if has_geometry else 0)
 
 
 def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
@@ -56,9 +51,8 @@ def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
 
 
 def split_image(image: Array) -> tuple[Array, Array]:
-    """Split a kernel's image [tiles, D + 1, P] into channels [tiles, 1, D, P] and transmittance [tiles, 1, P]."""
-    image = image[:, None]
-    return image[:, :, :-1], image[:, :, -1]
+    """Split a kernel's image [tiles, D + 1, P] into channels [tiles, D, P] and transmittance [tiles, P]."""
+    return image[:, :-1], image[:, -1]
 
 
 def unpack_gradients(
@@ -66,8 +60,8 @@ def unpack_gradients(
 ) -> tuple[Splats, Array, Array]:
     """Unpack a kernel's gradients, of `KernelSpec.gradient_shapes`, as those of splats, texels and probe."""
     packed, d_texels, d_probe = found
-    d_splats = unpack_splats(packed, splats, settings.has_geometry)
-    d_probe = d_probe.astype(probe.dtype) if settings.statistic else jnp.zeros_like(probe)
+    d_splats = unpack_splats(packed, splats, settings.kernel.has_geometry)
+    d_probe = d_probe.astype(probe.dtype) if settings.kernel.statistic else jnp.zeros_like(probe)
     return d_splats, d_texels.astype(texels.dtype), d_probe
 
 

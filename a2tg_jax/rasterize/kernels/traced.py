@@ -1,91 +1,20 @@
-"""Specification of kernels (`KernelSpec`), and the scalar functions that they apply, as jaxprs."""
+"""The scalar functions that kernels apply, as jaxprs."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Arguments, StaticRule
 from a2tg_jax.core.bilinear import Lookup, Sample, TextureRegion
 from a2tg_jax.rasterize import pixel
 from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
-from a2tg_jax.rasterize.kernels.packing import num_numbers
 from a2tg_jax.rasterize.kernels.tracing import example, trace
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats, num_channels
+from a2tg_jax.rasterize.splats import KernelSpec
 
 CUTOFF_SLACK = 1e-3
 """Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
-
-
-@dataclasses.dataclass(frozen=True)
-class KernelSpec:
-    """Specification for which a forward and a backward pass are compiled; hashable."""
-
-    rule: StaticRule
-    """Appearance rule."""
-    num_rule_numbers: int
-    """Number K of numbers per splat of the rule."""
-    num_columns: int
-    """Number C of numbers per texel; 0 without textures."""
-    dtype: str
-    """Dtype of all computations: "float32" or "float64"."""
-    tile_size: int
-    """Side of a tile in pixels."""
-    near_plane: float
-    """Least depth of visible hits."""
-    has_geometry: bool
-    """Whether depth, squared depth and normals are composited beside the colour."""
-    statistic: pixel.Statistic | None
-    """Statistic that the backward pass computes for densification, if any."""
-    num_colors: int = 3
-    """Number D of colours of a splat."""
-    has_rays: bool = False
-    """Whether pixels have rays of their own."""
-
-    @property
-    def arguments(self) -> Arguments:
-        """Arguments of the element-wise functions of the rule."""
-        return Arguments(self.num_rule_numbers, self.num_columns, self.num_colors, self.dtype)
-
-    @property
-    def num_tile_numbers(self) -> int:
-        """Number of `rasterize.pixel.TileNumbers`."""
-        return 6 if self.has_rays else 2
-
-    @property
-    def num_channels(self) -> int:
-        return num_channels(self.has_geometry, self.num_colors)
-
-    @property
-    def num_floats(self) -> int:
-        """Number S of floats per splat: its numbers, and the squared distance beyond which it is invisible."""
-        return num_numbers(self.has_geometry, self.num_colors) + self.num_rule_numbers + 1
-
-    @staticmethod
-    def of(
-        settings: CompositingSettings, rule: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None
-    ) -> "KernelSpec":
-        """Return the specification for these inputs of a compositor."""
-        return KernelSpec(
-            rule=rule,
-            num_rule_numbers=splats.numbers.shape[1],
-            num_columns=0 if regions is None else texels.shape[1],
-            dtype=np.dtype(splats.M.dtype).name,
-            tile_size=settings.grid.tile_size,
-            near_plane=settings.near_plane,
-            has_geometry=settings.has_geometry,
-            statistic=settings.statistic,
-            num_colors=settings.num_colors,
-            has_rays=settings.has_rays,
-        )
-
-    def gradient_shapes(self, splats: Splats, texels: Array, probe: Array) -> tuple[tuple[int, ...], ...]:
-        """Return the shapes of a kernel's gradients of packed splats, texels and probe; without a statistic [1, 4]."""
-        return (len(splats.M), self.num_floats), texels.shape, probe.shape if self.statistic else (1, 4)
 
 
 class Functions:
@@ -95,10 +24,10 @@ class Functions:
     """
 
     def __init__(self, spec: KernelSpec):
-        self._spec, self._rule = spec, spec.rule.rule
+        self._spec, self._functions = spec, spec.static.functions
         number, integer, flag = example(spec.dtype), example(jnp.int32), example(jnp.bool_)
         triple = (number,) * 3
-        normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_rule_numbers
+        normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_own_numbers
         splat = pixel.Splat((triple,) * 3, number, (number,) * spec.num_colors, normal, numbers)
         values = (number,) * spec.num_columns
         region = TextureRegion(integer, integer, integer) if values else None
@@ -119,8 +48,8 @@ class Functions:
         self, planes: pixel.Planes, region: TextureRegion | None, x: Array, y: Array
     ) -> tuple[Array, tuple[Array, ...]]:
         """Return the squared distance ρ of the pixel, and the position of the texture lookup."""
-        hit = pixel.intersect(planes, x, y, self._spec.near_plane, self._rule.has_low_pass)
-        return hit.rho, () if region is None else self._rule.texel_position(region, hit.u, hit.v)
+        hit = pixel.intersect(planes, x, y, self._spec.near_plane, self._functions.has_low_pass)
+        return hit.rho, () if region is None else self._functions.texel_position(region, hit.u, hit.v)
 
     def _forward(
         self, planes: pixel.Planes, splat: pixel.Splat, values: tuple[Array, ...], x: Array, y: Array,
@@ -128,7 +57,7 @@ class Functions:
     ) -> tuple[Array, Array, tuple[Array, ...]]:  # fmt: skip
         """Return transmittance and liveness behind the splat, and the channels with it."""
         at_pixel = planes, splat, values, x, y, transmittance, is_live
-        added, transmittance, is_live = pixel.blend(self._rule, self._spec.near_plane, *at_pixel)
+        added, transmittance, is_live = pixel.blend(self._functions, self._spec.near_plane, *at_pixel)
         return transmittance, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
 
     def _backward(
@@ -137,13 +66,13 @@ class Functions:
         jacobian: pixel.Rows,
     ) -> tuple[pixel.State, Array, tuple[Array, ...], Any]:  # fmt: skip
         """Return the state behind the splat, whether it contributes, the cotangents of the values, and all others."""
-        spec, rule = self._spec, self._rule
+        spec, functions = self._spec, self._functions
         at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
-        state, weight, d = pixel.blend_vjp(rule, spec.near_plane, *at_pixel, spec.statistic is not None)
+        state, weight, d = pixel.blend_vjp(functions, spec.near_plane, *at_pixel, spec.statistic is not None)
         added: tuple[Array, ...] = ()
         if spec.statistic and d.rho is not None:
             added = pixel.positional_gradient(
-                spec.statistic, splat.M, x, y, tile, d.rho, jacobian, spec.near_plane, rule.has_low_pass
+                spec.statistic, splat.M, x, y, tile, d.rho, jacobian, spec.near_plane, functions.has_low_pass
             )
         return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
 
@@ -158,14 +87,14 @@ def refusal_of(spec: KernelSpec, translate: Callable[[KernelSpec], Any]) -> str 
 
 
 def _place_of(primitive: str, spec: KernelSpec) -> str:
-    """Return in which function of a rule a primitive occurs, as in " in MyRule.shade"; "" if in none."""
-    rule = spec.rule.rule
+    """Return in which function of an appearance a primitive occurs, as in " in MyRule.shade"; "" if in none."""
+    functions = spec.static.functions
     for name, given in spec.arguments.of(()).items():
-        function = getattr(rule, name)
+        function = getattr(functions, name)
         if primitive in _primitives(trace(function, *given)[0]):
-            return f" in {spec.rule.name}.{name}"
+            return f" in {spec.static.name}.{name}"
         if name != "texel_position" and primitive in _primitives(trace(_gradient_of(function), *given)[0]):
-            return f" in the gradient of {spec.rule.name}.{name}"
+            return f" in the gradient of {spec.static.name}.{name}"
     return ""
 
 

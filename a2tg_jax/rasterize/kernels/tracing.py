@@ -23,12 +23,12 @@ def trace(function: Callable[..., Any], *examples: Any) -> tuple[core.ClosedJaxp
       function: function to trace.
       examples: pytrees of `example`, one per argument.
     """
-    closed, shape = _in_clean_context(lambda: jax.make_jaxpr(function, return_shape=True)(*examples))
+    closed, shape = in_clean_context(lambda: jax.make_jaxpr(function, return_shape=True)(*examples))
     return closed, jax.tree.structure(shape)
 
 
-def _in_clean_context(work: Callable[[], Any]) -> Any:
-    """Run work() on a thread of its own, for JAX's tracing is per thread, with the caller's dtype rules."""
+def in_clean_context(work: Callable[[], Any]) -> Any:
+    """Return work(), run on a thread of its own, because JAX's tracing is per thread, with the caller's dtype rules."""
     config: Any = jax.config
     is_x64, promotion = config.jax_enable_x64, config.jax_numpy_dtype_promotion
 

@@ -1,6 +1,6 @@
 """Scores of two images by windows, in plain array code: the average of a function of the means of x, y, x² + y², x·y.
 
-`native.ssim` has the same on CPUs, faster. Every derivative exists, in forward and reverse mode.
+`native.ssim` has the same on CPUs, faster; `scores` chooses. Every derivative exists, in forward and reverse mode.
 """
 
 import functools
@@ -31,6 +31,12 @@ def mean_score(score: Score, x: Array, y: Array) -> Array:
     blurred = window_mean(jnp.concatenate([x, x * x + y * y, x * y]), score.taps)
     mean_x, mean_squares, mean_product = jnp.split(blurred, 3)
     return jnp.mean(score.function(mean_x, window_mean(y, score.taps), mean_squares, mean_product))
+
+
+def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return the average, and its derivatives by x and y."""
+    value, slopes = jax.value_and_grad(functools.partial(mean_score, score), argnums=(0, 1))(x, y)
+    return value, *slopes
 
 
 def window_mean(images: Array, taps: tuple[float, ...]) -> Array:

@@ -14,12 +14,12 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from a2tg_jax.appearance import AppearanceRule, StaticRule, elementwise_rule
+from a2tg_jax.appearance import Elementwise, elementwise_functions
 from a2tg_jax.core import bilinear
 from a2tg_jax.core.bilinear import Lookup, TextureRegion
-from a2tg_jax.core.numerics import pixel_sum, spread
+from a2tg_jax.core.numerics import pixel_sum, spread_to_pixels
 from a2tg_jax.rasterize import pixel
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats, shading_arguments
+from a2tg_jax.rasterize.splats import CompositingSettings, Splats
 from a2tg_jax.rasterize.tile_pixels import TilePixels
 from a2tg_jax.rasterize.tiles import TileLists
 
@@ -51,78 +51,76 @@ class Tiles(NamedTuple):
     """Its pixels, if the camera has a ray for each pixel; the centre is then that of the rays."""
 
 
-def refusal(settings: CompositingSettings, rule: AppearanceRule, splats: Splats) -> None:
-    """Return None: XLA runs every rule."""
-
-
 def forward(
-    settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
     cutoff: Array, lists: TileLists,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return channels [groups, G, D, P] and transmittance [groups, G, P], G tiles a group.
+    """Return channels [tiles, D, P] and transmittance [tiles, P].
 
     Args:
-      settings: static options.
-      static: appearance rule without its arrays.
+      settings: static options, with the number G of tiles of a group.
       splats: N splats.
-      texels: [T, C] texels of the rule.
-      regions: [N] texture regions of the rule; None without textures.
+      texels: [T, C] texels of the appearance.
+      regions: [N] texture regions of the appearance; None without textures.
       cutoff: [N] squared distance beyond which each splat is invisible; not used here.
       lists: splats of each tile.
     """
-    rule = elementwise_rule(static, shading_arguments(texels, regions, splats.numbers, splats.colors))
+    functions = elementwise_functions(settings.kernel.static, settings.kernel.arguments)
     ids, dtype = padded_ids(lists), splats.M.dtype
 
     def group(index: Array) -> tuple[Array, Array]:
         tiles, start = tiles_of_group(settings, lists, index, dtype)
-        add_block = over_tiles(functools.partial(_block, settings, rule, texels), settings.tile_batch)
+        add_block = over_tiles(functools.partial(_block, settings, functions, texels), settings.tile_batch)
 
         def step(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
             at, transmittance, is_live, channels = carry
-            rows = gather_rows(splats, regions, block_ids(ids, at))
+            rows = gather_splats(splats, regions, block_ids(ids, at))
             added, transmittance, is_live = add_block(rows, at, tiles, transmittance, is_live)
             return at + BLOCK, transmittance, is_live, channels + added
 
-        shape = settings.tile_batch, settings.num_channels, settings.grid.tile_size**2
-        carry = (start, *initial_state(settings, lists, tiles), jnp.zeros(shape, dtype))
-        _, transmittance, _, channels = jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)
+        shape = settings.tile_batch, settings.kernel.num_channels, settings.grid.tile_size**2
+        carry = (start, *initial_pixels(settings, lists, tiles), jnp.zeros(shape, dtype))
+        _, transmittance, _, channels = jax.lax.while_loop(functools.partial(has_splats_left, tiles.end), step, carry)
         return channels, transmittance
 
-    shown: tuple[Array, Array] = jax.lax.map(group, jnp.arange(settings.num_groups, dtype=jnp.int32))
-    return shown
+    groups: tuple[Array, Array] = jax.lax.map(group, jnp.arange(settings.num_groups, dtype=jnp.int32))
+    return ungrouped(settings, *groups)
 
 
 def backward(
-    settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
     cutoff: Array, lists: TileLists, jacobian: Array, probe: Array, g: Array, suffix_sum: Array,
 ) -> tuple[Splats, Array, Array]:  # fmt: skip
     """Return the cotangents of splats, texels and probe.
 
     Args:
-      settings, static, splats, texels, regions, cutoff, lists: as for `forward`.
+      settings, splats, texels, regions, cutoff, lists: as for `forward`.
       jacobian, probe: as for `rasterize.compositor.composite`.
-      g: [groups, G, D, P] cotangents of the channels.
-      suffix_sum: [groups, G, P] B of the whole list (`rasterize.pixel.absorb_vjp`).
+      g: [tiles, D, P] cotangents of the channels.
+      suffix_sum: [tiles, P] B of the whole list (`rasterize.pixel.absorb_vjp`).
     """
     widths = [math.prod(leaf.shape[1:]) for leaf in splats]
     packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
     totals = packed, jnp.zeros_like(texels), jnp.zeros_like(probe)
-    rule = elementwise_rule(static, shading_arguments(texels, regions, splats.numbers, splats.colors))
+    functions = elementwise_functions(settings.kernel.static, settings.kernel.arguments)
     ids = padded_ids(lists)
+    g, suffix_sum = (_grouped(settings, of_tiles) for of_tiles in (g, suffix_sum))
 
     def group(index: Array, totals: Totals) -> Totals:
         tiles, start = tiles_of_group(settings, lists, index, splats.M.dtype)
-        pull_back = over_tiles(functools.partial(_block_vjp, settings, rule, texels, jacobian), settings.tile_batch)
+        pull_back = over_tiles(
+            functools.partial(_block_vjp, settings, functions, texels, jacobian), settings.tile_batch
+        )
 
         def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
             at, *state, totals = carry
             in_block = block_ids(ids, at)
-            rows = gather_rows(splats, regions, in_block)
+            rows = gather_splats(splats, regions, in_block)
             *state, d_rows = pull_back(rows, at, tiles, *state, g[index])
             return (at + BLOCK, *state, _accumulate(totals, in_block, d_rows))
 
-        carry = (start, *initial_state(settings, lists, tiles), suffix_sum[index], totals)
-        totals = jax.lax.while_loop(functools.partial(is_unfinished, tiles.end), step, carry)[-1]
+        carry = (start, *initial_pixels(settings, lists, tiles), suffix_sum[index], totals)
+        totals = jax.lax.while_loop(functools.partial(has_splats_left, tiles.end), step, carry)[-1]
         return totals
 
     packed, d_texels, d_probe = jax.lax.fori_loop(jnp.int32(0), jnp.int32(settings.num_groups), group, totals)
@@ -131,7 +129,21 @@ def backward(
     return d_splats, d_texels, d_probe
 
 
-def initial_state(settings: CompositingSettings, lists: TileLists, tiles: Tiles) -> tuple[Array, Array]:
+def ungrouped(settings: CompositingSettings, channels: Array, transmittance: Array) -> tuple[Array, Array]:
+    """Return arrays [groups, G, ...] as [tiles, ...], without the tiles that fill up the last group."""
+    images = channels, transmittance
+    channels, transmittance = (x.reshape(-1, *x.shape[2:])[: settings.grid.num] for x in images)
+    return channels, transmittance
+
+
+def _grouped(settings: CompositingSettings, x: Array) -> Array:
+    """Return an array [tiles, ...] as [groups, G, ...], filled up with zeros."""
+    missing = settings.num_groups * settings.tile_batch - x.shape[0]
+    x = jnp.pad(x, [(0, missing), *[(0, 0)] * (x.ndim - 1)])
+    return x.reshape(settings.num_groups, settings.tile_batch, *x.shape[1:])
+
+
+def initial_pixels(settings: CompositingSettings, lists: TileLists, tiles: Tiles) -> tuple[Array, Array]:
     """Return transmittance 1 [G, P], and the live pixels [G, P]; those that are not shown never are."""
     if tiles.pixels is not None:
         return jnp.ones_like(tiles.pixels.is_seen, tiles.x.dtype), tiles.pixels.is_seen
@@ -141,7 +153,7 @@ def initial_state(settings: CompositingSettings, lists: TileLists, tiles: Tiles)
     return jnp.ones_like(is_inside, tiles.x.dtype), is_inside
 
 
-def is_unfinished(ends: Array, carry: tuple[Any, ...]) -> Array:
+def has_splats_left(ends: Array, carry: tuple[Any, ...]) -> Array:
     """Return whether a tile of a group has splats left, and live pixels."""
     at, _, is_live = carry[:3]
     return jnp.any((at < ends) & jnp.any(is_live, axis=1))
@@ -186,7 +198,7 @@ def block_ids(ids: Array, at: Array) -> Array:
     return ids[jnp.minimum(at[:, None] + jnp.arange(BLOCK, dtype=jnp.int32)[None, :], ids.shape[0] - 1)]
 
 
-def gather_rows(splats: Splats, regions: TextureRegion | None, ids: Array) -> Block:
+def gather_splats(splats: Splats, regions: TextureRegion | None, ids: Array) -> Block:
     """Return the splats [G, B, ...] of some ids [G, B], and their texture regions."""
     flat = ids.reshape(-1)
     rows = jax.tree.map(lambda x: x[flat], (splats, regions))
@@ -221,7 +233,7 @@ def numbers_of(tile: Tiles) -> pixel.TileNumbers:
     return tile.x, tile.y, xx, xy, yx, yy
 
 
-def pixels_of(tile: Tiles, size: int, dtype: DTypeLike) -> tuple[Array, Array]:
+def pixel_offsets(tile: Tiles, size: int, dtype: DTypeLike) -> tuple[Array, Array]:
     """Return x and y of a tile's pixels, each [1, P], in its frame."""
     if tile.pixels is None:
         return pixels_of_tile(size, dtype)
@@ -233,7 +245,7 @@ def split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.S
     """Split splats [B, ...] into numbers for `pixel`, each [B], or spread over [B, num] pixels."""
 
     def put(x: Array) -> Array:
-        return x if num is None else spread(x, num=num)
+        return x if num is None else spread_to_pixels(x, num=num)
 
     def several(x: Array) -> Any:
         return tuple(put(x[:, k]) for k in range(x.shape[1]))
@@ -244,45 +256,47 @@ def split(splats: Splats, has_geometry: bool, num: int | None = None) -> pixel.S
     return pixel.Splat(M, put(splats.opacities), several(splats.colors), normal, numbers)
 
 
-def _hits(settings: CompositingSettings, rule: AppearanceRule, splats: Splats, tile: Tiles) -> pixel.Hit:
+def _hits(settings: CompositingSettings, functions: Elementwise, splats: Splats, tile: Tiles) -> pixel.Hit:
     """Return the hits of a tile's pixels with the splats of a block, [B, P] each."""
-    x, y = pixels_of(tile, settings.grid.tile_size, splats.M.dtype)
+    x, y = pixel_offsets(tile, settings.grid.tile_size, splats.M.dtype)
     planes = pixel.planes_of(split(splats, False).M, numbers_of(tile))
-    planes = jax.tree.map(lambda entry: spread(entry, x.shape[1]), planes)
-    return pixel.intersect(planes, x, y, settings.near_plane, rule.has_low_pass)
+    planes = jax.tree.map(lambda entry: spread_to_pixels(entry, x.shape[1]), planes)
+    return pixel.intersect(planes, x, y, settings.kernel.near_plane, functions.has_low_pass)
 
 
-def look_up(rule: AppearanceRule, texels: Array, regions: TextureRegion | None, hit: pixel.Hit) -> Lookup | None:
-    """Look up the textures of B splats at P pixels, [B, P] each; None if the rule has no textures."""
+def look_up(functions: Elementwise, texels: Array, regions: TextureRegion | None, hit: pixel.Hit) -> Lookup | None:
+    """Look up the textures of B splats at P pixels, [B, P] each; None without textures."""
     if regions is None:
         return None
     region = jax.tree.map(lambda x: x[:, None], regions)
-    corners = bilinear.corners_of(region, *rule.texel_position(region, hit.u, hit.v))
+    corners = bilinear.corners_of(region, *functions.texel_position(region, hit.u, hit.v))
     read = texels[jnp.stack([corner.texel for corner in corners])]
     sample = bilinear.interpolate(corners, tuple(tuple(jnp.moveaxis(texel, -1, 0)) for texel in read))
-    return Lookup(region, bilinear.or_empty(sample, region, rule.empty), corners)
+    return Lookup(region, bilinear.or_empty(sample, region, functions.empty), corners)
 
 
 def _show(
-    settings: CompositingSettings, rule: AppearanceRule, splats: Splats, hit: pixel.Hit, values: tuple[Array, ...],
+    settings: CompositingSettings, functions: Elementwise, splats: Splats, hit: pixel.Hit, values: tuple[Array, ...],
     at: Array, tile: Tiles, rho_probe: Array | None = None,
 ) -> pixel.Shown:  # fmt: skip
     """Return what a block shows at a tile's pixels, [B, P] each; entries past the end of the list show nothing."""
-    shown = pixel.show(rule, split(splats, settings.has_geometry, settings.grid.tile_size**2), hit, values, rho_probe)
+    shown = pixel.show(
+        functions, split(splats, settings.kernel.has_geometry, settings.grid.tile_size**2), hit, values, rho_probe
+    )
     in_list = (at + jnp.arange(BLOCK, dtype=jnp.int32) < tile.end)[:, None]
     return pixel.Shown(jnp.where(in_list, shown.alpha, 0.0), shown.channels)
 
 
 def _block(
-    settings: CompositingSettings, rule: AppearanceRule, texels: Array, rows: Block, at: Array, tile: Tiles,
+    settings: CompositingSettings, functions: Elementwise, texels: Array, rows: Block, at: Array, tile: Tiles,
     transmittance: Array, is_live: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Composite one block of B splats over one tile.
 
     Args:
       settings: static options.
-      rule: appearance rule.
-      texels: [T, C] texels of the rule.
+      functions: those of the appearance.
+      texels: [T, C] texels of the appearance.
       rows: splats of the block, and their texture regions.
       at: position of the block in the list; entries past the tile's end are left out.
       tile: the tile.
@@ -293,8 +307,8 @@ def _block(
       Added channels [D, P], and transmittance and live pixels after the block.
     """
     splats, regions = rows
-    hit = _hits(settings, rule, splats, tile)
-    shown = _show(settings, rule, splats, hit, values_of(look_up(rule, texels, regions, hit)), at, tile)
+    hit = _hits(settings, functions, splats, tile)
+    shown = _show(settings, functions, splats, hit, values_of(look_up(functions, texels, regions, hit)), at, tile)
 
     def add_splat(carry: tuple[Array, Array], alpha: Array) -> tuple[tuple[Array, Array], Array]:
         weight, transmittance, is_live = pixel.absorb(alpha, *carry)
@@ -313,7 +327,7 @@ def sum_rows(x: Array) -> Array:
 
 
 def _block_vjp(
-    settings: CompositingSettings, rule: AppearanceRule, texels: Array, jacobian: Array, rows: Block, at: Array,
+    settings: CompositingSettings, functions: Elementwise, texels: Array, jacobian: Array, rows: Block, at: Array,
     tile: Tiles, transmittance: Array, is_live: Array, suffix_sum: Array, g: Array,
 ) -> tuple[Array, Array, Array, BlockCotangents]:  # fmt: skip
     """Differentiate `_block`: return the state after the block, and the cotangents of its rows.
@@ -321,13 +335,15 @@ def _block_vjp(
     `suffix_sum` [P] is g·(channels added by this block and all behind it) + g_T·T_final; g is [D, P].
     """
     splats, regions = rows
-    lookup = look_up(rule, texels, regions, _hits(settings, rule, splats, tile))
+    lookup = look_up(functions, texels, regions, _hits(settings, functions, splats, tile))
 
     def of_floats(splats: Splats, values: tuple[Array, ...], rho_probe: Array | None) -> pixel.Shown:
-        hit = _hits(settings, rule, splats, tile)
-        return _show(settings, rule, splats, hit, pixel.values_at(rule, lookup, hit, values), at, tile, rho_probe)
+        hit = _hits(settings, functions, splats, tile)
+        return _show(
+            settings, functions, splats, hit, pixel.values_at(functions, lookup, hit, values), at, tile, rho_probe
+        )
 
-    rho_probe = jnp.zeros((BLOCK, transmittance.shape[0]), transmittance.dtype) if settings.statistic else None
+    rho_probe = jnp.zeros((BLOCK, transmittance.shape[0]), transmittance.dtype) if settings.kernel.statistic else None
     shown, pull_back = jax.vjp(of_floats, splats, values_of(lookup), rho_probe)
     g = g[:, None]
     seen: Any = sum(channel * g[k] for k, channel in enumerate(shown.channels))
@@ -337,9 +353,11 @@ def _block_vjp(
         return (after[0], after[1], after[2]), (weight, d_alpha)
 
     carry, (weights, d_alpha) = jax.lax.scan(add_splat, (transmittance, is_live, suffix_sum), (shown.alpha, seen))
-    d_shown = pixel.Shown(d_alpha, tuple(weights * g[k] for k in range(settings.num_channels)))
+    d_shown = pixel.Shown(d_alpha, tuple(weights * g[k] for k in range(settings.kernel.num_channels)))
     d_splats, d_values, d_rho = pull_back(d_shown)
-    d_probe = _statistic(settings, rule, jacobian, splats, tile, d_rho, weights) if settings.statistic else None
+    d_probe = (
+        _statistic(settings, functions, jacobian, splats, tile, d_rho, weights) if settings.kernel.statistic else None
+    )
     return *carry, (d_splats, d_probe, _texel_cotangents(lookup, d_values))
 
 
@@ -356,15 +374,15 @@ def _texel_cotangents(lookup: Lookup | None, d_values: tuple[Array, ...]) -> Tex
 
 
 def _statistic(
-    settings: CompositingSettings, rule: AppearanceRule, jacobian: Array, splats: Splats, tile: Tiles, d_rho: Array,
+    settings: CompositingSettings, functions: Elementwise, jacobian: Array, splats: Splats, tile: Tiles, d_rho: Array,
     weights: Array,
 ) -> Array:  # fmt: skip
     """Return Σ_pixels of the statistic, and the number of pixels composited, [B, 4]."""
-    assert settings.statistic is not None
-    x, y = pixels_of(tile, settings.grid.tile_size, d_rho.dtype)
+    assert settings.kernel.statistic is not None
+    x, y = pixel_offsets(tile, settings.grid.tile_size, d_rho.dtype)
     M = jax.tree.map(lambda entry: entry[:, None], split(splats, False).M)
-    near_plane, has_low_pass = settings.near_plane, rule.has_low_pass
+    near_plane, has_low_pass = settings.kernel.near_plane, functions.has_low_pass
     components = pixel.positional_gradient(
-        settings.statistic, M, x, y, numbers_of(tile), d_rho, jacobian, near_plane, has_low_pass
+        settings.kernel.statistic, M, x, y, numbers_of(tile), d_rho, jacobian, near_plane, has_low_pass
     )
     return jnp.stack([*map(pixel_sum, components), pixel_sum((weights > 0).astype(d_rho.dtype))], axis=1)

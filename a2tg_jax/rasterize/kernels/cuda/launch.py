@@ -11,8 +11,8 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.rasterize.kernels.cuda import nvrtc
-from a2tg_jax.rasterize.kernels.cuda.source import num_parts, num_threads, source
-from a2tg_jax.rasterize.kernels.traced import KernelSpec
+from a2tg_jax.rasterize.kernels.cuda.source import block_threads, num_parts, source
+from a2tg_jax.rasterize.splats import KernelSpec
 
 TARGET = "__gpu$xla.gpu.ptx"
 DEFAULT_CAPABILITY = "9.0"
@@ -21,8 +21,11 @@ DEFAULT_CAPABILITY = "9.0"
 
 def capability() -> str:
     """Return the least compute capability of this process's GPUs."""
-    found = [device.compute_capability for device in jax.local_devices() if device.platform == "gpu"]
-    return min(found, key=lambda text: [int(part) for part in text.split(".")], default=DEFAULT_CAPABILITY)
+    try:
+        found: list[str] = [device.compute_capability for device in jax.local_devices(backend="cuda")]
+    except RuntimeError:
+        return DEFAULT_CAPABILITY
+    return min(found, key=lambda text: [int(part) for part in text.split(".")])
 
 
 def launch(
@@ -49,7 +52,7 @@ def launch(
     call = jax.ffi.ffi_call(TARGET, shapes, input_output_aliases=aliases, vmap_method="sequential")
     attributes = {f"{kind}_{axis}": np.int32(1) for kind in ("grid", "block") for axis in "xyz"}
     attributes["grid_x"] = np.int32(num_tiles * num_parts(spec.tile_size))
-    attributes["block_x"] = np.int32(num_threads(spec.tile_size))
+    attributes["block_x"] = np.int32(block_threads(spec.tile_size))
     attributes["shared_mem_bytes"] = np.int32(0)
     found = call(*inputs, *totals, name=name, kernel_type="ptx", kernel_data=program, **attributes)
     return list(found)

@@ -11,7 +11,9 @@ from typing import Any
 import jax
 import numpy as np
 
-Emitter = Callable[[list[str], Any], str]
+from a2tg_jax.rasterize.kernels.jaxprs import Equation, aval_of, result_of
+
+Emitter = Callable[[list[str], Equation], str]
 """(operands, equation) to an expression."""
 
 C_TYPES = {
@@ -21,7 +23,7 @@ C_TYPES = {
 }
 
 
-def literal(value: Any, dtype: np.dtype[Any]) -> str:
+def literal(value: Any, dtype: np.dtype) -> str:
     """Return a number as a C literal, exact to the last bit."""
     if dtype == np.bool_:
         return str(int(value))
@@ -37,12 +39,11 @@ def literal(value: Any, dtype: np.dtype[Any]) -> str:
     return f"({number.hex()}{'f' if dtype.itemsize == 4 else ''})"
 
 
-def _dtype(equation: Any, operand: int = 0) -> np.dtype[Any]:
-    dtype: np.dtype[Any] = np.dtype(equation.invars[operand].aval.dtype)
-    return dtype
+def _dtype(equation: Equation, operand: int = 0) -> np.dtype:
+    return np.dtype(aval_of(equation.invars[operand]).dtype)
 
 
-def _is_float(equation: Any) -> bool:
+def _is_float(equation: Equation) -> bool:
     return _dtype(equation).kind == "f"
 
 
@@ -57,7 +58,7 @@ def _call(name: str) -> Emitter:
 def _extreme(symbol: str) -> Emitter:
     """Make an emitter of the larger or smaller of two numbers; NaN if one is NaN."""
 
-    def emit(x: list[str], equation: Any) -> str:
+    def emit(x: list[str], equation: Equation) -> str:
         or_nan = f" || {_is_nan(x[0])}" if _is_float(equation) else ""
         return f"({x[0]} {symbol} {x[1]}{or_nan}) ? {x[0]} : {x[1]}"
 
@@ -68,43 +69,43 @@ def _is_nan(x: str) -> str:
     return f"{x} != {x}"
 
 
-def _clamp(x: list[str], equation: Any) -> str:
+def _clamp(x: list[str], equation: Equation) -> str:
     low, number, high = x
     nan = f"{_is_nan(number)} ? {number} : " if _dtype(equation, 1).kind == "f" else ""
     return f"{nan}({number} < {low} ? {low} : {number}) < {high} ? ({number} < {low} ? {low} : {number}) : {high}"
 
 
-def _whole_power(x: list[str], equation: Any) -> str:
+def _whole_power(x: list[str], equation: Equation) -> str:
     exponent = equation.params["y"]
     one = literal(1, _dtype(equation))
     product = " * ".join(x * abs(exponent)) or one
     return f"{one} / ({product})" if exponent < 0 else product
 
 
-def _power(x: list[str], equation: Any) -> str:
+def _power(x: list[str], equation: Equation) -> str:
     return f"pow({x[0]}, ({C_TYPES[_dtype(equation).name]}){x[1]})"
 
 
-def _divide(x: list[str], equation: Any) -> str:
+def _divide(x: list[str], equation: Equation) -> str:
     if _is_float(equation):
         return f"{x[0]} / {x[1]}"
     minus = f"{x[1]} == -1 ? -{x[0]} : " if _dtype(equation).kind == "i" else ""
     return f"{x[1]} == 0 ? ({_c_type(equation)})-1 : {minus}{x[0]} / {x[1]}"
 
 
-def _remainder(x: list[str], equation: Any) -> str:
+def _remainder(x: list[str], equation: Equation) -> str:
     if _is_float(equation):
         return f"fmod({x[0]}, {x[1]})"
     minus = f"{x[1]} == -1 ? 0 : " if _dtype(equation).kind == "i" else ""
     return f"{x[1]} == 0 ? {x[0]} : {minus}{x[0]} % {x[1]}"
 
 
-def _c_type(equation: Any) -> str:
-    return C_TYPES[np.dtype(equation.outvars[0].aval.dtype).name]
+def _c_type(equation: Equation) -> str:
+    return C_TYPES[np.dtype(result_of(equation).dtype).name]
 
 
 def _shift(symbol: str) -> Emitter:
-    def emit(x: list[str], equation: Any) -> str:
+    def emit(x: list[str], equation: Equation) -> str:
         dtype = _dtype(equation)
         width = dtype.itemsize * 8
         signed, unsigned = C_TYPES[f"int{width}"], C_TYPES[f"uint{width}"]
@@ -116,26 +117,26 @@ def _shift(symbol: str) -> Emitter:
     return emit
 
 
-def _bitwise_not(x: list[str], equation: Any) -> str:
+def _bitwise_not(x: list[str], equation: Equation) -> str:
     return f"!{x[0]}" if _dtype(equation) == np.bool_ else f"~{x[0]}"
 
 
-def _absolute(x: list[str], equation: Any) -> str:
+def _absolute(x: list[str], equation: Equation) -> str:
     return f"fabs({x[0]})" if _is_float(equation) else f"({x[0]} < 0 ? -{x[0]} : {x[0]})"
 
 
-def _sign(x: list[str], equation: Any) -> str:
+def _sign(x: list[str], equation: Equation) -> str:
     sign = f"({_c_type(equation)})(({x[0]} > 0) - ({x[0]} < 0))"
     return f"{x[0]} != 0 && {x[0]} == {x[0]} ? {sign} : {x[0]}" if _is_float(equation) else sign
 
 
-def _round(x: list[str], equation: Any) -> str:
+def _round(x: list[str], equation: Equation) -> str:
     to_even = equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
     return f"{'rint' if to_even else 'round'}({x[0]})"
 
 
-def _convert(x: list[str], equation: Any) -> str:
-    source, target = _dtype(equation), np.dtype(equation.outvars[0].aval.dtype)
+def _convert(x: list[str], equation: Equation) -> str:
+    source, target = _dtype(equation), np.dtype(result_of(equation).dtype)
     if target == np.bool_:
         return f"{x[0]} != 0"
     if source.kind == "f" and target.kind in "iu":
@@ -146,17 +147,17 @@ def _convert(x: list[str], equation: Any) -> str:
     return f"({C_TYPES[target.name]}){x[0]}"
 
 
-def _limits(source: np.dtype[Any], target: np.dtype[Any]) -> tuple[float, float]:
+def _limits(source: np.dtype, target: np.dtype) -> tuple[float, float]:
     """Return the floats at and beyond which a conversion gives the least and the largest integer."""
     info = np.iinfo(target)
     return float(info.min), float(source.type(info.max))
 
 
-def _bitcast(x: list[str], equation: Any) -> str:
+def _bitcast(x: list[str], equation: Equation) -> str:
     return f"a2tg_{C_TYPES[_dtype(equation).name]}_as_{_c_type(equation)}({x[0]})".replace(" ", "_")
 
 
-def _select(x: list[str], equation: Any) -> str:
+def _select(x: list[str], equation: Equation) -> str:
     which, first, *others = x
     if _dtype(equation) == np.bool_:
         return f"{which} ? {others[0]} : {first}"
@@ -164,11 +165,11 @@ def _select(x: list[str], equation: Any) -> str:
     return "".join(cases) + (others[-1] if others else first)
 
 
-def _identity(x: list[str], _: Any) -> str:
+def _identity(x: list[str], _: Equation) -> str:
     return x[0]
 
 
-def _minus(x: list[str], _: Any) -> str:
+def _minus(x: list[str], _: Equation) -> str:
     return f"-{x[0]}"
 
 

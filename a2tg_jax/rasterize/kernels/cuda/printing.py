@@ -7,18 +7,21 @@ arrays become one variable per entry. Each thread has its own branch: `cond` bec
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from jax.extend import core
-from jax.typing import DTypeLike
+from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.rasterize.kernels.cuda.primitives import C_TYPES, PRIMITIVES, literal
 from a2tg_jax.rasterize.kernels.jaxprs import (
     Equation,
     Evaluator,
+    Step,
     Untranslatable,
+    Value,
+    Values,
     array_of,
+    aval_of,
     entries,
     map_entries,
     result_of,
@@ -61,7 +64,7 @@ def c_function(name: str, closed: core.ClosedJaxpr, inputs: Sequence[Argument], 
     printer = _Printer()
     given = [entry for argument in inputs for entry in argument.entries()]
     # A result may lie where an argument does.
-    kept = [printer.variable(v.aval.dtype, x) for v, x in zip(closed.jaxpr.invars, given, strict=True)]
+    kept = [printer.variable(aval_of(v).dtype, x) for v, x in zip(closed.jaxpr.invars, given, strict=True)]
     results = [entry for value in printer.run(closed, kept) for entry in entries(value)]
     places = [entry if a.num is not None else f"*{entry}" for a in outputs for entry in a.entries()]
     parameters = ", ".join([*(a.read for a in inputs), *(a.written for a in outputs)])
@@ -70,7 +73,7 @@ def c_function(name: str, closed: core.ClosedJaxpr, inputs: Sequence[Argument], 
     return f"INLINE void {name}({parameters}) {{\n{body}\n}}\n"
 
 
-class _Printer(Evaluator):
+class _Printer(Evaluator[str]):
     """Lines of C that evaluate jaxprs; a value is the name of a variable, or a literal."""
 
     target = "GPU kernels"
@@ -80,7 +83,7 @@ class _Printer(Evaluator):
         self._types: dict[str, str] = {}
         """C type of each variable and literal."""
 
-    def variable(self, dtype: Any, value: str | None = None) -> str:
+    def variable(self, dtype: DTypeLike, value: str | None = None) -> str:
         """Declare a variable; return its name."""
         return self._declare(_c_type(dtype), "" if value is None else f" = {value}")
 
@@ -90,7 +93,7 @@ class _Printer(Evaluator):
         self.lines.append(f"{c_type} {name}{value};")
         return name
 
-    def literal(self, number: Any, dtype: DTypeLike) -> str:
+    def literal(self, number: ArrayLike, dtype: DTypeLike) -> str:
         text = literal(number, np.dtype(dtype))
         self._types[text] = _c_type(dtype)
         return text
@@ -103,7 +106,9 @@ class _Printer(Evaluator):
             return None
         return lambda operands, equation: self.variable(result_of(equation).dtype, PRIMITIVES[name](operands, equation))
 
-    def branches(self, index: Any, branches: Sequence[Any], operands: list[Any], equation: Equation) -> list[Any]:
+    def branches(
+        self, index: Value[str], branches: Sequence[core.ClosedJaxpr], operands: Values[str], equation: Equation
+    ) -> Values[str]:
         avals = [result_of(equation, k) for k in range(len(equation.outvars))]
         results = [array_of([self.variable(a.dtype) for _ in range(math.prod(a.shape))], a.shape) for a in avals]
         for k, branch in enumerate(branches):
@@ -112,16 +117,14 @@ class _Printer(Evaluator):
                 self._assign(results, self.run(branch, operands))
         return results
 
-    def loop(
-        self, carry: list[Any], test: Callable[[list[Any]], str], step: Callable[[list[Any]], list[Any]]
-    ) -> list[Any]:
+    def loop(self, carry: Values[str], test: Callable[[Values[str]], Value[str]], step: Step[str]) -> Values[str]:
         rooms = self._copies(carry)
         with self._block("while (1)"):
             self.lines.append(f"if (!{test(rooms)}) break;")
             self._assign(rooms, step(rooms))
         return rooms
 
-    def counted(self, length: int, carry: list[Any], step: Callable[[list[Any]], list[Any]]) -> list[Any]:
+    def counted(self, length: int, carry: Values[str], step: Step[str]) -> Values[str]:
         rooms, count = self._copies(carry), self.variable(np.int32, "0")
         with self._block(f"for (; {count} < {length}; {count}++)"):
             self._assign(rooms, step(rooms))
@@ -133,26 +136,20 @@ class _Printer(Evaluator):
         yield
         self.lines.append("}")
 
-    def _assign(self, rooms: Sequence[Any], values: Sequence[Any]) -> None:
+    def _assign(self, rooms: Values[str], values: Values[str]) -> None:
         """Assign values to declared variables. Copies come first, for a value may be one of the variables."""
         names = [entry for room in rooms for entry in entries(room)]
         copies = [entry for value in self._copies(values) for entry in entries(value)]
         self.lines += [f"{name} = {copy};" for name, copy in zip(names, copies, strict=True)]
 
-    def _copies(self, values: Sequence[Any]) -> list[Any]:
+    def _copies(self, values: Values[str]) -> Values[str]:
         """Declare a variable for each entry of some values, and set it to the entry."""
         copy = lambda x: self._declare(self._types[x[0]], f" = {x[0]}")  # noqa: E731
         return [map_entries(copy, [value]) for value in values]
 
 
-def _c_type(dtype: Any) -> str:
+def _c_type(dtype: DTypeLike) -> str:
     name = np.dtype(dtype).name
     if name not in C_TYPES:
         raise Untranslatable(f"GPU kernels have no numbers of type {name}")
     return C_TYPES[name]
-
-
-def _constant(value: Any, aval: Any) -> Any:
-    dtype = np.dtype(aval.dtype)
-    _c_type(dtype)
-    return array_of([literal(number, dtype) for number in np.asarray(value).reshape(-1)], aval.shape)

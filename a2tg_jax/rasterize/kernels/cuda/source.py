@@ -9,22 +9,23 @@ import jax.numpy as jnp
 from a2tg_jax.core import bilinear
 from a2tg_jax.core.bilinear import Corner, TextureRegion
 from a2tg_jax.rasterize.kernels.cuda.printing import Argument, c_function
-from a2tg_jax.rasterize.kernels.traced import CUTOFF_SLACK, Functions, KernelSpec
+from a2tg_jax.rasterize.kernels.traced import CUTOFF_SLACK, Functions
 from a2tg_jax.rasterize.kernels.tracing import example, trace
+from a2tg_jax.rasterize.splats import KernelSpec
 
 Dialect = Literal["cuda", "opencl"]
 MOST_THREADS = 256
 WARP = 32
 
 
-def num_threads(tile_size: int) -> int:
+def block_threads(tile_size: int) -> int:
     """Return the threads of a block: a warp or more, and at most 256."""
     return min(MOST_THREADS, -(-(tile_size**2) // WARP) * WARP)
 
 
 def num_parts(tile_size: int) -> int:
     """Return the blocks that share a tile, for each thread has one pixel."""
-    return -(-(tile_size**2) // num_threads(tile_size))
+    return -(-(tile_size**2) // block_threads(tile_size))
 
 
 @functools.cache
@@ -32,7 +33,7 @@ def source(spec: KernelSpec, dialect: Dialect) -> str:
     """Return the kernels `forward` and `backward` of a spec as text.
 
     Raises:
-      Untranslatable: if the appearance rule uses a primitive or a dtype that has no translation.
+      Untranslatable: if the appearance uses a primitive or a dtype that has no translation.
     """
     functions = Functions(spec)
     constants = _constants(spec, functions.num_planes)
@@ -51,7 +52,7 @@ def _constants(spec: KernelSpec, num_planes: int) -> dict[str, Any]:
     return {
         "TILE_SIZE": spec.tile_size,
         "NUM_PIXELS": spec.tile_size**2,
-        "THREADS": num_threads(spec.tile_size),
+        "THREADS": block_threads(spec.tile_size),
         "PARTS": num_parts(spec.tile_size),
         "BATCH": 64 if spec.dtype == "float32" else 32,
         "NUM_NUMBERS": num_numbers,
@@ -100,7 +101,7 @@ def _pixel_functions(spec: KernelSpec, functions: Functions, count: int) -> list
 def _texture_functions(spec: KernelSpec, region: Argument, position: Argument) -> list[str]:
     number, integer = example(spec.dtype), example(jnp.int32)
     place = TextureRegion(integer, integer, integer)
-    empty = spec.rule.rule.empty
+    empty = spec.static.functions.empty
 
     def corners(region: TextureRegion, x: Any, y: Any) -> Any:
         texels, *weights = zip(*bilinear.corners_of(region, x, y), strict=True)

@@ -7,7 +7,7 @@
   over tiles, splats and pixels, from the scalar functions in `traced` and the texture lookups in `texels`. `lists`
   writes the functions that list the splats of each tile.
 - Running them: `llvm_modules` compiles a module. `ffi` lets XLA call Python functions on its buffers, through the
-  `gate` that closes when the program ends. `threads` shares the work, `sums` adds up the gradients of all threads, and
-  `dump` saves the compiled code if A2TG_DUMP is set.
+  `shutdown_gate`, which closes when the program ends. `threads` shares the work, `sums` adds up the gradients of all
+  threads, and `dump` saves the compiled code if A2TG_DUMP is set.
 - Used by the renderer and the losses: `composite` draws and lists tiles, `ssim` scores two images over windows.
 """

@@ -13,13 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import AppearanceRule, StaticRule
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import Outline
 from a2tg_jax.rasterize.kernels.native import ffi, sums, threads
 from a2tg_jax.rasterize.kernels.packing import pack_inputs, split_image, unpack_gradients
-from a2tg_jax.rasterize.kernels.traced import KernelSpec, refusal_of
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats
+from a2tg_jax.rasterize.kernels.traced import refusal_of
+from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
 if TYPE_CHECKING:
@@ -30,24 +29,20 @@ PAIRS_PER_THREAD, SPLATS_PER_THREAD = 2_000, 10_000
 """Least numbers of pairs and of splats that are worth another thread."""
 
 
-def refusal(settings: CompositingSettings, rule: AppearanceRule, splats: Splats) -> str | None:
-    """Return why a rule cannot run in native loops; None if it can, after compiling them."""
-    return _refusal(KernelSpec.of(settings, StaticRule.of(rule), splats, rule.texels, rule.regions))
-
-
 @functools.cache
-def _refusal(spec: KernelSpec) -> str | None:
+def refusal(spec: KernelSpec) -> str | None:
+    """Return why an appearance cannot run in native loops; None if it can, after compiling them."""
     from a2tg_jax.rasterize.kernels.native.passes import compiled_passes
 
     return refusal_of(spec, compiled_passes)
 
 
 def forward(
-    settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
     cutoff: Array, lists: TileLists,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return channels [tiles, 1, D, P] and transmittance [tiles, 1, P], as `xla.forward` does."""
-    spec = KernelSpec.of(settings, static, splats, texels, regions)
+    """Return channels [tiles, D, P] and transmittance [tiles, P], as `xla.forward` does."""
+    spec = settings.kernel
     name = _registered(spec, "forward", _forward_handler)
     shape = settings.grid.num, spec.num_channels + 1, spec.tile_size**2
     inputs = _packed(spec, settings, splats, texels, regions, cutoff, lists)
@@ -67,11 +62,11 @@ def _packed(
 
 
 def backward(
-    settings: CompositingSettings, static: StaticRule, splats: Splats, texels: Array, regions: TextureRegion | None,
+    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
     cutoff: Array, lists: TileLists, jacobian: Array, probe: Array, g: Array, suffix_sum: Array,
 ) -> tuple[Splats, Array, Array]:  # fmt: skip
     """Return the cotangents of splats, texels and probe, as `xla.backward` does."""
-    spec = KernelSpec.of(settings, static, splats, texels, regions)
+    spec = settings.kernel
     name = _registered(spec, "backward", _backward_handler)
     dtype, shapes = splats.M.dtype, spec.gradient_shapes(splats, texels, probe)
     cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]

@@ -7,18 +7,20 @@ results are chosen lane by lane; a loop runs until the last lane has left it.
 import contextlib
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
+from jax.extend import core
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels.jaxprs import entries, like, map_entries
+from a2tg_jax.rasterize.kernels.jaxprs import Step, Value, Values, entries, map_entries, rebuilt_like
 from a2tg_jax.rasterize.kernels.native.vectors import BOOL, INT, Translator
 
 
-def branches(lanes: Translator, index: ir.Value, jaxprs: Sequence[Any], operands: list[Any]) -> list[Any]:
+def branches(
+    lanes: Translator, index: ir.Value, jaxprs: Sequence[core.ClosedJaxpr], operands: Values[ir.Value]
+) -> Values[ir.Value]:
     """Emit `cond` or `switch`: all lanes run every branch, and some take part in it."""
     b = lanes.builder
-    chosen: list[Any] = []
+    chosen: Values[ir.Value] = []
     for k, branch in enumerate(jaxprs):
         symbol = "<=" if k == 0 else (">=" if k == len(jaxprs) - 1 else "==")
         is_here = b.icmp_signed(symbol, index, lanes.constant(k, INT))
@@ -30,9 +32,8 @@ def branches(lanes: Translator, index: ir.Value, jaxprs: Sequence[Any], operands
 
 
 def loop(
-    lanes: Translator, values: list[Any], test: Callable[[list[Any]], ir.Value],
-    step: Callable[[list[Any]], list[Any]],
-) -> list[Any]:  # fmt: skip
+    lanes: Translator, values: Values[ir.Value], test: Callable[[Values[ir.Value]], ir.Value], step: Step[ir.Value]
+) -> Values[ir.Value]:
     """Emit a loop that runs until `test` fails in the last lane."""
     b, carry = lanes.builder, _Carry(lanes, values)
     everyone = lanes.constant(1, BOOL)
@@ -53,7 +54,7 @@ def loop(
     return carry.load()
 
 
-def counted(lanes: Translator, length: int, values: list[Any], step: Callable[[list[Any]], list[Any]]) -> list[Any]:
+def fixed_loop(lanes: Translator, length: int, values: Values[ir.Value], step: Step[ir.Value]) -> Values[ir.Value]:
     """Emit a loop of a fixed number of steps."""
     b, carry, count = lanes.builder, _Carry(lanes, values), _Carry(lanes, [INT(0)])
     with _loop(lanes, lambda: b.icmp_signed("<", count.load()[0], INT(length))):
@@ -62,7 +63,9 @@ def counted(lanes: Translator, length: int, values: list[Any], step: Callable[[l
     return carry.load()
 
 
-def _choose(lanes: Translator, condition: ir.Value, if_true: Any, if_false: Any) -> Any:
+def _choose(
+    lanes: Translator, condition: ir.Value, if_true: Value[ir.Value], if_false: Value[ir.Value]
+) -> Value[ir.Value]:
     return map_entries(lambda pair: lanes.builder.select(condition, *pair), [if_true, if_false])
 
 
@@ -78,21 +81,21 @@ def _taking_part(lanes: Translator, mask: ir.Value) -> Iterator[None]:
 class _Carry:
     """Values in variables on the stack."""
 
-    def __init__(self, lanes: Translator, values: Sequence[Any]):
+    def __init__(self, lanes: Translator, values: Values[ir.Value]):
         self.lanes, self.values = lanes, values
         self.rooms = [lanes.room(entry.type) for value in values for entry in entries(value)]
         self.types = [entry.type for value in values for entry in entries(value)]
         self.store(values)
 
-    def store(self, values: Sequence[Any]) -> None:
+    def store(self, values: Values[ir.Value]) -> None:
         flat = [entry for value in values for entry in entries(value)]
         for entry, room in zip(flat, self.rooms, strict=True):
             self.lanes.builder.store(entry, room)
 
-    def load(self) -> list[Any]:
+    def load(self) -> Values[ir.Value]:
         loaded = [self.lanes.builder.load(room, typ=type_) for room, type_ in zip(self.rooms, self.types, strict=True)]
         remaining = iter(loaded)
-        return [like(value, remaining) for value in self.values]
+        return [rebuilt_like(value, remaining) for value in self.values]
 
 
 @contextlib.contextmanager

@@ -16,8 +16,6 @@ import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 
-from a2tg_jax.rasterize.kernels.manual_axes import vary_with
-
 Handler = Callable[[list[np.ndarray], list[np.ndarray]], None]
 """Function of arguments and results, views of XLA's buffers: it reads the arguments and fills the results."""
 
@@ -142,13 +140,9 @@ def call(name: str, results: Sequence[tuple[tuple[int, ...], DTypeLike]], *input
       name: name from `registered`.
       results: shape and dtype of each result.
       inputs: arguments of the handler.
-
-    Returns:
-      The results, varying over devices as the inputs do.
     """
     shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in results]
-    outputs: list[Array] = vary_with(inputs, jax.ffi.ffi_call(name, shapes, vmap_method="sequential")(*inputs))
-    return outputs
+    return list(jax.ffi.ffi_call(name, shapes, vmap_method="sequential")(*inputs))
 
 
 def _capsule(address: int | None, destructor: int | None = None) -> object:
@@ -160,11 +154,11 @@ def _capsule(address: int | None, destructor: int | None = None) -> object:
 
 def _gated(entry: Any) -> int:
     """Return the address of an entry behind the gate, which closes when the program ends."""
-    from a2tg_jax.rasterize.kernels.native import gate
+    from a2tg_jax.rasterize.kernels.native import shutdown_gate
 
     address = ctypes.cast(entry, _pointer).value or 0
     path = _CallFrame.api.offset, _Api.create_error.offset
-    return gate.gated(address, path, ctypes.addressof(_AT_THE_END))
+    return shutdown_gate.gated(address, path, ctypes.addressof(_AT_THE_END))
 
 
 def _entry(handler: Handler) -> Callable[..., int | None]:

@@ -7,13 +7,12 @@ lanes, or on plain scalars, so that a function and its derivative are defined on
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from jax.extend import core
-from jax.typing import DTypeLike
+from jax.typing import ArrayLike, DTypeLike
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels.jaxprs import Equation, Evaluator
+from a2tg_jax.rasterize.kernels.jaxprs import Equation, Evaluator, Step, Values
 from a2tg_jax.rasterize.kernels.native import control_flow, dump
 from a2tg_jax.rasterize.kernels.native.primitives import PRIMITIVES
 from a2tg_jax.rasterize.kernels.native.vectors import BOOL, FLAGS, INT, Translator, scalar_of, scalar_type
@@ -21,7 +20,7 @@ from a2tg_jax.rasterize.kernels.native.vectors import BOOL, FLAGS, INT, Translat
 __all__ = ["BOOL", "FLAGS", "INT", "Lanes", "scalar_of", "scalar_type"]
 
 
-class Lanes(Evaluator, Translator):
+class Lanes(Evaluator[ir.Value], Translator):
     """Translator of jaxprs at a builder's position, on vectors of `width` lanes; `width` 1 means plain scalars."""
 
     target = "native loops"
@@ -36,22 +35,24 @@ class Lanes(Evaluator, Translator):
             dump.write(self.builder.function.name, "jaxpr", f"{closed}\n\n", append=True)
         return self.run(closed, arguments)
 
-    def literal(self, number: Any, dtype: DTypeLike) -> ir.Constant:
+    def literal(self, number: ArrayLike, dtype: DTypeLike) -> ir.Constant:
         return self.constant(number, scalar_type(dtype))
 
     def check_dtype(self, dtype: DTypeLike) -> None:
         scalar_type(dtype)
 
-    def primitive(self, name: str) -> Callable[[list[Any], Equation], Any] | None:
+    def primitive(self, name: str) -> Callable[[list[ir.Value], Equation], ir.Value] | None:
         return functools.partial(PRIMITIVES[name], self) if name in PRIMITIVES else None
 
-    def branches(self, index: Any, branches: Sequence[Any], operands: list[Any], equation: Equation) -> list[Any]:
+    def branches(
+        self, index: ir.Value, branches: Sequence[core.ClosedJaxpr], operands: Values[ir.Value], equation: Equation
+    ) -> Values[ir.Value]:
         return control_flow.branches(self, index, branches, operands)
 
     def loop(
-        self, carry: list[Any], test: Callable[[list[Any]], Any], step: Callable[[list[Any]], list[Any]]
-    ) -> list[Any]:
+        self, carry: Values[ir.Value], test: Callable[[Values[ir.Value]], ir.Value], step: Step[ir.Value]
+    ) -> Values[ir.Value]:
         return control_flow.loop(self, carry, test, step)
 
-    def counted(self, length: int, carry: list[Any], step: Callable[[list[Any]], list[Any]]) -> list[Any]:
-        return control_flow.counted(self, length, carry, step)
+    def counted(self, length: int, carry: Values[ir.Value], step: Step[ir.Value]) -> Values[ir.Value]:
+        return control_flow.fixed_loop(self, length, carry, step)

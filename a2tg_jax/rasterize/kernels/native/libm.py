@@ -11,7 +11,7 @@ from llvmlite import ir
 from a2tg_jax.rasterize.kernels.native.vectors import INT, Vectors, num_bits, scalar_of
 
 
-def call(lanes: Vectors, name: str, operands: list[ir.Value]) -> ir.Value:
+def emit_call(lanes: Vectors, name: str, operands: list[ir.Value]) -> ir.Value:
     """Call a function of libm, such as "erf", on floats; its error is about one unit in the last place."""
     name = f"{name}f" if num_bits(operands[0].type) == 32 else name
     if lanes.width == 1:

@@ -32,7 +32,8 @@ from a2tg_jax.rasterize.kernels.native.lanes import BOOL, INT, Lanes
 from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
 from a2tg_jax.rasterize.kernels.native.texels import NativeTexture, Place, TexelWriter
 from a2tg_jax.rasterize.kernels.native.writer import LONG
-from a2tg_jax.rasterize.kernels.traced import CUTOFF_SLACK, Functions, KernelSpec
+from a2tg_jax.rasterize.kernels.traced import CUTOFF_SLACK, Functions
+from a2tg_jax.rasterize.splats import KernelSpec
 from a2tg_jax.rasterize.tile_pixels import TilePixels
 
 INTEGERS = ("first", "last", "columns", "width", "height")
@@ -100,7 +101,7 @@ class _LoadedSplat(NamedTuple):
     spread: list[ir.Value]
     """`numbers` in every lane."""
     texture: NativeTexture | None
-    """Its texture, if the rule has textures."""
+    """Its texture, if the appearance has textures."""
     spread_region: list[ir.Value]
     """`TextureRegion` in every lane."""
     limit: ir.Value
@@ -115,7 +116,7 @@ class _Rows(NamedTuple):
     probe: ir.Value
     """Row of the statistic."""
     texture: NativeTexture | None
-    """Cotangents of its texels, if the rule has textures."""
+    """Cotangents of its texels, if the appearance has textures."""
 
 
 TileValues = list[ir.Value]
@@ -130,7 +131,7 @@ class _Pass(TexelWriter):
     def __init__(self, spec: KernelSpec, functions: Functions, module: ir.Module, name: str, buffers: Sequence[str]):
         super().__init__(module, name, buffers, INTEGERS, spec.dtype)
         self.spec, self.functions, self.num_columns = spec, functions, spec.num_columns
-        self.empty = spec.rule.rule.empty
+        self.empty = spec.static.functions.empty
         self.lanes, self.scalars = Lanes(self.b, num_lanes(spec)), Lanes(self.b, 1)
         self.num_vectors = -(-(spec.tile_size**2) // self.lanes.width)
         self.reals = self.lanes.vector(self.real)

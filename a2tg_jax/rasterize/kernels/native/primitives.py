@@ -69,7 +69,7 @@ def _intrinsic(name: str) -> Emitter:
 
 
 def _libm(name: str) -> Emitter:
-    return lambda lanes, operands, _: libm.call(lanes, name, operands)
+    return lambda lanes, operands, _: libm.emit_call(lanes, name, operands)
 
 
 @functools.cache
@@ -82,7 +82,7 @@ def _elementary(name: str, in_libm: str) -> Emitter:
 
     def emit(lanes: Translator, operands: Operands, _: Equation) -> ir.Value:
         if num_bits(operands[0].type) != 32:
-            return libm.call(lanes, in_libm, operands)
+            return libm.emit_call(lanes, in_libm, operands)
         (result,) = lanes.emit(_formula(name), operands)
         return result
 
@@ -102,7 +102,7 @@ def _trigonometric(name: str) -> Emitter:
         room = lanes.room(x.type)
         b.store(result, room)
         with b.if_then(lanes.any(is_large), likely=False):
-            b.store(b.select(is_large, libm.call(lanes, name, operands), result), room)
+            b.store(b.select(is_large, libm.emit_call(lanes, name, operands), result), room)
         return b.load(room, typ=x.type)
 
     return emit
@@ -127,7 +127,7 @@ def _power(lanes: Translator, operands: Operands, equation: Equation) -> ir.Valu
         signed = _dtype(equation, 1).kind == "i"
         convert = lanes.builder.sitofp if signed else lanes.builder.uitofp
         exponent = convert(exponent, x.type)
-    return libm.call(lanes, "pow", [x, exponent])
+    return libm.emit_call(lanes, "pow", [x, exponent])
 
 
 def _whole_power(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
@@ -162,7 +162,7 @@ def _divide(lanes: Translator, operands: Operands, equation: Equation) -> ir.Val
 def _remainder(lanes: Translator, operands: Operands, equation: Equation) -> ir.Value:
     (x, _), b = operands, lanes.builder
     if is_float(x.type):
-        return libm.call(lanes, "fmod", operands)
+        return libm.emit_call(lanes, "fmod", operands)
     is_zero, safe = _safe_divisor(lanes, operands, equation)
     remainder = (b.srem if _is_signed(equation) else b.urem)(x, safe)
     return b.select(is_zero, x, remainder)

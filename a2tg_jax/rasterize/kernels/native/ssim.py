@@ -15,17 +15,15 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.custom_derivatives import SymbolicZero
 from jax.typing import DTypeLike
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels import windows
 from a2tg_jax.rasterize.kernels.native import ffi, llvm_modules, threads
 from a2tg_jax.rasterize.kernels.native.lanes import INT, Lanes
 from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
@@ -49,43 +47,19 @@ def _num_lanes(dtype: DTypeLike) -> int:
     return llvm_modules.vector_bytes() // int(np.dtype(dtype).itemsize)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def mean_score(score: Score, x: Array, y: Array) -> Array:
     """Return the average over all windows of images [C, H, W], float32 or float64, at least `least_width` wide."""
     return _score(score, x, y)[0]
 
 
-@functools.partial(mean_score.defjvp, symbolic_zeros=True)
-def _mean_score_jvp(score: Score, primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
-    value, *slopes = value_and_slopes(score, *primals)
-    terms = [
-        jnp.sum(slope * tangent)
-        for slope, tangent in zip(slopes, tangents, strict=True)
-        if not isinstance(tangent, SymbolicZero)
-    ]
-    return value, sum(terms, jnp.zeros_like(value))
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return the average, and its derivatives by x and y; under jit, XLA drops one that is not used."""
+    """Return the average, and its derivatives by x and y."""
     value, (d_x_mean, d_y_mean, *d_products) = _score(score, x, y)
     share = jnp.full(1, 1 / _num_windows(score, x), x.dtype)
     name = _registered(score, str(x.dtype), "pull_back", _pull_back_handler)
     inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
     d_x, d_y = (ffi.call(name, [(x.shape, x.dtype)], *given)[0] for given in inputs)
     return value, d_x, d_y
-
-
-@value_and_slopes.defjvp
-def _value_and_slopes_jvp(score: Score, primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Any, Any]:
-    """Differentiate the plain array code: second derivatives need no speed."""
-
-    def plain(x: Array, y: Array) -> tuple[Array, Array, Array]:
-        value, slopes = jax.value_and_grad(functools.partial(windows.mean_score, score), argnums=(0, 1))(x, y)
-        return value, *slopes
-
-    return value_and_slopes(score, *primals), jax.jvp(plain, primals, tangents)[1]
 
 
 def _score(score: Score, x: Array, y: Array) -> tuple[Array, Array]:

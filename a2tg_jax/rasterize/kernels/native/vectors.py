@@ -8,7 +8,7 @@ from jax.extend import core
 from jax.typing import DTypeLike
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
+from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable, Value, Values
 
 FLAGS = ("contract",)
 """Flags that let products and sums fuse; within a lane all other IEEE rules hold."""
@@ -196,6 +196,6 @@ class Translator(Vectors):
         """Emit a jaxpr of scalars, given one LLVM value per argument."""
         raise NotImplementedError
 
-    def run(self, jaxpr: Any, arguments: Sequence[Any]) -> list[Any]:
+    def run(self, jaxpr: core.ClosedJaxpr | core.Jaxpr, arguments: Sequence[Value[ir.Value]]) -> Values[ir.Value]:
         """Emit a jaxpr, closed or without constants."""
         raise NotImplementedError

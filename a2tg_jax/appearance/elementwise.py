@@ -1,0 +1,247 @@
+"""The element-wise functions of an appearance, composed with its parts, as compositors trace and compile them.
+
+They are called with scalars, or with arrays that broadcast: K numbers of the splat, C values of its texture, and u, v.
+`check_shading` names the appearance, what it returned and what was wanted.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple, NoReturn
+
+import jax
+import jax.extend.core
+import jax.numpy as jnp
+from jax import Array
+
+from a2tg_jax.appearance.base import Appearance, check_arrays_given, empty_values, without_arrays
+from a2tg_jax.appearance.exponents import Curve, falloff_of
+from a2tg_jax.appearance.part import Factor, Residual
+from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.core.checks import check_kind, described
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.pytree import check_pytree
+from a2tg_jax.core.table import Table, check_table
+
+ODD_SHAPE = (5, 7)
+"""Shape of arrays that fits no matrix in an appearance by chance."""
+CURVE = len(Curve._fields)
+
+
+def check_is_appearance(appearance: Any, gaussians: Gaussians | None = None) -> None:
+    """Raise ValueError unless a value is an appearance with its arrays, it and the dataclasses in it are pytrees, and
+    its tables, such as textures, fit the Gaussians, if given."""
+    check_kind("appearance", appearance, Appearance)
+    check_pytree("appearance", appearance)
+    check_arrays_given(appearance)
+    if gaussians is None:
+        return
+    for path, leaf in jax.tree_util.tree_leaves_with_path(appearance, is_leaf=lambda leaf: isinstance(leaf, Table)):
+        if isinstance(leaf, Table):
+            check_table(leaf, gaussians.num, "appearance" + jax.tree_util.keystr(path))
+
+
+class Elementwise(NamedTuple):
+    """What pixels read of an appearance."""
+
+    texel_position: Callable[[TextureRegion, Array, Array], tuple[Array, Array]]
+    """Position (x, y) of a texture lookup in texels, from region, u and v."""
+    shade: Callable[[tuple[Array, ...], tuple[Array, ...], Array, Array], tuple[Residual, Factor]]
+    """Colour residual and alpha factor, from numbers, texture values, u and v."""
+    falloff: Callable[[tuple[Array, ...], Array], Array]
+    """Kernel, from numbers and squared distance."""
+    max_alpha: float
+    has_low_pass: bool
+    empty: tuple[float, ...]
+    """Values of a splat without a texture; () if all splats have one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StaticShading:
+    """An appearance without its arrays; hashable, so that code can be compiled for it."""
+
+    appearance: Appearance
+    """The appearance with a stand-in for each array, every use of which raises."""
+
+    @staticmethod
+    def of(appearance: Appearance) -> "StaticShading":
+        name = type(appearance).__name__
+        return StaticShading(without_arrays(appearance, lambda path: _LeftOut(f"{name}.{path}")))
+
+    @property
+    def name(self) -> str:
+        """Name of the appearance's class."""
+        return type(self.appearance).__name__
+
+    @property
+    def functions(self) -> Elementwise:
+        """The functions, composed with exponents and features."""
+        own = self.appearance
+        has_curve, has_features = own.exponents is not None, own.features is not None
+
+        def shade(numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array) -> tuple[Residual, Factor]:
+            shaded = own.shade(numbers[:-CURVE] if has_curve else numbers, values, u, v)
+            if not has_features:
+                return shaded
+            _, factor = shaded
+            return None, factor
+
+        def falloff(numbers: tuple[Array, ...], rho: Array) -> Array:
+            return falloff_of(Curve(*numbers[-CURVE:]), rho) if has_curve else own.falloff(numbers, rho)
+
+        return Elementwise(own.texel_position, shade, falloff, own.alpha_limit, own.has_low_pass, empty_values(own))
+
+
+class _LeftOut:
+    """Stand-in for an array of an appearance. Every use raises an error with a remedy."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _LeftOut) and self._name == other._name
+
+    def __hash__(self) -> int:
+        return hash(self._name)
+
+    def _refuse(self, *_: Any) -> NoReturn:
+        raise ValueError(
+            f"{self._name} is an array, and texel_position, shade and falloff see only the static fields of an "
+            "appearance: return it from numbers(), or put it in the texels of atlas()"
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        self._refuse()
+
+    # A property: JAX asks whether there is such a method, and its own error would name neither field nor appearance.
+    __jax_array__ = property(_refuse)
+    __array__ = __getitem__ = __iter__ = __len__ = __bool__ = __float__ = __int__ = _refuse
+    __add__ = __sub__ = __mul__ = __truediv__ = __pow__ = __neg__ = __abs__ = __matmul__ = _refuse
+    __radd__ = __rsub__ = __rmul__ = __rtruediv__ = __rpow__ = __rmatmul__ = _refuse
+    __lt__ = __le__ = __gt__ = __ge__ = _refuse
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Numbers and dtype of the arguments of an appearance's element-wise functions."""
+
+    num_numbers: int
+    """Number K of numbers of a splat."""
+    num_values: int
+    """Number C of values of a texture; 0 without textures."""
+    num_colors: int
+    """Number D of colours of a splat."""
+    dtype: Any
+    """Dtype of all floats."""
+
+    def of(self, shape: tuple[int, ...]) -> dict[str, tuple[Any, ...]]:
+        """Return the arguments of each function, as arrays of one shape without values."""
+        number: Any = jax.ShapeDtypeStruct(shape, self.dtype)
+        integer: Any = jax.ShapeDtypeStruct(shape, jnp.int32)
+        numbers = (number,) * self.num_numbers
+        functions: dict[str, tuple[Any, ...]] = {
+            "shade": (numbers, (number,) * self.num_values, number, number),
+            "falloff": (numbers, number),
+        }
+        if self.num_values:
+            functions["texel_position"] = (TextureRegion(integer, integer, integer), number, number)
+        return functions
+
+
+@functools.lru_cache(maxsize=256)
+def check_shading(static: StaticShading, arguments: Arguments) -> None:
+    """Raise unless the element-wise functions of an appearance take scalars and return what the compositor needs.
+
+    Raises:
+      ValueError: if a result has another form than it must have.
+      Exception: what the appearance's own code raises, with a note that names it and the arguments.
+    """
+    name, functions = static.name, arguments.of(())
+    shaded = _traced(static, "shade", functions, arguments)
+    wanted = f"(residual, factor): {arguments.num_colors} colours that are added, or None, and a factor, or None"
+    if not isinstance(shaded, tuple | list) or len(shaded) != 2:
+        raise ValueError(f"{name}.shade must return {wanted}; it returned {described(shaded)}")
+    residual, factor = shaded
+    if residual is not None and _sizes(residual) != ((),) * arguments.num_colors:
+        raise ValueError(f"{name}.shade must return {wanted}; the residual is {described(residual)}")
+    if factor is not None and _sizes((factor,)) != ((),):
+        raise ValueError(f"{name}.shade must return {wanted}; the factor is {described(factor)}")
+    weight = _traced(static, "falloff", functions, arguments)
+    if _sizes((weight,)) != ((),):
+        raise ValueError(f"{name}.falloff must return one number for one rho; it returned {described(weight)}")
+    if "texel_position" in functions:
+        position = _traced(static, "texel_position", functions, arguments)
+        if _sizes(position) != ((), ()):
+            raise ValueError(
+                f"{name}.texel_position must return (x, y), two numbers; it returned {described(position)}"
+            )
+
+
+def _traced(static: StaticShading, function: str, functions: dict[str, tuple[Any, ...]], arguments: Arguments) -> Any:
+    """Return what a function of an appearance returns for scalars, without values."""
+    try:
+        return jax.eval_shape(getattr(static.functions, function), *functions[function])
+    except Exception as error:
+        error.add_note(
+            f"This happened in {static.name}.{function}, which is called with scalars of {arguments.dtype}: "
+            f"K = {arguments.num_numbers} numbers, and C = {arguments.num_values} texture values."
+        )
+        if isinstance(error, jax.errors.TracerBoolConversionError):
+            error.add_note("Its numbers have no values yet: use jnp.where instead of if.")
+        raise
+
+
+def _sizes(values: Any) -> tuple[tuple[int, ...], ...] | None:
+    """Return the shapes of several numbers, or of the entries of an array of them; None for anything else."""
+    if hasattr(values, "shape"):
+        return (tuple(values.shape[1:]),) * values.shape[0] if values.shape else None
+    if not isinstance(values, tuple | list) or not all(hasattr(value, "shape") for value in values):
+        return None
+    return tuple(tuple(value.shape) for value in values)
+
+
+@functools.lru_cache(maxsize=256)
+def takes_arrays(static: StaticShading, arguments: Arguments) -> bool:
+    """Return whether the element-wise functions of an appearance also take arrays, entry by entry.
+
+    A matrix product in `shade` takes scalars only: with arrays of pixels it would contract the pixels.
+    """
+    functions = arguments.of(ODD_SHAPE)
+    return all(_is_elementwise(getattr(static.functions, name), functions[name], arguments) for name in functions)
+
+
+def _is_elementwise(function: Callable[..., Any], given: tuple[Any, ...], arguments: Arguments) -> bool:
+    try:
+        results = jax.make_jaxpr(function)(*given).jaxpr.outvars
+    except Exception:  # Any error of the user's code: it has passed with scalars, so it cannot take arrays.
+        return False
+    shapes = ODD_SHAPE, (arguments.num_colors, *ODD_SHAPE)
+    return all(isinstance(result, jax.extend.core.Literal) or result.aval.shape in shapes for result in results)
+
+
+def elementwise_functions(static: StaticShading, arguments: Arguments) -> Elementwise:
+    """Return the functions of an appearance, made to take arrays if they take scalars only."""
+    functions = static.functions
+    if takes_arrays(static, arguments):
+        return functions
+
+    def shade(*given: Any) -> tuple[Residual, Factor]:
+        residual, factor = functions.shade(*given)
+        return None if residual is None else tuple(residual), factor
+
+    return functions._replace(
+        texel_position=functools.partial(_mapped, functions.texel_position),
+        shade=functools.partial(_mapped, shade),
+        falloff=functools.partial(_mapped, functions.falloff),
+    )
+
+
+def _mapped(function: Callable[..., Any], *given: Any) -> Any:
+    """Call a function of scalars for each entry of arrays that broadcast."""
+    leaves, structure = jax.tree.flatten(given)
+    shape = jnp.broadcast_shapes(*(jnp.shape(leaf) for leaf in leaves))
+    flat = [jnp.broadcast_to(leaf, shape).reshape(-1) for leaf in leaves]
+    results = jax.vmap(lambda *scalars: function(*jax.tree.unflatten(structure, scalars)))(*flat)
+    return jax.tree.map(lambda result: result.reshape(shape), results)

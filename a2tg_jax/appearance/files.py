@@ -1,0 +1,140 @@
+"""Arrays of appearances in files: named, without padding.
+
+Arrays of parts are called sizes, texels, shapes, degrees, base_degree and band_l. An array of a subclass has the path
+of its field, a table of a subclass FIELD.sizes and FIELD.elements. Version 0.2 wrapped one appearance into another,
+whose arrays were `inner.NAME`.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.appearance.bands import (
+    MAX_DEGREE,
+    Bands,
+    bands_of_dense,
+    degrees_of_sizes,
+    dense_bands,
+)
+from a2tg_jax.appearance.base import Appearance, allocate_appearance
+from a2tg_jax.appearance.exponents import Exponents
+from a2tg_jax.core.gaussians import no_rows
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.table import Table
+from a2tg_jax.texture import MAX_SIDE, Textures
+
+OLD_INNER = "inner."
+"""Prefix of the arrays of a wrapped appearance in files of version 0.2."""
+
+
+def arrays_of(appearance: Appearance, sh_degree: int) -> dict[str, np.ndarray]:
+    """Return named arrays without padding, which `with_arrays` reads (host).
+
+    Args:
+      appearance: of N Gaussians, of which all rows exist.
+      sh_degree: degree of their own spherical harmonics.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    if appearance.bands is not None and (coefficients := appearance.bands.coefficients) is not None:
+        degrees, dense = degrees_of_sizes(coefficients.sizes, sh_degree), dense_bands(coefficients, sh_degree)
+        arrays |= {"degrees": degrees.astype(np.uint8), "base_degree": np.asarray(sh_degree, np.uint8)}
+        for band in range(sh_degree + 1, MAX_DEGREE + 1):
+            first, last = (NUM_BASES[degree] - NUM_BASES[sh_degree] for degree in (band - 1, band))
+            arrays[f"band_{band}"] = dense[degrees >= band, first:last]
+    if appearance.exponents is not None:
+        arrays["shapes"] = np.asarray(appearance.exponents.shapes)
+    if appearance.texture is not None and (texels := appearance.texture.texels) is not None:
+        arrays |= {"sizes": texels.sizes, "texels": texels.flat()}
+    for field, value in _own_arrays(appearance).items():
+        for path, leaf in jax.tree_util.tree_leaves_with_path(value, is_leaf=lambda leaf: isinstance(leaf, Table)):
+            name = field + jax.tree_util.keystr(path)
+            if isinstance(leaf, Table):
+                arrays |= {f"{name}.sizes": leaf.sizes, f"{name}.elements": leaf.flat()}
+            else:
+                arrays[name] = np.asarray(leaf)
+    return arrays
+
+
+def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degree: int) -> Any:
+    """Return an appearance of the options of a template, with the arrays of a file (host).
+
+    Args:
+      template: with its options.
+      arrays: as `arrays_of` returns them, or as version 0.2 wrote them.
+      sh_degree: degree of the Gaussians' own spherical harmonics.
+
+    Raises:
+      ValueError: if an array is missing, or its shape does not fit the others.
+    """
+    arrays = {name.replace(OLD_INNER, ""): array for name, array in arrays.items()}
+    changes: dict[str, Any] = {}
+    if template.bands is not None:
+        changes["bands"] = Bands(_coefficients(arrays, sh_degree))
+    if template.exponents is not None:
+        shapes = _found(arrays, "shapes")
+        if shapes.ndim != 1 or not np.issubdtype(shapes.dtype, np.floating):
+            raise ValueError(f"shapes must be floats [N]; got {shapes.dtype}{list(shapes.shape)}")
+        changes["exponents"] = Exponents(jnp.asarray(shapes))
+    if template.texture is not None:
+        changes["texture"] = dataclasses.replace(template.texture, texels=_textures(arrays, "sizes", "texels"))
+    wanted = _own_arrays(allocate_appearance(template, jax.random.key(0), no_rows(2, 1)))
+    for field, value in wanted.items():
+
+        def read(path: Any, leaf: Any, field: str = field) -> Any:
+            name = field + jax.tree_util.keystr(path)
+            if isinstance(leaf, Table):
+                old = f"{name}.sizes" not in arrays  # Version 0.2 called those of billboards so.
+                return _textures(arrays, *(("sizes", "texels") if old else (f"{name}.sizes", f"{name}.elements")))
+            array = _found(arrays, name)
+            if array.shape[1:] != leaf.shape[1:]:
+                raise ValueError(f"{name} must be [N, …] with rows {leaf.shape[1:]}; got {array.shape}")
+            return jnp.asarray(array)
+
+        changes[field] = jax.tree_util.tree_map_with_path(read, value, is_leaf=lambda leaf: isinstance(leaf, Table))
+    return dataclasses.replace(template, **changes)
+
+
+def _own_arrays(appearance: Appearance) -> dict[str, Any]:
+    """Return the fields of a subclass that hold arrays, or pytrees of them."""
+    names = [field.name for field in dataclasses.fields(appearance) if not field.metadata.get("static")]
+    shared = {field.name for field in dataclasses.fields(Appearance)}
+    return {name: value for name in names if name not in shared and (value := getattr(appearance, name)) is not None}
+
+
+def _found(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    if name not in arrays:
+        raise ValueError(f"the array {name} of the appearance is missing")
+    return arrays[name]
+
+
+def _textures(arrays: Mapping[str, np.ndarray], sizes_name: str, texels_name: str) -> Textures:
+    sizes, texels = _found(arrays, sizes_name), _found(arrays, texels_name)
+    is_size = sizes.ndim == 2 and sizes.shape[1] == 2 and np.issubdtype(sizes.dtype, np.integer)
+    if not is_size or (sizes.size and not 0 <= sizes.min() <= sizes.max() <= MAX_SIDE):
+        raise ValueError(f"{sizes_name} must be integers [N, 2] in 0..{MAX_SIDE}; got {sizes.dtype} {sizes.shape}")
+    if texels.shape != (int(np.prod(sizes, axis=1).sum()), 4):
+        raise ValueError(f"{sizes_name} [N, 2] and {texels_name} [M, 4] disagree; got {sizes.shape} and {texels.shape}")
+    return Textures.of_flat(sizes.astype(np.int64), texels)
+
+
+def _coefficients(arrays: Mapping[str, np.ndarray], sh_degree: int) -> Any:
+    degrees, base = _found(arrays, "degrees"), int(_found(arrays, "base_degree"))
+    if degrees.ndim != 1 or not np.issubdtype(degrees.dtype, np.integer) or not 0 <= base <= MAX_DEGREE:
+        raise ValueError(f"degrees must be integers [N] above a base degree in 0..3; got {degrees.shape}, {base}")
+    if base != sh_degree:
+        raise ValueError(f"bands are above degree {base}, but the Gaussians have degree {sh_degree}")
+    degrees, dtype = degrees.astype(np.int64), np.dtype(np.float32)
+    bands = {}
+    for band in range(base + 1, MAX_DEGREE + 1):
+        found, wanted = arrays.get(f"band_{band}"), (int(np.count_nonzero(degrees >= band)), 2 * band + 1, 3)
+        if found is None or found.shape != wanted:
+            raise ValueError(f"band_{band} must be {list(wanted)}; got {None if found is None else found.shape}")
+        bands[band], dtype = found, found.dtype
+    dense = np.zeros((len(degrees), NUM_BASES[MAX_DEGREE] - NUM_BASES[base], 3), dtype)
+    for band, found in bands.items():
+        dense[degrees >= band, NUM_BASES[band - 1] - NUM_BASES[base] : NUM_BASES[band] - NUM_BASES[base]] = found
+    return bands_of_dense(dense, degrees, base)

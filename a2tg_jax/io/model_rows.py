@@ -1,0 +1,164 @@
+"""A model as plain tables of numbers, in the order of a Z curve, and the model again.
+
+Splats that are near each other stand near each other, so that what they show is alike. Each is turned by half about one
+of its own axes if that makes its rotation smaller, and its texture is mirrored along: it looks the same.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from a2tg_jax.appearance import Appearance, in_words
+from a2tg_jax.appearance.files import arrays_of, with_arrays
+from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.origin import BLACK, Color, Origin
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.io.quantise import nearest_half_turn, with_positive_w
+from a2tg_jax.io.validate import check_model
+from a2tg_jax.model import Model
+
+U_MIRRORED, V_MIRRORED = (2, 3), (1, 3)
+"""Axes of half-turns that mirror a texture's columns, and its rows."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """N splats; T texels in all. On the host."""
+
+    means: np.ndarray
+    """[N, 3]."""
+    quats: np.ndarray
+    """Unit quaternions [N, 4], w largest."""
+    log_scales: np.ndarray
+    """[N, 2]."""
+    logit_opacities: np.ndarray
+    """[N]."""
+    degrees: np.ndarray
+    """Degrees [N] of their spherical harmonics."""
+    bands: tuple[np.ndarray, ...]
+    """Band l is [M, 2l + 1, 3], of the M splats of degree l or more, in their order."""
+    sizes: np.ndarray | None
+    """Sizes [N, 2] of their textures, (Tv, Tu); None without textures."""
+    texels: np.ndarray | None
+    """Texels [T, 4], one texture after the other, each row by row."""
+    shapes: np.ndarray | None = None
+    """Shapes [N] of their kernels; None if all are Gaussians."""
+
+
+def check_encodable(
+    appearance: Appearance, file: str = "a compact file", instead: str = "save_model keeps any model"
+) -> None:
+    """Raise ValueError, saying what to do instead, unless a file can hold what splats show."""
+    if not appearance.is_portable:
+        raise ValueError(
+            f"model shows {in_words(appearance)}: {file} holds Gaussians with or without textures, exponents and "
+            f"bands; {instead}"
+        )
+
+
+def rows_of_model(model: Model) -> Rows:
+    """Return the tables of a model of which all rows exist, in the model's order; finite, or ValueError names the
+    field."""
+    gaussians = model.gaussians
+    fields = {field.name: np.asarray(getattr(gaussians, field.name)) for field in dataclasses.fields(gaussians)}
+    shown = arrays_of(model.appearance, gaussians.sh_degree)
+    for name, values in (*fields.items(), *shown.items()):
+        if not np.isfinite(values).all():
+            raise ValueError(f"model.{name} must be finite; some values are NaN or infinite")
+    sh = fields["sh"]
+    bands = [sh[:, NUM_BASES[degree] - 2 * degree - 1 : NUM_BASES[degree]] for degree in range(gaussians.sh_degree + 1)]
+    degrees = np.full(gaussians.num, gaussians.sh_degree)
+    if model.appearance.bands is not None:
+        degrees = np.asarray(shown["degrees"], np.int64)
+        bands += [shown[f"band_{degree}"] for degree in range(gaussians.sh_degree + 1, len(NUM_BASES))]
+    return Rows(
+        fields["means"], fields["quats"], fields["log_scales"], fields["logit_opacities"], degrees, tuple(bands),
+        shown.get("sizes"), shown.get("texels"), shown.get("shapes"),
+    )  # fmt: skip
+
+
+def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:
+    """Return the splats order[0], order[1], …
+
+    Args:
+      rows: the splats.
+      order: indices [N].
+      turns: turn splats by half if that makes their rotations smaller; else w only becomes positive.
+    """
+    quats = rows.quats[order]
+    quats, axis = nearest_half_turn(quats) if turns else (with_positive_w(quats), np.zeros(len(order), np.int64))
+    return Rows(
+        means=rows.means[order],
+        quats=quats,
+        log_scales=rows.log_scales[order],
+        logit_opacities=rows.logit_opacities[order],
+        degrees=rows.degrees[order],
+        bands=tuple(band[_owned(rows.degrees, order, degree)] for degree, band in enumerate(rows.bands)),
+        sizes=None if rows.sizes is None else rows.sizes[order],
+        texels=None if rows.texels is None or rows.sizes is None else rows.texels[_texels(rows.sizes, order, axis)],
+        shapes=None if rows.shapes is None else rows.shapes[order],
+    )
+
+
+def _owned(degrees: np.ndarray, order: np.ndarray, degree: int) -> np.ndarray:
+    """Return the rows of a band, in the order of their splats."""
+    places = np.cumsum(degrees >= degree) - 1
+    owned: np.ndarray = places[order[degrees[order] >= degree]]
+    return owned
+
+
+def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Return the old places of the texels of reordered and mirrored splats."""
+    areas = sizes.prod(axis=1)
+    starts = (np.cumsum(areas) - areas)[order]
+    areas = areas[order]
+    within = np.arange(areas.sum()) - np.repeat(np.cumsum(areas) - areas, areas)
+    heights, widths = (np.repeat(side, areas) for side in sizes[order].T)
+    row, column = np.divmod(within, np.maximum(widths, 1))
+    row = np.where(np.repeat(np.isin(axis, V_MIRRORED), areas), heights - 1 - row, row)
+    column = np.where(np.repeat(np.isin(axis, U_MIRRORED), areas), widths - 1 - column, column)
+    places: np.ndarray = np.repeat(starts, areas) + row * widths + column
+    return places
+
+
+def model_of(
+    rows: Rows, base_degree: int, appearance: Appearance, origin: Origin | None, background: Color = BLACK
+) -> Model:
+    """Return the model of tables, float32.
+
+    Args:
+      rows: the tables.
+      base_degree: of the spherical harmonics that all Gaussians have.
+      appearance: template of what they show.
+      origin: where it was trained.
+      background: RGB behind all splats.
+
+    Raises:
+      ValueError: if tables disagree.
+    """
+
+    def as_float(x: np.ndarray) -> Array:
+        return jnp.asarray(np.asarray(x, np.float32))
+
+    gaussians = Gaussians(
+        means=as_float(rows.means),
+        quats=as_float(rows.quats),
+        log_scales=as_float(rows.log_scales),
+        logit_opacities=as_float(rows.logit_opacities),
+        sh=as_float(np.concatenate(rows.bands[: base_degree + 1], axis=1)),
+    )
+    arrays: dict[str, np.ndarray] = {}
+    if rows.sizes is not None and rows.texels is not None:
+        arrays = {"sizes": rows.sizes, "texels": np.asarray(rows.texels, np.float32)}
+    if rows.shapes is not None:
+        arrays["shapes"] = np.asarray(rows.shapes, np.float32)
+    if appearance.bands is not None:
+        arrays |= {"degrees": rows.degrees, "base_degree": np.asarray(base_degree)}
+        for degree, band in enumerate(rows.bands[base_degree + 1 :], base_degree + 1):
+            arrays[f"band_{degree}"] = np.asarray(band, np.float32)
+    shown = with_arrays(appearance, arrays, base_degree)
+    model = Model(gaussians, shown, background=background, origin=origin)
+    check_model(model)
+    return model

@@ -1,0 +1,193 @@
+"""Who holds which rows: arrays whose rows are spread over the devices of a mesh, and those that every device has.
+
+JAX's shardings say it all: an array knows its mesh. A `Mesh | None` says where new arrays go; None is one device, where
+every function here leaves arrays as they are. On the host an array is read by `on_host` and written by `placed_like`,
+one at a time, so that a change takes a share of the memory of each device. If the devices belong to several processes,
+all of them make the same calls.
+"""
+
+import warnings
+import zlib
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from jax.typing import DTypeLike
+
+LARGEST_PART = 2**28
+"""Largest number of bytes read at a time. Each device holds them besides the array, for all processes."""
+
+
+def mesh_of(x: Any) -> Mesh | None:
+    """Return the mesh of the devices that share an array; None for an array on one device, of NumPy, or traced."""
+    sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
+    mesh = sharding.mesh if isinstance(sharding, NamedSharding) else None
+    return mesh if isinstance(mesh, Mesh) and mesh.size > 1 else None
+
+
+def num_processes(mesh: Mesh | None) -> int:
+    """Return the number of processes that the devices belong to."""
+    return 1 if mesh is None else len({device.process_index for device in mesh.devices.flat})
+
+
+def sharding_of_rows(mesh: Mesh, shape: tuple[int, ...], axis: int = 0) -> NamedSharding:
+    """Return where the rows of an array are, along one of its axes; every device has all if D does not divide them."""
+    is_divided = len(shape) > axis and shape[axis] >= mesh.size and shape[axis] % mesh.size == 0
+    return NamedSharding(mesh, P(*[None] * axis, mesh.axis_names[0]) if is_divided else P())
+
+
+def spread(mesh: Mesh | None, tree: Any, axis: int = 0) -> Any:
+    """Return arrays with their rows, along an axis, spread over the devices; those that D does not divide are on every
+    device.
+
+    Under jit it constrains where results are; otherwise it moves the arrays.
+
+    Raises:
+      ValueError: if arrays that are not spread yet differ between processes.
+    """
+    if mesh is None:
+        return tree
+    own = [x for x in jax.tree.leaves(tree) if not isinstance(x, jax.core.Tracer) and _is_own(x)]
+    if own and num_processes(mesh) > 1:
+        _check_same(own)
+
+    def of_leaf(x: Any) -> Any:
+        sharding = sharding_of_rows(mesh, jnp.shape(x), axis)
+        is_traced = isinstance(x, jax.core.Tracer)
+        return jax.lax.with_sharding_constraint(x, sharding) if is_traced else placed(x, sharding)
+
+    return jax.tree.map(of_leaf, tree)
+
+
+def everywhere(mesh: Mesh | None, tree: Any) -> Any:
+    """Return arrays that every device has whole (host)."""
+    return tree if mesh is None else jax.tree.map(lambda x: placed(x, NamedSharding(mesh, P())), tree)
+
+
+def placed(x: Any, sharding: NamedSharding) -> Array:
+    """Return an array whose parts are where a sharding says; other processes place theirs of an equal one."""
+    if isinstance(x, jax.Array) and x.sharding.is_equivalent_to(sharding, x.ndim):
+        return x
+    if sharding.is_fully_addressable:
+        array: Array = jax.device_put(x, sharding)
+        return array
+    return jax.make_array_from_callback(jnp.shape(x), sharding, on_host(x).__getitem__)
+
+
+def on_host(x: Any) -> np.ndarray:
+    """Return the values of an array."""
+    if _is_own(x):
+        return np.asarray(x)
+    if x.is_fully_replicated:
+        return np.asarray(x.addressable_data(0))
+    mesh = mesh_of(x)
+    if mesh is None or not x.sharding.is_equivalent_to(sharding_of_rows(mesh, x.shape), x.ndim):
+        whole = x if x.is_fully_addressable else multihost_utils.process_allgather(x, tiled=True)
+        return np.asarray(whole)
+    starts: dict[int, list[int]] = {}  # Of each process, the first rows of the parts on its devices.
+    for device, index in x.sharding.devices_indices_map(x.shape).items():
+        starts.setdefault(device.process_index, []).append(index[0].start or 0)
+    firsts = zip(*(sorted(own) for _, own in sorted(starts.items())), strict=True)
+    found, shards = np.empty(x.shape, x.dtype), sorted(x.addressable_shards, key=lambda one: one.index[0].start or 0)
+    num_rows = max(1, LARGEST_PART * len(x) // max(1, x.nbytes * len(starts)))
+    for shard, rows in zip(shards, firsts, strict=True):
+        for first in range(0, len(shard.data), num_rows):
+            # JAX keeps what was read of an array as long as the array lives, so a copy is read.
+            part = np.asarray(jnp.array(shard.data[first : first + num_rows], copy=True))
+            parts = part[None] if x.is_fully_addressable else multihost_utils.process_allgather(part)
+            for row, values in zip(rows, parts, strict=True):
+                found[row + first : row + first + len(values)] = values
+    return found
+
+
+def _is_own(x: Any) -> bool:
+    """Return whether an array is of this process alone, in one part."""
+    return mesh_of(x) is None and getattr(x, "is_fully_addressable", True)
+
+
+def placed_like(new: Any, old: Any) -> Array:
+    """Return values of the host, their rows spread over the devices of another array, whose shape may differ.
+
+    Raises:
+      ValueError: if several processes have different values.
+    """
+    mesh = mesh_of(old)
+    if mesh is None:
+        return jnp.asarray(new)
+    new = np.asarray(new)
+    placed: Array = spread(mesh, new.astype(jax.dtypes.canonicalize_dtype(new.dtype), copy=False))
+    return placed
+
+
+def zeros_beside(old: Any, shape: Sequence[int], dtype: DTypeLike) -> Array:
+    """Return zeros, their rows spread over the devices of another array."""
+    mesh = mesh_of(old)
+    return jnp.zeros(shape, dtype, device=None if mesh is None else sharding_of_rows(mesh, tuple(shape)))
+
+
+def rows_moved(x: Array, rows: Any) -> Array:
+    """Return the array whose row i is the former row rows[i].
+
+    It is traceable. Outside jit, rows that are spread over devices move on the host.
+    """
+    if mesh_of(x) is None:
+        moved: Array = x[rows]
+        return moved
+    return placed_like(on_host(x)[np.asarray(rows)], x)
+
+
+def readable(tree: Any) -> Any:
+    """Return arrays that this process can read: those that are on other processes' devices too are read (host)."""
+
+    def of_leaf(x: Any) -> Any:
+        return x if not isinstance(x, jax.Array) or x.is_fully_addressable else on_host(x)
+
+    return jax.tree.map(of_leaf, tree)
+
+
+def warn_of_uneven_rows(num: int, num_devices: int) -> None:
+    """Warn if the rows of a checkpoint cannot be spread evenly over so many devices, which costs memory."""
+    if num % num_devices:
+        fitting = [number for number in range(1, num_devices) if num % number == 0]
+        warnings.warn(
+            f"the checkpoint has {num:,} rows, which {num_devices} devices cannot share evenly: each holds all of "
+            f"them until the stage ends; {' or '.join(map(str, fitting))} could share them",
+            stacklevel=2,
+        )
+
+
+def asked_by_any(mesh: Mesh | None, is_asked: bool) -> bool:
+    """Return whether any of the processes asks for something (host)."""
+    if num_processes(mesh) == 1:
+        return is_asked
+    return bool(np.any(multihost_utils.process_allgather(np.asarray(is_asked))))
+
+
+def of_first(mesh: Mesh | None, tree: Any) -> Any:
+    """Return the first process's NumPy arrays in all processes, which have arrays of the same shapes."""
+    if num_processes(mesh) == 1:
+        return tree
+
+    def of_leaf(x: Any) -> np.ndarray:
+        x = np.ascontiguousarray(x)
+        told = multihost_utils.broadcast_one_to_all(x.reshape(-1).view(np.uint8))  # As bytes: JAX may round numbers.
+        same: np.ndarray = np.asarray(told, np.uint8).view(x.dtype).reshape(x.shape)
+        return same
+
+    return jax.tree.map(of_leaf, tree)
+
+
+def _check_same(arrays: Sequence[Any]) -> None:
+    """Raise ValueError unless all processes have the same arrays."""
+    digest = 0
+    for x in map(np.asarray, arrays):
+        values: Any = np.ascontiguousarray(x).view(np.uint8)
+        digest = zlib.crc32(values, zlib.crc32(repr(x.shape).encode(), digest))
+    if len(np.unique(multihost_utils.process_allgather(np.asarray(digest, np.uint32)))) > 1:
+        raise ValueError("the processes differ after a change of the model: train on machines that are alike")

@@ -1,0 +1,118 @@
+"""Check of the CUDA kernels on a GPU before they draw anything: XLA must draw the same, and find the same gradient."""
+
+import contextlib
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxlib.version import __version__ as jaxlib_version
+
+from a2tg_jax.appearance import Appearance, StaticShading, Texture, gaussian_cutoff
+from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.operating_system import cuda_of_driver
+from a2tg_jax.host.startup import cache_folder
+from a2tg_jax.rasterize.kernels import xla
+from a2tg_jax.rasterize.kernels.cuda import composite as cuda
+from a2tg_jax.rasterize.kernels.cuda.source import source
+from a2tg_jax.rasterize.kernels.tracing import in_clean_context
+from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats
+from a2tg_jax.rasterize.tiles import TileGrid, tile_lists
+
+MOST_DIFFERENCE = 1e-3
+"""Largest difference that counts as rounding of float32: |a − b| / |b|, Euclidean norms over a whole array."""
+NUM = 400
+"""Number of splats: lists of tiles then have several batches of 64."""
+GRID = TileGrid(width=48, height=32, tile_size=16)
+
+
+def failure() -> str | None:
+    """Return why the kernels cannot be used on this process's GPU; None if they can, or if there is no GPU.
+
+    Call it at any time, also while JAX traces or compiles: the check runs on a thread of its own. The first process
+    keeps the result in the cache folder, for this GPU, driver, jaxlib and text of the kernels.
+    """
+    reason: str | None = in_clean_context(_failure)
+    return reason
+
+
+def _failure() -> str | None:
+    try:
+        device = jax.local_devices(backend="cuda")[0]
+    except RuntimeError:  # Something is compiled for a GPU of another machine.
+        return None
+    file = cache_folder() / f"cuda-kernels-{_key(device)}.txt"
+    with contextlib.suppress(OSError):
+        return file.read_text(encoding="utf-8") or None
+    try:
+        difference = largest_difference(device)
+        told = "" if difference <= MOST_DIFFERENCE else f"CUDA kernels differ from XLA by {100 * difference:.2g} %"
+    except Exception as error:  # Whatever it is, XLA can draw.
+        told = " ".join(f"CUDA kernels failed: {type(error).__name__}: {error}".split())[:300]
+    told = told and f"{told}; please report this, and delete {file} to check them again"
+    with contextlib.suppress(OSError), replacing(file) as partial:
+        partial.write_text(told, encoding="utf-8")
+    return told or None
+
+
+def _key(device: Any) -> str:
+    driver = Path("/proc/driver/nvidia/version")
+    known = driver.read_text(encoding="utf-8") if driver.is_file() else cuda_of_driver()
+    text = known, device.device_kind, jax.__version__, jaxlib_version, source(_inputs()[0].kernel, "cuda")
+    return hashlib.sha256(repr(text).encode()).hexdigest()[:16]
+
+
+def largest_difference(device: Any) -> float:
+    """Return the largest difference between kernels and XLA, of the arrays of a textured view and of its gradient.
+
+    Args:
+      device: GPU on which both run.
+    """
+    settings, (splats, texels, regions, cutoff, jacobian, probe, g) = _inputs()
+
+    def drawn(kernels: Any, *arrays: Any) -> list[Any]:
+        splats, texels, regions, cutoff, jacobian, probe, g = arrays
+        lists = tile_lists(splats.M, cutoff, settings.kernel.near_plane, GRID, NUM * GRID.num)
+        inputs = settings, splats, texels, regions, cutoff, lists
+        channels, transmittance = kernels.forward(*inputs)
+        # The transmittance has the cotangent 1.
+        suffix_sum = jnp.sum(g * channels, axis=1) + transmittance
+        gradients = kernels.backward(*inputs, jacobian, probe, g, suffix_sum)
+        return jax.tree.leaves((channels, transmittance, gradients))
+
+    with jax.default_device(device):
+        draw = jax.jit(drawn, static_argnums=0)
+        found, wanted = (draw(module, splats, texels, regions, cutoff, jacobian, probe, g) for module in (cuda, xla))
+    pairs = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in zip(found, wanted, strict=True)]
+    return float(np.max([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs if b.size]))
+
+
+def _inputs() -> tuple[CompositingSettings, tuple[Any, ...]]:
+    """Return the static options, the arrays of kernels and the cotangent of the image."""
+    rng = np.random.default_rng(0)
+
+    def draw(low: float, high: float, *shape: int) -> Any:
+        return rng.uniform(low, high, (*shape, NUM)).astype(np.float32).T
+
+    x, y, depth, angle, u, v = draw(0, GRID.width), draw(0, GRID.height), *(draw(1, most) for most in (3, 4, 6, 6))
+    u_tilt, v_tilt = draw(-0.05, 0.05), draw(-0.05, 0.05)
+    # Columns of M: the axes u and v of a splat of 1 to 6 pixels, slightly inclined, and its centre.
+    rows = (
+        (u * np.cos(angle) + x * u_tilt, -v * np.sin(angle) + x * v_tilt, x),
+        (u * np.sin(angle) + y * u_tilt, v * np.cos(angle) + y * v_tilt, y),
+        (u_tilt, v_tilt, np.ones_like(x)),
+    )
+    M: Any = np.moveaxis(depth * np.asarray(rows, np.float32), -1, 0)
+    normals, nothing = draw(-1, 1, 3), draw(0, 0, 0)
+    splats = Splats(M, draw(0, 1, 3), draw(0.05, 0.6), normals, nothing)
+    texels, sides, first = draw(0.1, 0.9, 4, 4).reshape(-1, 4), *(draw(n, n).astype(np.int32) for n in (2, 0))
+    regions = TextureRegion(first + 4 * np.arange(NUM, dtype=np.int32), sides, sides)
+    static = StaticShading.of(Appearance(texture=Texture()))
+    kernel = KernelSpec(static, 0, 4, "float32", GRID.tile_size, 0.2, has_geometry=True, statistic="position")
+    settings = CompositingSettings(kernel, GRID, "auto", tile_batch=GRID.num)
+    g = rng.normal(size=(GRID.num, kernel.num_channels, GRID.tile_size**2)).astype(np.float32)
+    jacobian, probe = np.diag([40, 40, 1]).astype(np.float32), draw(0, 0, 4)
+    return settings, (splats, texels, regions, gaussian_cutoff(splats.opacities), jacobian, probe, g)

@@ -1,0 +1,204 @@
+"""The platform is chosen when JAX compiles, from where arrays are; CUDA kernels are checked before they draw."""
+
+import functools
+import os
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
+
+from a2tg_jax import RenderSettings, render_image
+from a2tg_jax.rasterize.kernels import choice
+from a2tg_jax.rasterize.kernels.by_platform import by_platform
+from a2tg_jax.rasterize.kernels.cuda import check, composite, launch, nvrtc
+from a2tg_jax.training.losses import mean_ssim
+
+NATIVE = r"custom_call @a2tg_"
+CUDA = rf"custom_call @{re.escape(launch.TARGET)}"
+
+
+def loss(gaussians, textures=None, layout=None, **settings):
+    scene = draw_scene(4, num=8, width=40, height=24)
+    settings = RenderSettings(capacity=512, **settings)
+    color = render_image(gaussians, as_camera(scene, "float32"), textures, settings=settings).color
+    return jnp.sum(color) + mean_ssim(color, color**2)
+
+
+@functools.cache
+def lowered(platform, **settings):
+    """The program of the gradient of a render and of SSIM, lowered for a platform."""
+    gradient = jax.jit(jax.grad(functools.partial(loss, **settings)))
+    gaussians = as_gaussians(draw_scene(4, num=8), "float32")
+    return gradient.trace(gaussians).lower(lowering_platforms=(platform,)).as_text().replace('"', "")
+
+
+@pytest.fixture
+def fake_nvrtc(monkeypatch):
+    """Programs for CUDA are lowered, but their kernels are empty."""
+    monkeypatch.setattr(nvrtc, "find", lambda: True)
+    monkeypatch.setattr(nvrtc, "ptx", lambda source, capability: "none")
+    choice.has_cuda.cache_clear()
+    lowered.cache_clear()
+    jax.clear_caches()
+    yield
+    choice.has_cuda.cache_clear()
+
+
+@pytest.mark.usefixtures("fake_nvrtc")
+def test_one_function_takes_the_kernels_of_the_platform_that_it_is_lowered_for():
+    """On CPUs lists, both passes and both passes of SSIM; on NVIDIA GPUs both passes; elsewhere none."""
+    assert len(re.findall(NATIVE, lowered("cpu"))) >= 5 and not re.search(CUDA, lowered("cpu"))
+    assert len(re.findall(CUDA, lowered("cuda"))) == 2 and not re.search(NATIVE, lowered("cuda"))
+    assert not re.search(f"{NATIVE}|{CUDA}", lowered("rocm"))
+
+
+@pytest.mark.usefixtures("fake_nvrtc")
+def test_a_compositor_of_another_platform_is_refused():
+    with pytest.raises(ValueError, match="compositor='cuda' needs JAX on an NVIDIA GPU"):
+        lowered("cpu", compositor="cuda")
+    with pytest.raises(ValueError, match="compositor='native' needs JAX on the CPU"):
+        lowered("cuda", compositor="native")
+
+
+@pytest.mark.usefixtures("fake_nvrtc")
+def test_xla_takes_more_tiles_at_once_elsewhere():
+    """15 tiles one by one on CPUs, else all together."""
+    for compositor in ("xla", "autodiff"):
+        many = [
+            len(re.findall("tensor<15x[0-9x]*64xf32>", lowered(name, compositor=compositor)))
+            for name in ("cpu", "cuda")
+        ]
+        assert many[0] < many[1]
+
+
+def code_of(platform, by):
+    return lambda x: {"sum": x[0] + by, "name": jnp.int32(len(platform))}
+
+
+def tripled(x):
+    shapes = {"sum": jax.ShapeDtypeStruct((), x.dtype), "name": jax.ShapeDtypeStruct((), jnp.int32)}
+    return by_platform(code_of, (3,), shapes, (x,), advice="no slope")
+
+
+def test_a_function_by_platform_under_transformations():
+    """Eagerly, without jit, under vmap of vmap, and in a loop; not differentiated."""
+    x = jnp.arange(6.0)
+    for run in (tripled, jax.jit(tripled)):
+        assert run(x[1]) == {"sum": 4, "name": 3}
+        with jax.disable_jit():
+            assert run(x[1])["sum"] == 4
+    both = jax.vmap(jax.vmap(tripled, out_axes=0), in_axes=1)(x.reshape(2, 3))
+    np.testing.assert_array_equal(both["sum"], x.reshape(2, 3).T + 3)
+    np.testing.assert_array_equal(jax.lax.map(tripled, x)["sum"], x + 3)
+    with pytest.raises(ValueError, match="no slope"):
+        jax.grad(lambda x: tripled(x)["sum"])(1.0)
+
+
+SCRIPT = """
+import jax, numpy as np
+from test_platforms import loss
+from scenes_random import as_gaussians, draw_scene
+gaussians = as_gaussians(draw_scene(4, num=8), "float32")
+found = {}
+for device in jax.devices():
+    draw = jax.jit(jax.value_and_grad(loss))
+    found[device] = draw(jax.device_put(gaussians, device))
+    assert all(leaf.devices() == {device} for leaf in jax.tree.leaves(found[device]))
+    with jax.default_device(device):
+        for a, b in zip(jax.tree.leaves(draw(jax.tree.map(np.asarray, gaussians))), jax.tree.leaves(found[device])):
+            np.testing.assert_array_equal(a, b)
+first, *others = found.values()
+assert len(others) == 2
+for other in others:
+    jax.tree.map(np.testing.assert_array_equal, first, other)
+"""
+
+
+def test_each_of_several_devices_draws_the_same(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=3")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.path.dirname(__file__), *sys.path]))
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture
+def a_gpu(monkeypatch, tmp_path, gpu_kernels):
+    """The CPU passes for an NVIDIA GPU, on which "auto" takes the CUDA kernels, run as OpenCL. Returns the cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setitem(choice.PLATFORMS, "native", "none")
+    (device,) = jax.local_devices()
+    monkeypatch.setattr(jax, "local_devices", lambda backend: [device])
+    choice.has_cuda.cache_clear()
+    jax.clear_caches()
+    yield tmp_path / "a2tg-jax"
+    choice.has_cuda.cache_clear()
+    jax.clear_caches()
+
+
+def drawn(compositor="auto"):
+    """A textured view and its gradient; the choice of the compositor falls inside a trace."""
+    scene = draw_scene(4, num=8, width=40, height=24)
+    arrays = as_gaussians(scene, "float32"), as_textures(scene, "float32")
+    return jax.jit(jax.value_and_grad(functools.partial(loss, compositor=compositor)))(*arrays)
+
+
+def assert_drawn_like_xla(found):
+    wanted = drawn("xla")
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * float(jnp.abs(b).max()))
+
+
+def test_kernels_that_agree_with_xla_are_used_and_checked_once(a_gpu, monkeypatch):
+    checked, run = [], check.largest_difference
+    monkeypatch.setattr(check, "largest_difference", lambda device: checked.append(run(device)) or checked[-1])
+    launched, launch_it = [], composite.launch
+    monkeypatch.setattr(composite, "launch", lambda *given: launched.append(given[1]) or launch_it(*given))
+    assert_drawn_like_xla(drawn())
+    assert launched == ["forward", "backward"] * 2 and len(checked) == 1
+    assert checked[0] < check.MOST_DIFFERENCE / 100
+    (file,) = a_gpu.iterdir()
+    assert file.read_text() == ""
+    choice.has_cuda.cache_clear()
+    assert choice.choose("auto", "cpu") == "cuda" and len(checked) == 1
+
+
+def fails(*_):
+    raise RuntimeError("CUDA_ERROR_ILLEGAL_ADDRESS\nat 0x0")
+
+
+def stale(spec, name, num_tiles, inputs, results, totals=()):
+    """Kernels that run but write nothing."""
+    return [*(jnp.zeros(shape.shape, shape.dtype) for shape in results), *totals]
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [(fails, r"failed: RuntimeError: CUDA_ERROR_ILLEGAL_ADDRESS at 0x0"), (stale, r"differ from XLA by 1e\+02 %")],
+)
+def test_xla_takes_over_from_kernels_that_are_wrong(a_gpu, monkeypatch, broken, words):
+    """The warning is one line, and comes again in the next process, which does not run the kernels again."""
+    monkeypatch.setattr(composite, "launch", broken)
+    with pytest.warns(
+        UserWarning, match=f"compositing by XLA, which is slower: CUDA kernels {words}; .* delete "
+    ) as told:
+        found = drawn()
+    assert len(told) == 1 and "\n" not in str(told[0].message)
+    assert_drawn_like_xla(found)
+    (file,) = a_gpu.iterdir()
+    assert str(file) in str(told[0].message) and file.read_text() in str(told[0].message)
+    choice.has_cuda.cache_clear()
+    monkeypatch.setattr(check, "largest_difference", None)
+    with pytest.warns(UserWarning, match="CUDA kernels"):
+        assert choice.choose("auto", "cpu") == "xla"
+    assert choice.choose("cuda", "cpu") == "cuda"
+
+
+def test_a_cache_folder_that_cannot_be_written_is_done_without(a_gpu, monkeypatch):
+    a_gpu.write_text("a file where the folder would be")
+    monkeypatch.setattr(check, "largest_difference", lambda device: 0.0)
+    assert choice.choose("auto", "cpu") == "cuda"
