@@ -146,7 +146,7 @@ def test_rows_move_while_all_have_one_degree():
     table = bands_of_dense(gaussians.sh[:, 1:], np.full(NUM, 3), 0)
     np.testing.assert_array_equal(dense_bands(table.gather(rows), 0), gaussians.sh[rows, 1:])
     model, _, _ = banded(0)
-    with pytest.raises(ValueError, match="blocks of 4 sizes cannot change rows: densify and prune before they grow"):
+    with pytest.raises(ValueError, match="coefficients of 4 sizes cannot change rows: densify and prune before"):
         model.appearance.coefficients.gather(rows)
 
 

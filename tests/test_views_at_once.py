@@ -28,7 +28,7 @@ def test_views_at_once_are_those_of_one_after_the_other(num_at_once):
     rows, views = jnp.asarray(rng.normal(size=(4, 3))), jnp.asarray(rng.normal(size=(4, 5)))
 
     def one(arrays):
-        derivative = jax.value_and_grad_of_views(loss_of(lambda x: 2 * x), argnums=(0, 1, 2, 3), has_aux=True)
+        derivative = jax.value_and_grad(loss_of(lambda x: 2 * x), argnums=(0, 1, 2, 3), has_aux=True)
         told, (by_gaussians, by_params, *others) = derivative(gaussians, params, arrays[0], probe, arrays[1])
         return (told, by_gaussians, others), by_params
 
