@@ -19,7 +19,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_mask
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.partition import combine, partition
-from a2tg_jax.core.table import Shape, Table
+from a2tg_jax.core.table import Shape, Table, is_table
 from a2tg_jax.data import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
@@ -322,7 +322,7 @@ def _moved(tree: Any, rows: Any) -> Any:
     return jax.tree.map(
         lambda leaf: leaf.gather(rows) if isinstance(leaf, Table) else rows_moved(leaf, rows),
         tree,
-        is_leaf=lambda leaf: isinstance(leaf, Table),
+        is_leaf=is_table,
     )
 
 

@@ -36,7 +36,7 @@ from a2tg_jax.core.numerics import at_least
 from a2tg_jax.core.partition import partition
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import sh_sum
-from a2tg_jax.core.table import Table, check_places, check_table
+from a2tg_jax.core.table import Table, check_places, check_table, is_table
 from a2tg_jax.texture import NEUTRAL_TEXEL, Textures
 
 MAX_ALPHA = 0.99
@@ -153,7 +153,7 @@ class Appearance:
         """
         if not isinstance(rate, Mapping):
             return rate
-        floats = [field.name for field in _array_fields(self) if getattr(self, field.name) is not None]
+        floats = [field.name for field in array_fields(self) if getattr(self, field.name) is not None]
         if unknown := [*rate.keys() - set(floats)]:
             raise ValueError(f"rates must be by the fields {', '.join(floats)}; got {unknown[0]!r}")
         own = {name: getattr(self, name) for name in floats}
@@ -263,12 +263,11 @@ def appearance_for(
     start: tuple[int, int] = (1, 1),
 ) -> Appearance:
     """Return the template of plain Gaussians with some parts; without textures, only `options.max_alpha` counts."""
-    max_alpha = None if has_textures or options.max_alpha == MAX_ALPHA else options.max_alpha
     return Appearance(
         texture=Texture(None, start, options) if has_textures else None,
         exponents=Exponents() if has_shapes else None,
         bands=Bands() if has_degrees else None,
-        max_alpha=max_alpha,
+        max_alpha=None if has_textures else options.max_alpha,
     )
 
 
@@ -283,11 +282,9 @@ def in_words(appearance: Appearance) -> str:
 
 
 PARTS = ("texture", "exponents", "bands")
-VIEW_FIELDS = ("given_colors", "features")
-"""Arrays that only change how a model is rendered."""
 
 
-def _array_fields(node: Any) -> list[dataclasses.Field[Any]]:
+def array_fields(node: Any) -> list[dataclasses.Field[Any]]:
     """Return the fields of an appearance, or of a part, that are not static."""
     return [field for field in dataclasses.fields(node) if not field.metadata.get("static")]
 
@@ -350,7 +347,7 @@ def without_arrays(node: Any, instead: Callable[[str], Any], name: str = "") -> 
       instead: makes the value of the field's path, such as "texture.texels".
     """
     changes = {}
-    for field in _array_fields(node):
+    for field in array_fields(node):
         value, path = getattr(node, field.name), f"{name}.{field.name}" if name else field.name
         if isinstance(value, Part):
             changes[field.name] = without_arrays(value, instead, path)
@@ -382,7 +379,7 @@ def count_floats(appearance: Appearance, num: int) -> int:
     An opacity that is not trained counts as -1.
     """
     total = -appearance.replaced_floats * num
-    for leaf in jax.tree.leaves(appearance, is_leaf=_is_table):
+    for leaf in jax.tree.leaves(appearance, is_leaf=is_table):
         total += leaf.count_floats(num) if isinstance(leaf, Table) else int(np.prod(leaf.shape[1:], dtype=int)) * num
     return total
 
@@ -398,10 +395,10 @@ def check_appearance(appearance: Any, gaussians: Gaussians) -> None:
     for name in PARTS:
         if (part := getattr(appearance, name)) is not None:
             part.check(gaussians)
-    for field in _array_fields(appearance):
+    for field in array_fields(appearance):
         if field.name in PARTS:
             continue
-        for leaf in jax.tree.leaves(getattr(appearance, field.name), is_leaf=_is_table):
+        for leaf in jax.tree.leaves(getattr(appearance, field.name), is_leaf=is_table):
             if isinstance(leaf, Table):
                 check_table(leaf, gaussians.num, f"{kind}.{field.name}")
                 check_places(leaf, f"{kind}.{field.name}")
@@ -419,16 +416,12 @@ def check_arrays_given(appearance: Appearance) -> None:
     """Raise ValueError if a part, or a table of a subclass, is a template without its arrays."""
     for name in PARTS:
         part = getattr(appearance, name)
-        for field in [] if part is None else _array_fields(part):
+        for field in [] if part is None else array_fields(part):
             if getattr(part, field.name) is None:
                 raise ValueError(
                     f"model.appearance.{name}.{field.name} is None: this appearance is a template, without arrays; say "
                     "Model(gaussians, allocate_appearance(appearance, key, gaussians))"
                 )
-
-
-def _is_table(leaf: Any) -> bool:
-    return isinstance(leaf, Table)
 
 
 # Rows, of Gaussians and appearances alike: every array has a row for each Gaussian, every table a block
@@ -442,18 +435,18 @@ def clear_rows(tree: Any, is_cleared: Array) -> Any:
             return leaf.clear(is_cleared)
         return jnp.where(is_cleared.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.zeros_like(leaf), leaf)
 
-    return jax.tree.map(cleared, tree, is_leaf=_is_table)
+    return jax.tree.map(cleared, tree, is_leaf=is_table)
 
 
 def take_rows(tree: Any, rows: np.ndarray) -> Any:
     """Return the rows of some Gaussians, which may repeat; tables in buckets as small as they need (host)."""
-    return jax.tree.map(lambda leaf: leaf.take(rows) if _is_table(leaf) else leaf[rows], tree, is_leaf=_is_table)
+    return jax.tree.map(lambda leaf: leaf.take(rows) if is_table(leaf) else leaf[rows], tree, is_leaf=is_table)
 
 
 def join_rows(trees: Sequence[Any]) -> Any:
     """Return the rows of several trees of one structure but for their tables, one after the other (host)."""
 
     def joined(*leaves: Any) -> Any:
-        return type(leaves[0]).joined(leaves) if _is_table(leaves[0]) else jnp.concatenate(leaves)
+        return type(leaves[0]).joined(leaves) if is_table(leaves[0]) else jnp.concatenate(leaves)
 
-    return jax.tree.map(joined, *trees, is_leaf=_is_table)
+    return jax.tree.map(joined, *trees, is_leaf=is_table)

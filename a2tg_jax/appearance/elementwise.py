@@ -21,7 +21,7 @@ from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.checks import check_kind, described
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.pytree import check_pytree
-from a2tg_jax.core.table import Table, check_table
+from a2tg_jax.core.table import check_table, is_table
 
 ODD_SHAPE = (5, 7)
 """Shape of arrays that fits no matrix in an appearance by chance."""
@@ -36,8 +36,8 @@ def check_is_appearance(appearance: Any, gaussians: Gaussians | None = None) -> 
     check_arrays_given(appearance)
     if gaussians is None:
         return
-    for path, leaf in jax.tree_util.tree_leaves_with_path(appearance, is_leaf=lambda leaf: isinstance(leaf, Table)):
-        if isinstance(leaf, Table):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(appearance, is_leaf=is_table):
+        if is_table(leaf):
             check_table(leaf, gaussians.num, "appearance" + jax.tree_util.keystr(path))
 
 

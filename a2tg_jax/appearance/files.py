@@ -20,11 +20,11 @@ from a2tg_jax.appearance.bands import (
     degrees_of_sizes,
     dense_bands,
 )
-from a2tg_jax.appearance.base import Appearance, allocate_appearance
+from a2tg_jax.appearance.base import Appearance, allocate_appearance, array_fields
 from a2tg_jax.appearance.exponents import Exponents
 from a2tg_jax.core.gaussians import no_rows
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.table import Table
+from a2tg_jax.core.table import Table, is_table
 from a2tg_jax.texture import MAX_SIDE, Textures
 
 OLD_INNER = "inner."
@@ -50,7 +50,7 @@ def arrays_of(appearance: Appearance, sh_degree: int) -> dict[str, np.ndarray]:
     if appearance.texture is not None and (texels := appearance.texture.texels) is not None:
         arrays |= {"sizes": texels.sizes, "texels": texels.flat()}
     for field, value in _own_arrays(appearance).items():
-        for path, leaf in jax.tree_util.tree_leaves_with_path(value, is_leaf=lambda leaf: isinstance(leaf, Table)):
+        for path, leaf in jax.tree_util.tree_leaves_with_path(value, is_leaf=is_table):
             name = field + jax.tree_util.keystr(path)
             if isinstance(leaf, Table):
                 arrays |= {f"{name}.sizes": leaf.sizes, f"{name}.elements": leaf.flat()}
@@ -94,13 +94,13 @@ def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degre
                 raise ValueError(f"{name} must be [N, …] with rows {leaf.shape[1:]}; got {array.shape}")
             return jnp.asarray(array)
 
-        changes[field] = jax.tree_util.tree_map_with_path(read, value, is_leaf=lambda leaf: isinstance(leaf, Table))
+        changes[field] = jax.tree_util.tree_map_with_path(read, value, is_leaf=is_table)
     return dataclasses.replace(template, **changes)
 
 
 def _own_arrays(appearance: Appearance) -> dict[str, Any]:
     """Return the fields of a subclass that hold arrays, or pytrees of them."""
-    names = [field.name for field in dataclasses.fields(appearance) if not field.metadata.get("static")]
+    names = [field.name for field in array_fields(appearance)]
     shared = {field.name for field in dataclasses.fields(Appearance)}
     return {name: value for name in names if name not in shared and (value := getattr(appearance, name)) is not None}
 

@@ -230,6 +230,11 @@ class Table:
         return short_repr(self)
 
 
+def is_table(leaf: Any) -> bool:
+    """Return whether a node of a pytree is a table, for `is_leaf` of `jax.tree`."""
+    return isinstance(leaf, Table)
+
+
 def _as_int32(index: Array) -> Array:
     """Return integers of any type as int32, clipped to its range."""
     wanted, own = np.iinfo(np.int32), np.iinfo(index.dtype)

@@ -15,7 +15,7 @@ from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.partition import combine, partition
-from a2tg_jax.core.table import Table
+from a2tg_jax.core.table import Table, is_table
 from a2tg_jax.host.machine import ALONE, Devices, Machine, this_machine
 from a2tg_jax.host.text import counted, shortened
 from a2tg_jax.io.archive import read_archive, write_archive
@@ -286,7 +286,7 @@ def _packed(model: Model, moments: AdamState) -> AdamState:
 
     def packed(moment: Model) -> Model:
         whole = combine(moment.appearance, rest)
-        whole = jax.tree.map(smaller, whole, is_leaf=lambda leaf: isinstance(leaf, Table))
+        whole = jax.tree.map(smaller, whole, is_leaf=is_table)
         return dataclasses.replace(moment, appearance=partition(whole)[0])
 
     return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))
