@@ -149,7 +149,7 @@ if TYPE_CHECKING:
     from a2tg_jax.training import like as like
     from a2tg_jax.training import load_checkpoint as load_checkpoint
     from a2tg_jax.training import save_checkpoint as save_checkpoint
-    from a2tg_jax.training.bilateral import BilateralGrid as BilateralGrid
+    from a2tg_jax.training.corrections import BilateralGrid as BilateralGrid
     from a2tg_jax.training.corrections import Correction as Correction
     from a2tg_jax.training.corrections import Exposure as Exposure
     from a2tg_jax.training.corrections import PoseRefinement as PoseRefinement
@@ -266,8 +266,7 @@ _NAMES = {
         "load_checkpoint",
         "save_checkpoint",
     ),
-    "a2tg_jax.training.bilateral": ("BilateralGrid",),
-    "a2tg_jax.training.corrections": ("Correction", "Exposure", "PoseRefinement"),
+    "a2tg_jax.training.corrections": ("BilateralGrid", "Correction", "Exposure", "PoseRefinement"),
     "a2tg_jax.training.gradients": ("ViewGradients", "value_and_grad", "view_gradients"),
     "a2tg_jax.training.losses": ("normal_consistency", "photometric_loss"),
 }

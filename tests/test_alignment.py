@@ -12,7 +12,7 @@ from a2tg_jax.cli.main import main
 from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.training.corrections import Exposure, exposed
-from a2tg_jax.training.option_groups import Corrections
+from a2tg_jax.training.options import Corrections
 
 TWIST = np.array([0.018, -0.012, 0.009, 0.012, -0.009, 0.015])
 

@@ -15,7 +15,7 @@ from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.results import compression
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.record import SceneSource, read_record
-from a2tg_jax.training import DivergedError, progress
+from a2tg_jax.training import DivergedError, reports
 
 TUNE = ["compress", "--tune-iterations", "30"]
 COARSE = CompactChoices(means=5, log_scales=3, quats=3, opacities=2, sh_0=3, sh_rest=2, texels=2)
@@ -62,7 +62,7 @@ def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
     ladder = {"means": (3, 5, 8, 14), "log_scales": (1, 2, 4, 10), "sh_0": (1, 2, 4, 10), "opacities": (1, 2, 4, 10)}
     monkeypatch.setattr(compression, "TUNED_LADDER", ladder)
     monkeypatch.setattr(tuning, "MOST_TUNINGS", 1)
-    monkeypatch.setattr(progress, "TIMED_SECONDS", 0.0)
+    monkeypatch.setattr(reports, "TIMED_SECONDS", 0.0)
     plain, tuned = tmp_path / "plain.a2tgz", tmp_path / "tuned.a2tgz"
     with monkeypatch.context() as patch:
         patch.setattr(compression, "smallest_tuned", lambda *a: tuning.TunedFiles([]))

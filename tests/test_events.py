@@ -18,7 +18,7 @@ from a2tg_jax.core.partition import combine, partition
 from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.results.forecast import forecast_run
 from a2tg_jax.results.plan import plan_run
-from a2tg_jax.training.effects import StageEffects
+from a2tg_jax.training.reports import StageEffects
 from a2tg_jax.training.step import initial_state, jitted_step
 from a2tg_jax.training.terms import l1
 

@@ -31,12 +31,12 @@ from a2tg_jax.results.forecast import (
 )
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
-from a2tg_jax.training import SYSTEMS, cost, progress
-from a2tg_jax.training.bilateral import BilateralGrid, sliced
+from a2tg_jax.training import SYSTEMS, cost, reports
+from a2tg_jax.training.corrections import BilateralGrid, sliced
 from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.option_groups import Corrections
-from a2tg_jax.training.progress import Pace
+from a2tg_jax.training.options import Corrections
+from a2tg_jax.training.reports import Pace
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import StepSettings, jitted_step
 
@@ -386,8 +386,8 @@ def test_the_pace_does_not_speak_of_growth_where_there_is_none():
 
 @pytest.mark.parametrize("is_shown", [True, False])
 def test_the_pace_stands_above_the_bar(capsys, monkeypatch, is_shown):
-    monkeypatch.setattr(progress, "TIMED_SECONDS", 0.0)
-    with progress.ProgressBar("a-stage", 0, 100, is_shown=is_shown) as bar:
+    monkeypatch.setattr(reports, "TIMED_SECONDS", 0.0)
+    with reports.ProgressBar("a-stage", 0, 100, is_shown=is_shown) as bar:
         for done in (10, 20, 30):
             bar.tell_pace(done, 1)
     captured = capsys.readouterr()
@@ -408,9 +408,9 @@ def test_items_without_a_terminal_are_counted_in_plain_lines(capsys, monkeypatch
 
 def test_without_a_terminal_tenths_are_plain_lines(capsys, monkeypatch):
     monkeypatch.setattr(progress_bars, "PLAIN_SECONDS", 0.0)
-    info, history = SimpleNamespace(loss=0.5, psnr=20.0), SimpleNamespace(iteration=())
-    with progress.ProgressBar("a-stage", 0, 20, is_shown=True) as bar:
+    info = SimpleNamespace(loss=0.5, psnr=20.0)
+    with reports.ProgressBar("a-stage", 0, 20, is_shown=True) as bar:
         for _ in range(20):
-            bar.update(info, history)
+            bar.update(info, None)
     lines = capsys.readouterr().err.splitlines()
     assert lines[:2] == ["a-stage: compiling", "a-stage: 2 of 20, loss 0.5000, 20.00 dB"] and len(lines) == 11

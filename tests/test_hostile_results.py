@@ -16,7 +16,6 @@ from a2tg_jax.results.history import NAMES, read_history, write_history
 from a2tg_jax.results.info import read_psnrs
 from a2tg_jax.results.record import RunRecord, SceneSource, chosen_system, read_record, read_run_file, write_record
 from a2tg_jax.training import History
-from a2tg_jax.training.checkpoint import HistoryLog
 
 HEAD = ",".join(NAMES)
 
@@ -277,25 +276,13 @@ def test_a_history_of_200_000_rows_is_read_and_drawn_in_seconds(tmp_path):
     np.testing.assert_array_equal(found.psnr, history.psnr)
 
 
-def test_rows_are_logged_in_constant_time_and_earlier_histories_stay():
-    log, expected = HistoryLog(History.empty()), History.empty()
-    kept = []
-    for index in range(100):
-        point = (1, index, 0.5 / (index + 1), float("inf") if index == 3 else 20.0, 7, 0.1, float(index))
-        log.add(*point)
-        expected = expected.with_point(*point)
-        kept.append(log.history)
-    again = HistoryLog(kept[49])
-    again.add(2, 0, 9.0, 9.0, 9, 9.0, 9.0)
-    for field in ("stage", "iteration", "loss", "psnr", "num_gaussians", "megabytes", "seconds"):
-        wanted = getattr(expected, field)
-        assert getattr(log.history, field).dtype == wanted.dtype
-        assert all(np.array_equal(getattr(kept[k], field), wanted[: k + 1]) for k in (0, 20, 49, 99))
-    assert len(again.history.loss) == 51 and kept[50].loss[50] == expected.loss[50]
-    start = time.perf_counter()
-    for index in range(200_000):
-        log.add(1, index, 0.5, 20.0, 7, 0.1, 1.0)
-    assert time.perf_counter() - start < 15
+def test_a_history_of_rows_has_its_dtypes_and_nan_where_a_row_lacks_a_term():
+    names = ("stage", "iteration", "loss", "psnr", "num_gaussians", "megabytes", "seconds")
+    rows = [dict(zip(names, (1, index, 0.5, 20.0, 7, 0.1, 1.0), strict=True)) for index in range(3)]
+    found = History.of_rows([rows[0], rows[1] | {"loss_l1": 0.25}, rows[2]])
+    assert all(getattr(found, name).dtype == getattr(History.empty(), name).dtype for name in names)
+    assert found.iteration.tolist() == [0, 1, 2] and np.isnan(found.terms["l1"]).tolist() == [True, False, True]
+    assert all(len(column) == 0 for column in History.of_rows([]).to_dict().values())
 
 
 # Things that are no files

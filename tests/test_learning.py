@@ -10,7 +10,7 @@ import pytest
 import a2tg_jax as a2tg
 from a2tg_jax.training import LearningRates
 from a2tg_jax.training.batches import BatchOrder
-from a2tg_jax.training.learning import LearningCheck, flat_psnr
+from a2tg_jax.training.reports import LearningCheck, flat_psnr
 
 NO_RATES = LearningRates(means=0.0, log_scales=0.0, quats=0.0, logit_opacities=0.0, sh_degree0=0.0, sh_rest=0.0)
 

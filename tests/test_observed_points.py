@@ -16,7 +16,7 @@ from a2tg_jax.data.observations import stacked_points
 from a2tg_jax.data.synthetic import exact_depths
 from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.training.batches import BatchOrder, Extras, PhotoStore, stack_views, view_bytes
-from a2tg_jax.training.depth_prior import PointDepths, points_loss
+from a2tg_jax.training.terms import PointDepths, points_loss
 
 RNG = np.random.default_rng(0)
 

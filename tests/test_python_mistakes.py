@@ -20,7 +20,7 @@ from a2tg_jax.appearance import Bands, Exponents
 from a2tg_jax.host import signals
 from a2tg_jax.training import Checkpoint, History
 from a2tg_jax.training.checkpoint import check_resume
-from a2tg_jax.training.option_groups import Corrections
+from a2tg_jax.training.options import Corrections
 
 CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(3), jnp.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]), 16, 12)
 
@@ -317,7 +317,7 @@ def test_a_class_that_was_defined_anew_is_told_from_the_one_before():
 
     checkpoint = Checkpoint(defined()(), 0, None, History.empty())
     with pytest.raises(
-        ValueError, match=r"Own as it was before it was defined anew\): resume with checkpoint.system, or"
+        ValueError, match=r"Own as it was before it was defined again\): resume with checkpoint.system, or"
     ):
         check_resume(checkpoint, defined()(), 0)
 

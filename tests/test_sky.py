@@ -16,9 +16,8 @@ from a2tg_jax.results.plan import fingerprint, plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.cost import forecast_stages
-from a2tg_jax.training.directions import MOST_TRIED, even_directions, fibonacci
 from a2tg_jax.training.registry import with_changes
-from a2tg_jax.training.sky import cell_rays, is_bare, sky_of, sphere
+from a2tg_jax.training.sky import MOST_TRIED, cell_rays, even_directions, fibonacci, is_bare, sky_of, sphere
 from a2tg_jax.training.start import check_start, initial_model
 
 WIDTH, HEIGHT, NUM = 48, 36, 60

@@ -21,13 +21,10 @@ from a2tg_jax.events import Due
 from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.batches import Extras, stack_views
-from a2tg_jax.training.bilateral import BilateralGrid, sliced, total_variation
-from a2tg_jax.training.corrections import exposed, learned
-from a2tg_jax.training.depth_prior import DepthPrior, depth_loss, scale_and_shift
-from a2tg_jax.training.option_groups import LossConfig
-from a2tg_jax.training.robust import RobustPhotometric, inliers
+from a2tg_jax.training.corrections import BilateralGrid, exposed, learned, sliced, total_variation
+from a2tg_jax.training.options import LossConfig
 from a2tg_jax.training.start import initial_model
-from a2tg_jax.training.terms import Photometric
+from a2tg_jax.training.terms import DepthPrior, Photometric, RobustPhotometric, depth_loss, inliers, scale_and_shift
 
 RNG = np.random.default_rng(0)
 

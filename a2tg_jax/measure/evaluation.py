@@ -23,7 +23,7 @@ from a2tg_jax.render import appearance_of
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.texture import Textures
 from a2tg_jax.training.corrections import exposed
-from a2tg_jax.training.learning import flat_psnr, has_learned
+from a2tg_jax.training.reports import flat_psnr, has_learned
 
 
 @dataclasses.dataclass(frozen=True)

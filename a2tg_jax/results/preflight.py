@@ -20,7 +20,7 @@ from a2tg_jax.results.output_checks import check_output
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, RunRecord
 from a2tg_jax.training import System
-from a2tg_jax.training.start import check_start, initial_number, num_rows
+from a2tg_jax.training.start import check_loss_data, check_start, initial_number, num_rows
 
 STATE_SIZE = 3
 """Arrays per parameter in a checkpoint: its value and two moments."""
@@ -59,6 +59,7 @@ def check_new_run(
     check_output(out)
     scene = record.scene.load(room_for_photographs(max_memory), is_divided=True)
     for system in record.systems.values():
+        check_loss_data(scene.train, system.stages())
         check_start(scene, system, num_given if system is record.system else None)
     check_room(record, scene, out, num_given)
     warn_of_small_budget(record.system)

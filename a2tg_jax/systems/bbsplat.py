@@ -7,9 +7,8 @@ from a2tg_jax.appearance import Billboards
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.mcmc import FillingMcmc, Mcmc
 from a2tg_jax.systems.stage1 import FLOATS_PER_TEXEL, QUICK, SMOKE, TwoStages
-from a2tg_jax.training.option_groups import LossConfig
-from a2tg_jax.training.rates import LearningRates
-from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.options import LossConfig
+from a2tg_jax.training.stage import LearningRates, Stage
 
 AUTHORS_LOSS = LossConfig(opacity_weight=0.01)
 AUTHORS_RATES = LearningRates(sh_degree0=5e-3, sh_rest=2.5e-4)

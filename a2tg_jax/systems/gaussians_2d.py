@@ -15,7 +15,7 @@ from a2tg_jax.systems.stage1 import (
     grown_by_density,
     pruned,
 )
-from a2tg_jax.training.option_groups import LossConfig
+from a2tg_jax.training.options import LossConfig
 from a2tg_jax.training.stage import Stage
 
 SURFACES = LossConfig(normal_weight=0.2)

@@ -12,8 +12,7 @@ from a2tg_jax.events import Event, StepEvent, Times
 from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
 from a2tg_jax.training.options import System
-from a2tg_jax.training.rates import LearningRates
-from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.stage import LearningRates, Stage
 
 QUICK_CAP = 10_000
 QUICK_OPACITY = 0.5

@@ -8,8 +8,7 @@ from a2tg_jax.appearance.movable_kernels import FLOATS_PER_KERNEL, NUM_KERNELS
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.densify.clone_split import CloneSplitPrune, OpacityReset
 from a2tg_jax.systems.stage1 import QUICK, QUICK_CAP, QUICK_RATES, SMOKE, SMOKE_CAP, TwoStages, grown_by_density
-from a2tg_jax.training.rates import LearningRates
-from a2tg_jax.training.stage import Stage
+from a2tg_jax.training.stage import LearningRates, Stage
 
 AUTHORS_LOG_SCALES = 3e-3
 

@@ -11,15 +11,12 @@ import numpy as np
 from jax import Array
 from numpy.typing import DTypeLike
 
-from a2tg_jax.core.cameras import check_camera
-from a2tg_jax.data.observations import ObservedPoints, check_observed_points, stacked_points
+from a2tg_jax.data.observations import ObservedPoints, stacked_points
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.cores import num_threads
-from a2tg_jax.host.text import shortened
 from a2tg_jax.parallel.exchange import Exchange
 from a2tg_jax.parallel.pictures import are_drawn_here, on_devices
 from a2tg_jax.parallel.rows import asked_by_any, everywhere
-from a2tg_jax.training.losses import SSIM_WINDOW
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25
@@ -168,12 +165,12 @@ class PhotoStore:
         self._extras = extras
         plan = plan_batches(views, len(order.indices(1)), room, extras)
         self._mesh = None if exchange is None else exchange.mesh
-        self.is_resident, self.num_ahead = not asked_by_any(self._mesh, not plan.is_resident), plan.num_ahead
-        self._keeps_rays = plan.keeps_rays
+        self._keeps_rays, self.num_ahead = plan.keeps_rays, plan.num_ahead
         self._rays: dict[tuple[int, int, int], Array] = {}
-        self._stacks: dict[tuple[int, int, int], tuple[Photographs, dict[int, int]]] = {}
+        self._stacks: dict[tuple[int, int, int], Photographs] = {}
         is_waiting = any(view.picture.is_remote for view in views)
         self._ahead = Ahead(self._read, self.num_ahead, is_waiting=is_waiting)
+        self.is_resident = not asked_by_any(self._mesh, not plan.is_resident)
 
     def batch(self, iteration: int) -> tuple[Photographs, np.ndarray | None]:
         """Return photographs of one kind that include those of an iteration, and their int32 indices among them, or
@@ -182,40 +179,34 @@ class PhotoStore:
         Raises:
           ValueError, OSError: if a photograph that was left where it lies has gone, has changed or cannot be read.
         """
-        indices = self._order.indices(iteration)
-        kind = self._order.kinds[indices[0]]
-        if not self.is_resident:
-            following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
-            batch = self._ahead.first({key: self._order.indices(key) for key in following})
-            batch = batch._replace(rays=self._rays_of(kind, batch.rays))
-            return batch if self._exchange is None else on_devices(self._exchange, batch, is_batch=True), None
-        stack, places = self._stack(kind)
-        return stack, np.asarray([places[index] for index in indices], np.int32)
-
-    def _stack(self, kind: tuple[int, int, int]) -> tuple[Photographs, dict[int, int]]:
-        """Return all photographs of a kind on the device, and the place of each view's."""
-        if kind not in self._stacks:
-            found = [index for index, own in enumerate(self._order.kinds) if own == kind]
-            stack = self._stacked(found)
-            stack = stack._replace(rays=self._rays_of(kind, stack.rays))
-            if self._exchange is None:
-                stack = jax.device_put(stack)
+        indices, kinds = self._order.indices(iteration), self._order.kinds
+        kind = kinds[indices[0]]
+        batch = self._stacks.get(kind)
+        if batch is None:
+            if self.is_resident:
+                batch = self._stacked([index for index, own in enumerate(kinds) if own == kind])
             else:
-                stack = on_devices(self._exchange, stack, is_batch=False)
-            self._stacks[kind] = stack, {index: place for place, index in enumerate(found)}
-        return self._stacks[kind]
+                following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
+                batch = self._ahead.first({key: self._order.indices(key) for key in following})
+            batch = self._placed(kind, batch)
+        if not self.is_resident:
+            return batch, None
+        self._stacks[kind] = batch
+        return batch, np.asarray([kinds[:index].count(kind) for index in indices], np.int32)
 
-    def _rays_of(self, kind: tuple[int, int, int], rays: Array | None) -> Array | None:
-        """Return the rays of a lens on every device, which keeps them if those of all lenses fit; None of a
-        pinhole."""
-        if rays is None:
-            return None
-        if kind not in self._rays:
-            placed: Array = jax.device_put(rays) if self._mesh is None else everywhere(self._mesh, rays)
-            if not self._keeps_rays:
-                return placed
-            self._rays[kind] = placed
-        return self._rays[kind]
+    def _placed(self, kind: tuple[int, int, int], batch: Photographs) -> Photographs:
+        """Return photographs of a kind on the devices, with the rays of their lens, which stay there if those of all
+        lenses fit."""
+        rays = self._rays.get(kind, batch.rays)
+        if rays is not None and kind not in self._rays:
+            rays = jax.device_put(rays) if self._mesh is None else everywhere(self._mesh, rays)
+            if self._keeps_rays:
+                self._rays[kind] = rays
+        batch = batch._replace(rays=rays)
+        if self._exchange is not None:
+            placed: Photographs = on_devices(self._exchange, batch, is_batch=not self.is_resident)
+            return placed
+        return jax.device_put(batch) if self.is_resident else batch
 
     def _read(self, indices: Sequence[int]) -> Photographs:
         """Return the photographs of an iteration, without those that other processes' devices draw."""
@@ -257,59 +248,6 @@ class Ahead:
     def close(self) -> None:
         """End the threads when their present batches are done."""
         self._pool.shutdown(cancel_futures=True)
-
-
-def check_loss_data(views: tuple[View, ...], extras: Extras, has_ssim: bool) -> None:
-    """Raise ValueError unless one view at least has each of the extras, and all are large enough for SSIM."""
-    for view in views if has_ssim else ():
-        if min(view.picture.size) < SSIM_WINDOW:
-            height, width = view.picture.size
-            raise ValueError(
-                f"view {view.name} has {width} by {height} pixels, but the loss has SSIM, which needs {SSIM_WINDOW} by "
-                f"{SSIM_WINDOW}: take larger photographs, or set loss.ssim_weight to 0"
-            )
-    if extras.depths and all(view.depth is None for view in views):
-        raise ValueError(
-            "loss.depth_weight, or a custom term, needs depth maps, but no training view has one: put them as "
-            "NAME.npy or NAME.png into the folder depths beside images, or leave it out"
-        )
-    if extras.points and all(view.points is None for view in views):
-        raise ValueError(
-            "loss.points_weight, or a custom term, needs points that photographs observed, but no training view "
-            "has any: load a COLMAP model whose images list them (in Python, say scene_from_arrays(…, observed=…)), or "
-            "leave it out"
-        )
-
-
-def check_views(views: tuple[View, ...]) -> None:
-    """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes, of which some
-    pixels count."""
-    if not isinstance(views, tuple | list) or not all(isinstance(view, View) for view in views):
-        raise ValueError(f"scene.train must be a tuple of views; got {shortened(views)}")
-    if not views:
-        raise ValueError("scene.train must hold at least one view; got none")
-    for view in views:
-        check_camera(view.camera, f"view {view.name}: camera")
-        height, width, picture = view.camera.height, view.camera.width, view.picture
-        if picture.shape not in ((height, width, 3), (height, width, 4)) or picture.dtype != np.uint8:
-            raise ValueError(
-                f"picture of view {view.name} must be uint8 {[height, width, 3]}, as large as its camera says, or have "
-                f"an opacity as 4th channel; got {np.dtype(picture.dtype)} {list(picture.shape)}"
-            )
-        if view.mask is not None and view.mask.shape != (height, width):
-            raise ValueError(
-                f"mask of view {view.name} must be {[height, width]}, as large as its camera says; "
-                f"got {list(view.mask.shape)}"
-            )
-        if view.mask is not None and not view.mask.num:
-            raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or mend its mask")
-        if view.depth is not None and view.depth.shape != (height, width):
-            raise ValueError(
-                f"depth of view {view.name} must be {[height, width]}, as large as its camera says; "
-                f"got {list(view.depth.shape)}"
-            )
-        if view.points is not None:
-            check_observed_points(view.points, (height, width), f"points of view {view.name}")
 
 
 def device_room() -> float:

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance import Appearance
 from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
@@ -21,13 +20,13 @@ from a2tg_jax.host.text import counted, shortened
 from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.io.model_file import LONGEST_REASON
-from a2tg_jax.io.validate import check_count
+from a2tg_jax.io.validate import check_count, check_finite, check_like, check_model
 from a2tg_jax.model import Model
+from a2tg_jax.training.corrections import initial_corrections
 from a2tg_jax.training.options import System
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.stage import Stage
-from a2tg_jax.training.state_check import check_history, check_is_ahead, check_state, find_stage
-from a2tg_jax.training.step import TrainState, initial_state
+from a2tg_jax.training.step import EXPLODED, TrainState, initial_state
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -61,14 +60,10 @@ class History:
             return f"History({rows})"
         return f"History({rows} to iteration {self.iteration[-1]:,} of stage {self.stage[-1]}, {self.psnr[-1]:.2f} dB)"
 
-    @staticmethod
-    def row(values: Sequence[Any], terms: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values of `COLUMNS` and those of loss terms by the names of their columns, such as loss_l1."""
-        return dict(zip(COLUMNS, values, strict=True)) | {f"{TERM}{name}": value for name, value in terms.items()}
-
     def to_dict(self) -> dict[str, np.ndarray]:
         """Return the columns by name, as `pandas.DataFrame` takes them; loss terms as loss_l1 and so on."""
-        return self.row([getattr(self, name) for name in COLUMNS], self.terms)
+        own = {name: getattr(self, name) for name in COLUMNS}
+        return own | {f"{TERM}{name}": values for name, values in self.terms.items()}
 
     @property
     def last_seconds(self) -> float:
@@ -76,9 +71,17 @@ class History:
 
     def with_point(self, /, *point: float, **terms: float) -> "History":
         """One more row, its values in the order of the fields, and those of loss terms by name."""
-        log = HistoryLog(self)
-        log.add(*point, **terms)
-        return log.history
+        own = dict(zip(COLUMNS, point, strict=True))
+        return self.followed_by(History.of_rows([own | {f"{TERM}{name}": value for name, value in terms.items()}]))
+
+    @staticmethod
+    def of_rows(rows: Sequence[Mapping[str, float]]) -> "History":
+        """Return the history of rows, each a value for each column; NaN for a loss term that a row lacks."""
+        names = dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)])
+        kinds = {name: column.dtype for name, column in History.empty().to_dict().items()}
+        return History.of_columns(
+            {name: np.asarray([row.get(name, np.nan) for row in rows], kinds.get(name, np.float64)) for name in names}
+        )
 
     @staticmethod
     def of_columns(columns: Mapping[str, np.ndarray]) -> "History":
@@ -100,40 +103,6 @@ COLUMNS = tuple(field.name for field in dataclasses.fields(History) if field.nam
 """Columns that each history has."""
 TERM = "loss_"
 """Beginning of the names of the others."""
-
-
-class HistoryLog:
-    """History that grows row by row, in amortised constant time."""
-
-    def __init__(self, history: History):
-        """Args:
-        history: the rows so far; its arrays stay as they are.
-        """
-        self._num = len(history.iteration)
-        self._columns = {name: np.array(column) for name, column in history.to_dict().items()}
-
-    @property
-    def history(self) -> History:
-        """The rows so far. Later rows do not change it."""
-        return History.of_columns({name: column[: self._num] for name, column in self._columns.items()})
-
-    def add(self, /, *point: float, **terms: float) -> None:
-        """Add a row, its values in the order of the fields, and those of loss terms by name."""
-        size = len(self._columns["iteration"])
-        if self._num == size:
-            size = 2 * self._num + FIRST_ROWS
-            self._columns = {name: np.resize(column, size) for name, column in self._columns.items()}
-        row = History.row(point, terms)
-        for name in row:  # In their order, which that of a set would not be.
-            if name not in self._columns:
-                self._columns[name] = np.full(size, np.nan)
-        for name, column in self._columns.items():
-            column[self._num] = row.get(name, np.nan)
-        self._num += 1
-
-
-FIRST_ROWS = 16
-"""Number of rows that an empty log has room for."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -239,23 +208,30 @@ def _checkpoint_of(
 ) -> Checkpoint:
     options = system_from_dict(header["system"], where, system)
     options.check()
-    stage = find_stage(options, header["stage"])
-    is_ahead = check_is_ahead(header["is_ahead"], stage)
+    stages, index, is_ahead = options.stages(), header["stage"], header["is_ahead"]
+    if type(index) is not int or not 0 <= index < len(stages):
+        raise ValueError(f"stage must be a number in 0..{len(stages) - 1}; got {shortened(index)}")
+    stage = stages[index]
+    if not isinstance(is_ahead, list) or len(is_ahead) != len(stage.events) or {type(x) for x in is_ahead} - {bool}:
+        raise ValueError(f"is_ahead must say true or false of {len(stage.events)} events; got {shortened(is_ahead)}")
     (gaussians,) = _filled((Gaussians(*range(5)),), arrays)
     check_gaussians(gaussians)
     shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}
     appearance = with_arrays(stage.appearance, shown, gaussians.sh_degree)
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     check_appearance(appearance, gaussians)
-    wanted = _wanted(stage, gaussians, appearance, is_ahead)
+    model = Model(gaussians, appearance, jnp.zeros((), jnp.int32))
+    wanted: TrainState = jax.eval_shape(lambda: initial_state(stage, model, [""]))
+    events = (event if ahead else None for event, ahead in zip(wanted.events, is_ahead, strict=True))
+    wanted = dataclasses.replace(wanted, events=tuple(events))
     terms = header.get("terms", [])  # no history of an older version has them
     if not isinstance(terms, list) or not all(isinstance(name, str) for name in terms):
         raise ValueError(f"terms must be a list of names; got {shortened(terms)}")
     kept = _rest(wanted), dict.fromkeys(COLUMNS, 0) | {"terms": dict.fromkeys(terms, 0)}
     _, (rest, columns) = _filled((gaussians, kept), arrays)
     moments, num_live, *others = jax.tree.map(jnp.asarray, rest)
-    model = Model(gaussians, appearance, num_live)
-    state, history = TrainState(model, moments, *others), History(**columns)
+    state = TrainState(Model(gaussians, appearance, num_live), moments, *others)
+    history = History(**columns)
     check_state(state, wanted, stage)
     check_history(history)
     counts = {name: header.get(name, 0) for name in ("num_restored", "num_refused")}
@@ -263,15 +239,17 @@ def _checkpoint_of(
         check_count(name, count, MOST_COUNTED)
     machine = config_from_dict(Machine, header["machine"], "machine") if "machine" in header else None
     devices = config_from_dict(Devices, header.get("devices", {}), "devices")
-    return Checkpoint(options, header["stage"], state, history, machine=machine, devices=devices, **counts)
+    return Checkpoint(options, index, state, history, machine=machine, devices=devices, **counts)
 
 
 MOST_COUNTED = 2**31 - 1
+MOST_TOLD = 300
+"""Largest number of characters of the options that differ from a checkpoint's."""
 SHOWN = "shown/"
 """Prefix of the names of appearance arrays."""
 
 
-def _rest(state: TrainState) -> tuple[Any, ...]:
+def _rest(state: TrainState) -> tuple[object, ...]:
     """Return the part of a checkpoint beside Gaussians and appearance."""
     return state.moments, state.model.num_live, state.events, state.iteration, state.status, state.corrections
 
@@ -281,7 +259,7 @@ def _packed(model: Model, moments: AdamState) -> AdamState:
     _, rest = partition(model.appearance)
     rows = np.arange(model.gaussians.num)
 
-    def smaller(leaf: Any) -> Any:
+    def smaller(leaf: object) -> object:
         return leaf.take(rows, padding=(0.0,) * len(leaf.padding)) if isinstance(leaf, Table) else leaf
 
     def packed(moment: Model) -> Model:
@@ -292,7 +270,7 @@ def _packed(model: Model, moments: AdamState) -> AdamState:
     return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))
 
 
-def _named_arrays(tree: Any, *, only_names: bool = False) -> dict[str, Any]:
+def _named_arrays(tree: object, *, only_names: bool = False) -> dict[str, Any]:
     """Return the leaves of a pytree under the names of their paths, in the order of the tree."""
     paths = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path): None if only_names else np.asarray(leaf) for path, leaf in paths}
@@ -304,54 +282,72 @@ def _filled(template: Any, arrays: dict[str, np.ndarray]) -> Any:
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
-def _wanted(stage: Stage, gaussians: Gaussians, appearance: Appearance, is_ahead: Sequence[bool]) -> TrainState:
-    """Return the shapes and dtypes of a state of a stage, some of whose events may be past."""
-    model = Model(gaussians, appearance, jnp.zeros((), jnp.int32))
-    state: TrainState = jax.eval_shape(lambda: initial_state(stage, model, [""]))
-    events = (event if ahead else None for event, ahead in zip(state.events, is_ahead, strict=True))
-    return dataclasses.replace(state, events=tuple(events))
+def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
+    """Raise ValueError, naming the leaf, unless a state fits a stage.
+
+    Args:
+      state: state from the file; the arrays of its model fit each other.
+      wanted: shapes and dtypes of a state of that model.
+      stage: stage of both states.
+    """
+    check_like("state.model.num_live", state.model.num_live, wanted.model.num_live)
+    for name in ("moments", "events", "iteration", "status"):
+        check_like(f"state.{name}", getattr(state, name), getattr(wanted, name))
+    check_model(state.model)
+    check_count("state.iteration", state.iteration, stage.iterations)
+    check_count("state.status", state.status, EXPLODED)
+    check_count("state.moments.count", state.moments.count, np.iinfo(np.int32).max)
+    check_finite("state.moments.mu", state.moments.mu)
+    check_finite("state.moments.nu", state.moments.nu, is_signed=False)
+    names, dtype = [""] * len(state.corrections[0].rows) if state.corrections else [], state.model.gaussians.means.dtype
+    neutral = jax.eval_shape(lambda: initial_corrections(stage.corrections, names, None, dtype))
+    check_like("state.corrections", state.corrections, neutral)
+    for known in state.corrections:
+        check_finite("state.corrections.rows", known.rows)
+        check_finite("state.corrections.mu", known.moments.mu)
+        check_finite("state.corrections.nu", known.moments.nu, is_signed=False)
+        if (np.asarray(known.moments.count) < 0).any():
+            raise ValueError("state.corrections.count must be at least 0; some are below")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state.events):
+        if np.isnan(np.asarray(leaf)).any():
+            raise ValueError(f"state.events{jax.tree_util.keystr(path)} must be numbers; some are NaN")
+
+
+def check_history(history: History) -> None:
+    """Raise ValueError, naming the column, unless its columns are numbers of one length.
+
+    dB may be infinite, and loss terms NaN.
+    """
+    columns = {name: np.asarray(column) for name, column in history.to_dict().items()}
+    num = columns["iteration"].shape
+    for name, column in columns.items():
+        if column.ndim != 1 or column.shape != num or column.dtype.kind not in "iuf":
+            raise ValueError(f"history.{name} must be numbers {list(num)}; got {column.dtype} {list(column.shape)}")
+        is_term = name.startswith("loss_")
+        if (np.isnan(column).any() and not is_term) or (name != "psnr" and np.isinf(column).any()):
+            raise ValueError(f"history.{name} must be finite; some are not")
+        if name not in ("loss", "psnr") and not is_term and (column < 0).any():
+            raise ValueError(f"history.{name} must be at least 0; some are below")
 
 
 def check_resume(resume: Checkpoint, system: System, index: int) -> None:
     """Raise ValueError unless the checkpoint is of that stage of that system."""
     if resume.stage != index:
         raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to go on")
-    if resume.system != system:
-        raise ValueError(
-            f"the checkpoint was made with another configuration ({_differing(resume.system, system)}): resume with "
-            f"checkpoint.system{_or_anew(resume.system, system)}"
-        )
-    found, wanted = resume.state.model.gaussians.sh_degree, system.initial_sh_degree
-    if found != wanted:
-        raise ValueError(
-            f"the checkpoint's Gaussians are of degree {found}, but the system's of {wanted}: it was made by an older "
-            "version, so train anew"
-        )
-
-
-def _is_defined_anew(before: System, now: System) -> bool:
-    """Return whether the classes of two systems are of one name and module, as when a notebook's cell runs twice."""
-    kinds = type(before), type(now)
-    return kinds[0] is not kinds[1] and len({(kind.__module__, kind.__qualname__) for kind in kinds}) == 1
-
-
-def _or_anew(before: System, now: System) -> str:
-    """Return what leads to the new class, for advice; empty if it is the same one."""
-    if not _is_defined_anew(before, now):
-        return ""
-    return f", or with load_checkpoint(path, {type(now).__name__}) of what save_checkpoint wrote, for the new class"
-
-
-def _differing(before: System, now: System) -> str:
-    """Return the options in which two systems differ, in a few words."""
-    if _is_defined_anew(before, now):
-        return f"the class {type(now).__name__} as it was before it was defined anew"
-    if type(before) is not type(now):
-        return f"{type(before).__name__}, not {type(now).__name__}"
-    values, others = flatten_config(before), flatten_config(now)
-    pairs = ((name, value, others[name]) for name, value in values.items() if value != others[name])
-    return shortened(", ".join(f"{name} {value!r}, not {other!r}" for name, value, other in pairs), MOST_TOLD)
-
-
-MOST_TOLD = 300
-"""Largest number of characters of the options that differ from a checkpoint's."""
+    if resume.system == system:
+        return
+    before, now, advice = type(resume.system), type(system), ""
+    values, others = flatten_config(resume.system), flatten_config(system)
+    if before is now:
+        pairs = {name: (values[name], others[name]) for name in values if values[name] != others[name]}
+        told = [f"{name} {value!r}, not {other!r}" for name, (value, other) in pairs.items()]
+        differing = ", ".join(told)
+    elif (before.__module__, before.__qualname__) == (now.__module__, now.__qualname__):  # A notebook's cell ran twice.
+        differing = f"the class {now.__name__} as it was before it was defined again"
+        advice = f", or with load_checkpoint(path, {now.__name__}) of what save_checkpoint wrote, for the new class"
+    else:
+        differing = f"{before.__name__}, not {now.__name__}"
+    raise ValueError(
+        f"the checkpoint was made with another configuration ({shortened(differing, MOST_TOLD)}): resume with "
+        f"checkpoint.system{advice}"
+    )

@@ -6,21 +6,20 @@ import warnings
 from typing import Any
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
-from a2tg_jax.core.checks import check_kind
+from a2tg_jax.core.checks import check_kind, kind_of
 from a2tg_jax.core.forks import check_process
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.text import counted, in_bytes, shortened
 from a2tg_jax.model import Model
-from a2tg_jax.training.batches import check_loss_data, check_views
 from a2tg_jax.training.checkpoint import Checkpoint, History, check_resume
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, StageRun, Watch, never, unwatched
 from a2tg_jax.training.options import System
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.stage import Background
-from a2tg_jax.training.start import check_start, initial_model
+from a2tg_jax.training.start import check_loss_data, check_start, check_views, initial_model
 
 BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
 """Background of a finished model for each background of training."""
@@ -117,14 +116,12 @@ def fit(
       ValueError: if options contradict each other, the scene or the checkpoint.
     """
     _check_arguments(scene, system, resume, checkpoint_every)
-    stages, first = system.stages(), 0
+    stages, first = system.stages(), 0 if resume is None else resume.stage
+    check_loss_data(scene.train, stages[first:])
     if resume is None:
         check_start(scene, system)
     else:
-        first = resume.stage
         check_resume(resume, system, first)
-        for stage in stages[first:]:
-            check_loss_data(scene.train, stage.extras, stage.has_ssim)
     session = Session() if session is None else session
     results: list[StageResult] = []
     with signals.ctrl_c_noted() as is_interrupted:
@@ -148,10 +145,13 @@ def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None, ch
         path = os.fspath(scene)
         example = "say synthetic_scene()" if path == "synthetic" else f"say load_scene({path!r})"
     check_kind("scene", scene, Scene, example)
-    if isinstance(system, str):
-        raise ValueError(f"system must be a System; got a name: say find_system({shortened(system)!r}).preset('quick')")
-    example = f"say {system.__name__}() or {system.__name__}.preset('quick')" if isinstance(system, type) else ""
-    check_kind("system", system, System, example)
+    if not isinstance(system, System):
+        found, example = kind_of(system), ""
+        if isinstance(system, str):
+            found, example = "a name", f": say find_system({shortened(system)!r}).preset('quick')"
+        elif isinstance(system, type) and issubclass(system, System):
+            example = f": say {system.__name__}() or {system.__name__}.preset('quick')"
+        raise ValueError(f"system must be a System; got {found}{example}")
     if resume is not None:
         check_kind("resume", resume, Checkpoint, "say load_checkpoint(path)" if isinstance(resume, is_path) else "")
     if checkpoint_every is not None and checkpoint_every < 1:
@@ -192,9 +192,9 @@ def fit_stage(
     stages = system.stages()
     if not 0 <= index < len(stages):
         raise ValueError(f"index must be that of one of the {len(stages)} stages, from 0; got {index}")
+    check_loss_data(scene.train, stages[index : index + 1])
     if resume is not None:
         check_resume(resume, system, index)
-    check_loss_data(scene.train, stages[index].extras, stages[index].has_ssim)
     return _train_stage(
         scene, system, index, start, resume, num_restored, session, on_log,
         is_last=index == len(stages) - 1, on_checkpoint=on_checkpoint, checkpoint_every=checkpoint_every,

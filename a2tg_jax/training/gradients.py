@@ -54,7 +54,7 @@ def view_gradients(
     background: Any = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     has_geometry: bool = True,
-    sh_degree: Any = None,
+    sh_degree: int | Array | None = None,
     statistic: Statistic = "position",
 ) -> ViewGradients:
     """Render a view and differentiate a loss of it in one pass; meant for jit.
@@ -173,7 +173,7 @@ def differentiate(
     settings: RenderSettings,
     *,
     has_geometry: bool,
-    sh_degree: Any,
+    sh_degree: int | Array | None,
     statistic: Statistic | None,
     has_probe: bool,
 ) -> Differentiated:

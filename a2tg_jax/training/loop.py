@@ -33,13 +33,11 @@ from a2tg_jax.parallel.rows import (
 from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
-from a2tg_jax.training.checkpoint import Checkpoint, History, HistoryLog, Interrupted
+from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Interrupted
 from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
-from a2tg_jax.training.effects import StageEffects
-from a2tg_jax.training.learning import LearningCheck
 from a2tg_jax.training.options import System
-from a2tg_jax.training.progress import ProgressBar
+from a2tg_jax.training.reports import LearningCheck, ProgressBar, StageEffects
 from a2tg_jax.training.returned import checked_change
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.start import padded
@@ -135,21 +133,23 @@ class StageRun:
         self.views, self.system, self.index = scene.train, system, index
         self.stage = system.stages()[index]
         self.num_restored = (resume.num_restored if resume else 0) if num_restored is None else num_restored
-        self._logged, self.earlier_seconds = HistoryLog(resume.history if resume else History.empty()), 0.0
+        self._earlier = resume.history if resume else History.empty()
+        self._rows: list[dict[str, float]] = []
+        """Rows of the history since then."""
 
         # Steps take over the buffers that they are given: copies on the device, or on the host to be shared out.
         copied = jnp.array if self.mesh is None else np.array
-        if resume is not None:
-            check_corrections(resume.state.corrections, len(self.views))
-            warn_of_uneven_rows(resume.state.model.gaussians.num, self.session.num_devices)
-            self.state: TrainState = spread(self.mesh, jax.tree.map(copied, resume.state))
-            self.earlier_seconds = resume.history.last_seconds
-        elif start is not None:
+        if resume is None:
+            if start is None:
+                raise ValueError("a stage needs a model to start from, or a checkpoint to go on from")
             model = padded(jax.tree.map(copied, start.live), self.stage, system, self.session.num_devices)
             names = [view.name for view in self.views]
-            self.state = spread(self.mesh, initial_state(self.stage, spread(self.mesh, model), names, start.origin))
+            state = initial_state(self.stage, spread(self.mesh, model), names, start.origin)
         else:
-            raise ValueError("a stage needs a model to start from, or a checkpoint to go on from")
+            check_corrections(resume.state.corrections, len(self.views))
+            warn_of_uneven_rows(resume.state.model.gaussians.num, self.session.num_devices)
+            state = jax.tree.map(copied, resume.state)
+        self.state: TrainState = spread(self.mesh, state)
         self._pad_for_events()
 
         self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))
@@ -192,11 +192,11 @@ class StageRun:
     @property
     def history(self) -> History:
         """Logged figures so far."""
-        return self._logged.history
+        return self._earlier.followed_by(History.of_rows(self._rows))
 
     @property
     def seconds(self) -> float:
-        return self.earlier_seconds + time.perf_counter() - self.started
+        return self._earlier.last_seconds + time.perf_counter() - self.started
 
     @property
     def model(self) -> Model:
@@ -245,7 +245,7 @@ class StageRun:
                     iteration += 1
                     self._log(iteration, info)
                     self.learning.observe(iteration, float(info.psnr))
-                    bar.update(info, self.history)
+                    bar.update(info, self._rows[-1] if self._rows else None)
                 ahead = self.effects.programs_ahead(iteration)
                 bar.tell_pace(iteration, self.num_compiled, ahead, self.effects.seconds_a_program)
                 if iteration == stop:
@@ -271,16 +271,16 @@ class StageRun:
 
     def _log(self, iteration: int, info: StepInfo) -> None:
         """Add a row to the history, if one is due."""
-        if iteration % LOG_EVERY == 0 or iteration == self.stage.iterations:
-            num_bytes = self.state.model.bytes_of(int(info.num_live))
-            row = (
-                self.index + 1, iteration, float(info.loss), float(info.psnr), int(info.num_live),
-                num_bytes / 1e6, self.seconds,
-            )  # fmt: skip
-            terms = {name: float(value) for name, value in info.terms.items()}
-            self._logged.add(*row, **terms)
-            if self.on_log is not None:
-                self.on_log(History.row(row, terms))
+        if iteration % LOG_EVERY and iteration < self.stage.iterations:
+            return
+        num_live = int(info.num_live)
+        megabytes = self.state.model.bytes_of(num_live) / 1e6
+        values = self.index + 1, iteration, float(info.loss), float(info.psnr), num_live, megabytes, self.seconds
+        terms = {f"{TERM}{name}": float(value) for name, value in info.terms.items()}
+        self._rows.append(dict(zip(COLUMNS, values, strict=True)) | terms)
+        if self.on_log is not None:
+            self.on_log(self._rows[-1])
+        if len(self._rows) == 1:
             self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
 
     # Steps
@@ -312,10 +312,10 @@ class StageRun:
     def arguments(self, iteration: int) -> tuple[Any, ...]:
         """Return the arguments of the step of an iteration."""
         photographs, views = self.photographs.batch(iteration)
-        due = None
+        render, due = self.render_settings(self._size(iteration)), None
         if are_events_decided_by_host(self.state):
             due = tuple(times is None or bool(times.is_due(iteration)) for times in self.clock.times)
-        settings = StepSettings(self.render_settings(self._size(iteration)), self.system.background, due)
+        settings = StepSettings(render, self.system.background, due)
         rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
         # Otherwise XLA may choose a sharding for them that JAX cannot name.
         views, rows = everywhere(self.mesh, (views, rows))
@@ -407,17 +407,17 @@ class StageRun:
         if iteration not in self._due_on_host():
             return
         for place, (event, times) in enumerate(zip(self.stage.events, self.clock.times, strict=True)):
-            if isinstance(event, HostEvent):
-                if iteration in event.iterations(self.stage.iterations):
-                    self._apply(place, event, iteration)
-            elif times is not None and event.observes and iteration == times.last:
-                self._keep(place, None)
+            if not isinstance(event, HostEvent):
+                if times is not None and event.observes and iteration == times.last:
+                    self._keep(place, None)
+            elif iteration in event.iterations(self.stage.iterations):
+                self._apply(place, event, iteration)
 
     def _apply(self, place: int, event: HostEvent, iteration: int) -> None:
         """Apply a host event."""
         due = event.iterations(self.stage.iterations)
-        told = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes)
-        change = event.apply(told, self.state.model, self.state.moments, self.state.events[place])
+        now = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes)
+        change = event.apply(now, self.state.model, self.state.moments, self.state.events[place])
         change = checked_change(f"stage {self.stage.name!r}: {type(event).__name__}.apply", change)
         self.effects.apply(place, self.state, change)
         self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
@@ -433,8 +433,7 @@ class StageRun:
         events = tuple(None if state is None else event.gather(state, rows) for event, state in pairs)
         self.state = dataclasses.replace(self.state, events=events)
 
-    def _keep(self, place: int, gathered: Any) -> None:
+    def _keep(self, place: int, state: object) -> None:
         """Replace the state of the event at a place."""
-        events = list(self.state.events)
-        events[place] = gathered
-        self.state = dataclasses.replace(self.state, events=tuple(events))
+        events = (*self.state.events[:place], state, *self.state.events[place + 1 :])
+        self.state = dataclasses.replace(self.state, events=events)

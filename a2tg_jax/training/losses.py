@@ -4,7 +4,6 @@ Images are [H, W, 3], nominally in [0, 1] and never clipped here; a clip would k
 """
 
 import functools
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -167,7 +166,7 @@ def check_same_shape(image: Array, target: Array) -> None:
         raise ValueError(f"image and target must be floats in [0, 1]; got {image.dtype} and {target.dtype}")
 
 
-def _hint(value: Any) -> str:
+def _hint(value: object) -> str:
     """Return what to say in place of a value that is no image, if it has one."""
     if hasattr(value, "color"):
         return "say output.color"

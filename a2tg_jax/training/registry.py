@@ -69,7 +69,7 @@ def reference_of(system: System) -> str:
     return next((name for name, own in SYSTEMS.items() if own == reference), reference)
 
 
-def system_to_dict(system: System) -> dict[str, Any]:
+def system_to_dict(system: System) -> dict[str, object]:
     """Return a system and all its options as JSON-able values."""
     return {"name": reference_of(system), "options": config_to_dict(system)}
 
@@ -103,7 +103,7 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
     return config_from_dict(kind, options, f"{where}: options")
 
 
-def with_changes(system: System, changes: Mapping[str, Any], where: str) -> System:
+def with_changes(system: System, changes: Mapping[str, object], where: str) -> System:
     """Return the system with some options changed, given as nested dictionaries as in a configuration file.
 
     Raises:
@@ -112,13 +112,13 @@ def with_changes(system: System, changes: Mapping[str, Any], where: str) -> Syst
     return changed_config(system, changes, where)
 
 
-def differences(system: System) -> dict[str, Any]:
+def differences(system: System) -> dict[str, object]:
     """Return the options in which a system differs from its class's defaults, nested."""
     return _differences(config_to_dict(system), config_to_dict(type(system)()))
 
 
-def _differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    changed: dict[str, Any] = {}
+def _differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, object]:
+    changed: dict[str, object] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
             inner = _differences(value, defaults[name])

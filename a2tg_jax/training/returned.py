@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from a2tg_jax.core.checks import check_kind, described, dtype_of
 from a2tg_jax.core.gaussians import check_gaussians
@@ -17,7 +18,7 @@ from a2tg_jax.io.validate import check_like
 from a2tg_jax.model import Model
 
 
-def check_scalar(name: str, value: Any) -> None:
+def check_scalar(name: str, value: object) -> None:
     """Raise ValueError unless what a loss function or term of that name returned is a real number."""
     is_number = isinstance(value, int | float | np.ndarray | np.generic | jax.Array) and np.shape(value) == ()
     kind = dtype_of(value) if is_number else None
@@ -46,7 +47,7 @@ def checked_change(name: str, change: Any) -> Change:
     return checked
 
 
-def check_kept(name: str, found: Any, wanted: Any) -> None:
+def check_kept(name: str, found: object, wanted: object) -> None:
     """Raise ValueError, naming the leaf, unless a pytree has the structure, shapes and dtypes of another."""
     before, after = (str(jax.tree.structure(tree)) for tree in (wanted, found))
     if after != before:
@@ -54,6 +55,6 @@ def check_kept(name: str, found: Any, wanted: Any) -> None:
     check_like(name, jax.tree.map(_shape_of, found), wanted)
 
 
-def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
+def _shape_of(leaf: ArrayLike) -> jax.ShapeDtypeStruct:
     """Return the shape and dtype that JAX gives a number or an array, which stays where it is."""
     return jax.ShapeDtypeStruct(np.shape(leaf), jax.dtypes.canonicalize_dtype(dtype_of(leaf)))

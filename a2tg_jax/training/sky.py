@@ -4,7 +4,7 @@ Each view is divided into cells. A cell is empty if no point of the scene projec
 sky if at least a quarter of the views that look there see an empty cell. All of it is on the host.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.capture_geometry import vertical_of
 from a2tg_jax.core.gaussians import Gaussians, sh_of_colors
 from a2tg_jax.data.scene import Scene, View
-from a2tg_jax.training.directions import even_directions
 
 DISTANCE = 10.0
 """Radius of the sphere, in distances of the far points from the cameras' mean."""
@@ -35,6 +34,16 @@ LOWEST = -0.2
 """Smallest sine of the angle of the sky above the horizon; hills and buildings may end below it."""
 NOWHERE = 9.0
 """Coordinate of cells without a ray, far from all unit directions."""
+NUMS_TRIED = 20_000, 200_000
+"""Directions all around that tell where the part is; the second number if too few of the first are in it."""
+LEAST_FOUND = 5
+"""Smallest number of these that must be in the part."""
+NEAR = 3.0
+"""Largest distance of a direction of the part from one of those found, in spacings of these."""
+MOST_TRIED = 2_000_000
+"""Largest number of directions all around, of which those in the part are taken."""
+MORE = 1.02
+"""Factor by which more directions are tried than are likely to be enough."""
 
 
 class Emptiness(NamedTuple):
@@ -243,3 +252,56 @@ def _units(vectors: np.ndarray) -> np.ndarray:
     """Return vectors [..., 3] of length 1; 0 of 0."""
     units: np.ndarray = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
     return units
+
+
+def even_directions(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
+    """Return evenly spread unit directions [num, 3] that are sky, and the angle between neighbours.
+
+    Args:
+      num: how many.
+      is_sky: returns [M] bool for directions [M, 3]. It is asked about `NUMS_TRIED` and about those nearby.
+
+    Raises:
+      ValueError: if there is hardly any, or the sky is too small for so many.
+    """
+    coarse, tried = _coarse(is_sky)
+    near, share = cKDTree(coarse), len(coarse) / tried
+    reach, found = NEAR * spacing(tried), np.zeros((0, 3))
+    while len(found) < num:
+        total = int(MORE * num / share) + 1
+        if total > MOST_TRIED:
+            raise ValueError(
+                f"sky_gaussians is {num:,}, but the sky that training views share is small, with room for about "
+                f"{int(share * MOST_TRIED / MORE):,}: lower sky_gaussians"
+            )
+        found = fibonacci(total)
+        found = found[np.isfinite(near.query(found, distance_upper_bound=reach)[0])]
+        found = found[is_sky(found)]
+        share = min(max(len(found), 1) / total, share / MORE)
+    chosen = np.linspace(0, len(found) - 1, num).round().astype(int)
+    return found[chosen], spacing(total) * float(np.sqrt(len(found) / num))
+
+
+def _coarse(is_sky: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, int]:
+    """Return directions that are sky, and how many were tried all around."""
+    for tried in NUMS_TRIED:
+        found = fibonacci(tried)
+        found = found[is_sky(found)]
+        if len(found) >= LEAST_FOUND:
+            return found, tried
+    raise ValueError(
+        "sky_gaussians: too few training views see the same part of a sky, or it is tiny: leave out sky_gaussians"
+    )
+
+
+def spacing(num: int) -> float:
+    """Return the angle between neighbours of so many directions all around."""
+    return float(np.sqrt(4 * np.pi / num))
+
+
+def fibonacci(num: int) -> np.ndarray:
+    """Return unit vectors [num, 3] spread evenly over the sphere, a Fibonacci lattice."""
+    index = np.arange(num) + 0.5
+    z, angle = 1 - 2 * index / num, np.pi * (1 + 5**0.5) * index
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)

@@ -1,4 +1,4 @@
-"""A stage: an appearance, events, loss terms, rates and a length. A system is a sequence of stages."""
+"""A stage: an appearance, events, loss terms, learning rates and a length. A system is a sequence of stages."""
 
 import dataclasses
 import inspect
@@ -6,7 +6,7 @@ import math
 import numbers
 import re
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,8 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats, in_words
-from a2tg_jax.core.checks import check_kind, fields_of, kind_of
-from a2tg_jax.core.gaussians import no_rows
+from a2tg_jax.core.checks import check_kind, check_number, fields_of, kind_of
+from a2tg_jax.core.gaussians import Gaussians, no_rows
 from a2tg_jax.core.pytree import check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
@@ -25,9 +25,47 @@ from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.batches import Extras
 from a2tg_jax.training.corrections import Correction
-from a2tg_jax.training.rates import LearningRates
 from a2tg_jax.training.terms import Target
 
+
+@pytree
+class LearningRates:
+    """Adam's learning rates of the Gaussians."""
+
+    means: float = 1.6e-4
+    """Learning rate of the means, times scene_scale; decays exponentially over each stage."""
+    means_final_factor: float = 0.01
+    """Factor of the means' learning rate at the end of a stage."""
+    log_scales: float = 5e-3
+    """Learning rate of the logarithms of the scales."""
+    quats: float = 1e-3
+    """Learning rate of the rotations."""
+    logit_opacities: float = 5e-2
+    """Learning rate of the logits of the opacities."""
+    sh_degree0: float = 2.5e-3
+    """Learning rate of the colours, the spherical harmonics of degree 0."""
+    sh_rest: float = 1.25e-4
+    """Learning rate of the other spherical harmonics."""
+
+    def check_options(self) -> None:
+        """Raise ValueError, beginning with the name of the field, if a rate is out of range."""
+        for field in dataclasses.fields(self):
+            check_number(field.name, getattr(self, field.name), least=0)
+        check_number("means_final_factor", self.means_final_factor, above=0)  # The decay is exponential.
+
+    def of_gaussians(self, means: Array, sh_degree: int = 3) -> Gaussians:
+        """Return one rate per field of the Gaussians, which broadcasts against it.
+
+        Args:
+          means: present rate of the means, a scalar.
+          sh_degree: degree of spherical harmonics of the Gaussians, 0 to 3.
+        """
+        sh = jnp.full((1, NUM_BASES[sh_degree], 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
+        fields: Any = (means, self.quats, self.log_scales, self.logit_opacities, sh)
+        return Gaussians(*fields)
+
+
+T = TypeVar("T")
 COOLED = 0.1
 """Factor of learning rates at the end of a stage that cools down."""
 Background = Literal["black", "white", "random"]
@@ -157,12 +195,13 @@ class Stage:
         if not self.losses:
             raise ValueError(f"{where} losses must have a term, such as Term(function)")
 
-    def cooled(self, rates: Any, progress: Array) -> Any:
+    def cooled(self, rates: T, progress: Array) -> T:
         """Return learning rates, a pytree, at a share of the stage; traced."""
         if not self.cools_down:
             return rates
         factor = 1 - (1 - COOLED) * progress
-        return jax.tree.map(lambda rate: rate * factor.astype(jnp.result_type(rate, float)), rates)
+        lower: T = jax.tree.map(lambda rate: rate * factor.astype(jnp.result_type(rate, float)), rates)
+        return lower
 
     def clock(self) -> "Clock":
         """Return the schedule for the step (host)."""

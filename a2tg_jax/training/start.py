@@ -10,14 +10,17 @@ import numpy as np
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
 from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
-from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.partition import combine, partition
 from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
-from a2tg_jax.data.scene import Scene
+from a2tg_jax.data.observations import check_observed_points
+from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.data.start_points import Sight, unseeing
+from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.training.batches import check_loss_data
+from a2tg_jax.training.batches import Extras
+from a2tg_jax.training.losses import SSIM_WINDOW
 from a2tg_jax.training.options import System
 from a2tg_jax.training.sky import check_sky, sky_of
 from a2tg_jax.training.stage import Stage
@@ -35,11 +38,11 @@ def initial_model(scene: Scene, system: System) -> Model:
     first = system.stages()[0]
     num, degree, opacity = initial_number(scene, system, first), system.initial_sh_degree, system.initial_opacity
     num_sky = system.sky_gaussians
+    sky = sky_of(scene, num_sky, opacity=opacity, sh_degree=degree) if num_sky else None
     gaussians = init_from_points(
         scene.points, start_colors(scene), num - num_sky, system.seed, opacity=opacity, sh_degree=degree
     )
-    if num_sky:
-        gaussians = _followed_by(gaussians, sky_of(scene, num_sky, opacity=opacity, sh_degree=degree))
+    gaussians = gaussians if sky is None else _followed_by(gaussians, sky)
     adapted = fainter_where_dense if first.appearance.has_low_pass else wider_where_dense
     return Model(adapted(gaussians, [view.camera for view in scene.train]))
 
@@ -105,7 +108,7 @@ def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarra
 
 def check_start(scene: Scene, system: System, num_given: int | None = None) -> None:
     """Refuse points that no training view sees, a first stage whose events cannot work with the initial number of
-    Gaussians, depth priors of a scene without depth maps, and Gaussians of a sky that no view sees.
+    Gaussians, and Gaussians of a sky that no view sees.
 
     Args:
       scene: its photographs and points.
@@ -121,10 +124,63 @@ def check_start(scene: Scene, system: System, num_given: int | None = None) -> N
         _check_seen(scene, system)
         _rows_needed(stages[0], num, system)
     (system.check_number if num_given is None else system.check_given_number)(num)
-    for stage in stages:
-        check_loss_data(scene.train, stage.extras, stage.has_ssim)
     if system.sky_gaussians:
         check_sky(scene, system.sky_gaussians)
+
+
+def check_loss_data(views: tuple[View, ...], stages: Sequence[Stage]) -> None:
+    """Raise ValueError unless at least one view has each of the data that losses read, and all are large enough for
+    SSIM."""
+    extras = Extras(*map(any, zip(*(stage.extras for stage in stages), strict=True)))
+    for view in views if any(stage.has_ssim for stage in stages) else ():
+        if min(view.picture.size) < SSIM_WINDOW:
+            height, width = view.picture.size
+            raise ValueError(
+                f"view {view.name} has {width} by {height} pixels, but the loss has SSIM, which needs {SSIM_WINDOW} by "
+                f"{SSIM_WINDOW}: take larger photographs, or set loss.ssim_weight to 0"
+            )
+    if extras.depths and all(view.depth is None for view in views):
+        raise ValueError(
+            "loss.depth_weight, or a custom term, needs depth maps, but no training view has one: put them as "
+            "NAME.npy or NAME.png into the folder depths beside images, or leave it out"
+        )
+    if extras.points and all(view.points is None for view in views):
+        raise ValueError(
+            "loss.points_weight, or a custom term, needs points that photographs observed, but no training view "
+            "has any: load a COLMAP model whose images list them (in Python, say scene_from_arrays(…, observed=…)), or "
+            "leave it out"
+        )
+
+
+def check_views(views: tuple[View, ...]) -> None:
+    """Raise ValueError, naming the view, unless there are photographs, uint8, of their cameras' sizes, of which some
+    pixels count."""
+    if not isinstance(views, tuple | list) or not all(isinstance(view, View) for view in views):
+        raise ValueError(f"scene.train must be a tuple of views; got {shortened(views)}")
+    if not views:
+        raise ValueError("scene.train must hold at least one view; got none")
+    for view in views:
+        check_camera(view.camera, f"view {view.name}: camera")
+        height, width, picture = view.camera.height, view.camera.width, view.picture
+        if picture.shape not in ((height, width, 3), (height, width, 4)) or picture.dtype != np.uint8:
+            raise ValueError(
+                f"picture of view {view.name} must be uint8 {[height, width, 3]}, as large as its camera says, or have "
+                f"an opacity as 4th channel; got {np.dtype(picture.dtype)} {list(picture.shape)}"
+            )
+        if view.mask is not None and view.mask.shape != (height, width):
+            raise ValueError(
+                f"mask of view {view.name} must be {[height, width]}, as large as its camera says; "
+                f"got {list(view.mask.shape)}"
+            )
+        if view.mask is not None and not view.mask.num:
+            raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or mend its mask")
+        if view.depth is not None and view.depth.shape != (height, width):
+            raise ValueError(
+                f"depth of view {view.name} must be {[height, width]}, as large as its camera says; "
+                f"got {list(view.depth.shape)}"
+            )
+        if view.points is not None:
+            check_observed_points(view.points, (height, width), f"points of view {view.name}")
 
 
 def _check_seen(scene: Scene, system: System) -> None:
@@ -185,13 +241,22 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     Raises:
       ValueError: if Gaussians were to be added to a model whose textures have grown.
     """
-    num = model.gaussians.num
+    gaussians, shapes, num = model.gaussians, model.appearance.shapes, model.gaussians.num
     room = -(-_rows_needed(stage, num, system) // num_devices) * num_devices
-    gaussians, appearance = _with_rows(_shown_by(stage, model), room), model.appearance
+    if shapes is not None and stage.appearance.exponents is None:
+        warnings.warn(
+            f"stage {stage.name!r} has no shapes of kernels: it takes the Gaussians nearest to those of the model",
+            stacklevel=2,
+        )
+        gaussians = nearest_gaussians(gaussians, np.asarray(shapes))
+    if room > num:
+        spare = no_rows(room - num, gaussians.sh.shape[1], gaussians.means.dtype)
+        gaussians = _followed_by(gaussians, spare)
+    appearance = model.appearance
     is_same = template_of(appearance) == stage.appearance
     if not is_same or room > num:
         appearance = new_appearance(stage.appearance, gaussians, system)
-        if (shapes := model.appearance.shapes) is not None and appearance.shapes is not None:
+        if shapes is not None and appearance.shapes is not None:
             appearance = appearance.with_shapes(appearance.shapes.at[:num].set(shapes))
     if is_same and room > num:
         (new, rest), (old, _) = partition(appearance), partition(model.appearance)
@@ -205,31 +270,11 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     return Model(gaussians, appearance, jnp.asarray(num, jnp.int32))
 
 
-def _shown_by(stage: Stage, model: Model) -> Gaussians:
-    """Return the Gaussians of a model, the nearest ones to its kernels if the stage has no shapes of them."""
-    shapes = model.appearance.shapes
-    if shapes is None or stage.appearance.exponents is not None:
-        return model.gaussians
-    warnings.warn(
-        f"stage {stage.name!r} has no shapes of kernels: it takes the Gaussians nearest to those of the model",
-        stacklevel=2,
-    )
-    return nearest_gaussians(model.gaussians, np.asarray(shapes))
-
-
 def new_appearance(template: Appearance, gaussians: Gaussians, system: System) -> Appearance:
     """Return the appearance that a stage of a system begins with, of the options of a template."""
     key = jax.random.fold_in(jax.random.key(system.seed), KEY_OF_APPEARANCE)
     allocated: Appearance = allocate_appearance(template, key, gaussians)
     return allocated
-
-
-def _with_rows(gaussians: Gaussians, room: int) -> Gaussians:
-    """Return the Gaussians, followed by spare rows."""
-    num = room - gaussians.num
-    if num == 0:
-        return gaussians
-    return _followed_by(gaussians, no_rows(num, gaussians.sh.shape[1], gaussians.means.dtype))
 
 
 def _followed_by(gaussians: Gaussians, others: Gaussians) -> Gaussians:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import DTypeLike
 
 from a2tg_jax.appearance import Appearance, projected
 from a2tg_jax.core.cameras import Camera
@@ -147,7 +148,7 @@ def jitted_step() -> jax.stages.Wrapped:
 
 def train_step(
     settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs,
-    views: Array | None, scene_scale: Array, key: Array, rows: Any = None,
+    views: Array | None, scene_scale: Array, key: Array, rows: Array | None = None,
 ) -> tuple[TrainState, StepInfo]:  # fmt: skip
     """Run one iteration.
 
@@ -178,7 +179,7 @@ def train_step(
 
 def attempt(
     settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs,
-    views: Array | None, scene_scale: Array, key: Array, rows: Any = None,
+    views: Array | None, scene_scale: Array, key: Array, rows: Array | None = None,
 ) -> Attempt:  # fmt: skip
     """Return the outcome of one iteration. Arguments as of `train_step`, none of them donated."""
     iteration = state.iteration + 1
@@ -208,7 +209,7 @@ def attempt(
     seen = _seen(stage, batch, own, found)
     model, moments, events, info = _events(settings.due, stage, clock, now, seen, model, moments, state.events)
     corrections = tuple(
-        updated(correction, known, rows, grad, progress)
+        updated(correction, known, rows, grad, progress)  # type: ignore[arg-type]
         for correction, known, grad in zip(stage.corrections, state.corrections, found.grads[2], strict=True)
     )
     after = TrainState(model, moments, events, iteration, state.status, corrections)
@@ -325,7 +326,7 @@ def _mean_over(mask: Array | None, values: Array) -> Array:
     return mean if mask is None else mean / jnp.mean(mask.astype(values.dtype))
 
 
-def drawn_backgrounds(key: Array, kind: Background, num: int, dtype: Any) -> Array:
+def drawn_backgrounds(key: Array, kind: Background, num: int, dtype: DTypeLike) -> Array:
     """Return the colours [V, 3] behind the views of a step."""
     if kind == "random":
         return jax.random.uniform(key, (num, 3), dtype)
@@ -413,13 +414,13 @@ def _status(clock: Clock, tried: Attempt) -> Array:
     return jnp.where(jnp.any(found.is_overflow), OVERFLOW, status).astype(jnp.int32)
 
 
-def _others(known: Any, tree: Any) -> list[Array]:
+def _others(known: object, tree: object) -> list[Array]:
     """Return the leaves of a tree that are no leaves of a known one."""
     ids = {id(leaf) for leaf in jax.tree.leaves(known)}
     return [leaf for leaf in jax.tree.leaves(tree) if id(leaf) not in ids]
 
 
-def _all_finite(tree: Any) -> Array:
+def _all_finite(tree: object) -> Array:
     """Return whether all numbers are finite: row by row first, then by one reduction of all rows."""
     rows = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(tree)]
     # Without the barrier XLA would reduce each leaf to one flag apart, which costs a GPU two launches a leaf.

@@ -1,16 +1,19 @@
 """Loss terms: a stage minimises their weighted sum.
 
 A term is a frozen dataclass registered as a pytree, whose numbers are traced; `Term` makes one of any function.
+Here are the terms of the paper and its baselines, one that leaves out what moves, and priors of depth.
 """
 
 import functools
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Literal, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.numerics import safe_divide
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.model import Model
@@ -130,3 +133,193 @@ def opacity(model: Model, target: Target, output: RenderOutput) -> Array:
 def scale(model: Model, target: Target, output: RenderOutput) -> Array:
     """Return the mean scale of the live Gaussians (3DGS-MCMC)."""
     return mean_scale(model.gaussians, model.live_count)
+
+
+PATCHES = 32
+"""Number of patches along the shorter side of a photograph."""
+REACH = 1
+"""Number of patches around one over which the residual is averaged."""
+
+
+@pytree
+class RobustPhotometric:
+    """The photometric loss over inliers: patches without an outlying residual (`inliers`).
+
+    Passers-by, cars and shadows are on a few photographs only, so that the model cannot show them, and their residual
+    stays large over whole patches. Each step finds them from its own residual, as in RobustNeRF (Sabour et al., 2023).
+    """
+
+    ssim_weight: float = 0.2
+    share: float = 0.3
+    """Largest share of a photograph that is left out."""
+    factor: float = 4.0
+    """Least residual of what is left out, as a multiple of the photograph's median."""
+    start: float = 0.25
+    """Share of the stage after which something is left out; before, much is outlying that is not learned yet."""
+    has_ssim: bool = static(default=True)
+    """Whether to compute SSIM. Without it, images smaller than its window can be trained on."""
+
+    def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
+        return functools.reduce(jnp.add, self.parts(model, target, output).values())
+
+    def parts(self, model: Model, target: Target, output: RenderOutput) -> dict[str, Array]:
+        residual = jnp.mean(jnp.abs(output.color - target.image), axis=-1)
+        counts = inliers(residual, self.share, self.factor, target.mask) | (target.progress < self.start)
+        color, image = (jnp.where(counts[..., None], x, jnp.zeros_like(x)) for x in (output.color, target.image))
+        return photometric_parts(color, image, ssim_weight=self.ssim_weight if self.has_ssim else 0)
+
+
+def inliers(residual: Array, share: Array | float, factor: Array | float, mask: Array | None = None) -> Array:
+    """Return [H, W] bool, False at pixels of patches with an outlying residual; no gradient goes through it.
+
+    The residual of a patch is the mean over the patch and its neighbours. It is outlying if it is larger than the
+    quantile 1 − `share` of all patches and than `factor` times their median.
+
+    Args:
+      residual: [H, W] not negative.
+      share: largest share of outlying patches, in [0, 1].
+      factor: of the median.
+      mask: [H, W] bool, pixels that count; the others are no part of quantile and median. None: all count.
+    """
+    height, width = residual.shape
+    side = max(1, min(height, width) // PATCHES)
+    counts = jnp.ones_like(residual) if mask is None else mask.astype(residual.dtype)
+    sums, nums = (_around(_patch_sums(x, side)) for x in (jax.lax.stop_gradient(residual) * counts, counts))
+    patches = jnp.where(nums > 0, sums / jnp.maximum(nums, 1), jnp.nan)
+    quantiles = jnp.stack([jnp.asarray(0.5, residual.dtype), 1 - jnp.asarray(share, residual.dtype)])
+    middle, high = jnp.nanquantile(patches, quantiles)
+    is_fine = ~(patches > jnp.maximum(high, factor * middle))
+    found = jnp.repeat(jnp.repeat(is_fine, side, axis=0), side, axis=1)
+    return found[:height, :width]
+
+
+def _patch_sums(image: Array, side: int) -> Array:
+    """Return the sums over square patches; those at the right and lower edges may be cut off."""
+    zero = jnp.zeros((), image.dtype)
+    sums: Array = jax.lax.reduce_window(image, zero, jax.lax.add, (side, side), (side, side), _padding(image, side))
+    return sums
+
+
+def _padding(image: Array, side: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    return (0, -image.shape[0] % side), (0, -image.shape[1] % side)
+
+
+def _around(patches: Array) -> Array:
+    """Return the sums over each patch and its neighbours."""
+    side = 2 * REACH + 1
+    zero = jnp.zeros((), patches.dtype)
+    reach = (REACH, REACH), (REACH, REACH)
+    sums: Array = jax.lax.reduce_window(patches, zero, jax.lax.add, (side, side), (1, 1), reach)
+    return sums
+
+
+DepthKind = Literal["inverse", "depth"]
+"""Meaning of depth maps: inverse depth up to scale and shift (monocular networks), or depth up to scale (sensors,
+networks of metric depth, of which 0 is unknown)."""
+LEAST_ALPHA = 0.5
+"""Least rendered alpha of pixels that are compared."""
+
+
+@pytree
+class DepthPrior:
+    """Mean absolute difference of inverse depths after scale and shift of least squares (`depth_loss`)."""
+
+    weight: float
+    kind: DepthKind = static(default="inverse")
+
+    name = "depth"
+    has_geometry = True
+    has_depths = True
+
+    def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
+        prior = target.depth if self.kind == "inverse" else safe_divide(jnp.ones_like(target.depth), target.depth)
+        counts = jnp.isfinite(prior) if self.kind == "inverse" else target.depth > 0
+        if target.mask is not None:
+            counts = counts & target.mask
+        return self.weight * depth_loss(output.depth, output.alpha, prior, counts, has_shift=self.kind == "inverse")
+
+
+@pytree
+class PointDepths:
+    """Mean absolute difference of inverse depths at the points that the photograph observed (`points_loss`)."""
+
+    weight: float
+
+    name = "points"
+    has_geometry = True
+    has_points = True
+
+    def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
+        return self.weight * points_loss(output.depth, output.alpha, target.points, target.mask)
+
+
+def depth_loss(depth: Array, alpha: Array, prior: Array, counts: Array, *, has_shift: bool = True) -> Array:
+    """Mean |s·prior + t − alpha/depth| over the pixels that count and are covered.
+
+    s ≥ 0 and t are the least squares solution of this view. No gradient goes through them.
+
+    Args:
+      depth: [H, W] rendered depth Σ z·α·T, not divided by alpha.
+      alpha: [H, W] rendered alpha.
+      prior: [H, W] inverse depth up to scale and shift.
+      counts: [H, W] bool, the pixels in which the prior is known.
+      has_shift: whether there is a shift; without, t = 0.
+
+    Returns:
+      A scalar; 0 if no pixel counts.
+    """
+    counts = counts & (alpha > LEAST_ALPHA) & (depth > 0)
+    inverse = jnp.where(counts, safe_divide(alpha, depth), 0.0)
+    prior = jnp.where(counts, prior, 0.0)
+    scale, shift = jax.lax.stop_gradient(scale_and_shift(prior, inverse, counts, has_shift=has_shift))
+    return _mean_error(scale * prior + shift, inverse, counts)
+
+
+def points_loss(depth: Array, alpha: Array, points: ObservedPoints, mask: Array | None = None) -> Array:
+    """Mean |1/z − alpha/depth| over the pixels of points of depth z that count and are covered.
+
+    Args:
+      depth: [H, W] rendered depth Σ z·α·T, not divided by alpha.
+      alpha: [H, W] rendered alpha.
+      points: [S], as `ObservedPoints` has them.
+      mask: [H, W] bool, True at pixels that count; None: all.
+
+    Returns:
+      A scalar; 0 if no point counts.
+    """
+    depth, alpha = (_at(points.pixels, image) for image in (depth, alpha))
+    counts = (points.depths > 0) & (alpha > LEAST_ALPHA) & (depth > 0)
+    if mask is not None:
+        counts = counts & _at(points.pixels, mask)
+    known = safe_divide(jnp.ones_like(points.depths), points.depths)
+    inverse, known = (jnp.where(counts, x, 0.0) for x in (safe_divide(alpha, depth), known))
+    return _mean_error(known, inverse, counts)
+
+
+def _at(pixels: Array, image: Array) -> Array:
+    """Return the values [S] of an image [H, W] at pixels in order, 0 at those beyond its end."""
+    values: Array = (
+        image.reshape(-1).at[pixels].get(mode="fill", fill_value=0, unique_indices=True, indices_are_sorted=True)
+    )
+    return values
+
+
+def _mean_error(one: Array, other: Array, counts: Array) -> Array:
+    """Return the mean absolute difference over those that count; 0 if none does."""
+    error = jnp.where(counts, jnp.abs(one - other), 0.0)
+    return jnp.sum(error) / jnp.maximum(jnp.sum(counts), 1).astype(error.dtype)
+
+
+def scale_and_shift(prior: Array, inverse: Array, counts: Array, *, has_shift: bool = True) -> tuple[Array, Array]:
+    """Return s ≥ 0 and t that minimise Σ (s·prior + t − inverse)² over the pixels that count.
+
+    Where all values of the prior are equal, s is 0.
+    """
+    weights = counts.astype(prior.dtype)
+    num = jnp.maximum(jnp.sum(weights), 1)
+    zero = jnp.zeros((), prior.dtype)
+    middle, wanted = (jnp.sum(weights * x) / num if has_shift else zero for x in (prior, inverse))
+    centered = weights * (prior - middle)
+    scale = safe_divide(jnp.sum(centered * (inverse - wanted)), jnp.sum(centered * centered))
+    scale = jnp.maximum(scale, 0)
+    return scale, wanted - scale * middle

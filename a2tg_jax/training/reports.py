@@ -1,0 +1,371 @@
+"""Reports of a stage to the user: its progress, a forecast of its duration, and warnings of what goes wrong.
+
+Events that do nothing or compile too often, and training that does not learn, are warned of.
+"""
+
+import collections
+import dataclasses
+import datetime
+import sys
+import time
+import warnings
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from tqdm import tqdm
+
+from a2tg_jax.data.scene import View, view_image
+from a2tg_jax.events import Change, Event, HostEvent, StepEvent
+from a2tg_jax.host.progress_bars import has_terminal, is_line_due
+from a2tg_jax.host.text import counted, in_bytes
+from a2tg_jax.parallel.rows import on_host
+from a2tg_jax.training.batches import BatchOrder
+from a2tg_jax.training.options import System
+from a2tg_jax.training.stage import Background, Stage
+from a2tg_jax.training.step import StepInfo, TrainState
+
+MOMENTUM = 0.95
+TIMED_SECONDS, TIMED_STEPS = 2.0, 3
+"""Smallest number of timed steps before a forecast of the duration."""
+BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
+"""tqdm's format without its rate and remaining time, which count compilation."""
+
+
+class Pace:
+    """Time of an iteration, and forecasts of a stage's duration: early, and at a half."""
+
+    def __init__(self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, may_grow: bool = True):
+        """Args:
+        first: iterations done before.
+        total: the last iteration.
+        now: a clock in seconds.
+        may_grow: whether Gaussians may be added.
+        """
+        self._total, self._now, self._may_grow = total, now, may_grow
+        self._due = [first, (first + total) // 2]
+        self._before: tuple[int, float, int] | None = None
+        self._steps, self._seconds = 0, 0.0
+        self._ahead, self._seconds_a_program = 0, 0.0
+
+    def time(self, done: int, num_compiled: int, ahead: int = 0, seconds_a_program: float = 0.0) -> None:
+        """Time the iterations since the last call, unless programs were compiled meanwhile.
+
+        Args:
+          done: iterations so far.
+          num_compiled: programs compiled so far.
+          ahead: programs that will be compiled, about.
+          seconds_a_program: time of a compilation.
+        """
+        now = self._now()
+        self._ahead, self._seconds_a_program = ahead, seconds_a_program
+        if self._before is not None and self._before[2] == num_compiled:
+            self._steps += done - self._before[0]
+            self._seconds += now - self._before[1]
+        self._before = done, now, num_compiled
+
+    def told(self, done: int) -> str | None:
+        """Return a forecast if one is due and enough was timed since the last, or None."""
+        left = self.left(done)
+        is_due = self._due and done >= self._due[0] and self._steps >= TIMED_STEPS and self._seconds >= TIMED_SECONDS
+        if left is None or not is_due or done >= self._total:
+            return None
+        growing = "; more if Gaussians are added" if self._may_grow and len(self._due) > 1 else ""
+        told = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration, about {left} for the other "
+        self._due = [due for due in self._due[1:] if due > done]
+        self._steps, self._seconds = 0, 0.0
+        compiling = f"with {counted(self._ahead, 'program')} to compile" if self._ahead else "without compiling"
+        return f"{told}{self._total - done:,}, {compiling}{growing}"
+
+    def left(self, done: int) -> datetime.timedelta | None:
+        """Return the remaining time, that of known compilations included; None before a step was timed."""
+        if self._steps == 0:
+            return None
+        of_steps = (self._total - done) * self._seconds / self._steps
+        return datetime.timedelta(seconds=round(of_steps + self._ahead * self._seconds_a_program))
+
+
+class ProgressBar:
+    """A line with loss, PSNR, live Gaussians, memory and time left; a line for every tenth without a terminal."""
+
+    def __init__(self, title: str, done: int, total: int, *, is_shown: bool, may_grow: bool = True):
+        is_bar = is_shown and has_terminal()
+        self._bar = tqdm(
+            desc=f"{title} (compiling)", initial=done, total=total, disable=not is_bar, unit="it",
+            dynamic_ncols=True, mininterval=0.5, bar_format=BAR,
+        )  # fmt: skip
+        self._title, self._done, self._total = title, done, total
+        self._pace = Pace(done, total, may_grow=may_grow)
+        self._is_shown, self._is_plain = is_shown, is_shown and not is_bar
+        self._last_line = done, time.perf_counter()
+        self._loss: float | None = None
+        self._psnr = 0.0
+        if self._is_plain:
+            self._print("compiling")
+
+    def __enter__(self) -> "ProgressBar":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def tell_pace(self, done: int, num_compiled: int, ahead: int = 0, seconds_a_program: float = 0.0) -> None:
+        """Print a forecast if one is due, after a group of steps that were launched together.
+
+        Args: as of `Pace.time`.
+        """
+        self._pace.time(done, num_compiled, ahead, seconds_a_program)
+        told = self._pace.told(done)
+        if told is not None and self._is_shown:
+            self._bar.write(f"{self._title}: {told}")
+
+    def update(self, info: StepInfo, row: Mapping[str, float] | None) -> None:
+        """Count one iteration; loss and PSNR are running means. `row` is the last one of the history."""
+        loss, psnr = float(info.loss), float(info.psnr)
+        if self._loss is None:
+            self._loss, self._psnr = loss, psnr
+            self._bar.set_description_str(self._title)
+        self._loss += (1 - MOMENTUM) * (loss - self._loss)
+        self._psnr += (1 - MOMENTUM) * (psnr - self._psnr)
+        self._done += 1
+        self._bar.update()
+        if row and not self._bar.disable:
+            self._bar.set_postfix_str(self._told(row), refresh=False)
+        if self._is_plain and is_line_due(self._done, self._total, *self._last_line):
+            self._print(f"{self._done:,} of {self._total:,}, {self._told(row)}")
+
+    def _told(self, row: Mapping[str, float] | None) -> str:
+        left = self._pace.left(self._done)
+        words = [] if left is None or self._done == self._total else [f"{left} left"]
+        words.append(f"loss {self._loss:.4f}, {self._psnr:.2f} dB")
+        if row:
+            words.append(f"{row['num_gaussians']:,} Gaussians, {in_bytes(1e6 * row['megabytes'])}")
+        return ", ".join(words)
+
+    def _print(self, text: str) -> None:
+        print(f"{self._title}: {text}", file=sys.stderr, flush=True)
+        self._last_line = self._done, time.perf_counter()
+
+
+CHECKED_AFTER = 0.2
+"""Share of the first stage after which training must have learned something."""
+LEAST_ITERATIONS = 200
+"""Training is not judged earlier than this."""
+NUM_COMPARED = 16
+"""Iterations before the check whose PSNR is averaged."""
+NEARLY_FLAT = 40.0
+"""Photographs that one colour shows to so many dB tell nothing of whether a model has learned."""
+ADVICE = (
+    "Look whether the points and cameras fit (cameras.png of a2tg sfm; in a2tg view RUN, photographs beside the render "
+    "from their cameras), then try fewer initial_gaussians, a lower initial_opacity or "
+    "lower learning rates, and refine_poses if poses may be wrong"
+)
+FLAT_BACKGROUNDS: dict[Background, float] = {"black": 0.0, "white": 1.0, "random": 0.5}
+
+
+class LearningCheck:
+    """Warn once if training is not above a flat colour per view after a fifth of its first stage."""
+
+    def __init__(
+        self, views: tuple[View, ...], order: BatchOrder, iterations: int, background: Background, *, is_first: bool,
+        small_budget: str = "",
+    ):  # fmt: skip
+        """Args:
+        views: the training views.
+        order: training views of each iteration.
+        iterations: length of the stage.
+        background: behind transparent photographs.
+        is_first: whether this is the first stage; later ones are not checked.
+        small_budget: what a small memory budget has room for, for the warning.
+        """
+        self._views, self._order, self._level = views, order, FLAT_BACKGROUNDS[background]
+        self._advice = f"{small_budget}: raise it" if small_budget else ADVICE
+        at = max(round(CHECKED_AFTER * iterations), LEAST_ITERATIONS)
+        self._at = at if is_first and at <= iterations else 0
+        self._seen: collections.deque[tuple[int, float]] = collections.deque(maxlen=NUM_COMPARED)
+
+    def observe(self, iteration: int, psnr: float) -> None:
+        """Record the training PSNR of an iteration in dB; warn once if it stays low."""
+        if iteration > self._at:
+            return
+        self._seen.append((iteration, psnr))
+        if iteration < self._at:
+            return
+        reached, flat = float(np.mean([psnr for _, psnr in self._seen])), []
+        for iteration, _ in self._seen:
+            for view in (self._views[index] for index in self._order.indices(iteration)):
+                mask = None if view.mask is None else jnp.asarray(view.mask.read())
+                flat.append(float(flat_psnr(jnp.asarray(view_image(view, (self._level,) * 3)), mask)))
+        if not has_learned(reached, float(np.mean(flat))):
+            warnings.warn(
+                f"training does not learn: {reached:.1f} dB on the training views after {self._at:,} iterations, where "
+                f"one flat colour per view reaches {np.mean(flat):.1f} dB. {self._advice}",
+                stacklevel=2,
+            )
+
+
+def has_learned(psnr: float, flat: float) -> bool:
+    """Return whether a PSNR is above that of flat colours (`flat_psnr`); always, if the photographs are nearly flat."""
+    return psnr > flat or flat > NEARLY_FLAT
+
+
+def flat_psnr(target: Array, mask: Array | None = None) -> Array:
+    """Return the PSNR in dB of the best image of one flat colour, which a model reaches without learning more.
+
+    Args:
+      target: [H, W, 3], clipped to [0, 1] first.
+      mask: [H, W] bool, the pixels that count; None: all of them.
+    """
+    target = jnp.clip(target, 0, 1)
+    weight = jnp.ones(target.shape[:2], target.dtype) if mask is None else jnp.asarray(mask, target.dtype)
+    weight = (weight / jnp.sum(weight))[:, :, None]
+    mean = jnp.sum(weight * target, axis=(0, 1), keepdims=True)
+    return -10 * jnp.log10(jnp.mean(jnp.sum(weight * (target - mean) ** 2, axis=(0, 1))))
+
+
+MANY_PROGRAMS = 3
+"""Compilations because of one event after which it is told how to keep shapes."""
+
+
+@dataclasses.dataclass
+class Effects:
+    """What an event on the host has done so far."""
+
+    num_applied: int = 0
+    num_compiled: int = 0
+    """Number of its changes of shape after which a step was compiled."""
+    has_changed: bool = False
+    """Whether it has ever changed the model or the moments."""
+    unused: str | None = None
+    """`Change.unused` if that was given each time."""
+
+
+class StageEffects:
+    """What the events of a stage do; each process has the same."""
+
+    def __init__(self, stage: Stage, system: System, num_sizes: int):
+        """Args:
+        stage: with its events.
+        system: names the options in messages.
+        num_sizes: number of image sizes, each of which has a program.
+        """
+        self._stage, self._system, self._num_sizes = stage, system, num_sizes
+        self._on_host: dict[int, tuple[HostEvent, Effects]] = {
+            place: (event, Effects()) for place, event in enumerate(stage.events) if isinstance(event, HostEvent)
+        }
+        self._reshaped_by: list[int] = []
+        self._num_compiled, self._seconds = 0, 0.0
+
+    def apply(self, place: int, state: TrainState, change: Change) -> None:
+        """Note a change by the event at a place.
+
+        Args:
+          place: index of the event.
+          state: before the change.
+          change: as the event returned it.
+        """
+        _, own = self._on_host[place]
+        before = state.model, state.moments, state.events[place]
+        after = change.model, change.moments, change.state
+        is_reshaped = _shapes(before) != _shapes(after)
+        if is_reshaped:
+            self._reshaped_by.append(place)
+        # Values are compared until the event has changed some once, which is nearly always the first time.
+        own.has_changed = own.has_changed or is_reshaped or not _are_equal(before[:2], after[:2])
+        if own.num_applied == 0 or not change.unused:
+            own.unused = change.unused
+        own.num_applied += 1
+
+    def launch(self, iteration: int, seconds: float | None) -> None:
+        """Note a step that was launched, and warn if an event is why steps are compiled again and again.
+
+        Args:
+          iteration: of the step.
+          seconds: time that its compilation took; None: there was none.
+        """
+        reshaped_by, self._reshaped_by = self._reshaped_by, []
+        if seconds is None:
+            return
+        self._num_compiled, self._seconds = self._num_compiled + 1, self._seconds + seconds
+        for place in dict.fromkeys(reshaped_by):
+            event, own = self._on_host[place]
+            own.num_compiled += 1
+            if own.num_compiled == MANY_PROGRAMS and type(event).with_room is HostEvent.with_room:
+                left = len(self._ahead(event, iteration))
+                warnings.warn(
+                    f"stage {self._stage.name!r}: {type(event).__name__} has changed shapes {MANY_PROGRAMS} times, and "
+                    f"each time a step was compiled, last for {seconds:.0f} s; it happens {counted(left, 'time')} "
+                    "more: keep shapes, by keep_rows(model, moments, state, is_kept) to remove Gaussians, or by "
+                    "padding in with_room for what will be added",
+                    stacklevel=2,
+                )
+
+    def programs_ahead(self, iteration: int) -> int:
+        """Return the number of programs that events will cause from an iteration on, about."""
+        num = 0.0
+        for event, own in self._on_host.values():
+            if left := len(self._ahead(event, iteration)):
+                times = event.iterations(self._stage.iterations)
+                known = own.num_compiled, own.num_applied
+                caused, among = known if own.num_applied else (event.num_programs(self._stage.iterations), len(times))
+                num += left * caused / among
+        return round(num * self._num_sizes)
+
+    @property
+    def seconds_a_program(self) -> float:
+        """Mean time of a compilation so far."""
+        return self._seconds / max(1, self._num_compiled)
+
+    def _ahead(self, event: HostEvent, iteration: int) -> list[int]:
+        """Return the times of an event from an iteration on after which there are steps."""
+        end = self._stage.iterations
+        return [time for time in event.iterations(end) if iteration <= time < end]
+
+    def warn_of_never(self) -> None:
+        """Warn of events none of whose times is in the stage."""
+        end = self._stage.iterations
+        for event in self._stage.events:
+            first = _first_time(event, end)
+            if first is not None and not 1 <= first <= end:
+                warnings.warn(
+                    f"stage {self._stage.name!r}: {type(event).__name__} never happens, for it is first due at "
+                    f"iteration {first:,} of {end:,}",
+                    stacklevel=2,
+                )
+
+    def warn_of_unused(self) -> None:
+        """Warn of events that happened at all their times and never made a difference."""
+        told = []
+        for event, own in self._on_host.values():
+            times = event.iterations(self._stage.iterations)
+            if not own.num_applied or own.num_applied < len(times):  # A resumed stage has not seen the first ones.
+                continue
+            if not own.has_changed:
+                told.append(f"{type(event).__name__} changed nothing, though it happened {own.num_applied:,} times")
+            elif own.unused:
+                told.append(f"{self._system.path_of(event)}.{own.unused}")
+        if told:
+            warnings.warn(f"stage {self._stage.name!r}: {'; '.join(told)}", stacklevel=2)
+
+
+def _first_time(event: Event, num_iterations: int) -> int | None:
+    """Return the iteration at which an event happens first, or the last one below 1; None if it names no time."""
+    if isinstance(event, StepEvent):
+        times = event.times(num_iterations)
+        return max(1, -(-times.first // times.every)) * times.every if times.num_times else None
+    assert isinstance(event, HostEvent)
+    found = event.iterations(num_iterations)
+    return next((time for time in found if time >= 1), found[-1]) if found else None
+
+
+def _shapes(tree: object) -> tuple[object, list[object]]:
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [jax.typeof(leaf) for leaf in leaves]
+
+
+def _are_equal(tree: object, other: object) -> bool:
+    """Return whether two trees of the same shapes have the same numbers."""
+    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
+    return all(a is b or np.array_equal(on_host(a), on_host(b)) for a, b in pairs)
