@@ -77,13 +77,13 @@ def _command(arguments: list[str]) -> str:
 def _stub() -> None:
     """Has commands end where work would begin."""
     from a2tg_jax.cli import main as cli
-    from a2tg_jax.results import frames, record, run_evaluation, whole_run
+    from a2tg_jax.results import frames, record, run_evaluation, run_training
 
     def reached(*arguments, **options):
         raise ValueError(REACHED)
 
     cli.configure_cpu = lambda: None
-    whole_run.train_run = reached
+    run_training.train_run = reached
     run_evaluation._measure = reached
     frames.Renderer = reached
     record.synthetic_scene = functools.cache(functools.partial(record.synthetic_scene, num_points=100))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lab.fingerprint import fingerprint
 
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
@@ -25,7 +26,7 @@ from a2tg_jax.events import Due, Now, Times
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.mcmc import FillingMcmc
 from a2tg_jax.model import Model
-from a2tg_jax.results.plan import fingerprint, plan_run
+from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.summary import budget_lines
 from a2tg_jax.training.fitting import warn_of_budget
 from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict, with_changes

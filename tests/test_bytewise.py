@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lab.fingerprint import fingerprint
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
@@ -19,7 +20,6 @@ from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.densify.exponents import LimitExponents
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import HostEvent
-from a2tg_jax.results.plan import fingerprint
 from a2tg_jax.results.record import compared_system
 from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint

@@ -12,6 +12,7 @@ from experiment_records import CELL, record, result
 from lab import tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.figures import figures_table
+from lab.fingerprint import fingerprint
 from lab.grid import Method, has_scale, read_grid, splats_in
 from lab.grid_file import GRIDS, Block
 from lab.jobs import Folders
@@ -20,7 +21,6 @@ from run import chosen, experiments, main, parse_arguments
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.config_json import flatten_config
-from a2tg_jax.results.plan import fingerprint
 from a2tg_jax.training.terms import Term
 
 NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("methods", "scales"))
@@ -354,7 +354,8 @@ def test_a_fingerprint_is_of_what_decides_the_result():
     assert fingerprint(quick, 0) == fingerprint(a2tg.find_system("gaussians-2d-mcmc").preset("quick"), 0)
     assert fingerprint(quick, 0) != fingerprint(dataclasses.replace(quick, seed=1), 0)
     code = (
-        "import a2tg_jax as a; from a2tg_jax.results.plan import fingerprint as f; print(f(a.A2tg.preset('quick'), 1))"
+        "import sys; sys.path.append('experiments'); import a2tg_jax as a; from lab.fingerprint import fingerprint;"
+        "print(fingerprint(a.A2tg.preset('quick'), 1))"
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert told.strip() == fingerprint(quick, 1), "another process says the same"

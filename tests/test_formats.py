@@ -26,7 +26,6 @@ from a2tg_jax import (
     transform_gaussians,
 )
 from a2tg_jax.appearance import Appearance, Exponents, MovableKernels, Texture, allocate_appearance, template_of
-from a2tg_jax.cli import train
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Origin
@@ -34,13 +33,13 @@ from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
 from a2tg_jax.io.gaussforge_files import SUFFIXES
-from a2tg_jax.results import first_stage, preflight, run_training
-from a2tg_jax.results.first_stage import GivenSplats
+from a2tg_jax.io.model_file import number_in_file
+from a2tg_jax.results import init_file, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
-from a2tg_jax.results.preflight import check_init
+from a2tg_jax.results.init_file import check_init, write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
+from a2tg_jax.results.run_training import RunOptions, begin_run
 from a2tg_jax.results.viewing import open_source
-from a2tg_jax.results.whole_run import begin_run
 
 OTHERS = [".ply", ".ksplat", *SUFFIXES]
 TEXTURES = "textures (--bake turns them into plain splats)"
@@ -266,7 +265,8 @@ def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsy
     write_record(run, record)
     assert read_record(run) == record
     with pytest.raises(KeyboardInterrupt):
-        run_training.train_run(run, scene, progress=False)
+        write_first_stage(run, record, load_splats(tmp_path / "a.ply"), scene)
+        run_training.train_run(run, scene, RunOptions(progress=False))
     ((index, first),) = started
     assert index == 1
     np.testing.assert_allclose(first.gaussians.means, some_gaussians(40).means, atol=1e-5)
@@ -278,52 +278,50 @@ def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsy
 
 
 def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, monkeypatch):
-    scene, read, told = synthetic_scene(width=32, height=24, num_views=4, num_points=50), [], []
-    load = first_stage.load_splats
+    scene, read, counts = synthetic_scene(width=32, height=24, num_views=4, num_points=50), [], []
+
+    def read_and_noted(file):
+        read.append(file)
+        return load_splats(file)
 
     def trained(*_, **options):
         raise RuntimeError("the second stage")
 
-    monkeypatch.setattr(first_stage, "load_splats", lambda file: read.append(file) or load(file))
+    for module in (init_file, run_training):
+        monkeypatch.setattr(module, "load_splats", read_and_noted)
     monkeypatch.setattr(SceneSource, "load", lambda self, room, **options: scene)
-    monkeypatch.setattr(preflight, "tell_forecast", lambda *args: told.append(args))
+    monkeypatch.setattr(run_training, "print_forecast", lambda *args: counts.append(args[4]))
     monkeypatch.setattr(run_training, "fit_stage", trained)
     save_ply(tmp_path / "a.ply", some_gaussians(40))
     system = A2tg(stage1_iterations=5, stage2_iterations=4)
     record = RunRecord(SceneSource("synthetic"), "a2tg", system, init=str(tmp_path / "a.ply"))
     with pytest.raises(RuntimeError, match="the second stage"):
-        begin_run(record, tmp_path / "run", overwrite=False, progress=False)
-    assert read == [tmp_path / "a.ply"]
-    run, given = RunFolder(tmp_path / "run"), first_stage.given_splats(record)
-    assert told[0][-1] == first_stage.number_given(run, record, given) == 40
-    assert len(read) == 1, "a resumed run counts the model of its first stage"
-    write_archive(run.model("a2tg-gaussians"), {}, {"means": np.zeros((40, 3))}, format="a2tg-jax model")
-    assert first_stage.number_given(run, record, given) == 40, "nothing but the means is read"
-    write_archive(run.model("a2tg-gaussians"), {}, {"quats": np.zeros((40, 4))}, format="a2tg-jax model")
-    with pytest.raises(ValueError, match="it has no means"):
-        first_stage.number_given(run, record, given)
-    run.model("a2tg-gaussians").unlink()
-    monkeypatch.setattr(train, "tell_forecast", lambda *args: told.append(args))
-    monkeypatch.setattr(SceneSource, "load", lambda self, room=None, **options: scene)
+        begin_run(record, tmp_path / "run", RunOptions(progress=False))
+    assert read == [tmp_path / "a.ply"] and counts == [40]
+    resume = ["train", "--out", str(tmp_path / "run"), "--resume", "--quiet"]
     with pytest.raises(RuntimeError, match="the second stage"):
-        main(["train", "--out", str(run.path), "--resume", "--quiet"])
-    assert told[1][-1] == 40 and len(read) == 2, "a resumed run without that model reads the file once"
+        main(resume)
+    assert len(read) == 1 and counts == [40, 40], "a resumed run counts the model of its first stage"
+    RunFolder(tmp_path / "run").model("a2tg-gaussians").unlink()
+    with pytest.raises(RuntimeError, match="the second stage"):
+        main(resume)
+    assert len(read) == 2 and counts == [40] * 3, "a resumed run without that model reads the file again"
 
 
-def test_splats_of_a_file_are_taken_once(tmp_path):
-    save_ply(tmp_path / "a.ply", some_gaussians(40))
-    given = GivenSplats(tmp_path / "a.ply")
-    assert given.splats is given.taken()
-    with pytest.raises(RuntimeError, match="were taken already"):
-        given.splats  # noqa: B018
+def test_gaussians_of_a_model_are_counted_by_their_means(tmp_path):
+    write_archive(tmp_path / "a.npz", {}, {"means": np.zeros((40, 3))}, format="a2tg-jax model")
+    assert number_in_file(tmp_path / "a.npz") == 40, "nothing else is read"
+    write_archive(tmp_path / "a.npz", {}, {"quats": np.zeros((40, 4))}, format="a2tg-jax model")
+    with pytest.raises(ValueError, match="it has no means"):
+        number_in_file(tmp_path / "a.npz")
 
 
 def test_what_a_first_stage_cannot_take_of_a_file_is_refused_or_told(tmp_path):
     save_model(tmp_path / "a.npz", textured())
     with pytest.warns(UserWarning, match="leaves out what its splats show besides Gaussians"):
-        check_init(GivenSplats(tmp_path / "a.npz"), tmp_path / "run", A2tg(sh_degree=3))
+        check_init(tmp_path / "a.npz", tmp_path / "run", A2tg(sh_degree=3))
     save_ply(tmp_path / "a.ply", init_from_points(np.eye(4, 3), np.eye(4, 3), sh_degree=2))
     with pytest.warns(UserWarning, match="its spherical harmonics above degree 1"):
-        check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", A2tg(sh_degree=1))
+        check_init(tmp_path / "a.ply", tmp_path / "run", A2tg(sh_degree=1))
     with pytest.raises(ValueError, match="4 Gaussians, 592 bytes at degree 2, which is more than the memory_budget"):
-        check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", A2tg(sh_degree=2, memory_budget=0.0005))
+        check_init(tmp_path / "a.ply", tmp_path / "run", A2tg(sh_degree=2, memory_budget=0.0005))

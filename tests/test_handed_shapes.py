@@ -8,12 +8,21 @@ import numpy as np
 import pytest
 from small_values import some_gaussians
 
-from a2tg_jax import A2tg, Bytewise, Model, load_model, save_model, save_ply, synthetic_scene, transform_gaussians
+from a2tg_jax import (
+    A2tg,
+    Bytewise,
+    Model,
+    load_model,
+    load_splats,
+    save_model,
+    save_ply,
+    synthetic_scene,
+    transform_gaussians,
+)
 from a2tg_jax.appearance import Appearance, Exponents, Texture, allocate_appearance, template_of
 from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
-from a2tg_jax.results.first_stage import GivenSplats, write_first_stage
 from a2tg_jax.results.folder import create_run
-from a2tg_jax.results.preflight import check_init
+from a2tg_jax.results.init_file import check_init, write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.start import padded
@@ -38,9 +47,9 @@ def scene():
 
 def first_model(file, scene, system, tmp_path) -> Model:
     """The model that the splats of a file give in place of the first stage."""
-    planned = RunRecord(SceneSource("synthetic"), system.name, system).plan.stages[0]
-    run = create_run(tmp_path / "run")
-    write_first_stage(run, planned, GivenSplats(file), scene)
+    record = RunRecord(SceneSource("synthetic"), system.name, system, init=str(file))
+    run, planned = create_run(tmp_path / "run"), record.plan.stages[0]
+    write_first_stage(run, record, load_splats(file), scene)
     found = load_model(run.model(planned.name))
     assert template_of(found.appearance) == planned.stage.appearance
     return found
@@ -67,21 +76,21 @@ def test_shapes_of_a_file_are_kept_or_its_nearest_gaussians_taken(tmp_path, scen
 
 def test_a_first_stage_without_shapes_is_told(tmp_path, recwarn):
     save_model(tmp_path / "a.npz", shaped())
-    check_init(GivenSplats(tmp_path / "a.npz"), tmp_path / "run", Bytewise())
+    check_init(tmp_path / "a.npz", tmp_path / "run", Bytewise())
     assert not recwarn.list
     with pytest.warns(UserWarning, match=r"leaves out the shapes of its kernels \(the nearest Gaussians .* place\)$"):
-        check_init(GivenSplats(tmp_path / "a.npz"), tmp_path / "run", A2tg())
+        check_init(tmp_path / "a.npz", tmp_path / "run", A2tg())
     save_model(tmp_path / "b.npz", shaped(Texture()))
     with pytest.warns(UserWarning, match="leaves out what its splats show besides kernels$"):
-        check_init(GivenSplats(tmp_path / "b.npz"), tmp_path / "run", Bytewise())
+        check_init(tmp_path / "b.npz", tmp_path / "run", Bytewise())
 
 
 def test_bytes_of_shapes_count_in_a_budget(tmp_path, scene):
     """56 bytes a Gaussian: 13 floats, and one of its shape."""
     save_ply(tmp_path / "a.ply", GAUSSIANS)
-    check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", Bytewise(memory_budget="2.24kB"))
+    check_init(tmp_path / "a.ply", tmp_path / "run", Bytewise(memory_budget="2.24kB"))
     with pytest.raises(ValueError, match=r"40 Gaussians, 2\.24 kB at degree 0, .* of 2\.20 kB"):
-        check_init(GivenSplats(tmp_path / "a.ply"), tmp_path / "run", Bytewise(memory_budget="2.2kB"))
+        check_init(tmp_path / "a.ply", tmp_path / "run", Bytewise(memory_budget="2.2kB"))
     assert Bytewise(memory_budget="5.5kB").small_budget == "memory_budget has room for 98 Gaussians of 56 bytes"
     given, _ = forecast_stages(scene, Bytewise(), NUM)
     assert given.model_bytes == 40 * 56

@@ -17,8 +17,8 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.io.gaussforge_files import SUFFIXES
-from a2tg_jax.results.first_stage import GivenSplats, write_first_stage
 from a2tg_jax.results.folder import create_run
+from a2tg_jax.results.init_file import write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource
 
 UTM = np.array([431234.5, 5411222.25, 312.0])
@@ -314,10 +314,10 @@ def test_training_in_a_map_starts_from_a_file_where_it_is(tmp_path, name):
     a2tg.save_ply(tmp_path / "b.ply", model, float64=True)
     world = Similarity(0.5, TURN.T, -0.5 * TURN.T @ (UTM + 1))
     scene = dataclasses.replace(a2tg.synthetic_scene(width=8, height=8, num_views=2, num_points=5), transform=world)
-    planned = RunRecord(SceneSource("synthetic"), "gaussians-2d", a2tg.Gaussians2d()).plan.stages[0]
+    record = RunRecord(SceneSource("synthetic"), "gaussians-2d", a2tg.Gaussians2d(), init=str(tmp_path / name))
     run = create_run(tmp_path / "run")
-    write_first_stage(run, planned, GivenSplats(tmp_path / name), scene)
-    found = a2tg.load_model(run.model(planned.name)).gaussians.means
+    write_first_stage(run, record, a2tg.load_splats(tmp_path / name), scene)
+    found = a2tg.load_model(run.model(record.plan.names[0])).gaussians.means
     np.testing.assert_allclose(found, 0.5 * (true - UTM - 1) @ TURN, rtol=0, atol=1e-5)
 
 

@@ -14,7 +14,7 @@ from a2tg_jax import save_model, synthetic_scene
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.arguments import flag_with_value, in_flags, typed_paths
 from a2tg_jax.data.scene import origin_of_scene
-from a2tg_jax.results import whole_run
+from a2tg_jax.results import run_training
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.systems.a2tg import A2tg
@@ -194,7 +194,7 @@ def place(tmp_path_factory):
 def test_a_mistake_is_one_line_and_exit_code_2(capsys, monkeypatch, place, mistake):
     monkeypatch.chdir(place)
     monkeypatch.setattr(cli, "configure_cpu", lambda: None)
-    monkeypatch.setattr(whole_run, "train_run", lambda *_, **__: pytest.fail("training began"))
+    monkeypatch.setattr(run_training, "train_run", lambda *_, **__: pytest.fail("training began"))
     before = sorted(place.rglob("*"))
     code = cli.main(mistake.split())
     printed = capsys.readouterr()

@@ -30,14 +30,20 @@ from a2tg_jax.host.machine import this_machine
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.results import preflight as checks
-from a2tg_jax.results import run_evaluation, run_training, whole_run
-from a2tg_jax.results.folder import RunFolder, create_run
-from a2tg_jax.results.lock import claimed, opened
-from a2tg_jax.results.preflight import check_apart
+from a2tg_jax.results import forecast, run_evaluation, run_training
+from a2tg_jax.results.checks import check_apart
+from a2tg_jax.results.folder import (
+    OLD,
+    RunFolder,
+    claimed,
+    create_run,
+    old_run,
+    opened,
+    put_back_old,
+    set_aside,
+)
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
-from a2tg_jax.results.run_replacement import OLD, old_run, set_aside, undo_unfinished
-from a2tg_jax.results.run_training import MOST_RESTORED, train_run
+from a2tg_jax.results.run_training import MOST_RESTORED, RunOptions, train_run
 from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
 from a2tg_jax.training import DivergedError, find_system, load_checkpoint, save_checkpoint
 from a2tg_jax.training.batches import BatchOrder
@@ -47,6 +53,7 @@ SIZES = {"initial_gaussians": 60, "densify": Mcmc(cap=60)}
 SOURCE = SceneSource("synthetic", downscale=6)
 RECORD = RunRecord(SOURCE, "gaussians-2d-mcmc", Gaussians2dMcmc(stage1_iterations=20, **SIZES))
 NAME = "gaussians-2d-mcmc-gaussians"
+QUIET = RunOptions(progress=False)
 TRAIN = [
     *("train", "synthetic", "--system", "gaussians-2d-mcmc", "--downscale", "6", "--stage1-iterations", "20"),
     *("--initial-gaussians", "60", "--densify.cap", "60"),
@@ -283,7 +290,7 @@ def test_a_process_killed_while_it_sets_a_run_aside_loses_nothing(tmp_path, monk
         patch.setattr(os, "replace", rename)
         with contextlib.suppress(SystemExit):
             set_aside(run)
-    undo_unfinished(run)
+    put_back_old(run)
     assert files_of(run) == before
 
 
@@ -307,7 +314,7 @@ def test_the_run_folder_and_the_scene_lie_apart(tmp_path):
 
 def test_a_full_disk_is_seen_before_training(tmp_path, monkeypatch, capsys):
     usage = shutil.disk_usage(tmp_path)._replace(free=50_000)
-    monkeypatch.setattr(checks.shutil, "disk_usage", lambda path: usage)
+    monkeypatch.setattr(forecast.shutil, "disk_usage", lambda path: usage)
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     assert "GB for models and checkpoints" in capsys.readouterr().err and not (tmp_path / "run").exists()
 
@@ -332,7 +339,7 @@ def stopped(scene, tmp_path_factory):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(run_training, "save_checkpoint", function)
             with contextlib.suppress(KeyboardInterrupt):
-                train_run(run, scene, progress=False)
+                train_run(run, scene, QUIET)
     return RunFolder(folder / "run"), load_model(RunFolder(folder / "whole").model(NAME))
 
 
@@ -347,7 +354,7 @@ def test_a_damaged_newest_checkpoint_is_said_and_the_one_before_used(scene, stop
     *_, older, newest = run.checkpoints(NAME)
     newest.write_bytes(newest.read_bytes()[:1000])
     with pytest.warns(UserWarning, match=rf"is damaged.* continues from {older.name}"):
-        train_run(run, scene, progress=False)
+        train_run(run, scene, QUIET)
     assert_same(run, whole)
     assert not list((run.path / "checkpoints").glob("*"))
 
@@ -359,7 +366,7 @@ def test_without_a_checkpoint_that_can_be_read_nothing_begins_anew(scene, stoppe
     with pytest.raises(
         ValueError, match=rf"there is no other checkpoint: delete it to train {NAME} from its beginning"
     ):
-        train_run(run, scene, progress=False)
+        train_run(run, scene, QUIET)
     assert run.checkpoints(NAME)
 
 
@@ -368,7 +375,7 @@ def test_other_threads_are_said(scene, stopped, tmp_path, monkeypatch):
     threads = this_machine().threads
     monkeypatch.setenv("A2TG_NUM_THREADS", str(threads + 1))
     with pytest.warns(UserWarning, match=rf"there are {threads + 1} threads and were {threads} \(A2TG_NUM_THREADS="):
-        train_run(run, scene, progress=False)
+        train_run(run, scene, QUIET)
 
 
 # LPIPS
@@ -376,7 +383,7 @@ def test_other_threads_are_said(scene, stopped, tmp_path, monkeypatch):
 
 def test_lpips_is_kept_while_the_models_are_the_same(scene, stopped, tmp_path, monkeypatch):
     run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
-    train_run(run, scene, progress=False)
+    train_run(run, scene, QUIET)
     run_evaluation.evaluate_run(run, scene)
     metrics, per_view = (json.loads(path.read_text()) for path in (run.metrics, run.per_view))
     assert metrics["models"][NAME]["sha256"] == sha256_of(run.model(NAME))
@@ -458,7 +465,7 @@ TRAPPED = "Trapped-gaussians"
 def test_the_state_before_a_divergence_is_a_file(scene, tmp_path):
     run = trapped_run(scene, tmp_path / "run", "stop")
     with pytest.raises(ValueError, match=r"not finite at iteration 12 .*means is not finite in 60 of 60.*--on-nan"):
-        train_run(run, scene, progress=False)
+        train_run(run, scene, QUIET)
     kept = load_checkpoint(run.diverged(TRAPPED, 11), Trapped)
     assert kept.iteration == 11 and np.isfinite(kept.model.gaussians.means).all()
     assert run.checkpoints(TRAPPED)[-1] == run.checkpoint(TRAPPED, 10)
@@ -467,7 +474,7 @@ def test_the_state_before_a_divergence_is_a_file(scene, tmp_path):
 def test_restoring_takes_another_order_and_resuming_repeats_it(scene, tmp_path, monkeypatch):
     run = trapped_run(scene, tmp_path / "run", "restore")
     with pytest.warns(UserWarning, match=r"restarts from iteration 10 with the views in another order \(1 of 5"):
-        train_run(run, scene, progress=False)
+        train_run(run, scene, QUIET)
     other, save, numbers = trapped_run(scene, tmp_path / "other", "restore"), save_checkpoint, []
 
     def save_and_stop(path, checkpoint):
@@ -481,8 +488,8 @@ def test_restoring_takes_another_order_and_resuming_repeats_it(scene, tmp_path, 
         patch.setattr(run_training, "save_checkpoint", save_and_stop)
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
-                train_run(other, scene, progress=False)
-    train_run(other, scene, progress=False)
+                train_run(other, scene, QUIET)
+    train_run(other, scene, QUIET)
     assert numbers[-1] == (14, 1) and numbers[3] == (8, 0)
     for name in ("means", "sh"):
         first, second = (getattr(load_model(r.model(TRAPPED)).gaussians, name) for r in (run, other))
@@ -495,7 +502,7 @@ def test_restoring_has_an_end(scene, tmp_path):
         pytest.warns(UserWarning),
         pytest.raises(ValueError, match=f"was restored {MOST_RESTORED} times already") as raised,
     ):
-        train_run(run, scene, progress=False)
+        train_run(run, scene, QUIET)
     assert isinstance(raised.value.__cause__, DivergedError)
     assert find_system(f"{__name__}:Trapped") == Trapped()
 
@@ -563,7 +570,7 @@ def test_errors_of_training_tell_how_to_go_on(tmp_path, monkeypatch, capsys):
     error = capsys.readouterr().err.splitlines()[-1]
     told = "the disk is full: make room, or write to another disk"
     assert f"{told}; there is no checkpoint yet; continue with: a2tg train" in error
-    assert whole_run.how_to_go_on(RunFolder(tmp_path / "run")) in error
+    assert run_training.how_to_go_on(RunFolder(tmp_path / "run")) in error
 
 
 LACKS = {
@@ -587,8 +594,8 @@ def test_a_lack_of_memory_in_training_tells_how_to_go_on(told, tmp_path, monkeyp
     monkeypatch.setattr(run_training, "fit_stage", raising(LACKS[told]))
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
-    how = whole_run.how_to_go_on(RunFolder(tmp_path / "run"))
-    advice = in_flags(whole_run.LESS_MEMORY, ["memory_budget", "batch_size"])
+    how = run_training.how_to_go_on(RunFolder(tmp_path / "run"))
+    advice = in_flags(run_training.LESS_MEMORY, ["memory_budget", "batch_size"])
     assert error == f"a2tg: error: {told}{advice}; {how}"
 
 

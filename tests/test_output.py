@@ -15,11 +15,10 @@ from a2tg_jax.cli import main as cli
 from a2tg_jax.cli import mesh
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.host.text import in_bytes
+from a2tg_jax.results.checks import check_export, check_new, check_output
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.forecast import RunForecast
 from a2tg_jax.results.info import describe_run
-from a2tg_jax.results.output_checks import check_export, check_new, check_output
-from a2tg_jax.results.preflight import warn_of_small_budget
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.training.cost import Bytes
 
@@ -52,12 +51,9 @@ def test_levels_below_the_current_folder_are_not_told(tmp_path, monkeypatch, cap
     assert capsys.readouterr().err == ""
 
 
-def test_a_budget_for_few_gaussians_is_warned_of(recwarn):
-    warn_of_small_budget(a2tg.A2tg(memory_budget="1MB"))
-    warn_of_small_budget(a2tg.A2tg())
-    assert not recwarn.list
-    with pytest.warns(UserWarning, match=r"^memory_budget has room for 4 Gaussians of 232 bytes; "):
-        warn_of_small_budget(a2tg.A2tg(memory_budget="1kB"))
+def test_a_budget_for_few_gaussians_is_said():
+    assert not a2tg.A2tg(memory_budget="1MB").small_budget and not a2tg.A2tg().small_budget
+    assert a2tg.A2tg(memory_budget="1kB").small_budget == "memory_budget has room for 4 Gaussians of 232 bytes"
 
 
 def test_a_limit_below_the_program_itself_says_so():
@@ -65,7 +61,7 @@ def test_a_limit_below_the_program_itself_says_so():
     with pytest.raises(
         ValueError, match=r"20.0 MB may be used: the program itself takes about 1.10 GB of it: allow more"
     ):
-        forecast.check(20e6)
+        forecast.check_memory(20e6)
 
 
 def test_sizes_have_three_digits_and_a_unit_that_suits_them():

@@ -25,12 +25,12 @@ from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics, evaluate
 from a2tg_jax.measure.metrics import psnr
 from a2tg_jax.model import Model
 from a2tg_jax.render import render_image
+from a2tg_jax.results.checks import check_held_out
 from a2tg_jax.results.figures import curves_figure, save_figure, sizes_figure
-from a2tg_jax.results.folder import RunFolder, check_free, create_run, open_run
+from a2tg_jax.results.folder import OLD, RunFolder, check_free, create_run, drop_old, open_run, set_aside
 from a2tg_jax.results.history import read_history, write_history
 from a2tg_jax.results.images import error_picture, largest_gain, level_colors, side_by_side, to_uint8
 from a2tg_jax.results.plan import plan_run
-from a2tg_jax.results.preflight import check_held_out
 from a2tg_jax.results.record import (
     RunRecord,
     SceneSource,
@@ -41,8 +41,7 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.run_evaluation import evaluate_run
-from a2tg_jax.results.run_replacement import OLD, drop_old, set_aside
-from a2tg_jax.results.run_training import train_run
+from a2tg_jax.results.run_training import RunOptions, train_run
 from a2tg_jax.results.summary import (
     ModelResult,
     RunResult,
@@ -616,7 +615,7 @@ def test_views_of_the_training_are_not_scored_as_held_out(tmp_path):
     with pytest.raises(ValueError, match=told):
         evaluate_run(run, grown)
     with pytest.raises(ValueError, match=told):
-        train_run(run, grown, progress=False)
+        train_run(run, grown, RunOptions())
     check_held_out(Model(gaussians, origin=origin_of_scene(grown)), scene, run.path)
     check_held_out(Model(gaussians), grown, run.path)
 

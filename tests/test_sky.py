@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lab.fingerprint import fingerprint
 from scipy.spatial import cKDTree
 
 import a2tg_jax as a2tg
@@ -12,7 +13,7 @@ from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.core.gaussians import SH_C0, rotation_matrices
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.densify.pruning import blending_weights
-from a2tg_jax.results.plan import fingerprint, plan_run
+from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.cost import forecast_stages

@@ -7,15 +7,15 @@ import pytest
 from test_results import some_history
 
 from a2tg_jax.cli import main as cli
-from a2tg_jax.results import tensorboard
 from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.history import EventWriter
 
 pytest.importorskip("tensorboardX", reason="the extra [tensorboard] is not installed")
 from tensorboard_events import scalars
 
 
 def written(run, *histories, skipped=None):
-    writer = tensorboard.EventWriter(run, "a2tg-gaussians")
+    writer = EventWriter(run, "a2tg-gaussians")
     if skipped is not None:
         writer.skip(skipped)
     for history in histories:

@@ -6,11 +6,10 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from a2tg_jax.results.checks import check_apart, check_output, check_weights
 from a2tg_jax.results.finish_options import FinishOptions
 from a2tg_jax.results.finishing import finish_run
 from a2tg_jax.results.folder import RunFolder, open_run
-from a2tg_jax.results.output_checks import check_output
-from a2tg_jax.results.preflight import check_apart, check_weights
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,14 +32,12 @@ from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.formats import FORMATS
+from a2tg_jax.results.checks import check_export, check_output, check_weights
 from a2tg_jax.results.compression import SUFFIX, check_compact, compress, compression_text, default_output
-from a2tg_jax.results.folder import json_text, open_run
+from a2tg_jax.results.folder import json_text, open_run, opened
 from a2tg_jax.results.info import describe_run, run_facts
-from a2tg_jax.results.lock import opened
-from a2tg_jax.results.output_checks import check_export, check_output
-from a2tg_jax.results.preflight import check_weights
+from a2tg_jax.results.run_training import LESS_MEMORY, measure
 from a2tg_jax.results.summary import metrics_json
-from a2tg_jax.results.whole_run import LESS_MEMORY, measure
 from a2tg_jax.training import SYSTEMS
 
 BROKEN_PIPE = 128 + 13

@@ -8,9 +8,9 @@ from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import LastModel, defaulting_to
 from a2tg_jax.mesh.files import mesh_files
+from a2tg_jax.results.checks import check_export, check_not_source, check_output
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, TextureSource, write_mesh
-from a2tg_jax.results.output_checks import check_export, check_not_source, check_output
 from a2tg_jax.results.viewing import open_source
 
 

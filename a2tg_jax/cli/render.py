@@ -8,6 +8,7 @@ from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import LastModel, defaulting_to
 from a2tg_jax.host.text import counted
+from a2tg_jax.results.checks import check_output
 from a2tg_jax.results.folder import open_run
 from a2tg_jax.results.frame_folder import FrameFolder
 from a2tg_jax.results.frames import (
@@ -20,7 +21,6 @@ from a2tg_jax.results.frames import (
     write_animation,
     write_video,
 )
-from a2tg_jax.results.output_checks import check_output
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,9 +17,8 @@ from a2tg_jax.data.sfm_database import CameraModel, Matching
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.results.camera_picture import save_camera_picture
-from a2tg_jax.results.forecast import quick_downscale, quick_flags
-from a2tg_jax.results.output_checks import check_output
-from a2tg_jax.results.preflight import check_apart
+from a2tg_jax.results.checks import check_apart, check_output
+from a2tg_jax.results.forecast import quick_flags
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +71,7 @@ class Sfm:
         save_camera_picture(out, out / CAMERA_PICTURE)
         print(_told(found))
         run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
-        command = shlex.join([*run, *quick_flags(quick_downscale(found.longest_side))])
+        command = shlex.join([*run, *quick_flags(found.longest_side)])
         print(f"cameras: {out / CAMERA_PICTURE}\nscene: {out}; continue with: {command}")
 
     def _places(self) -> tuple[list[Path], Path]:

@@ -22,11 +22,9 @@ from a2tg_jax.host.text import counted, shortened
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.parallel.processes import ProcessPlace, Team, joined
-from a2tg_jax.results.first_stage import given_splats, number_given
-from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
-from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs, tell_forecast
-from a2tg_jax.results.lock import opened
-from a2tg_jax.results.preflight import check_weights
+from a2tg_jax.results.folder import RunFolder, open_run, opened, resuming_command
+from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs
+from a2tg_jax.results.history import check_tensorboard
 from a2tg_jax.results.record import (
     DEFAULT_SYSTEM,
     SYNTHETIC,
@@ -41,10 +39,9 @@ from a2tg_jax.results.record import (
     scene_place,
     write_record,
 )
+from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, unseen
 from a2tg_jax.results.several_processes import follow_first_process
 from a2tg_jax.results.summary import RunResult, summary_text
-from a2tg_jax.results.tensorboard import check_tensorboard
-from a2tg_jax.results.whole_run import begin_run, go_on, unseen
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import SYSTEMS, Session, System, find_system
 
@@ -77,15 +74,14 @@ class Demo:
     """Show no progress of training; forecasts, warnings and results stay."""
 
     def run(self) -> None:
+        options = RunOptions(overwrite=self.overwrite, session=tidy_session(), progress=not self.quiet)
         if self.resume:
             _check_resumed_only(self.overwrite)
             with opened(self.out) as run:
-                scene = read_record(run).scene.load()
-                tell_result(go_on(run, scene, session=tidy_session(), progress=not self.quiet), self.out)
+                tell_result(resume_run(run, options), self.out)
             return
         record = RunRecord(SceneSource(SYNTHETIC), DEFAULT_SYSTEM, DEMO_SYSTEM, (BASELINE,))
-        result = begin_run(record, self.out, overwrite=self.overwrite, session=tidy_session(), progress=not self.quiet)
-        tell_result(result, self.out)
+        tell_result(begin_run(record, self.out, options), self.out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,42 +188,24 @@ class Train:
         follow_first_process(record, scene, session)
 
     def _run(self) -> None:
-        weights, most = self.lpips_weights, bytes_allowed(self.max_memory)
         if self.tensorboard:
             check_tensorboard()
-        watched, session = in_browser if self.view else unseen, tidy_session(devices_named(self.devices))
+        options = RunOptions(
+            overwrite=self.overwrite,
+            lpips_weights=self.lpips_weights,
+            max_memory=bytes_allowed(self.max_memory),
+            tensorboard=self.tensorboard,
+            progress=not self.quiet,
+            watched=in_browser if self.view else unseen,
+            session=tidy_session(devices_named(self.devices)),
+        )
         if not self.resume:
-            result = begin_run(
-                self.record,
-                self.out,
-                overwrite=self.overwrite,
-                lpips_weights=weights,
-                max_memory=most,
-                watched=watched,
-                session=session,
-                progress=not self.quiet,
-                tensorboard=self.tensorboard,
-            )
-            tell_result(result, self.out)
+            tell_result(begin_run(self.record, self.out, options), self.out)
             return
         _check_resumed_only(self.overwrite)
-        check_weights(weights)
         with opened(self.out) as run:
-            record = self._resumed(run)
-            scene = record.scene.load(room_for_photographs(most), is_divided=True)
-            given = given_splats(record)
-            tell_forecast(scene, record.plan, most, session.num_devices, number_given(run, record, given))
-            result = go_on(
-                run,
-                scene,
-                lpips_weights=weights,
-                watched=watched,
-                session=session,
-                progress=not self.quiet,
-                tensorboard=self.tensorboard,
-                given=given,
-            )
-            tell_result(result, self.out)
+            self._resumed(run)
+            tell_result(resume_run(run, options), self.out)
 
     @property
     def record(self) -> RunRecord:

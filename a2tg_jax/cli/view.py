@@ -11,8 +11,8 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import LastModel
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
+from a2tg_jax.results.checks import check_new, check_not_source, check_output, check_separate
 from a2tg_jax.results.live_viewer import shown_live
-from a2tg_jax.results.output_checks import check_new, check_not_source, check_output, check_separate
 from a2tg_jax.results.ply_export import check_ply, export_ply
 from a2tg_jax.results.viewing import open_source, routes_of
 from a2tg_jax.results.web_export import check_page, export_web, exported_text, page_files

@@ -22,7 +22,7 @@ from a2tg_jax.io.formats import (
 )
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
-from a2tg_jax.results.output_checks import check_new, check_output
+from a2tg_jax.results.checks import check_new, check_output
 from a2tg_jax.results.viewing import open_source
 
 

@@ -16,8 +16,7 @@ from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
 from a2tg_jax.results.corrected_metrics import refined_views
 from a2tg_jax.results.finish_options import FinishOptions
-from a2tg_jax.results.folder import RunFolder, check_free, read_json, resuming_command, write_json
-from a2tg_jax.results.lock import claimed
+from a2tg_jax.results.folder import RunFolder, check_free, claimed, read_json, resuming_command, write_json
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import RunRecord, read_record, write_record
 from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, settings_of

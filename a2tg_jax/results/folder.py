@@ -22,19 +22,19 @@ NAME is that of a stage, such as `a2tg-gaussians` or `a2tg-textures`: the system
 """
 
 import contextlib
-import dataclasses
 import glob
 import json
 import os
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from a2tg_jax.host.atomic import left_over, named_if_full, replacing
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.machine import ALONE, Devices
+from a2tg_jax.host.operating_system import flush_folder, try_lock
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import config_from_dict
@@ -42,6 +42,7 @@ from a2tg_jax.io.config_json import config_from_dict
 KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
 DAMAGED = ".damaged"
+OLD = ".a2tg-old"
 IN_USE = "is not empty; add --resume to continue it, --overwrite to start again, or choose another --out"
 """Error text of training for a folder that already holds a run."""
 MOST_NAMES = 100_000
@@ -49,15 +50,22 @@ MOST_NAMES = 100_000
 MOST_MARKER_BYTES = 1 << 24
 
 
-@dataclasses.dataclass(frozen=True)
 class RunFolder:
     """Paths within one run folder."""
 
-    path: Path
-
-    @property
-    def marker(self) -> Path:
-        return self.path / ".a2tg-run"
+    def __init__(self, path: Path):
+        self.path = path
+        self.marker = path / ".a2tg-run"
+        self.record = path / "run.toml"
+        self.tensorboard = path / "tensorboard"
+        self.metrics = path / "metrics.json"
+        self.per_view = path / "per_view.json"
+        self.finish = path / "finish.json"
+        self.point_cloud = path / "point_cloud.ply"
+        self.viewer = path / "viewer.html"
+        self.report = path / "report.html"
+        self.figures = path / "figures"
+        self.test = path / "test"
 
     def own(self, path: Path) -> Path:
         """Return the path after noting it in the marker. Only noted paths are ever replaced or deleted."""
@@ -106,8 +114,7 @@ class RunFolder:
         """Delete what runs wrote into their folder, and folders left empty. The marker stays, empty."""
         for path in self.own_files(self.written()):
             path.unlink(missing_ok=True)
-            if path.parent != self.path and not any(path.parent.iterdir()):
-                path.parent.rmdir()
+            remove_if_empty(path.parent, self.path)
         if self.marker.is_file():
             os.truncate(self.marker, 0)
             self.own(self.marker)
@@ -118,44 +125,10 @@ class RunFolder:
         return any(path != self.record for path in self.own_files(self.written()))
 
     @property
-    def record(self) -> Path:
-        return self.path / "run.toml"
-
-    @property
-    def tensorboard(self) -> Path:
-        return self.path / "tensorboard"
-
-    @property
-    def metrics(self) -> Path:
-        return self.path / "metrics.json"
-
-    @property
-    def per_view(self) -> Path:
-        return self.path / "per_view.json"
-
-    @property
-    def finish(self) -> Path:
-        return self.path / "finish.json"
-
-    @property
-    def point_cloud(self) -> Path:
-        return self.path / "point_cloud.ply"
-
-    @property
-    def viewer(self) -> Path:
-        return self.path / "viewer.html"
-
-    @property
-    def report(self) -> Path:
-        return self.path / "report.html"
-
-    @property
-    def figures(self) -> Path:
-        return self.path / "figures"
-
-    @property
-    def test(self) -> Path:
-        return self.path / "test"
+    def has_progress(self) -> bool:
+        """Whether a training left a checkpoint, a model or the state before a divergence."""
+        files = self.own_files(self.written())
+        return any(path.parent.name in ("checkpoints", "models", "diverged") for path in files)
 
     def model(self, name: str) -> Path:
         return self.path / "models" / f"{name}.npz"
@@ -290,6 +263,118 @@ def _is_file(path: Path) -> bool:
         return path.is_file()
     except OSError:
         return False
+
+
+def remove_if_empty(folder: Path, root: Path) -> None:
+    """Remove a folder below another, if it is empty."""
+    if folder != root and folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
+# One process at a time
+
+
+@contextlib.contextmanager
+def claimed(run: RunFolder) -> Iterator[None]:
+    """Keep other processes from training and measuring in a run folder. The folder is made if it does not exist.
+
+    The lock is the operating system's, on the marker: it ends with the process, however that ends. Some file systems
+    have no locks. Partial files of a killed process are removed, and a run that it was about to replace is put back.
+
+    Raises:
+      FileExistsError: if another process is at it.
+      ValueError: if the marker is not this program's.
+    """
+    run.written()
+    run.path.mkdir(parents=True, exist_ok=True)
+    with open(run.marker, "a", encoding="utf-8") as file:
+        if not try_lock(file.fileno()):
+            raise FileExistsError(
+                f"another process is training or measuring in {run.path}: wait until it ends, or choose another --out"
+            )
+        run.own(run.marker)
+        put_back_old(run)
+        own = {run.path / name for name in run.written()}
+        for folder in {path.parent for path in own}:
+            for partial, path in left_over(folder).items():
+                if path in own:
+                    partial.unlink(missing_ok=True)
+        yield
+
+
+@contextlib.contextmanager
+def opened(path: str | os.PathLike[str]) -> Iterator[RunFolder]:
+    """Claim an existing run folder.
+
+    Raises:
+      FileNotFoundError: if there is none at `path`.
+      FileExistsError, ValueError: as `claimed` does.
+    """
+    run = RunFolder(Path(path))
+    if not is_regular(run.marker):
+        open_run(path)  # A process that was killed in its first moments left a marker, but no record.
+    with claimed(run):
+        yield open_run(path)
+
+
+# Replacement of a run. The old one waits in RUN/.a2tg-old, a run folder too, until the new one has its report. Until
+# the new one has a checkpoint, the old one can be put back. Its record moves first and returns last, so that a folder
+# without a record is one in which a process was killed between two of the files.
+
+
+def old_run(run: RunFolder) -> RunFolder | None:
+    """Return the run that this one is about to replace, or None."""
+    old = RunFolder(run.path / OLD)
+    return old if old.path.is_dir() else None
+
+
+def set_aside(run: RunFolder) -> None:
+    """Move what runs wrote into a folder, as its marker lists it, to RUN/.a2tg-old.
+
+    If a run lies there already, because the one that was to replace it never ended, that one is kept and this one
+    deleted.
+    """
+    if old_run(run) is None:
+        _move(run, RunFolder(run.path / OLD), is_record_first=True)
+    run.clear()
+
+
+def put_back_old(run: RunFolder) -> bool:
+    """Put back the run that this one replaces, unless this one has a checkpoint or a model. Return whether it did."""
+    old = old_run(run)
+    is_moving = not run.record.is_file()
+    if old is None or (run.has_progress and not is_moving):
+        return False
+    if not is_moving:
+        run.clear()
+    _move(old, run, is_record_first=False)
+    drop_old(run)
+    return True
+
+
+def drop_old(run: RunFolder) -> None:
+    """Delete the run that was set aside, if there is one, and its folder unless there is anything else in it."""
+    old = old_run(run)
+    if old is not None:
+        old.clear()
+        old.marker.unlink(missing_ok=True)
+        if not any(old.path.iterdir()):
+            old.path.rmdir()
+
+
+def _move(source: RunFolder, target: RunFolder, *, is_record_first: bool) -> None:
+    names = source.written()
+    target.own_all(names)
+    paths = sorted(source.own_files(names), key=lambda path: (path == source.record) != is_record_first)
+    for path in paths:
+        moved = target.path / path.relative_to(source.path)
+        moved.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(path, moved)
+        remove_if_empty(path.parent, source.path)
+    flush_folder(target.path)
+
+
+# JSON
 
 
 def json_text(data: object) -> str:

@@ -2,7 +2,10 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
 
 import jax
 
@@ -15,7 +18,6 @@ from a2tg_jax.host.memory import memory_limit
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import RunRecord
-from a2tg_jax.training import System
 from a2tg_jax.training.cost import (
     COMPILER,
     FIRST_PROGRAM,
@@ -37,7 +39,7 @@ REPORT = 290 * MB
 EVALUATION_PER_PIXEL = 150
 """Bytes of a view that is rendered, with depth and normals, compared and drawn."""
 KEPT_STATES = 3
-"""Number of checkpoints of a stage on disk while a new one is written."""
+"""Number of checkpoints on disk while a new one is written."""
 PICTURE_PER_PIXEL = 2
 """Bytes on disk of each picture of a sheet."""
 ROUGHLY = 2.0
@@ -51,18 +53,13 @@ QUICK = "quick"
 QUICK_SIDE = 640
 """Longer side of the photographs, in pixels, with which `quick` takes minutes on two cores."""
 OPTIONS = {
-    "photographs": "--downscale, or batch_size",
-    "model": "{limits}, memory_budget or sh_degree",
-    "gradients": "{limits}, memory_budget, batch_size or sh_degree",
-    "pixels": "--downscale",
-    "corrections": "corrections.grid.size or --downscale",
+    "photographs": ("--downscale", "batch_size"),
+    "model": ("memory_budget", "sh_degree"),
+    "gradients": ("memory_budget", "batch_size", "sh_degree"),
+    "pixels": ("--downscale",),
+    "corrections": ("corrections.grid.size", "--downscale"),
 }
-"""Options to change, by what needs most of the memory; `limits` are those of the systems' number of Gaussians."""
-OPTIONS_OF_FILES = {
-    "model": "sh_degree, or a smaller --init file",
-    "gradients": "batch_size, sh_degree, or a smaller --init file",
-}
-"""Options to change where a file decides on the number of Gaussians."""
+"""Options to change, by what needs most of the memory; those that limit the number of Gaussians come before."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,78 +73,72 @@ class RunForecast:
     seconds: float
     """Training time on CPUs; 0 if it cannot be estimated."""
     limits: tuple[str, ...] = ()
-    """Names of the options that limit the number of Gaussians."""
+    """Names of what limits the number of Gaussians."""
     whole: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Bytes that one of several devices must have room for, by stage (`StageForecast.whole_bytes`)."""
     num_programs: int = 0
     """Steps that are compiled, as far as events say."""
-    of_file: frozenset[str] = frozenset()
-    """Names of the phases whose number of Gaussians is that of a file."""
 
     @property
     def peak(self) -> tuple[str, Bytes]:
         """Phase with the most memory, and its parts."""
         return max(self.phases.items(), key=lambda item: item[1].total)
 
-    def told(self, limit: float) -> str:
+    def text(self, limit: float) -> str:
         """Return the forecast as lines of text."""
         phase, needed = self.peak
-        told = f"{phase}: {_told_parts(needed)}"
         lines = [
-            f"memory: about {in_bytes(needed.total)} at the peak ({told}); {in_bytes(limit)} may be used",
+            f"memory: about {in_bytes(needed.total)} at the peak ({phase}: {_parts(needed)}); {in_bytes(limit)} may be "
+            "used",
             f"disk: about {in_bytes(self.disk_bytes)} in the run folder",
         ]
         if self.seconds:
-            compiling = _between(PROGRAM_SECONDS * self.num_programs)
             lines.append(
                 f"time: very roughly {_between(self.seconds)} of training on {counted(num_threads(), 'core')}, and "
-                f"{compiling} of compiling {counted(self.num_programs, 'program')}; the first steps of each stage tell "
-                "it better"
+                f"{_between(PROGRAM_SECONDS * self.num_programs)} of compiling {counted(self.num_programs, 'program')};"
+                " the first steps of each stage give a better estimate"
             )
         return "\n".join(lines)
 
-    def check(self, limit: float) -> None:
-        """Raise if the run cannot fit.
-
-        Args:
-          limit: bytes that may be used.
-
-        Raises:
-          ValueError: naming the options to change.
-        """
+    def check_memory(self, limit: float) -> None:
+        """Raise ValueError, naming the options to change, if the run needs more bytes than it may use."""
         phase, needed = self.peak
         if needed.total <= limit:
             return
         largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
-        advice = (
-            f"change {self._told_options(largest, phase)}, or"
-            if largest != "program"
-            else (f"the program itself takes about {in_bytes(needed.program)} of it:")
-        )
+        advice = f"change {self._options(largest)}, or"
+        if largest == "program":
+            advice = f"the program itself takes about {in_bytes(needed.program)} of it:"
         raise ValueError(
-            f"the run would need about {in_bytes(needed.total)} of memory ({phase}: {_told_parts(needed)}), and "
+            f"the run would need about {in_bytes(needed.total)} of memory ({phase}: {_parts(needed)}), and "
             f"{in_bytes(limit)} may be used: {advice} allow more with --max-memory"
         )
 
     def check_one_device(self, limit: float) -> None:
-        """Raise if one of several devices has no room for the finished model besides its share of the state.
-
-        Raises:
-          ValueError: naming the options to change.
-        """
+        """Raise ValueError if one of several devices has no room for the finished model besides its share of the
+        state."""
         phase, needed = max(self.whole.items(), key=lambda item: item[1], default=("", 0.0))
         if needed > limit:
             raise ValueError(
                 f"the model of {phase} must fit on one device: that takes about {in_bytes(needed)}, and "
-                f"{in_bytes(limit)} may be used: change {self._told_options('model', phase)}"
+                f"{in_bytes(limit)} may be used: change {self._options('model')}"
             )
 
-    def _told_options(self, largest: str, phase: str) -> str:
-        """Return the options to change if this part of a phase's memory is the largest."""
-        if phase in self.of_file and largest in OPTIONS_OF_FILES:
-            return OPTIONS_OF_FILES[largest]
-        own = (name for name in self.limits if name != "memory_budget")
-        return OPTIONS[largest].format(limits=", ".join(own)).removeprefix(", ")
+    def check_disk(self, out: Path) -> None:
+        """Raise ValueError unless the disk of a folder, which need not exist, has room for the run."""
+        path = Path(os.path.abspath(out))
+        free = shutil.disk_usage(next(folder for folder in (path, *path.parents) if folder.is_dir())).free
+        if self.disk_bytes > free:
+            raise ValueError(
+                f"{out} needs {self.disk_bytes / 1e9:.1f} GB for models and checkpoints, but the disk has "
+                f"{free / 1e9:.1f} GB: make room, or choose another --out, fewer Gaussians or fewer --compare"
+            )
+
+    def _options(self, largest: str) -> str:
+        """Return the options to change if this part of the memory is the largest."""
+        names = dict.fromkeys((*(self.limits if largest in ("model", "gradients") else ()), *OPTIONS[largest]))
+        *others, last = names
+        return f"{', '.join(others)} or {last}" if others else last
 
 
 def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_devices: int = 1) -> RunForecast:
@@ -156,93 +147,109 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     Args:
       scene: the run's scene.
       plan: its stages.
-      num_given: Gaussians of the file in place of the main system's first stage; None without one.
-      num_devices: number of devices that train together; memory is that of all of them.
+      num_given: number of Gaussians of the file instead of the main system's first stage; None without one.
+      num_devices: number of devices that train together; memory is the sum over all of them.
     """
     is_host = default_platform() == "cpu"
     stages = _stages(scene, plan, num_given, num_devices)
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
     for name, stage in stages.items():
-        if not stage.is_trained:
-            continue
-        resident += FURTHER_STAGE + FURTHER_PROGRAM * (stage.num_programs - 1)
-        compiling = max(COMPILER - stage.bytes.gradients - stage.bytes.pixels, 0)  # before there are any of these
-        phases[name] = stage.bytes._replace(program=(resident + compiling) if is_host else 0)
-    shown = Bytes(
+        if stage.is_trained:
+            resident += FURTHER_STAGE + FURTHER_PROGRAM * (stage.num_programs - 1)
+            # A step is compiled before its gradients and pixels take memory.
+            compiling = max(COMPILER - stage.bytes.gradients - stage.bytes.pixels, 0)
+            phases[name] = stage.bytes._replace(program=(resident + compiling) if is_host else 0)
+    model_bytes = [stage.model_bytes for stage in stages.values()]
+    phases["evaluation"] = Bytes(
         program=(resident + REPORT) if is_host else 0,
         photographs=held_bytes(scene) if is_host else 0,
-        model=sum(stage.model_bytes for stage in stages.values()),
+        model=sum(model_bytes),
         pixels=EVALUATION_PER_PIXEL * largest_view((*scene.test, *scene.train)),
     )
-    seconds = sum(stage.seconds for stage in stages.values()) if is_host else 0
-    systems = {id(planned.system): planned.system for planned in plan.stages}.values()
-    limits = tuple(dict.fromkeys(name for system in systems for name in system.limits()))
-    disk = _disk_bytes(scene, plan, list(stages.values()))
-    whole = {name: stage.whole_bytes for name, stage in stages.items()}
-    of_file = {name for name in stages if num_given == stages[name].num_rows and plan.begins_like_main(name)}
-    of_file |= {"evaluation"} if of_file == stages.keys() else set()
-    sizes = {view.picture.size for view in scene.train}
-    programs = len(sizes) * sum(stage.num_programs for stage in stages.values())
-    return RunForecast({**phases, "evaluation": shown}, disk, seconds, limits, whole, programs, frozenset(of_file))
+    limits = [] if num_given is None else ["the --init file (to a smaller one)"]
+    limits += [name for planned in plan.stages for name in planned.system.limits()]
+    # Models stay, checkpoints of one stage at a time, and sheets of photograph, renders and error.
+    pixels = sum(view.camera.width * view.camera.height for view in scene.test or scene.train)
+    pictures = PICTURE_PER_PIXEL * (3 + max(1, len(plan.chains) - 1)) * pixels
+    return RunForecast(
+        phases,
+        disk_bytes=sum(model_bytes) + KEPT_STATES * STATES * max(model_bytes) + pictures,
+        seconds=sum(stage.seconds for stage in stages.values()) if is_host else 0,
+        limits=tuple(dict.fromkeys(limits)),
+        whole={name: stage.whole_bytes for name, stage in stages.items()},
+        num_programs=len({view.picture.size for view in scene.train})
+        * sum(stage.num_programs for stage in stages.values()),
+    )
 
 
-def quick_downscale(longest_side: int) -> int:
-    """Return the downscale with which photographs of this longer side train quickly."""
-    return max(1, math.ceil(longest_side / QUICK_SIDE))
+def _stages(scene: Scene, plan: RunPlan, num_given: int | None, num_devices: int = 1) -> dict[str, StageForecast]:
+    """Return the forecast of every stage, by name."""
+    found: dict[str, StageForecast] = {}
+    for chain in plan.chains.values():
+        num = num_given if chain[0] == plan.main[0] else None
+        forecasts = forecast_stages(scene, plan[chain[-1]].system, num, num_devices)
+        found |= dict(zip(chain, forecasts, strict=True))
+    return found
 
 
-def quick_flags(downscale: int) -> list[str]:
-    """Return the flags of a quick training with a downscale."""
+def print_forecast(
+    scene: Scene, plan: RunPlan, max_memory: int | None, num_devices: int = 1, num_given: int | None = None,
+    out: Path | None = None,
+) -> None:  # fmt: skip
+    """Print the forecast of a run. Arguments as in `forecast_run`, and:
+
+    Args:
+      max_memory: bytes that the run may use; None: what the machine has available.
+      out: folder of a new run, whose disk must have room for it.
+
+    Raises:
+      ValueError: if the run cannot fit, naming the options to change.
+    """
+    found, limit = forecast_run(scene, plan, num_given, num_devices), allowed_memory(max_memory, num_devices)
+    if out is not None:
+        found.check_disk(out)
+    found.check_memory(limit)
+    if num_devices > 1:
+        found.check_one_device(allowed_memory(max_memory))
+    print(found.text(limit), flush=True)
+
+
+def quick_flags(longest_side: int, downscale: int = 1) -> list[str]:
+    """Return the flags of a quick training with photographs of this longer side, already downscaled by a factor."""
+    downscale *= max(1, math.ceil(longest_side / QUICK_SIDE))
     return ["--preset", QUICK, *(["--downscale", str(downscale)] if downscale > 1 else [])]
 
 
-def quicker_text(scene: Scene, record: RunRecord, num_given: int | None = None) -> str:
-    """Return the flags with which a long run on CPUs gets quicker, with their forecast; empty for other runs.
-
-    Args:
-      scene: the scene of the record, downscaled as it says.
-      record: the run.
-      num_given: as in `forecast_run`.
-    """
+def print_quicker(scene: Scene, record: RunRecord, num_given: int | None = None) -> None:
+    """Print the flags that make a long run on CPUs quicker, with their forecast; nothing for other runs."""
     seconds = forecast_run(scene, record.plan, num_given).seconds
     presets = type(record.system).presets()
     if seconds * ROUGHLY <= LONG or QUICK not in presets:
-        return ""
-    downscale = quick_downscale(max(max(view.camera.width, view.camera.height) for view in scene.train))
+        return
+    side = max(max(view.camera.width, view.camera.height) for view in scene.train)
     system = dataclasses.replace(presets[QUICK], memory_budget=record.system.memory_budget)
-    quick = dataclasses.replace(record, system=system, preset=QUICK)
-    quick_seconds = _training_seconds(scene, quick.plan, downscale, num_given)
-    if quick_seconds > seconds / 2:
-        return ""
-    flags = " ".join(quick_flags(downscale * record.scene.downscale))
-    return f"quicker: {flags} takes very roughly {_between(quick_seconds)}"
-
-
-def _training_seconds(scene: Scene, plan: RunPlan, downscale: int, num_given: int | None) -> float:
-    """Return the training time on CPUs if the photographs are downscaled further."""
-    forecasts = _stages(scene, plan, num_given)
-    return sum(
+    plan = dataclasses.replace(record, system=system, preset=QUICK).plan
+    forecasts, further = _stages(scene, plan, num_given), max(1, math.ceil(side / QUICK_SIDE))
+    quick_seconds = sum(
         planned.stage.iterations
         * planned.system.batch_size
-        * iteration_seconds(scene.train, forecasts[planned.name].num_rows, downscale)
+        * iteration_seconds(scene.train, forecasts[planned.name].num_rows, further)
         for planned in plan.stages
         if forecasts[planned.name].is_trained
     )
+    if quick_seconds <= seconds / 2:
+        flags = " ".join(quick_flags(side, record.scene.downscale))
+        print(f"quicker: {flags} takes very roughly {_between(quick_seconds)}", flush=True)
 
 
 def bytes_allowed(max_memory: float | str | None) -> int | None:
-    """Return the bytes of --max-memory, written like a memory budget.
-
-    Raises:
-      ValueError: if it is not.
-    """
+    """Return the bytes of a memory limit, written like a memory budget. Raises ValueError if it is not."""
     megabytes = megabytes_of(max_memory, "--max-memory")
     return None if megabytes is None else bytes_of(megabytes)
 
 
 def allowed_memory(max_memory: int | None, num_devices: int = 1) -> int:
-    """Return the bytes a run may use: the limit asked for, or what the machine or so many of its accelerators have
-    available (host)."""
+    """Return the bytes a run may use: the given limit, or what the machine or its accelerators have available."""
     if max_memory is not None:
         return max_memory
     stats = jax.local_devices()[0].memory_stats() or {}
@@ -254,41 +261,7 @@ def room_for_photographs(max_memory: int | None) -> int | None:
     return None if max_memory is None else int(SHARE_OF_MEMORY * max_memory)
 
 
-def tell_forecast(
-    scene: Scene, plan: RunPlan, max_memory: int | None, num_devices: int = 1, num_given: int | None = None
-) -> None:
-    """Print the forecast of a run, on so many devices together. `num_given` is as in `forecast_run`.
-
-    Raises:
-      ValueError: if that cannot fit, naming the options to change.
-    """
-    found, limit = forecast_run(scene, plan, num_given, num_devices), allowed_memory(max_memory, num_devices)
-    found.check(limit)
-    if num_devices > 1:
-        found.check_one_device(allowed_memory(max_memory))
-    print(found.told(limit), flush=True)
-
-
-def _stages(scene: Scene, plan: RunPlan, num_given: int | None, num_devices: int = 1) -> dict[str, StageForecast]:
-    """Return the forecast of every stage, by name."""
-    systems: dict[int, tuple[System, list[StageForecast]]] = {}
-    for planned in plan.stages:
-        if id(planned.system) not in systems:
-            num = num_given if plan.begins_like_main(planned.name) else None
-            systems[id(planned.system)] = planned.system, list(forecast_stages(scene, planned.system, num, num_devices))
-    return {planned.name: systems[id(planned.system)][1][planned.index] for planned in plan.stages}
-
-
-def _disk_bytes(scene: Scene, plan: RunPlan, stages: Sequence[StageForecast]) -> float:
-    """Return the bytes of checkpoints, models, and pictures of the test views."""
-    views = scene.test or scene.train
-    pixels = sum(view.camera.width * view.camera.height for view in views)
-    num_pictures = 3 + max(1, len(plan.chains) - 1)
-    kept = sum((KEPT_STATES * STATES * stage.is_trained + 1) * stage.model_bytes for stage in stages)
-    return kept + PICTURE_PER_PIXEL * num_pictures * pixels
-
-
-def _told_parts(needed: Bytes) -> str:
+def _parts(needed: Bytes) -> str:
     """Return the parts of the memory in words; corrections only if there are any."""
     parts = needed._asdict()
     return ", ".join(f"{name} {in_bytes(size)}" for name, size in parts.items() if size or name != "corrections")

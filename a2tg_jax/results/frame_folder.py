@@ -8,7 +8,7 @@ from pathlib import Path
 
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, read_regular, sha256_of
-from a2tg_jax.results.output_checks import check_new
+from a2tg_jax.results.checks import check_new
 
 LIST = ".a2tg-frames"
 """Name of the list, which has the format of sha256sum."""

@@ -10,9 +10,8 @@ import numpy as np
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import in_bytes, shortened
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.results.folder import RunFolder, iteration_of, read_json, resuming_command
+from a2tg_jax.results.folder import RunFolder, iteration_of, old_run, read_json, resuming_command
 from a2tg_jax.results.record import read_record, repeating_command
-from a2tg_jax.results.run_replacement import old_run
 
 SPLITS = ("test", "validation", "train")
 

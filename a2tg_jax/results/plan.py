@@ -9,7 +9,6 @@ import numpy as np
 
 from a2tg_jax.training import Stage, System
 
-PACKAGE = "a2tg_jax"
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Largest number of iterations between checkpoints."""
 STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
@@ -66,11 +65,6 @@ class RunPlan:
                 return planned
         raise ValueError(f"the run has the models {', '.join(self.names)}; got {name!r}")
 
-    def begins_like_main(self, name: str) -> bool:
-        """Return whether a stage is the first one of the main system, or follows it."""
-        start = self[name].start
-        return name == self.main[0] if start is None else self.begins_like_main(start)
-
     def first_iteration(self, name: str) -> int:
         """Return the number of iterations before a stage, in the stages that it follows."""
         start = self[name].start
@@ -105,65 +99,19 @@ def plan_run(systems: Mapping[str, System]) -> RunPlan:
 def _is_same(known: PlannedStage, wanted: PlannedStage) -> bool:
     """Return whether training both would give the same model, bit for bit."""
     same_place = (known.index, known.start) == (wanted.index, wanted.start)
-    same_options = _common_options(known.system) == _common_options(wanted.system)
-    return same_place and same_options and _is_equal(known.stage, wanted.stage)
+    same_options = common_options(known.system) == common_options(wanted.system)
+    return same_place and same_options and is_equal(known.stage, wanted.stage)
 
 
-def is_same_so_far(made: System, wanted: System, index: int) -> bool:
-    """Return whether two systems train their stages up to `index` alike, whatever follows."""
-    if _common_options(made) != _common_options(wanted):
-        return False
-    stages, others = made.stages(), wanted.stages()
-    return all(_is_equal(stages[at], others[at]) for at in range(index + 1))
-
-
-def _common_options(system: System) -> list[Any]:
+def common_options(system: System) -> list[Any]:
     """Return the options that training reads from the system itself."""
     names = [field.name for field in dataclasses.fields(System)]
     return [getattr(system, name) for name in names if name not in STAGE_OPTIONS]
 
 
-def _is_equal(a: Stage, b: Stage) -> bool:
+def is_equal(a: Stage, b: Stage) -> bool:
     """Return whether two stages are equal in everything, arrays and classes included."""
     (leaves, structure), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
     if structure != other:  # type: ignore[operator]
         return False
     return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in zip(leaves, others, strict=True))
-
-
-def fingerprint(system: System, index: int) -> str:
-    """Return a text shared by two systems that train a stage alike from the same start, in any process.
-
-    It tells classes and functions apart by module and name, and is another one for another version's options.
-
-    Raises:
-      ValueError: if a stage holds a function without such a name, or a value that nothing is known of.
-    """
-    return repr((_common_options(system), _described(system.stages()[index])))
-
-
-def _described(value: Any) -> Any:
-    """Return a value of a stage as numbers, texts and tuples, the same in every process."""
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        told = tuple((field.name, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
-        return _name_of(type(value)), told
-    if isinstance(value, tuple | list):
-        return _name_of(type(value)), *map(_described, value)
-    if isinstance(value, Mapping):
-        return tuple((_described(key), _described(value[key])) for key in value)
-    if isinstance(value, np.ndarray | np.generic | jax.Array):
-        return np.asarray(value).tolist()
-    if isinstance(value, type) or callable(value):
-        return _name_of(value)
-    raise ValueError(f"a stage holds {value!r}, which cannot be told from others in another process")
-
-
-def _name_of(value: Any) -> str:
-    """Return the module and name of a class or function; the name alone for this package, whose modules may move."""
-    name = getattr(value, "__qualname__", "<nameless>")
-    if "<" in name and not isinstance(value, type):
-        raise ValueError(f"a stage holds {value!r}: make it a function of a module, which has a name of its own")
-    module = value.__module__
-    return f"{PACKAGE if module.partition('.')[0] == PACKAGE else module}.{name}"

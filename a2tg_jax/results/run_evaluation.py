@@ -17,6 +17,7 @@ from a2tg_jax.measure.evaluation import Evaluation, evaluate
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
+from a2tg_jax.results.checks import check_held_out
 from a2tg_jax.results.corrected_metrics import measure_corrected, write_corrections
 from a2tg_jax.results.folder import RunFolder, read_json, resuming_command, write_json
 from a2tg_jax.results.history import read_history
@@ -30,7 +31,6 @@ from a2tg_jax.results.images import (
     to_uint8,
 )
 from a2tg_jax.results.plan import RunPlan
-from a2tg_jax.results.preflight import check_held_out
 from a2tg_jax.results.record import HeldOut, read_record
 from a2tg_jax.results.report import Comparison, ShownComparison, write_report
 from a2tg_jax.results.run_figures import write_figures

@@ -1,24 +1,42 @@
-"""Training in a run folder, stage after stage, with checkpoints to resume from."""
+"""Runs in their folders: begun or resumed, trained stage after stage with checkpoints, and measured."""
 
+import contextlib
 import dataclasses
+import functools
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from a2tg_jax.data import Scene
-from a2tg_jax.host.machine import this_machine
+from a2tg_jax.host import signals
+from a2tg_jax.host.errors import error_text
+from a2tg_jax.host.machine import Devices, this_machine
+from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
-from a2tg_jax.io.model_file import FORMAT, load_model, save_model
-from a2tg_jax.model import Model
-from a2tg_jax.results.first_stage import GivenSplats, given_splats, write_first_stage
-from a2tg_jax.results.folder import RunFolder, iteration_of
-from a2tg_jax.results.history import write_history
-from a2tg_jax.results.plan import PlannedStage, is_same_so_far
-from a2tg_jax.results.preflight import check_held_out
-from a2tg_jax.results.record import OnNan, RunRecord, read_record, write_record
-from a2tg_jax.results.run_replacement import set_aside
-from a2tg_jax.results.several_processes import tell_end, tell_stage
-from a2tg_jax.results.tensorboard import EventWriter
+from a2tg_jax.io.formats import load_splats
+from a2tg_jax.io.model_file import FORMAT, load_model, number_in_file, save_model
+from a2tg_jax.parallel.processes import team
+from a2tg_jax.results.checks import check_apart, check_held_out, check_output, check_weights
+from a2tg_jax.results.folder import (
+    RunFolder,
+    check_free,
+    claimed,
+    drop_old,
+    iteration_of,
+    put_back_old,
+    resuming_command,
+    set_aside,
+)
+from a2tg_jax.results.forecast import print_forecast, print_quicker, room_for_photographs
+from a2tg_jax.results.history import EventWriter, write_history
+from a2tg_jax.results.init_file import check_init, write_first_stage
+from a2tg_jax.results.plan import PlannedStage
+from a2tg_jax.results.record import SYNTHETIC, OnNan, RunRecord, read_record, write_record
+from a2tg_jax.results.run_evaluation import evaluate_run
+from a2tg_jax.results.several_processes import check_alike, tell_end, tell_stage
+from a2tg_jax.results.summary import RunResult
 from a2tg_jax.training import (
     Checkpoint,
     DivergedError,
@@ -31,222 +49,301 @@ from a2tg_jax.training import (
 )
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
+from a2tg_jax.training.start import check_loss_data, check_start
 
+LESS_MEMORY = (
+    "close other programs, or start another run with a larger --downscale, or a smaller memory_budget or batch_size"
+)
+"""Advice of the command line for trainings that have run out of memory."""
 MOST_RESTORED = 5
 """Largest number of times a diverged stage is restored, each time with another order of the views."""
+Watched = Callable[[Scene], AbstractContextManager[Watch]]
+"""Function that gives the watcher of a scene's training."""
+
+
+def unseen(scene: Scene) -> AbstractContextManager[Watch]:
+    """Watch nothing."""
+    return contextlib.nullcontext(unwatched)
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOptions:
+    """How a run is carried out. The model depends on none of it, except for last bits on other devices."""
+
+    overwrite: bool = False
+    """Replace the run that is in the folder; it is deleted once the new run has its report."""
+    lpips_weights: Path | None = None
+    """Weights file for LPIPS; None leaves it out."""
+    max_memory: int | None = None
+    """Bytes that the process may take; None: what the machine has available."""
+    tensorboard: bool = False
+    """Write the histories for TensorBoard too, at each checkpoint."""
+    progress: bool = True
+    """Show progress bars."""
+    watched: Watched = unseen
+    session: Session = dataclasses.field(default_factory=Session)
+
+
+def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
+    """Train and measure a new run, after checking everything about it.
+
+    Args:
+      record: what is trained.
+      out: the run folder; made if it is not there.
+      options: how it is trained.
+
+    Raises:
+      ValueError, OSError: if the run cannot be trained, naming the option, weights, folder, scene, disk or memory; if
+        another process is at that folder; or as `train_run`.
+      Stopped: if the process is asked to end; its `advice` says how to continue.
+    """
+    record.check()
+    check_weights(options.lpips_weights)
+    if record.scene.path != SYNTHETIC and not is_url(record.scene.path):
+        check_apart(out, Path(record.scene.path))
+    check_free(out, overwrite=options.overwrite)
+    given = None if record.init is None else check_init(Path(record.init), out, record.system)
+    check_output(out)
+    scene = record.scene.load(room_for_photographs(options.max_memory), is_divided=True)
+    num_given = None if given is None else given.num
+    for system in record.systems.values():
+        check_loss_data(scene.train, system.stages())
+        check_start(scene, system, num_given if system is record.system else None)
+    if record.system.small_budget:
+        warnings.warn(f"{record.system.small_budget}; it is in bytes of the model, such as 20MB", stacklevel=2)
+    print_forecast(scene, record.plan, options.max_memory, options.session.num_devices, num_given, out)
+    print_quicker(scene, record, num_given)
+    run = RunFolder(out)
+    with claimed(run):
+        check_free(out, overwrite=options.overwrite)  # Another process may have been here meanwhile.
+        if run.is_begun:
+            set_aside(run)
+        write_record(run, record)
+        if given is not None:
+            write_first_stage(run, record, given, scene)
+        del given  # The training takes its memory.
+        return _train_and_measure(run, record, scene, options)
+
+
+def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
+    """Train the stages of a claimed run that are not finished yet, and measure. Raises as `begin_run`."""
+    check_weights(options.lpips_weights)
+    record, num_given = read_record(run), None
+    scene = record.scene.load(room_for_photographs(options.max_memory), is_divided=True)
+    if record.init is not None:
+        first = run.model(record.plan.main[0])
+        if not first.is_file():
+            write_first_stage(run, record, load_splats(Path(record.init)), scene)
+        num_given = number_in_file(first)
+    print_forecast(scene, record.plan, options.max_memory, options.session.num_devices, num_given)
+    return _train_and_measure(run, record, scene, options)
+
+
+def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options: RunOptions) -> RunResult:
+    with _advised(run, options.session.devices):
+        check_alike(record, scene, options.session)
+        with signals.noted() as is_stopped, options.watched(scene) as watch:
+            train_run(run, scene, options, is_stopped=is_stopped, watch=watch)
+        if (others := team()) is not None:
+            others.leave()
+        return measure(run, scene, lpips_weights=options.lpips_weights)
+
+
+def measure(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path | None = None) -> RunResult:
+    """Call `evaluate_run`, and delete a replaced run once all stages are trained."""
+    result = evaluate_run(run, scene, lpips_weights=lpips_weights)
+    if len(result.models) == len(result.plan.names):
+        drop_old(run)
+    return result
+
+
+@contextlib.contextmanager
+def _advised(run: RunFolder, devices: Devices) -> Iterator[None]:
+    """Add to whatever ends the training how to continue it. Without a checkpoint, a replaced run is put back."""
+
+    def advice() -> str:
+        if put_back_old(run):
+            return f"the run that was in {run.path} is untouched"
+        return how_to_go_on(run, devices)
+
+    if (others := team()) is not None:
+        others.advice = advice
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        number = stop.number if isinstance(stop, signals.Stopped) else signals.CTRL_C
+        raise signals.Stopped(number, advice()) from None
+    except Exception as error:
+        told = error_text(error, LESS_MEMORY)
+        if told is None:
+            raise
+        if others is not None:
+            others.told(error)
+        raise ValueError(f"{told}; {advice()}") from error
+
+
+def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
+    """Return the path of the newest checkpoint, and the command that resumes, as `resuming_command`."""
+    names = read_record(run).plan.names
+    checkpoints = [path for name in names for path in run.checkpoints(name)]
+    finished = [run.model(name) for name in names if run.model(name).is_file()]
+    last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
+    if finished and not checkpoints:
+        last = f"the last model is {finished[-1]}"
+    return f"{last}; continue with: {resuming_command(run, devices)}"
 
 
 def train_run(
-    run: RunFolder,
-    scene: Scene,
-    *,
-    replaced_by: RunRecord | None = None,
-    progress: bool = True,
-    is_stopped: IsStopped = never,
-    watch: Watch = unwatched,
-    session: Session | None = None,
-    tensorboard: bool = False,
-    given: GivenSplats | None = None,
+    run: RunFolder, scene: Scene, options: RunOptions, *, is_stopped: IsStopped = never, watch: Watch = unwatched
 ) -> None:
-    """Train every stage of the run's record that is not finished yet.
+    """Train every stage of the run's record that is not finished yet, from its newest checkpoint.
 
-    A stage goes on from its newest checkpoint. When it ends, its history and its model are written, and its checkpoints
-    deleted.
+    When a stage ends, its history and its model are written, and its checkpoints deleted.
 
     Args:
       run: a run folder with its record.
       scene: the scene of the record.
-      replaced_by: what takes the place of the run that is in the folder, which is set aside at the first checkpoint.
-      progress: show a progress bar.
-      is_stopped: asked between steps. Once it says True, there is a checkpoint and a KeyboardInterrupt.
+      options: how it is trained.
+      is_stopped: called between steps. Once it returns True, there is a checkpoint and a KeyboardInterrupt.
       watch: called between steps with the stage under way (`training.loop.Watch`).
-      session: what trainings of this process share, compiled shapes and devices; None: a new one.
-      tensorboard: write the histories as files of TensorBoard too, at each checkpoint.
-      given: splats in place of the first stage, if their file was read already.
 
     Raises:
-      ValueError: as `fit` does, or if a checkpoint or model is damaged, of another version, or made with other numbers
+      ValueError: as `fit` does, or if a checkpoint or model is damaged, of another version, or made with other options
         than the record's.
     """
-    record = replaced_by or read_record(run)
-    session = Session() if session is None else session
-    given = given or given_splats(record)
+    record = read_record(run)
+    fit = functools.partial(
+        fit_stage, scene, progress=options.progress, is_stopped=is_stopped, watch=watch, session=options.session
+    )
     for planned in record.plan.stages:
-        if given is not None and planned.name == record.plan.main[0] and not run.model(planned.name).is_file():
-            write_first_stage(run, planned, given, scene)
-        events = EventWriter(run, planned.name) if tensorboard else None
-        training = _Training(run, planned, scene, record.on_nan, progress, is_stopped, watch, session, events)
-        if replaced_by is not None:
-            result = training.train(replaced_by)
-        elif run.model(planned.name).is_file():
+        if run.model(planned.name).is_file():
             _check_model(run.model(planned.name), planned)
-            run.drop_old_checkpoints(planned.name, keep=0)
-            continue
         else:
-            result = training.train()
-        replaced_by = None
-        if events is not None:
-            events.add(result.history)
-            events.close()
-        write_history(run.own(run.history(planned.name)), result.history)
-        save_model(run.own(run.model(planned.name)), result.model, {"system": system_to_dict(planned.system)})
+            events = EventWriter(run, planned.name) if options.tensorboard else None
+            result = _train_stage(run, planned, scene, fit, events, record.on_nan)
+            if events is not None:
+                events.add(result.history)
+                events.close()
+            write_history(run.own(run.history(planned.name)), result.history)
+            save_model(run.own(run.model(planned.name)), result.model, {"system": system_to_dict(planned.system)})
         run.drop_old_checkpoints(planned.name, keep=0)
     tell_end()
 
 
-@dataclasses.dataclass(frozen=True)
-class _Training:
-    """One stage in a run folder."""
+def _train_stage(
+    run: RunFolder,
+    planned: PlannedStage,
+    scene: Scene,
+    fit: Callable[..., StageResult],
+    events: EventWriter | None,
+    on_nan: OnNan,
+) -> StageResult:
+    """Train a stage from its newest checkpoint or from its beginning; after a divergence, restore if that is
+    allowed."""
 
-    run: RunFolder
-    planned: PlannedStage
-    scene: Scene
-    on_nan: OnNan
-    progress: bool
-    is_stopped: IsStopped
-    watch: Watch
-    session: Session
-    events: EventWriter | None
-
-    def train(self, replaced_by: RunRecord | None = None) -> StageResult:
-        """Train the stage from its newest checkpoint or from its beginning; after a divergence, restore if that is
-        allowed."""
-        keep = _Keeper(self.run, self.planned.name, replaced_by, self.events)
-        num_restored = None
-        while True:
-            resume = None if keep.replaced_by is not None else _newest_checkpoint(self.run, self.planned)
-            try:
-                return self._train(resume, keep, num_restored)
-            except DivergedError as error:
-                is_own = keep.replaced_by is None
-                num_restored = self._restored(error, self.run.checkpoints(self.planned.name) if is_own else [])
-
-    def _train(self, resume: Checkpoint | None, keep: "_Keeper", num_restored: int | None) -> StageResult:
-        planned = self.planned
-        if self.events is not None and resume is not None:
-            self.events.skip(resume.history)
-        resumed = None if resume is None else self.run.checkpoint(planned.name, resume.iteration)
-        start = None if planned.start is None else self.run.model(planned.start)
-        model = None if start is None else self._checked_model(start)
-        tell_stage(planned.name, resumed, start, num_restored)
-        return fit_stage(
-            self.scene,
-            planned.system,
-            planned.index,
-            model,
-            resume=resume,
-            on_checkpoint=keep,
-            checkpoint_every=planned.checkpoint_every,
-            progress=self.progress,
-            title=planned.name,
-            is_stopped=self.is_stopped,
-            num_restored=num_restored,
-            watch=self.watch,
-            session=self.session,
-        )
-
-    def _checked_model(self, path: Path) -> Model:
-        """Return the model that the stage starts from, unless it was trained on views that are held out now."""
-        model = load_model(path)
-        check_held_out(model, self.scene, path)
-        return model
-
-    def _restored(self, error: DivergedError, checkpoints: list[Path]) -> int:
-        """Save the state before the diverged step, and return the number of the next order of views.
-
-        Raises:
-          ValueError: if the run is to stop then, or has gone back often enough.
-        """
-        before, run = error.checkpoint, self.run
-        path = run.own(run.diverged(self.planned.name, before.iteration))
-        save_checkpoint(path, before)
-        told, count = f"{error}, in {path}", before.num_restored + 1
-        if self.on_nan == "stop":
-            raise ValueError(f"{told}; --on-nan restore continues with the views in another order") from error
-        if count > MOST_RESTORED:
-            raise ValueError(f"{told}; the stage was restored {MOST_RESTORED} times already") from error
-        back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"
-        warnings.warn(
-            f"{told}; the stage restarts from {back} with the views in another order ({count} of {MOST_RESTORED} "
-            "times)",
-            stacklevel=4,
-        )
-        return count
-
-
-class _Keeper:
-    """Writer of checkpoints. The first checkpoint of a replacing run sets the old run aside."""
-
-    def __init__(self, run: RunFolder, name: str, replaced_by: RunRecord | None, events: EventWriter | None):
-        self.run, self.name, self.replaced_by, self.events = run, name, replaced_by, events
-
-    def __call__(self, checkpoint: Checkpoint) -> None:
+    def keep(checkpoint: Checkpoint) -> None:
         if checkpoint.iteration == 0:
             return  # The stage would begin with the same state again.
-        if self.replaced_by is not None:
-            set_aside(self.run)
-        if self.events is not None:
-            self.events.add(checkpoint.history)
-        save_checkpoint(self.run.own(self.run.checkpoint(self.name, checkpoint.iteration)), checkpoint)
-        if self.replaced_by is not None:
-            # Last: a folder without a record is one in which the old run is put back.
-            write_record(self.run, self.replaced_by)
-            self.replaced_by = None
-        self.run.drop_old_checkpoints(self.name)
+        if events is not None:
+            events.add(checkpoint.history)
+        save_checkpoint(run.own(run.checkpoint(planned.name, checkpoint.iteration)), checkpoint)
+        run.drop_old_checkpoints(planned.name)
+
+    num_restored = None
+    while True:
+        resume = _newest_checkpoint(run, planned)
+        if events is not None and resume is not None:
+            events.skip(resume.history)
+        resumed = None if resume is None else run.checkpoint(planned.name, resume.iteration)
+        model, start = None, None if planned.start is None else run.model(planned.start)
+        if start is not None:
+            model = load_model(start)
+            check_held_out(model, scene, start)
+        tell_stage(planned.name, resumed, start, num_restored)
+        try:
+            return fit(
+                planned.system,
+                planned.index,
+                model,
+                resume=resume,
+                on_checkpoint=keep,
+                checkpoint_every=planned.checkpoint_every,
+                title=planned.name,
+                num_restored=num_restored,
+            )
+        except DivergedError as error:
+            num_restored = _number_of_next_order(run, planned, error, on_nan)
+
+
+def _number_of_next_order(run: RunFolder, planned: PlannedStage, error: DivergedError, on_nan: OnNan) -> int:
+    """Save the state before the diverged step, and return the number of the next order of views.
+
+    Raises:
+      ValueError: if the run is to stop then, or has gone back often enough.
+    """
+    before, checkpoints = error.checkpoint, run.checkpoints(planned.name)
+    path = run.own(run.diverged(planned.name, before.iteration))
+    save_checkpoint(path, before)
+    told, count = f"{error}, in {path}", before.num_restored + 1
+    if on_nan == "stop":
+        raise ValueError(f"{told}; --on-nan restore continues with the views in another order") from error
+    if count > MOST_RESTORED:
+        raise ValueError(f"{told}; the stage was restored {MOST_RESTORED} times already") from error
+    back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"
+    warnings.warn(
+        f"{told}; the stage restarts from {back} with the views in another order ({count} of {MOST_RESTORED} times)",
+        stacklevel=4,
+    )
+    return count
 
 
 def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | None:
-    """Return the newest readable checkpoint of a stage, made with the same options so far; None without one.
+    """Return the newest readable checkpoint of a stage, made with the same options; None without one.
 
     Raises:
       ValueError: if there are some, and none can be read.
     """
-    paths = run.checkpoints(planned.name)[::-1]
-    damages: list[ValueError] = []
-    for path in paths:
+    damaged: list[tuple[Path, ValueError]] = []
+    for path in reversed(run.checkpoints(planned.name)):
         try:
             checkpoint = load_checkpoint(path, system=type(planned.system))
         except ValueError as error:
-            damages.append(error)
+            damaged.append((path, error))
             continue
-        _check_unchanged(path, checkpoint.system, planned)
-        for damaged, damage in zip(paths, damages, strict=False):
-            aside = run.set_damaged_aside(damaged)
+        _check_options(path, checkpoint.system, planned.system)
+        for damaged_path, damage in damaged:
+            aside = run.set_damaged_aside(damaged_path)
             warnings.warn(
                 f"{damage}; it was renamed to {aside.name}, and training continues from {path.name}", stacklevel=2
             )
-        _warn_of_machine(path, checkpoint)
-        return dataclasses.replace(checkpoint, system=planned.system)
-    if damages:
+        differences = [] if checkpoint.machine is None else checkpoint.machine.differences(this_machine())
+        if differences:
+            warnings.warn(
+                f"{path.name} was made on another machine, so last bits will differ: {'; '.join(differences)}",
+                stacklevel=2,
+            )
+        return checkpoint
+    if damaged:
         raise ValueError(
-            f"{damages[0]}; there is no other checkpoint: delete it to train {planned.name} from its beginning"
+            f"{damaged[0][1]}; there is no other checkpoint: delete it to train {planned.name} from its beginning"
         )
     return None
 
 
-def _warn_of_machine(path: Path, checkpoint: Checkpoint) -> None:
-    """Warn if a resumed run will differ in its last bits, because another machine wrote the checkpoint."""
-    told = [] if checkpoint.machine is None else checkpoint.machine.differences(this_machine())
-    if told:
-        warnings.warn(
-            f"{path.name} was made on another machine, so last bits will differ: {'; '.join(told)}", stacklevel=3
-        )
-
-
 def _check_model(path: Path, planned: PlannedStage) -> None:
-    """Raise if a finished model was made with other options than those of the record."""
+    """Raise ValueError if a finished model is damaged or was made with other options than the record's."""
     try:
         made = read_archive_header(path, format=FORMAT).get("system")
     except ValueError as error:
         raise ValueError(f"{error}; delete it to train {planned.name} again") from error
-    if made is not None:
-        _check_unchanged(path, system_from_dict(made, str(path), type(planned.system)), planned)
+    if made is not None:  # The first stage may be from a file.
+        _check_options(path, system_from_dict(made, str(path), type(planned.system)), planned.system)
 
 
-def _check_unchanged(path: Path, made: System, planned: PlannedStage) -> None:
-    if is_same_so_far(made, planned.system, planned.index):
-        return
-    before, now = flatten_config(made), flatten_config(planned.system)
-    names = ", ".join(name for name in now if before[name] != now[name])
-    advice = "restore that, or train in a new folder"
-    raise ValueError(f"{path} was made with another {names} than in run.toml: {advice}")
+def _check_options(path: Path, made: System, wanted: System) -> None:
+    before, now = flatten_config(made), flatten_config(wanted)
+    names = ", ".join(name for name, value in now.items() if before.get(name) != value)
+    if names:
+        raise ValueError(
+            f"{path} was made with another {names} than in run.toml: restore that, or train in a new folder"
+        )

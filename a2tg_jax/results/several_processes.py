@@ -30,7 +30,7 @@ DIFFERING = ("options", "--devices", "views, cameras or points")
 """Facts that are compared with the first process."""
 
 
-def check_alike(record: RunRecord, scene: Scene, session: Session | None) -> None:
+def check_alike(record: RunRecord, scene: Scene, session: Session) -> None:
     """Compare options, devices and the scene with the first process's; all processes call it together.
 
     Raises:
@@ -47,11 +47,11 @@ def check_alike(record: RunRecord, scene: Scene, session: Session | None) -> Non
     others.has_met = True
 
 
-def digests_of(record: RunRecord, scene: Scene, session: Session | None) -> list[bytes]:
+def digests_of(record: RunRecord, scene: Scene, session: Session) -> list[bytes]:
     """Return 32 bytes for each of `DIFFERING` that differ if training would. Paths and the pixels of photographs, masks
     and depth maps are not compared."""
     systems = [(label, repr(system)) for label, system in record.systems.items()]
-    mesh = None if session is None else session.mesh
+    mesh = session.mesh
     devices = [] if mesh is None else [(device.process_index, device.id) for device in mesh.devices.flat]
     views = [_told_of_view(view) for view in scene.train]
     rays = [_checksum(own[0].camera.rays) for own in views_by_kind(scene.train)]

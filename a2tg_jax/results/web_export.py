@@ -14,9 +14,8 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.results.folder import read_json
-from a2tg_jax.results.output_checks import check_new
-from a2tg_jax.results.run_replacement import remove_if_empty
+from a2tg_jax.results.checks import check_new
+from a2tg_jax.results.folder import read_json, remove_if_empty
 from a2tg_jax.results.viewing import ServedPhotographs, Source, middle_of, scene_or_warning
 from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html, viewer_html_with
 

@@ -21,10 +21,10 @@ from a2tg_jax.core.origin import WHITE
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.results.folder import read_json, write_json
-from a2tg_jax.results.plan import fingerprint, is_same_so_far
 from a2tg_jax.results.record import SceneSource
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.registry import differences, reference_of
+from lab.fingerprint import fingerprint, is_same_so_far
 from lab.versions import is_from_before
 
 MOST_TRAIN_VIEWS = 16

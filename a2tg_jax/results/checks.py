@@ -1,4 +1,4 @@
-"""Places to write to, checked before any work."""
+"""Checks before any work: places to write to, weights, and models of views that are held out."""
 
 import os
 import sys
@@ -6,6 +6,10 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
+from a2tg_jax.data import Scene
+from a2tg_jax.host.text import counted
+from a2tg_jax.measure.metrics import load_lpips
+from a2tg_jax.model import Model
 from a2tg_jax.results.folder import RunFolder
 
 EXPORTS = (".a2tgz", ".glb")
@@ -36,6 +40,13 @@ def check_output(path: Path) -> None:
         raise ValueError(f"{path} cannot be made, for nothing can be written in {existing}: {error.strerror}") from None
     if len(missing) > 1 and not existing.is_relative_to(os.getcwd()):
         print(f"a2tg: {missing[-1]} does not exist and will be made", file=sys.stderr)
+
+
+def check_apart(out: Path, source: Path) -> None:
+    """Raise ValueError if one of two folders, one to read and one to write, lies in the other."""
+    written, read = out.resolve(), source.resolve()
+    if written.is_relative_to(read) or read.is_relative_to(written):
+        raise ValueError(f"{out} and {source} overlap: choose an output folder outside it")
 
 
 def check_separate(first: Path, second: Path, flags: str) -> None:
@@ -79,3 +90,29 @@ def check_not_source(files: Iterable[Path], source: Path, flag: str) -> None:
     for file in files:
         if file.exists() and source.exists() and file.samefile(source):
             raise ValueError(f"{file} is the model itself; choose another {flag}")
+
+
+def check_weights(lpips_weights: Path | None) -> None:
+    """Raise ValueError or FileNotFoundError unless these are LPIPS weights, or None."""
+    if lpips_weights is not None:
+        load_lpips(lpips_weights)
+
+
+def check_held_out(model: Model, scene: Scene, path: Path) -> None:
+    """Raise ValueError if a model was trained on views that its scene holds out: their figures would be too good.
+
+    Args:
+      model: a model of a run; without an origin its views are unknown, and it passes.
+      scene: the scene of the run, as it is read now.
+      path: the file of the model.
+    """
+    if model.origin is None:
+        return
+    trained = {name for name, is_test in zip(model.origin.names, model.origin.is_test, strict=True) if not is_test}
+    leaked = sorted(trained & {view.name for view in scene.test} - {view.name for view in scene.train})
+    if leaked:
+        raise ValueError(
+            f"{path} was trained on {counted(len(leaked), 'view')} that {scene.name} now holds out, such as "
+            f"{leaked[0]}: the photographs have changed, or views of panoramas, which are held out together since, are "
+            "among them; train in a new folder"
+        )
