@@ -342,8 +342,13 @@ def set_aside(run: RunFolder) -> None:
 def put_back_old(run: RunFolder) -> bool:
     """Put back the run that this one replaces, unless this one has a checkpoint or a model. Return whether it did."""
     old = old_run(run)
+    if old is None:
+        return False
+    if not old.own_files(old.written()):
+        drop_old(run)  # A process was killed before it moved the first file.
+        return False
     is_moving = not run.record.is_file()
-    if old is None or (run.has_progress and not is_moving):
+    if run.has_progress and not is_moving:
         return False
     if not is_moving:
         run.clear()

@@ -106,9 +106,10 @@ class RunForecast:
         if needed.total <= limit:
             return
         largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
-        advice = f"change {self._options(largest)}, or"
         if largest == "program":
             advice = f"the program itself takes about {in_bytes(needed.program)} of it:"
+        else:
+            advice = f"change {self._options(largest)}, or"
         raise ValueError(
             f"the run would need about {in_bytes(needed.total)} of memory ({phase}: {_parts(needed)}), and "
             f"{in_bytes(limit)} may be used: {advice} allow more with --max-memory"
