@@ -84,6 +84,6 @@ def _stub() -> None:
 
     cli.configure_cpu = lambda: None
     run_training.train_run = reached
-    run_evaluation._measure = reached
+    run_evaluation._evaluations = reached
     frames.Renderer = reached
     record.synthetic_scene = functools.cache(functools.partial(record.synthetic_scene, num_points=100))

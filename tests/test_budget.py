@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 import json
 import tomllib
-import types
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +25,6 @@ from a2tg_jax.events import Due, Now, Times
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.mcmc import FillingMcmc
 from a2tg_jax.model import Model
-from a2tg_jax.results.plan import plan_run
-from a2tg_jax.results.summary import budget_lines
 from a2tg_jax.training.fitting import warn_of_budget
 from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict, with_changes
 from a2tg_jax.training.start import check_start
@@ -256,14 +253,6 @@ def test_what_misses_its_budget_is_warned_of(num, budget, message):
         warn_of_budget(a2tg.Gaussians2dMcmc(memory_budget=budget), model)
     warn_of_budget(a2tg.Gaussians2dMcmc(memory_budget=model.num_bytes / 1e6), model)
     warn_of_budget(a2tg.Gaussians2dMcmc(), model)
-
-
-def test_the_summary_tells_budgets():
-    systems = {"a2tg": a2tg.A2tg(memory_budget="1.5MB"), "free": a2tg.Gaussians2dMcmc()}
-    measured = types.SimpleNamespace(num_bytes=1_499_000)
-    models = dict.fromkeys(("a2tg-gaussians", "a2tg-textures", "free-gaussians"), measured)
-    found = budget_lines(types.SimpleNamespace(plan=plan_run(systems), models=models))
-    assert found == ["a2tg-textures takes 1,499,000 bytes of its budget of 1,500,000 (99.93 %)"]
 
 
 @pytest.mark.parametrize(

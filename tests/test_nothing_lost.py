@@ -394,7 +394,7 @@ def test_lpips_is_kept_while_the_models_are_the_same(scene, stopped, tmp_path, m
     run.metrics.write_text(json.dumps(metrics))
     run.per_view.write_text(json.dumps(per_view))
     result = run_evaluation.evaluate_run(run, scene)
-    assert result.models[NAME].test.lpips == 0.25 and result.is_lpips_kept and result.lpips_network == "alex"
+    assert result.models[NAME].shown.lpips == 0.25 and result.is_lpips_kept and result.lpips_network == "alex"
     assert json.loads(run.metrics.read_text())["models"][NAME]["test"]["lpips"] == 0.25
     with open(run.model(NAME), "ab") as file:
         file.write(b"\0")

@@ -20,36 +20,36 @@ from test_results import NAMES, circle, some_history, some_result
 
 from a2tg_jax.appearance import Appearance, Bands, Texture
 from a2tg_jax.appearance.bands import empty_bands
-from a2tg_jax.core.gaussians import SH_C0, init_from_points
+from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.render import RenderOutput, RenderSettings
-from a2tg_jax.results.figures import curves_figure, save_figure, sizes_figure
+from a2tg_jax.results.figures import ReportFigure, curves_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import create_run
-from a2tg_jax.results.images import largest_gain
+from a2tg_jax.results.images import largest_gain, save_animation
 from a2tg_jax.results.model_pictures import (
     FLIGHT_FRAMES,
     TEXTURE_SIDE,
-    animation,
     depth_picture,
     flight,
     learned_textures,
+    level_maps,
     normal_picture,
 )
-from a2tg_jax.results.report import SECTIONS, Comparison, ShownComparison, write_report
-from a2tg_jax.results.run_figures import Figures, ReportFigure, level_maps
+from a2tg_jax.results.report import SECTIONS, Comparison, write_report
 from a2tg_jax.results.summary import ModelResult
 from a2tg_jax.texture import textures_from_arrays
 
 
-def written_report(folder, result, *, view: str, captions: list[str], figures: Figures = Figures()) -> str:  # noqa: B008
+def written_report(folder, result, *, view: str, captions: list[str], figures=()) -> str:
     run = create_run(folder)
     run.own(run.point_cloud).touch()
     image = np.zeros((30, 40, 3), np.uint8)
-    comparison = Comparison(view, [image] * len(captions), captions, largest_gain(image, image, image))
-    write_report(run, result, [ShownComparison.of(comparison)], figures)
+    comparison = Comparison.of(view, [image] * len(captions), captions, largest_gain(image, image, image))
+    places = dict.fromkeys(("curves", "textures", "maps", "geometry", "flight"), ()) | dict(figures)
+    write_report(run, result, [comparison], places)
     return run.report.read_text(encoding="utf-8")
 
 
@@ -57,7 +57,7 @@ def written_report(folder, result, *, view: str, captions: list[str], figures: F
 def report(tmp_path) -> str:
     path = tmp_path / "curves.png"
     save_figure(path, curves_figure({"a": some_history()}, {"a": 0}))
-    figures = Figures(curves=[ReportFigure(path, "Curves.", "chart", [("#ff0000", "red")])])
+    figures = {"curves": [ReportFigure(path, "Curves.", "chart", [("#ff0000", "red")])]}
     captions = ["photograph", "before", "after"]
     return written_report(tmp_path / "run", some_result(), view="a<b.png", captions=captions, figures=figures)
 
@@ -136,8 +136,7 @@ def test_the_report_says_what_is_special_about_a_run(tmp_path):
     def special(measured: ModelResult) -> ModelResult:
         views = [dataclasses.replace(view, flat_psnr=26.0) for view in measured.train.per_view]
         train = dataclasses.replace(measured.train, per_view=tuple(views))
-        corrected = {f"train_{way}": train for way in ("color_fit", "aligned")}
-        return dataclasses.replace(measured, train=train, test=None, corrected=corrected)
+        return dataclasses.replace(measured, splits=dict.fromkeys(("train", "train_color_fit", "train_aligned"), train))
 
     plain = some_result()
     result = dataclasses.replace(plain, models={name: special(found) for name, found in plain.models.items()})
@@ -300,8 +299,9 @@ def test_a_flight_is_a_small_animation():
 
 
 def test_an_animation_keeps_its_pictures_in_order():
-    images = [np.full((8, 8, 3), SH_C0 * level, np.float32) for level in (0, 1, 2)]
-    moving = Image.open(io.BytesIO(animation(map(jnp.asarray, images))))
+    pictures = (Image.new("RGB", (8, 8), (level,) * 3) for level in (0, 72, 144))
+    save_animation(buffer := io.BytesIO(), pictures, 15)
+    moving = Image.open(buffer)
     shades = []
     for index in range(3):
         moving.seek(index)

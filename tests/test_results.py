@@ -29,7 +29,8 @@ from a2tg_jax.results.checks import check_held_out
 from a2tg_jax.results.figures import curves_figure, save_figure, sizes_figure
 from a2tg_jax.results.folder import OLD, RunFolder, check_free, create_run, drop_old, open_run, set_aside
 from a2tg_jax.results.history import read_history, write_history
-from a2tg_jax.results.images import error_picture, largest_gain, level_colors, side_by_side, to_uint8
+from a2tg_jax.results.images import error_picture, largest_gain, side_by_side, to_uint8
+from a2tg_jax.results.model_pictures import level_colors
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import (
     RunRecord,
@@ -68,7 +69,7 @@ def some_result(record: RunRecord = RECORD) -> RunResult:
         views = (ViewMetrics("a<b.png", psnr, 0.5, 0.25, 9.0), ViewMetrics("c.png", psnr + 2, 0.7, 0.75, 7.0))
         found = Evaluation(views, "alex", 20.0, ())
         num_bytes = 23_200 + 16 * texels
-        return ModelResult(found, found, 100, texels, num_bytes, num_bytes, 0, 62.0)
+        return ModelResult({"test": found, "train": found}, 100, texels, num_bytes, num_bytes, 0, 62.0)
 
     models = dict(zip(NAMES, (measured(20, 0), measured(23, 300), measured(22, 0)), strict=True))
     return RunResult("scene", record, record.plan, models)
@@ -551,6 +552,15 @@ def test_gains_name_the_bytes_that_they_cost(own, other, expected):
     assert bytes_compared(result, "gaussians-2d-mcmc-continued") == expected
     assert (
         summary_text(result).splitlines()[-1] == f"a2tg-textures: +1.00 dB over gaussians-2d-mcmc-continued, {expected}"
+    )
+
+
+def test_the_summary_says_how_much_of_its_budget_a_model_takes():
+    system = dataclasses.replace(RECORD.system, memory_budget="28.1kB")
+    text = summary_text(some_result(dataclasses.replace(RECORD, system=system)))
+    assert (
+        "a2tg-textures takes 28,000 bytes of its budget of 28,100 (99.64 %)" in text
+        and "budget" not in summary_text(some_result())
     )
 
 

@@ -23,7 +23,7 @@ from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tuned, TunedFiles
 from a2tg_jax.io.compact import GROUPS, CompactChoices, decode_model, encode_model, grids_of, half_turned
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.results.corrected_metrics import refined_views
+from a2tg_jax.results.run_evaluation import refined_views
 from a2tg_jax.training import DivergedError, Stage
 from a2tg_jax.training.corrections import Correction, Exposure, PoseRefinement, exposed
 

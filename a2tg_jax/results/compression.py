@@ -27,10 +27,9 @@ from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.results.corrected_metrics import refined_views
 from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
 from a2tg_jax.results.record import read_record
-from a2tg_jax.results.run_evaluation import settings_of
+from a2tg_jax.results.run_evaluation import refined_views, settings_of
 from a2tg_jax.results.summary import aligned
 from a2tg_jax.results.web_export import loss_told
 

@@ -14,12 +14,11 @@ from a2tg_jax.host.regular_files import is_regular, sha256_of
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.results.corrected_metrics import refined_views
 from a2tg_jax.results.finish_options import FinishOptions
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, read_json, resuming_command, write_json
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import RunRecord, read_record, write_record
-from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, settings_of
+from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, refined_views, settings_of
 from a2tg_jax.results.summary import RunResult, aligned
 from a2tg_jax.training.registry import system_to_dict
 

@@ -21,7 +21,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.folder import RunFolder, resuming_command
 from a2tg_jax.results.frame_folder import FRAME_NAME, FrameFolder
-from a2tg_jax.results.images import picture_names, to_uint8, write_png
+from a2tg_jax.results.images import picture_names, save_animation, to_uint8, write_png
 from a2tg_jax.results.record import read_record
 from a2tg_jax.results.run_evaluation import settings_of
 
@@ -112,24 +112,15 @@ def video_name() -> str:
 
 def write_animation(frames: Sequence[Path], path: Path, *, frames_per_second: float = FRAMES_PER_SECOND) -> None:
     """Make an animated WebP of some frames, which loops. Memory holds one frame at a time."""
-    first, *others = frames
-    duration = round(1000 / frames_per_second)
-    with FrameFolder(path.parent).writing(path.name) as temporary, Image.open(first) as image:
-        image.save(
-            temporary,
-            "WEBP",
-            save_all=True,
-            append_images=map(_opened, others),
-            duration=duration,
-            loop=0,
-            quality=WEBP_QUALITY,
-        )
 
+    def opened() -> Iterator[Image.Image]:
+        for frame in frames:
+            with Image.open(frame) as image:
+                image.load()
+                yield image
 
-def _opened(path: Path) -> Image.Image:
-    with Image.open(path) as image:
-        image.load()
-        return image
+    with FrameFolder(path.parent).writing(path.name) as temporary:
+        save_animation(temporary, opened(), frames_per_second, quality=WEBP_QUALITY)
 
 
 def write_video(frames: Sequence[Path], path: Path, *, frames_per_second: float = FRAMES_PER_SECOND) -> bool:

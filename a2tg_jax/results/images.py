@@ -1,4 +1,4 @@
-"""Pictures made from renders: errors, crops, side-by-side sheets, texture resolutions.
+"""Pictures made from renders: errors, crops, side-by-side sheets, animations, and their files.
 
 Images are uint8 [H, W, 3] unless said otherwise.
 """
@@ -9,21 +9,18 @@ import hashlib
 import io
 import itertools
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import matplotlib
 import numpy as np
-from matplotlib import colormaps
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter
 
-from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.notebook_display import enlarged
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.model import Model
-from a2tg_jax.texture import Textures
 
 ERROR_GAIN = 4
 CHECKER = (0.75, 0.55)
@@ -75,22 +72,16 @@ def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> C
     """
     height, width = target.shape[:2]
     side = max(8, min(height, width) // 4)
+    errors = [np.sum((image.astype(np.float32) - target) ** 2, axis=-1) for image in (before, after)]
 
     def in_squares(error: np.ndarray) -> np.ndarray:
         means: np.ndarray = uniform_filter(error, size=side, mode="constant", origin=-(side // 2))
         return means[: max(1, height - side + 1), : max(1, width - side + 1)]
 
-    errors = [np.sum(_squared_error(image, target), axis=-1) for image in (before, after)]
-    left_over = in_squares(errors[1])
-    gain = in_squares(errors[0] - errors[1])
-    is_good = left_over <= errors[1].mean()
+    gain, is_good = in_squares(errors[0] - errors[1]), in_squares(errors[1]) <= errors[1].mean()
     best = np.where(is_good, gain, -np.inf) if is_good.any() else gain
     top, left = np.unravel_index(int(best.argmax()), best.shape)
     return Crop(int(top), int(left), side)
-
-
-def _squared_error(image: np.ndarray, target: np.ndarray) -> np.ndarray:
-    return (image.astype(np.float32) - target.astype(np.float32)) ** 2
 
 
 def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
@@ -120,20 +111,15 @@ def picture_names(view_names: Iterable[str]) -> dict[str, str]:
     names: dict[str, str] = {}
     taken: set[str] = set()
     for view_name in sorted(view_names):
-        stem = _of_file(os.path.splitext(view_name)[0].replace("/", "_"))
+        stem = os.path.splitext(view_name)[0].replace("/", "_")
+        data = stem.encode(errors="surrogatepass")
+        if len(data) > LONGEST_STEM:
+            stem = f"{data[:LONGEST_STEM].decode(errors='ignore')}-{hashlib.sha256(data).hexdigest()[:8]}"
         choices = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
         chosen = next(choice for choice in choices if choice.casefold() not in taken)
         taken.add(chosen.casefold())
         names[view_name] = f"{chosen}.png"
     return names
-
-
-def _of_file(stem: str) -> str:
-    """Return the stem of a file name that file systems take: a long one is cut, and told apart by a hash."""
-    data = stem.encode(errors="surrogatepass")
-    if len(data) <= LONGEST_STEM:
-        return stem
-    return f"{data[:LONGEST_STEM].decode(errors='ignore')}-{hashlib.sha256(data).hexdigest()[:8]}"
 
 
 def save_picture(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -> None:
@@ -163,35 +149,9 @@ def file_uri(path: Path) -> str:
     return f"data:image/{path.suffix[1:]};base64," + base64.b64encode(path.read_bytes()).decode()
 
 
-def level_colors(num_levels: int) -> np.ndarray:
-    """Return [num_levels, 3] colours of levels 0, 1, …, dark to bright."""
-    return colormaps["viridis"](np.linspace(0.0, 1.0, max(2, num_levels)))[:num_levels, :3]
-
-
-def texel_levels(textures: Textures) -> np.ndarray:
-    """Return [N] integers log₂(Tu·Tv), rounded; 0 for an empty texture."""
-    levels: np.ndarray = np.rint(np.log2(np.maximum(textures.sizes.prod(axis=1), 1))).astype(int)
-    return levels
-
-
-def colored_by_level(model: Model, levels: np.ndarray) -> Model:
-    """Return a model with every Gaussian in the colour of its level, from any direction.
-
-    Alpha textures stay, RGB residuals and view dependence go.
-
-    Args:
-      model: the model.
-      levels: [N] integers.
-    """
-    colors = (level_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
-    if model.textures is not None:
-        buckets = tuple(bucket.at[..., :3].set(0.0) for bucket in model.textures.buckets)
-        model = model.with_textures(dataclasses.replace(model.textures, buckets=buckets))
-    return with_flat_colors(model, np.ones(model.gaussians.num, bool), colors)
-
-
-def with_flat_colors(model: Model, is_chosen: np.ndarray, colors: np.ndarray) -> Model:
-    """Return a model whose marked Gaussians have coefficients of degree 0 only: `colors`, one for all or [N, 3]."""
-    sh = np.where(is_chosen[:, None, None], 0, model.sh)
-    sh[:, 0] = np.where(is_chosen[:, None], colors, sh[:, 0])
-    return model.with_sh(sh)
+def save_animation(
+    file: Path | BinaryIO, pictures: Iterator[Image.Image], frames_per_second: float, **options: int
+) -> None:
+    """Write pictures as an animated WebP that loops. Memory holds one of them at a time."""
+    duration = round(1000 / frames_per_second)
+    next(pictures).save(file, "WEBP", save_all=True, append_images=pictures, duration=duration, loop=0, **options)

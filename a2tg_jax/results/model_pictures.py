@@ -1,12 +1,11 @@
-"""Pictures of one model: its textures, depth, normals, and a flight past its cameras."""
+"""Pictures of one model: its textures, depth, normals, maps of what varies, and a flight past its cameras."""
 
+import dataclasses
 import io
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from matplotlib import colormaps
 from PIL import Image
 
@@ -16,7 +15,7 @@ from a2tg_jax.core.paths import smooth_path
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.images import checkered, colored_by_level, to_uint8
+from a2tg_jax.results.images import checkered, save_animation, to_uint8
 from a2tg_jax.texture import texture_arrays
 
 NUM_TEXTURES, TEXTURE_SIDE, TEXTURE_MARGIN, TEXTURES_PER_ROW = 24, 64, 8, 8
@@ -33,7 +32,7 @@ FLIGHT_FRAMES, FLIGHT_PER_SECOND, FLIGHT_SIDE = 60, 15, 480
 
 def learned_textures(model: Model) -> np.ndarray | None:
     """Return a sheet of some textures of a model, as opaque as they are, on a chequered ground, in their Gaussians'
-    colours.
+    colours and own proportions.
 
     They are those that add most to the picture: by the spread of their texels times the area of the Gaussian.
 
@@ -50,33 +49,17 @@ def learned_textures(model: Model) -> np.ndarray | None:
     if not order:
         return None
     colors = 0.5 + SH_C0 * np.asarray(model.gaussians.sh)[:, 0]
-    return _sheet([_on_checker(texels[index], colors[index]) for index in order])
-
-
-def _on_checker(texels: np.ndarray, color: np.ndarray) -> np.ndarray:
-    """Return uint8 [h, w, 3] of a texture in its own proportions, on a chequered ground.
-
-    Args:
-      texels: [Tv, Tu, 4] RGB residual and alpha factor.
-      color: [3] of the Gaussian.
-    """
-    scale = TEXTURE_SIDE // max(texels.shape[:2])
-    large = np.kron(texels, np.ones((scale, scale, 1)))
-    ground = checkered(large.shape[:2], TEXTURE_SIDE // 8)
-    alpha = np.clip(large[..., 3:], 0, 1)
-    return to_uint8(alpha * np.clip(color + large[..., :3], 0, 1) + (1 - alpha) * ground)
-
-
-def _sheet(pictures: list[np.ndarray]) -> np.ndarray:
-    """Return pictures in rows, each at the top left of its place."""
     step = TEXTURE_SIDE + TEXTURE_MARGIN
-    rows, columns = -(-len(pictures) // TEXTURES_PER_ROW), min(len(pictures), TEXTURES_PER_ROW)
+    rows, columns = -(-len(order) // TEXTURES_PER_ROW), min(len(order), TEXTURES_PER_ROW)
     sheet = np.zeros((rows * step - TEXTURE_MARGIN, columns * step - TEXTURE_MARGIN, 4), np.uint8)
-    for index, picture in enumerate(pictures):
-        top, left = (step * place for place in divmod(index, TEXTURES_PER_ROW))
-        height, width = picture.shape[:2]
-        sheet[top : top + height, left : left + width, :3] = picture
-        sheet[top : top + height, left : left + width, 3] = 255
+    for place, index in enumerate(order):
+        scale = TEXTURE_SIDE // max(texels[index].shape[:2])
+        large = np.kron(texels[index], np.ones((scale, scale, 1)))  # [h, w, 4]: RGB residual and alpha factor
+        alpha, color = np.clip(large[..., 3:], 0, 1), np.clip(colors[index] + large[..., :3], 0, 1)
+        picture = to_uint8(alpha * color + (1 - alpha) * checkered(large.shape[:2], TEXTURE_SIDE // 8))
+        top, left = (step * number for number in divmod(place, TEXTURES_PER_ROW))
+        target = sheet[top : top + picture.shape[0], left : left + picture.shape[1]]
+        target[..., :3], target[..., 3] = picture, 255
     return sheet
 
 
@@ -109,12 +92,54 @@ def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
     return _on_hit(0.5 + 0.5 * normal / np.where(is_seen[..., None], length, 1.0), is_seen)
 
 
+class LevelMap(NamedTuple):
+    """Level of each Gaussian in a property that varies, such as its degree."""
+
+    file: str
+    told: str
+    levels: np.ndarray
+    """[N] integers, each of which has a colour."""
+    names: Sequence[str]
+    """Meaning of levels 0, 1, …"""
+
+
+def level_maps(model: Model) -> list[LevelMap]:
+    """Return the texels of each Gaussian and its degree, each only if it varies."""
+    maps = []
+    if model.textures is not None and model.appearance.texture_options is not None:
+        levels = np.rint(np.log2(np.maximum(model.textures.sizes.prod(axis=1), 1))).astype(int)
+        names = ["1 or none", *(str(2**level) for level in range(1, levels.max() + 1))]
+        maps.append(LevelMap("resolutions.png", "the number of its texels", levels, names))
+    if model.appearance.bands is not None:
+        names = [str(degree) for degree in range(model.degrees.max() + 1)]
+        maps.append(LevelMap("degrees.png", "the degree of its view dependence", model.degrees, names))
+    return [one for one in maps if len(np.unique(one.levels)) > 1]
+
+
+def level_colors(num_levels: int) -> np.ndarray:
+    """Return [num_levels, 3] colours of levels 0, 1, …, dark to bright."""
+    return colormaps["viridis"](np.linspace(0.0, 1.0, max(2, num_levels)))[:num_levels, :3]
+
+
 def level_picture(model: Model, levels: np.ndarray, camera: Camera, settings: RenderSettings) -> np.ndarray:
-    """Return uint8 [H, W, 3] of the Gaussians in the colours of their levels, on a chequered ground."""
-    output = Renderer(colored_by_level(model, levels), settings=settings, has_geometry=False)(camera)
+    """Return uint8 [H, W, 3] of the Gaussians in the colours of their levels [N], from any direction, on a chequered
+    ground. Alpha textures stay, RGB residuals and view dependence go."""
+    colors = (level_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
+    if model.textures is not None:
+        buckets = tuple(bucket.at[..., :3].set(0.0) for bucket in model.textures.buckets)
+        model = model.with_textures(dataclasses.replace(model.textures, buckets=buckets))
+    model = with_flat_colors(model, np.ones(model.gaussians.num, bool), colors)
+    output = Renderer(model, settings=settings, has_geometry=False)(camera)
     behind = (1 - np.asarray(output.alpha))[..., None]
     ground = _ground((camera.height, camera.width)) - np.asarray(model.background)
     return to_uint8(np.asarray(output.color) + behind * ground)
+
+
+def with_flat_colors(model: Model, is_chosen: np.ndarray, colors: np.ndarray) -> Model:
+    """Return a model whose marked Gaussians have coefficients of degree 0 only: `colors`, one for all or [N, 3]."""
+    sh = np.where(is_chosen[:, None, None], 0, model.sh)
+    sh[:, 0] = np.where(is_chosen[:, None], colors, sh[:, 0])
+    return model.with_sh(sh)
 
 
 def _is_hit(output: RenderOutput) -> np.ndarray:
@@ -136,21 +161,12 @@ def flight(model: Model, settings: RenderSettings) -> bytes | None:
     cameras = [] if model.origin is None else list(model.origin.cameras)
     if len(cameras) < 2:
         return None
-    path = [_small(camera) for camera in smooth_path(cameras, FLIGHT_FRAMES)]
+    path = []
+    for camera in smooth_path(cameras, FLIGHT_FRAMES):
+        scale = min(1.0, FLIGHT_SIDE / max(camera.width, camera.height))
+        path.append(resize_camera(camera, *(max(1, round(scale * side)) for side in (camera.width, camera.height))))
     renderer = Renderer(model, cameras=path[::10], settings=settings, has_geometry=False)
-    return animation(renderer(camera).color for camera in path)
-
-
-def _small(camera: Camera) -> Camera:
-    """Return the camera with pictures of `FLIGHT_SIDE` at most."""
-    scale = min(1.0, FLIGHT_SIDE / max(camera.width, camera.height))
-    return resize_camera(camera, *(max(1, round(scale * side)) for side in (camera.width, camera.height)))
-
-
-def animation(images: Iterable[Array]) -> bytes:
-    """Return images [H, W, 3] in [0, 1] as an animated WebP that loops."""
-    first, *others = (Image.fromarray(to_uint8(jnp.asarray(image))) for image in images)
     buffer = io.BytesIO()
-    duration = round(1000 / FLIGHT_PER_SECOND)
-    first.save(buffer, "WEBP", save_all=True, append_images=others, duration=duration, loop=0, quality=75, method=2)
+    pictures = (Image.fromarray(to_uint8(renderer(camera).color)) for camera in path)
+    save_animation(buffer, pictures, FLIGHT_PER_SECOND, quality=75, method=2)
     return buffer.getvalue()

@@ -1,11 +1,10 @@
 """report.html: one page with everything a run found, images, style and script inlined, no network."""
 
 import base64
-import dataclasses
 import hashlib
 import inspect
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -15,10 +14,10 @@ from a2tg_jax.host.json_text import MOST_TOML_BYTES
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.io.config_json import flatten_config
+from a2tg_jax.results.figures import ReportFigure
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.results.images import Crop, jpeg_uri
+from a2tg_jax.results.images import Crop, file_uri, jpeg_uri
 from a2tg_jax.results.record import repeating_command
-from a2tg_jax.results.run_figures import Figures
 from a2tg_jax.results.summary import (
     RunResult,
     bytes_compared,
@@ -49,48 +48,42 @@ Table = tuple[Sequence[str], Sequence[Sequence[str]], set[tuple[int, int]]]
 """Titles, rows, and the (row, column) of the marked cells."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Comparison:
-    """One view as photographed and as rendered."""
-
-    name: str
-    images: Sequence[np.ndarray]
-    """Images, uint8 [H, W, 3], the photograph first."""
-    captions: Sequence[str]
-    crop: Crop | None
-    """Part to show enlarged."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ShownComparison:
-    """One view as the report holds it: with compressed pictures."""
+class Comparison(NamedTuple):
+    """One view as photographed and as rendered, in compressed pictures."""
 
     name: str
     captions: Sequence[str]
     uris: Sequence[str]
+    """Photograph first."""
     crops: Sequence[str]
     """Enlarged parts; may be empty."""
     size: tuple[int, int]
     """Width and height of the render in pixels."""
 
-    @classmethod
-    def of(cls, view: Comparison) -> "ShownComparison":
-        parts = [] if view.crop is None else [view.crop.of(image) for image in view.images]
-        crops = [jpeg_uri(part, zoom=CROP_ZOOM) for part in parts]
-        height, width = view.images[-1].shape[:2]
-        return cls(view.name, view.captions, [jpeg_uri(image) for image in view.images], crops, (width, height))
+    @staticmethod
+    def of(name: str, images: Sequence[np.ndarray], captions: Sequence[str], crop: Crop | None) -> "Comparison":
+        """Args:
+        name: of the view.
+        images: uint8 [H, W, 3], the photograph first.
+        captions: of the images.
+        crop: the part to show enlarged.
+        """
+        crops = [] if crop is None else [jpeg_uri(crop.of(image), zoom=CROP_ZOOM) for image in images]
+        height, width = images[-1].shape[:2]
+        return Comparison(name, captions, [jpeg_uri(image) for image in images], crops, (width, height))
 
 
-def write_report(run: RunFolder, result: RunResult, views: Sequence[ShownComparison], figures: Figures) -> None:
+def write_report(
+    run: RunFolder, result: RunResult, views: Sequence[Comparison], figures: Mapping[str, Sequence[ReportFigure]]
+) -> None:
     """Write report.html from the results, some views, and the figures in the run folder."""
-    shown = next(iter(result.models.values()))
-    held_out = result.record.scene.held_out
-    num_held_out = len(shown.test.per_view) if shown.test else 0
+    main, held_out = result.models[result.main], result.record.scene.held_out
+    num_held_out = len(main.splits[held_out].per_view) if held_out in main.splits else 0
     page = _page(
         sections=SECTIONS,
         title=f"{next(iter(result.plan.chains))} on {result.scene}",
         about=(inspect.getdoc(type(result.record.system)) or "").split("\n", 1)[0],
-        num_views=len(shown.train.per_view) + num_held_out,
+        num_views=len(main.train.per_view) + num_held_out,
         num_held_out=num_held_out,
         purpose={"test": "testing", "validation": "validation"}[held_out],
         viewer=run.viewer.name if run.viewer.is_file() else None,
@@ -99,10 +92,11 @@ def write_report(run: RunFolder, result: RunResult, views: Sequence[ShownCompari
         summary=(summary := _summary(result)),
         rows_shown=[row[0] for row in summary[1]],
         lpips_network=result.lpips_network,
-        corrections={key.partition("_")[2] for key in result.models[result.main].corrected},
+        corrections={split.partition("_")[2] for split in main.splits},
         comparisons=views,
         figures=figures,
-        views=[(split, *_views(result, split)) for split in (held_out, "train") if split in shown.splits],
+        file_uri=file_uri,
+        views=[(split, *_views(result, split)) for split in (held_out, "train") if split in main.splits],
         files=_files(run, result),
         configuration=_configuration(result),
         versions=versions(),
@@ -134,30 +128,28 @@ def _source(text: str) -> str:
 
 def _cards(result: RunResult, size: tuple[int, int] | None) -> list[tuple[str, str]]:
     """Return the figures on top of the page; `size` is that of the renders."""
-    last = result.models[result.main]
+    last, scene = result.models[result.main], result.record.scene
+    split = scene.held_out.capitalize() if scene.held_out in last.splits else "Training"
+    own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
+    others = sum(measured.seconds for measured in result.models.values()) - own
     gains = [
         (f"Gain over {name}, {bytes_compared(result, name)}", f"{gain:+.2f} dB") for name, gain in result.gains.items()
     ]
-    device = jax.devices()[0].platform.upper()
-    own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
-    others = sum(measured.seconds for measured in result.models.values()) - own
+    speed = f"Speed{f' at {size[0]}×{size[1]}' if size else ''}, on this {jax.devices()[0].platform.upper()}"
     return [
-        (f"{last.held_out.capitalize() if last.test else 'Training'} PSNR", f"{last.shown.psnr:.2f} dB"),
+        (f"{split} PSNR", f"{last.shown.psnr:.2f} dB"),
         *gains,
         ("SSIM", f"{last.shown.ssim:.4f}"),
         ("Gaussians", f"{last.num_gaussians:,}"),
         ("Memory", f"{megabytes(last.num_bytes)} MB"),
-        (
-            f"Speed{f' at {size[0]}×{size[1]}' if size else ''}, on this {device}",
-            f"{last.shown.frames_per_second:.1f} fps",
-        ),
+        (speed, f"{last.shown.frames_per_second:.1f} fps"),
         ("Training", minutes(own)),
         *([("Comparisons' training", minutes(others))] if others else []),
     ]
 
 
 def _main_first(result: RunResult) -> list[str]:
-    """Return the names of the models, that of the main one first, where a phone shows it."""
+    """Return the names of the models, the main one first, where a phone shows it."""
     return sorted(result.models, key=lambda name: name != result.main)
 
 
@@ -181,7 +173,7 @@ def _best(row: Sequence[str]) -> list[int]:
 
 
 def _views(result: RunResult, split: str) -> Table:
-    """Return PSNR and SSIM of each view by each model, whose bytes stand beside its name."""
+    """Return PSNR and SSIM of each view by each model, with its bytes next to its name."""
     names = _main_first(result)
     sizes = [f"{name} ({megabytes(result.models[name].num_bytes)} MB)" for name in names]
     found = zip(*(result.models[name].splits[split].per_view for name in names), strict=True)

@@ -1,24 +1,33 @@
-"""Evaluation of a run's finished models: metrics, pictures, figures, point cloud, report."""
+"""Evaluation of a run's finished models: metrics, pictures, figures, point cloud, report.
+
+A photograph's exposure and the exact pose of its camera cannot be learned from other photographs. Runs that learn these
+of the training views are therefore scored twice: as they are, and up to exposure and pose. `color_fit`: each render's
+colours are mapped to the photograph's by the affine map of least squares. `aligned`: test cameras are moved to where
+the model looks most like the photograph (`measure.alignment.align_poses`), training cameras to where training moved
+them.
+"""
 
 import dataclasses
+import functools
 import os
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
-from a2tg_jax.core.origin import Color
+import jax.numpy as jnp
+import numpy as np
+
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import encode_web_scene, is_viewable
+from a2tg_jax.measure.alignment import align_poses
 from a2tg_jax.measure.evaluation import Evaluation, evaluate
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.checks import check_held_out
-from a2tg_jax.results.corrected_metrics import measure_corrected, write_corrections
+from a2tg_jax.results.figures import write_figures
 from a2tg_jax.results.folder import RunFolder, read_json, resuming_command, write_json
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.images import (
@@ -32,10 +41,10 @@ from a2tg_jax.results.images import (
 )
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import HeldOut, read_record
-from a2tg_jax.results.report import Comparison, ShownComparison, write_report
-from a2tg_jax.results.run_figures import write_figures
+from a2tg_jax.results.report import Comparison, write_report
 from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, per_view_json
 from a2tg_jax.training import System
+from a2tg_jax.training.corrections import learned
 from a2tg_jax.web.page import viewer_html_with
 
 REPORTED_VIEWS = 4
@@ -61,28 +70,37 @@ def evaluate_run(
     scene = scene or record.scene.load()
     for name, model in models.items():
         check_held_out(model, scene, run.model(name))
+    histories = {name: read_history(run.history(name)) for name in models}
     measured = {
-        name: dataclasses.replace(
-            _measure(model, scene, plan, plan[name].system, _seconds(run, name), lpips_weights, record.scene.held_out),
+        name: ModelResult(
+            splits=_evaluations(model, scene, plan, plan[name].system, lpips_weights, record.scene.held_out),
+            num_gaussians=model.num,
+            num_texels=0 if model.textures is None else model.textures.num_texels,
+            num_bytes=model.num_bytes,
+            num_published_bytes=model.num_published_bytes,
+            num_padding_bytes=model.num_padding_bytes,
+            seconds=histories[name].last_seconds,
             sha256=sha256_of(run.model(name)),
         )
         for name, model in models.items()
     }
     if lpips_weights is None:
-        measured = with_kept_lpips(run, measured)
+        measured = _with_kept_lpips(run, measured)
     result = RunResult(scene.name, record, plan, measured, is_lpips_kept=lpips_weights is None)
     write_json(run.own(run.metrics), metrics_json(result))
     write_json(run.own(run.per_view), per_view_json(result))
     for name, model in models.items():
-        write_corrections(run, name, model)
-    main = models[result.main]
+        if model.origin is not None and model.origin.corrections:  # exposure [3, 4] = [A | b] and pose [6] by view
+            write_json(run.own(run.corrections(name)), learned(model.origin))
+    main, settings = models[result.main], settings_of(plan[result.main].system)
     save_ply(run.own(run.point_cloud), main)
-    _write_viewer(run, main, f"{scene.name} · {result.main}")
-    histories = {name: read_history(run.history(name)) for name in models}
+    if is_viewable(main.appearance):
+        data = encode_web_scene(main, title=f"{scene.name} · {result.main}")
+        with replacing(run.own(run.viewer)) as temporary:
+            temporary.write_text(viewer_html_with(data), encoding="utf-8")
     starts = {name: plan.first_iteration(name) for name in models}
-    camera = (*scene.test, *scene.train)[0].camera
-    figures = write_figures(run, main, camera, settings_of(plan[result.main].system), histories, starts)
-    write_report(run, result, _write_pictures(run, result, models, scene), figures)
+    figures = write_figures(run, main, (*scene.test, *scene.train)[0].camera, settings, histories, starts)
+    write_report(run, result, _write_sheets(run, result, models, scene), figures)
     return result
 
 
@@ -103,106 +121,92 @@ def finished_stages(run: RunFolder, plan: RunPlan) -> list[str]:
     return names
 
 
-def _write_viewer(run: RunFolder, model: Model, title: str) -> None:
-    """Write viewer.html, if browsers can show the model."""
-    if is_viewable(model.appearance):
-        with replacing(run.own(run.viewer)) as temporary:
-            temporary.write_text(viewer_html_with(encode_web_scene(model, title=title)), encoding="utf-8")
-
-
 def settings_of(system: System) -> RenderSettings:
     """Return the render settings of a system's models."""
     return RenderSettings(tile_size=system.tile_size)
 
 
-def _seconds(run: RunFolder, name: str) -> float:
-    """Return the training time of a stage."""
-    return read_history(run.history(name)).last_seconds
+def refined_views(views: tuple[View, ...], model: Model) -> tuple[View, ...]:
+    """Return training views with the cameras learned in training."""
+    origin = model.origin
+    if origin is None:
+        return views
+    viewmats = dict(zip(origin.names, origin.viewmats, strict=True))
+
+    def moved(view: View) -> View:
+        viewmat = jnp.asarray(np.asarray(viewmats[view.name], np.float32))
+        return dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat))
+
+    return tuple(moved(view) if view.name in viewmats else view for view in views)
 
 
-def _measure(
+def _evaluations(
     model: Model,
     scene: Scene,
     plan: RunPlan,
     system: System,
-    seconds: float,
     lpips_weights: str | os.PathLike[str] | None,
     held_out: HeldOut,
-) -> ModelResult:
-    views = (*scene.test, *scene.train)
-    found = evaluate(views, model, settings=settings_of(system), lpips_weights=lpips_weights)
-    return ModelResult(
-        train=found[len(scene.test) :],
-        test=found[: len(scene.test)] if scene.test else None,
-        num_gaussians=model.num,
-        num_texels=0 if model.textures is None else model.textures.num_texels,
-        num_bytes=model.num_bytes,
-        num_published_bytes=model.num_published_bytes,
-        num_padding_bytes=model.num_padding_bytes,
-        seconds=seconds,
-        corrected=measure_corrected(model, scene, plan, settings_of(system), lpips_weights, held_out),
-        held_out=held_out,
-    )
+) -> dict[str, Evaluation]:
+    """Return the metrics of a model by split. Those up to exposure and pose are of all models of a run if any of its
+    systems learns these."""
+    settings = settings_of(system)
+    measure = functools.partial(evaluate, settings=settings, lpips_weights=lpips_weights)
+    both = measure((*scene.test, *scene.train), model)
+    splits: dict[str, tuple[View, ...]] = {held_out: scene.test} if scene.test else {}
+    found = {split: both[: len(views)] for split, views in splits.items()}
+    found["train"] = both[len(scene.test) :]
+    has_exposure = any(planned.system.exposure for planned in plan.stages)
+    has_poses = any(planned.system.refine_poses for planned in plan.stages)
+    for split, views in {**splits, "train": scene.train}.items():
+        if has_exposure:
+            found[f"{split}_color_fit"] = measure(views, model, fit_colors=True)
+        if has_poses:
+            moved = refined_views(views, model) if split == "train" else align_poses(views, model, settings=settings)
+            found[f"{split}_aligned"] = measure(moved, model)
+            if has_exposure:
+                found[f"{split}_aligned_color_fit"] = measure(moved, model, fit_colors=True)
+    return found
 
 
-def _write_pictures(
-    run: RunFolder, result: RunResult, models: Mapping[str, Model], scene: Scene
-) -> list[ShownComparison]:
-    """Write a sheet of each view, and return some for the report. Memory holds the pictures of one view at a time."""
-    views, names = scene.test or scene.train, [*(result.compared or result.before), result.main]
-    renderers = {name: _renderer(models[name], scene, result.plan[name].system) for name in names}
-    files = picture_names(view.name for view in views)
-    reported = []
-    for index, view in enumerate(views):
-        comparison = _compare(view, renderers, models[result.main].background)
-        _write_sheet(run.test / files[view.name], run, comparison)
-        if index % -(-len(views) // REPORTED_VIEWS) == 0:
-            reported.append(ShownComparison.of(comparison))
-    return reported
-
-
-def _renderer(model: Model, scene: Scene, system: System) -> Renderer:
-    """Return the renderer that `evaluate` uses, so that nothing is compiled anew."""
-    cameras = [view.camera for view in (*scene.test, *scene.train)]
-    return Renderer(model, cameras=cameras, settings=settings_of(system), has_geometry=False)
-
-
-def _compare(view: View, renderers: Mapping[str, Renderer], background: Color) -> Comparison:
-    """Return one view as photographed, as rendered by the models to compare with, and by the main model."""
-    truth = to_uint8(view_image(view, background))
-    renders = [to_uint8(renderer(view.camera).color) for renderer in renderers.values()]
-    crop = largest_gain(truth, renders[0], renders[-1]) if len(renders) > 1 else None
-    return Comparison(view.name, [truth, *renders], ["photograph", *renderers], crop)
-
-
-def _write_sheet(path: Path, run: RunFolder, comparison: Comparison) -> None:
-    """Write the photograph, the renders and the error of the last render side by side."""
-    error = error_picture(comparison.images[-1], comparison.images[0])
-    sheet = side_by_side([*comparison.images, error], [*comparison.captions, f"error, {ERROR_GAIN} times"])
-    save_picture(run.own(path), sheet)
-
-
-def with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dict[str, ModelResult]:
+def _with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dict[str, ModelResult]:
     """Return the metrics with the LPIPS of metrics.json for every model file that has not changed since."""
+
+    def merged(found: Evaluation, kept: Mapping[str, Mapping[str, float]]) -> Evaluation:
+        per_view = tuple(dataclasses.replace(view, lpips=float(kept[view.name]["lpips"])) for view in found.per_view)
+        return dataclasses.replace(found, per_view=per_view, lpips_network=network)
+
     try:
         metrics, per_view = read_json(run.metrics), read_json(run.per_view)
-        network, models = metrics["lpips_network"], metrics["models"]
-        unchanged = {name for name, found in measured.items() if models.get(name, {}).get("sha256") == found.sha256}
-        return {
-            name: _with_lpips(found, per_view[name], network) if network and name in unchanged else found
-            for name, found in measured.items()
-        }
+        network, changed = metrics["lpips_network"], dict(measured)
+        for name, found in measured.items():
+            if network and metrics["models"].get(name, {}).get("sha256") == found.sha256:
+                splits = {split: merged(own, per_view[name][split]) for split, own in found.splits.items()}
+                changed[name] = dataclasses.replace(found, splits=splits)
+        return changed
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return dict(measured)  # none was measured, or it cannot be read
+        return dict(measured)  # None was measured, or it cannot be read.
 
 
-def _with_lpips(found: ModelResult, kept: Mapping[str, Any], network: str) -> ModelResult:
-    test = None if found.test is None else _merged(found.test, kept[found.held_out], network)
-    corrected = {key: _merged(evaluation, kept[key], network) for key, evaluation in found.corrected.items()}
-    train = _merged(found.train, kept["train"], network)
-    return dataclasses.replace(found, train=train, test=test, corrected=corrected)
-
-
-def _merged(found: Evaluation, kept: Mapping[str, Any], network: str) -> Evaluation:
-    per_view = tuple(dataclasses.replace(view, lpips=float(kept[view.name]["lpips"])) for view in found.per_view)
-    return dataclasses.replace(found, per_view=per_view, lpips_network=network)
+def _write_sheets(run: RunFolder, result: RunResult, models: Mapping[str, Model], scene: Scene) -> list[Comparison]:
+    """Write a sheet of photograph, renders and error for each view, and return some for the report. Memory holds the
+    pictures of one view at a time."""
+    views, names = scene.test or scene.train, [*(result.compared or result.before), result.main]
+    # The cameras are those of `evaluate`, so that nothing is compiled again.
+    cameras = [view.camera for view in (*scene.test, *scene.train)]
+    renderers = [
+        Renderer(models[name], cameras=cameras, settings=settings_of(result.plan[name].system), has_geometry=False)
+        for name in names
+    ]
+    files, reported = picture_names(view.name for view in views), []
+    for index, view in enumerate(views):
+        truth = to_uint8(view_image(view, models[result.main].background))
+        renders = [to_uint8(renderer(view.camera).color) for renderer in renderers]
+        images, captions = [truth, *renders], ["photograph", *names]
+        error = error_picture(renders[-1], truth)
+        sheet = side_by_side([*images, error], [*captions, f"error, {ERROR_GAIN} times"])
+        save_picture(run.own(run.test / files[view.name]), sheet)
+        if index % -(-len(views) // REPORTED_VIEWS) == 0:
+            crop = largest_gain(truth, renders[0], renders[-1]) if len(renders) > 1 else None
+            reported.append(Comparison.of(view.name, images, captions, crop))
+    return reported

@@ -11,17 +11,16 @@ from typing import Any
 import jax
 
 from a2tg_jax.measure.evaluation import Evaluation
-from a2tg_jax.results.corrected_metrics import corrected_title
 from a2tg_jax.results.plan import RunPlan
-from a2tg_jax.results.record import HeldOut, RunRecord
+from a2tg_jax.results.record import RunRecord
 
 QUALITIES = ("PSNR (dB)", "SSIM", "LPIPS")
-FIGURES = (
-    "Gaussians", "texels a Gaussian", "memory (MB)", "as published (MB)", "padding (MB)", "frames a second",
-    "training time",
-)  # fmt: skip
-NUM_QUALITIES = 2 * len(QUALITIES)
-"""Number of the first figures, of held-out and training views."""
+WAYS = {
+    "color_fit": "colours fitted",
+    "aligned": "poses aligned",
+    "aligned_color_fit": "poses aligned, colours fitted",
+}
+"""Titles of metrics up to exposure and pose, by the suffix of a split in metrics.json: test_color_fit, …"""
 EQUAL_BYTES = 0.01
 """Largest relative difference of two sizes that are called equal."""
 
@@ -30,9 +29,9 @@ EQUAL_BYTES = 0.01
 class ModelResult:
     """Measurements of one stage's model."""
 
-    train: Evaluation
-    test: Evaluation | None
-    """Metrics of the held-out views; None without such views."""
+    splits: Mapping[str, Evaluation]
+    """Metrics by their names in metrics.json: of the held-out views, "test" or "validation", if there are any; of the
+    "train" views; then those up to exposure and pose, if a system of the run learns these."""
     num_gaussians: int
     num_texels: int
     """Number of texels; 0 without textures."""
@@ -46,21 +45,15 @@ class ModelResult:
     """Training time of this stage."""
     sha256: str = ""
     """SHA-256 of the model's file."""
-    corrected: Mapping[str, Evaluation] = dataclasses.field(default_factory=dict)
-    """Metrics up to exposure and pose (`results.corrected_metrics`), if a system of the run learns these."""
-    held_out: HeldOut = "test"
-    """Kind of the held-out views."""
 
     @property
-    def splits(self) -> dict[str, Evaluation]:
-        """All evaluations, by their names in metrics.json."""
-        held_out: dict[str, Evaluation] = {} if self.test is None else {self.held_out: self.test}
-        return {"train": self.train, **held_out, **self.corrected}
+    def train(self) -> Evaluation:
+        return self.splits["train"]
 
     @property
     def shown(self) -> Evaluation:
         """Evaluation of the held-out views, or of the training views if there are none."""
-        return self.test or self.train
+        return next(iter(self.splits.values()))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,15 +94,26 @@ class RunResult:
 
     @property
     def lpips_network(self) -> str | None:
-        return next(iter(self.models.values())).train.lpips_network
+        return self.models[self.main].train.lpips_network
 
 
 def metrics_json(result: RunResult) -> dict[str, Any]:
     """Return the content of metrics.json."""
+    models = {}
+    for name, measured in result.models.items():
+        counts = {key: value for key, value in vars(measured).items() if key != "splits"}
+        splits = {
+            split: {
+                "psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips, "flat_psnr": found.flat_psnr,
+                "views": len(found.per_view),
+            }
+            for split, found in measured.splits.items()
+        }  # fmt: skip
+        models[name] = {**splits, **counts, "frames_per_second": measured.shown.frames_per_second}
     return {
         "scene": result.scene,
         "main": result.main,
-        "models": {name: _model_json(measured) for name, measured in result.models.items()},
+        "models": models,
         "gains_db": result.gains,
         "lpips_network": result.lpips_network,
         "versions": versions(),
@@ -142,22 +146,29 @@ def versions() -> dict[str, str]:
 
 def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
     """Return titles and rows of the headline table: a column for each model, a row for each metric present."""
-    models = result.models.values()
-    qualities = [f"{split} {name}" for split in (result.record.scene.held_out, "train") for name in QUALITIES]
-    columns = [_figures(measured) for measured in models]
-    rows = [[name, *cells] for name, *cells in zip((*qualities, *FIGURES), *columns, strict=True)]
-    keys = dict.fromkeys(key for measured in models for key in measured.corrected)
-    further = [
-        row for key in keys for row in _corrected_rows(key, [measured.corrected.get(key) for measured in models])
+    models = list(result.models.values())
+    rows = []
+    for split in dict.fromkeys(split for measured in models for split in measured.splits):
+        views, _, way = split.partition("_")
+        title = f"{views}, {WAYS[way]}:" if way else views
+        cells = zip(*(_qualities(measured.splits.get(split)) for measured in models), strict=True)
+        rows += [[f"{title} {name}", *row] for name, row in zip(QUALITIES, cells, strict=True)]
+    figures = [
+        {
+            "Gaussians": f"{found.num_gaussians:,}",
+            "texels a Gaussian": f"{found.num_texels / found.num_gaussians:.2f}" if found.num_texels else "",
+            "memory (MB)": megabytes(found.num_bytes),
+            "as published (MB)": (
+                megabytes(found.num_published_bytes) if found.num_published_bytes != found.num_bytes else ""
+            ),
+            "padding (MB)": megabytes(found.num_padding_bytes) if found.num_padding_bytes else "",
+            "frames a second": f"{found.shown.frames_per_second:.1f}",
+            "training time": minutes(found.seconds),
+        }
+        for found in models
     ]
-    rows[NUM_QUALITIES:NUM_QUALITIES] = further
+    rows += [[name, *(column[name] for column in figures)] for name in figures[0]]
     return ["", *result.models], [row for row in rows if any(row[1:])]
-
-
-def _corrected_rows(key: str, found: Sequence[Evaluation | None]) -> list[list[str]]:
-    """Return the rows of a table for figures up to exposure or pose."""
-    cells = zip(*(_qualities(evaluation) for evaluation in found), strict=True)
-    return [[f"{corrected_title(key)}: {name}", *row] for name, row in zip(QUALITIES, cells, strict=True)]
 
 
 def summary_text(result: RunResult, width: int | None = None) -> str:
@@ -165,17 +176,25 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
 
     Args:
       result: the run.
-      width: in characters; models that do not fit beside each other follow below. None: the terminal's.
+      width: in characters; models that do not fit next to each other follow below. None: the terminal's.
     """
     titles, rows = summary_table(result)
     names, *columns = zip(titles, *rows, strict=True)
-    lines: list[str] = []
-    for block in _blocks(names, columns, width or shutil.get_terminal_size().columns):
-        lines += ["", *aligned([names, *block])] if lines else aligned([names, *block])
+    width = width or shutil.get_terminal_size().columns
+    blocks = [[names]]
+    for column in columns:
+        if len(blocks[-1]) > 1 and max(map(len, aligned([*blocks[-1], column]))) > width:
+            blocks.append([names])
+        blocks[-1].append(column)
+    lines = "\n\n".join("\n".join(aligned(block)) for block in blocks).split("\n")
     if result.lpips_network:
         kept = ", kept from an earlier measurement of the same models" if result.is_lpips_kept else ""
         lines.append(f"LPIPS with {result.lpips_network}{kept}")
-    lines += budget_lines(result)
+    for name in dict.fromkeys(chain[-1] for chain in result.plan.chains.values()):
+        budget = result.plan[name].system.budget_bytes
+        if budget is not None and name in result.models:
+            used = result.models[name].num_bytes
+            lines.append(f"{name} takes {used:,} bytes of its budget of {budget:,} ({100 * used / budget:.2f} %)")
     lines += learning_lines(result)
     for name, gain in result.gains.items():
         lines.append(f"{result.main}: {gain:+.2f} dB over {name}, {bytes_compared(result, name)}")
@@ -183,7 +202,7 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
 
 
 def bytes_compared(result: RunResult, name: str) -> str:
-    """Return the bytes of the main model beside those of another, for the line of its gain."""
+    """Return the bytes of the main model against another's, for the line of its gain."""
     own, other = result.models[result.main].num_bytes, result.models[name].num_bytes
     if abs(own - other) <= EQUAL_BYTES * other:
         return f"at equal bytes ({megabytes(own)} MB)"
@@ -192,36 +211,14 @@ def bytes_compared(result: RunResult, name: str) -> str:
     return f"with {times} times its bytes ({megabytes(own)} MB and {megabytes(other)} MB)"
 
 
-def budget_lines(result: RunResult) -> list[str]:
-    """Return how much of its memory budget each finished model takes."""
-    lines = []
-    for name in dict.fromkeys(chain[-1] for chain in result.plan.chains.values()):
-        budget = result.plan[name].system.budget_bytes
-        if budget is not None and name in result.models:
-            used = result.models[name].num_bytes
-            lines.append(f"{name} takes {used:,} bytes of its budget of {budget:,} ({100 * used / budget:.2f} %)")
-    return lines
-
-
 def learning_lines(result: RunResult) -> list[str]:
     """Return a warning for each finished model that does not beat one flat colour per view on its training views."""
-    trained = {name: measured.train for name, measured in result.models.items()}
     return [
-        f"{name} did not learn: {found.psnr:.1f} dB on its training views, where one flat colour per view reaches "
-        f"{found.flat_psnr:.1f} dB"
-        for name, found in trained.items()
-        if not found.has_learned
+        f"{name} did not learn: {measured.train.psnr:.1f} dB on its training views, where one flat colour per view "
+        f"reaches {measured.train.flat_psnr:.1f} dB"
+        for name, measured in result.models.items()
+        if not measured.train.has_learned
     ]
-
-
-def _blocks(names: tuple[str, ...], columns: Sequence[tuple[str, ...]], width: int) -> list[list[tuple[str, ...]]]:
-    """Group columns so that each group, of at least one column, fits beside the names."""
-    blocks: list[list[tuple[str, ...]]] = [[]]
-    for column in columns:
-        if blocks[-1] and max(map(len, aligned([names, *blocks[-1], column]))) > width:
-            blocks.append([])
-        blocks[-1].append(column)
-    return blocks
 
 
 def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
@@ -247,40 +244,8 @@ def minutes(seconds: float) -> str:
     return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
 
 
-def _model_json(measured: ModelResult) -> dict[str, Any]:
-    quality = {
-        split: {
-            "psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips, "flat_psnr": found.flat_psnr,
-            "views": len(found.per_view),
-        }
-        for split, found in measured.splits.items()
-    }  # fmt: skip
-    names = (
-        "num_gaussians", "num_texels", "num_bytes", "num_published_bytes", "num_padding_bytes", "seconds", "sha256"
-    )  # fmt: skip
-    counts = {name: getattr(measured, name) for name in names}
-    return {**quality, **counts, "frames_per_second": measured.shown.frames_per_second}
-
-
 def _qualities(found: Evaluation | None) -> list[str]:
     """Return PSNR, SSIM and LPIPS; empty for a missing metric."""
     if found is None:
         return ["", "", ""]
     return [f"{found.psnr:.2f}", f"{found.ssim:.4f}", "" if found.lpips is None else f"{found.lpips:.4f}"]
-
-
-def _figures(measured: ModelResult) -> list[str]:
-    """Return one model's column of the headline table; empty for a missing metric."""
-    is_textured = measured.num_texels > 0
-    is_counted_otherwise = measured.num_published_bytes != measured.num_bytes
-    return [
-        *_qualities(measured.test),
-        *_qualities(measured.train),
-        f"{measured.num_gaussians:,}",
-        f"{measured.num_texels / measured.num_gaussians:.2f}" if is_textured else "",
-        megabytes(measured.num_bytes),
-        megabytes(measured.num_published_bytes) if is_counted_otherwise else "",
-        megabytes(measured.num_padding_bytes) if measured.num_padding_bytes else "",
-        f"{measured.shown.frames_per_second:.1f}",
-        minutes(measured.seconds),
-    ]
