@@ -28,16 +28,15 @@ if TYPE_CHECKING:
     from a2tg_jax.core.optim import adam_update as adam_update
     from a2tg_jax.core.optim import exponential_decay as exponential_decay
     from a2tg_jax.core.origin import Origin as Origin
-    from a2tg_jax.core.overflow import CapacityWarning as CapacityWarning
-    from a2tg_jax.core.partition import combine as combine
-    from a2tg_jax.core.partition import partition as partition
     from a2tg_jax.core.paths import look_at as look_at
     from a2tg_jax.core.paths import path_through as path_through
     from a2tg_jax.core.paths import smooth_path as smooth_path
+    from a2tg_jax.core.pytree import combine as combine
+    from a2tg_jax.core.pytree import partition as partition
     from a2tg_jax.core.pytree import pytree as pytree
     from a2tg_jax.core.pytree import static as static
     from a2tg_jax.core.similarity import Similarity as Similarity
-    from a2tg_jax.core.transform import transform_gaussians as transform_gaussians
+    from a2tg_jax.core.similarity import transform_gaussians as transform_gaussians
     from a2tg_jax.data import Mask as Mask
     from a2tg_jax.data import ObservedPoints as ObservedPoints
     from a2tg_jax.data import Picture as Picture
@@ -53,9 +52,8 @@ if TYPE_CHECKING:
     from a2tg_jax.densify.clone_split import CloneSplitPrune as CloneSplitPrune
     from a2tg_jax.densify.clone_split import FillingDensity as FillingDensity
     from a2tg_jax.densify.clone_split import OpacityReset as OpacityReset
-    from a2tg_jax.densify.exponents import LimitExponents as LimitExponents
-    from a2tg_jax.densify.floaters import PruneFloaters as PruneFloaters
     from a2tg_jax.densify.pruning import Prune as Prune
+    from a2tg_jax.densify.pruning import PruneFloaters as PruneFloaters
     from a2tg_jax.densify.splitting import SplitByGradient as SplitByGradient
     from a2tg_jax.densify.view_dependence import AdaptDegrees as AdaptDegrees
     from a2tg_jax.events import Change as Change
@@ -115,17 +113,19 @@ if TYPE_CHECKING:
     from a2tg_jax.model import concatenate as concatenate
     from a2tg_jax.rasterize.render_types import RenderOutput as RenderOutput
     from a2tg_jax.rasterize.render_types import RenderSettings as RenderSettings
+    from a2tg_jax.render import CapacityWarning as CapacityWarning
     from a2tg_jax.render import render_appearance as render_appearance
     from a2tg_jax.render import render_image as render_image
     from a2tg_jax.renderer import Renderer as Renderer
     from a2tg_jax.renderer import plan_render as plan_render
     from a2tg_jax.systems.a2tg import A2tg as A2tg
-    from a2tg_jax.systems.bbsplat import BBSplat as BBSplat
+    from a2tg_jax.systems.baselines import BBSplat as BBSplat
+    from a2tg_jax.systems.baselines import Gaussians2d as Gaussians2d
+    from a2tg_jax.systems.baselines import Gaussians2dMcmc as Gaussians2dMcmc
+    from a2tg_jax.systems.baselines import SuperGaussians as SuperGaussians
+    from a2tg_jax.systems.baselines import TexturedGaussians as TexturedGaussians
     from a2tg_jax.systems.bytewise import Bytewise as Bytewise
-    from a2tg_jax.systems.gaussians_2d import Gaussians2d as Gaussians2d
-    from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc as Gaussians2dMcmc
-    from a2tg_jax.systems.supergaussians import SuperGaussians as SuperGaussians
-    from a2tg_jax.systems.textured_gaussians import TexturedGaussians as TexturedGaussians
+    from a2tg_jax.systems.bytewise import LimitExponents as LimitExponents
     from a2tg_jax.texture import Textures as Textures
     from a2tg_jax.texture import allocate_textures as allocate_textures
     from a2tg_jax.texture import texture_arrays as texture_arrays
@@ -167,8 +167,8 @@ _NAMES = {
         "Exponents",
         "TexelRates",
         "Texture",
-        "allocate_appearance",
         "TextureOptions",
+        "allocate_appearance",
     ),
     "a2tg_jax.core.bilinear": ("TextureRegion",),
     "a2tg_jax.core.cameras": ("Camera", "resize_camera"),
@@ -176,12 +176,9 @@ _NAMES = {
     "a2tg_jax.core.gradient_statistics": ("GradientStatistics",),
     "a2tg_jax.core.optim": ("adam_init", "adam_update", "exponential_decay"),
     "a2tg_jax.core.origin": ("Origin",),
-    "a2tg_jax.core.overflow": ("CapacityWarning",),
-    "a2tg_jax.core.partition": ("combine", "partition"),
     "a2tg_jax.core.paths": ("look_at", "path_through", "smooth_path"),
-    "a2tg_jax.core.pytree": ("pytree", "static"),
-    "a2tg_jax.core.similarity": ("Similarity",),
-    "a2tg_jax.core.transform": ("transform_gaussians",),
+    "a2tg_jax.core.pytree": ("combine", "partition", "pytree", "static"),
+    "a2tg_jax.core.similarity": ("Similarity", "transform_gaussians"),
     "a2tg_jax.data": (
         "Mask",
         "ObservedPoints",
@@ -197,20 +194,10 @@ _NAMES = {
         "with_validation_views",
     ),
     "a2tg_jax.densify.clone_split": ("CloneSplitPrune", "FillingDensity", "OpacityReset"),
-    "a2tg_jax.densify.exponents": ("LimitExponents",),
-    "a2tg_jax.densify.floaters": ("PruneFloaters",),
-    "a2tg_jax.densify.pruning": ("Prune",),
+    "a2tg_jax.densify.pruning": ("Prune", "PruneFloaters"),
     "a2tg_jax.densify.splitting": ("SplitByGradient",),
     "a2tg_jax.densify.view_dependence": ("AdaptDegrees",),
-    "a2tg_jax.events": (
-        "Change",
-        "Due",
-        "EventInfo",
-        "HostEvent",
-        "StepEvent",
-        "Times",
-        "keep_rows",
-    ),
+    "a2tg_jax.events": ("Change", "Due", "EventInfo", "HostEvent", "StepEvent", "Times", "keep_rows"),
     "a2tg_jax.finish.compaction": ("loss_beside_renders", "loss_on_views", "measure_choices", "smallest_within"),
     "a2tg_jax.finish.polishing": ("polish",),
     "a2tg_jax.finish.shrinking": ("shrink_textures",),
@@ -235,15 +222,11 @@ _NAMES = {
     "a2tg_jax.mesh.triangles": ("Mesh",),
     "a2tg_jax.model": ("Model", "concatenate"),
     "a2tg_jax.rasterize.render_types": ("RenderOutput", "RenderSettings"),
-    "a2tg_jax.render": ("render_appearance", "render_image"),
+    "a2tg_jax.render": ("CapacityWarning", "render_appearance", "render_image"),
     "a2tg_jax.renderer": ("Renderer", "plan_render"),
     "a2tg_jax.systems.a2tg": ("A2tg",),
-    "a2tg_jax.systems.bbsplat": ("BBSplat",),
-    "a2tg_jax.systems.bytewise": ("Bytewise",),
-    "a2tg_jax.systems.gaussians_2d": ("Gaussians2d",),
-    "a2tg_jax.systems.gaussians_2d_mcmc": ("Gaussians2dMcmc",),
-    "a2tg_jax.systems.supergaussians": ("SuperGaussians",),
-    "a2tg_jax.systems.textured_gaussians": ("TexturedGaussians",),
+    "a2tg_jax.systems.baselines": ("BBSplat", "Gaussians2d", "Gaussians2dMcmc", "SuperGaussians", "TexturedGaussians"),
+    "a2tg_jax.systems.bytewise": ("Bytewise", "LimitExponents"),
     "a2tg_jax.texture": ("Textures", "allocate_textures", "texture_arrays", "textures_from_arrays"),
     "a2tg_jax.training": (
         "Checkpoint",

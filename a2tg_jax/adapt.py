@@ -163,12 +163,15 @@ class Upscale(HostEvent):
             sizes, scales[:num], k_a=self.k_a, k_s=self.k_s, cap=self.cap,
             anisotropic=self.anisotropic, axes=self.axes,
         )  # fmt: skip
-        how = self._how_to_select(model.num_bytes, due)
-        mask = select(averages[:num], sizes, proposed, **how)
+        if self.select == "budget":
+            rule = {"budget_bytes": event_budget(self._budget_bytes, model.num_bytes, due.index, due.count)}
+        else:
+            rule = {self.select: getattr(self, self.select)}
+        mask = select(averages[:num], sizes, proposed, **rule)
         grown = np.where(mask[:, None], proposed, sizes)
         unused = self._unused(sizes[mask], scales[:num][mask])
         if self.select == "budget" and due.index == due.count and (grown == proposed).all():
-            left = how["budget_bytes"] - _bytes_between(sizes, grown)
+            left = rule["budget_bytes"] - _bytes_between(sizes, grown)
             grown = self._with_the_rest(averages[:num], grown, scales[:num], left)
         new_sizes[:num] = grown
         kept = None if self.moments == "copied" else (new_sizes == old_sizes).all(axis=1)
@@ -204,12 +207,6 @@ class Upscale(HostEvent):
                 left -= _bytes_between(sizes, grown)
                 sizes = grown
         return sizes
-
-    def _how_to_select(self, used_bytes: int, due: Due) -> dict[str, float]:
-        """Return the keyword that tells `select` how to choose."""
-        if self.select == "budget":
-            return {"budget_bytes": event_budget(self._budget_bytes, used_bytes, due.index, due.count)}
-        return {self.select: getattr(self, self.select)}
 
 
 def next_sizes(
@@ -329,7 +326,12 @@ def select(
     added_bytes = BYTES_PER_TEXEL * (np.prod(proposed, axis=1) - np.prod(sizes, axis=1))
     can_grow = added_bytes > 0
     if fraction is not None:
-        return _select_fraction(statistic, can_grow, fraction)
+        check_number("fraction", fraction, least=0, most=1)
+        candidates = np.flatnonzero(can_grow & (statistic > 0))
+        order = np.argsort(-statistic[candidates], kind="stable")
+        mask = np.zeros(len(statistic), bool)
+        mask[candidates[order[: math.floor(fraction * len(statistic) + 0.5)]]] = True
+        return mask
     if budget_bytes is not None:
         return within_budget(statistic, can_grow, added_bytes, budget_bytes)
     check_number("threshold", threshold)
@@ -369,20 +371,6 @@ def reallocate(
     return ReallocateResult(rebuilt, moments)
 
 
-def _select_fraction(statistic: np.ndarray, can_grow: np.ndarray, fraction: float) -> np.ndarray:
-    check_number("fraction", fraction, least=0, most=1)
-    candidates = np.flatnonzero(can_grow & (statistic > 0))
-    order = np.argsort(-statistic[candidates], kind="stable")
-    num = math.floor(fraction * len(statistic) + 0.5)
-    return _mask(len(statistic), candidates[order[:num]])
-
-
 def _bytes_between(sizes: np.ndarray, larger: np.ndarray) -> int:
     """Return the bytes that textures take more at their larger sizes."""
     return BYTES_PER_TEXEL * int(np.prod(larger, axis=1).sum() - np.prod(sizes, axis=1).sum())
-
-
-def _mask(num: int, chosen: ArrayLike) -> np.ndarray:
-    mask = np.zeros(num, bool)
-    mask[np.asarray(chosen, np.int64)] = True
-    return mask

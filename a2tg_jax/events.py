@@ -18,7 +18,7 @@ from a2tg_jax.appearance.base import clear_rows
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_mask
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.table import Shape, Table, is_table
 from a2tg_jax.data import View
 from a2tg_jax.host.text import shortened

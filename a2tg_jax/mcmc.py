@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.appearance.copies import DEAD_OPACITY, MAX_SHARES, share
 from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.checks import check_number, check_shape
-from a2tg_jax.core.gaussians import Gaussians, check_gaussians, rotation_matrices
+from a2tg_jax.core.gaussians import DEAD_OPACITY, MAX_SHARES, Gaussians, check_gaussians, rotation_matrices, share
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import bucket_capacity

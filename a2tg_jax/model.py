@@ -11,19 +11,17 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, count_floats, in_words, template_of
-from a2tg_jax.appearance.bands import MAX_DEGREE, bands_of_dense, degrees_of_sizes, dense_bands
 from a2tg_jax.appearance.base import check_arrays_given, join_rows, take_rows
+from a2tg_jax.appearance.parts import MAX_DEGREE, bands_of_dense, degrees_of_sizes, dense_bands
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind, check_unmasked, short_repr
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.notebook_display import html_table
 from a2tg_jax.core.origin import BLACK, Color, Origin
-from a2tg_jax.core.partition import partition
-from a2tg_jax.core.pytree import beside, pytree, static
+from a2tg_jax.core.pytree import beside, partition, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.core.transform import transform_gaussians
+from a2tg_jax.core.similarity import Similarity, transform_gaussians
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.render import render_appearance, with_features

@@ -4,9 +4,13 @@ N splats, H×W pixels. An eager call plans its own capacity. Under jit or vmap, 
 which `plan_render` fills in.
 """
 
+import collections
 import dataclasses
 import functools
-from collections.abc import Callable
+import threading
+import warnings
+from collections.abc import Callable, Hashable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +23,14 @@ from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain_array
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.overflow import OverflowWatch
 from a2tg_jax.rasterize.capacity import with_capacity
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.texture import Textures, check_textures
+
+
+class CapacityWarning(UserWarning):
+    """An eager render had too small a capacity: its image is only the background."""
 
 
 def render_image(
@@ -76,24 +83,56 @@ def render_appearance(
     background = (0,) * num_colors if background is None else background
     check_background(background, num_colors)
     if num_live is not None:
-        check_live(num_live, gaussians.num)
+        check_shape("num_live", num_live, ())
+        is_known, num = not isinstance(num_live, jax.core.Tracer), gaussians.num
+        if not jnp.issubdtype(dtype_of(num_live), jnp.integer) or (is_known and not 0 <= int(num_live) <= num):
+            raise ValueError(f"num_live must be an integer, 0 to {num}; got {num_live}")
     planned = with_capacity(settings, gaussians, camera, appearance, num_live)
     background = jnp.asarray(background, gaussians.means.dtype)
-    output, _ = _jitted_render()(gaussians, camera, appearance, background, planned, num_live=num_live)
+    output, _ = jitted_render()(gaussians, camera, appearance, background, planned, num_live=num_live)
     if settings.capacity is not None:
         kind = settings, camera.width, camera.height, gaussians.num
-        _overflow_watch().observe(output.overflow, settings.capacity, kind)
+        _watch_overflow(output.overflow, settings.capacity, kind)
     return output
 
 
 @functools.cache
-def _jitted_render() -> Callable[..., tuple[RenderOutput, Array]]:
-    return jax.jit(render_traced, static_argnums=(4,))
+def jitted_render() -> Callable[..., tuple[RenderOutput, Array]]:
+    """Return `render_traced` under jit; its cache counts the compilations."""
+    return jax.jit(render_traced, static_argnums=(4,), static_argnames=("has_geometry",))
 
 
-@functools.cache
-def _overflow_watch() -> OverflowWatch:
-    return OverflowWatch()
+def _watch_overflow(overflow: Array, capacity: int, kind: Hashable) -> None:
+    """Warn if this render, or one before it that is done by now, has overflowed; do nothing under jit and vmap.
+
+    The first render of a kind (settings, image size and number of Gaussians) is waited for; later ones are read once
+    they are done, so that rendering stays asynchronous.
+    """
+    if isinstance(overflow, jax.core.Tracer):
+        return
+    with _watch_lock:
+        _pending.append((overflow, capacity))
+    if kind not in _watched_kinds:
+        _watched_kinds.add(kind)
+        overflow.block_until_ready()
+    while True:
+        with _watch_lock:
+            if not _pending or not (_pending[0][0].is_deleted() or _pending[0][0].is_ready()):
+                return
+            done, its_capacity = _pending.popleft()
+        if not done.is_deleted() and bool(done):
+            warnings.warn(
+                f"settings.capacity of {its_capacity:,} was too small for a render: its image is only the background. "
+                "Plan it with settings = plan_render(model, cameras), or leave capacity=None outside jit",
+                CapacityWarning,
+                stacklevel=4,
+            )
+
+
+_watch_lock = threading.Lock()
+_watched_kinds: set[Hashable] = set()
+_pending: collections.deque[tuple[Any, int]] = collections.deque(maxlen=64)
+"""Flags of renders that may not be done yet, and their capacities; the oldest are forgotten."""
 
 
 def with_features(appearance: Appearance, features: ArrayLike | None, gaussians: Gaussians) -> Appearance:
@@ -110,14 +149,6 @@ def with_features(appearance: Appearance, features: ArrayLike | None, gaussians:
         found = f"{dtype_of(features)}{[*np.shape(features)]}"
         raise ValueError(f"features must be {gaussians.means.dtype} as the means are, D >= 1; got {found}")
     return dataclasses.replace(appearance, features=jnp.asarray(features))
-
-
-def check_live(num_live: Array | int, num: int) -> None:
-    """Raise ValueError unless a number of live rows is an integer, up to `num` where it has a value."""
-    check_shape("num_live", num_live, ())
-    is_known = not isinstance(num_live, jax.core.Tracer)
-    if not jnp.issubdtype(dtype_of(num_live), jnp.integer) or (is_known and not 0 <= int(num_live) <= num):
-        raise ValueError(f"num_live must be an integer, 0 to {num}; got {num_live}")
 
 
 def check_background(background: ArrayLike, num_colors: int = 3) -> None:

@@ -1,10 +1,8 @@
 """Room for tile lists: planned for given cameras, or kept and enlarged by a renderer for moving cameras (host)."""
 
 import dataclasses
-import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
@@ -17,8 +15,7 @@ from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.capacity import HEAD_ROOM, capacity_for, pairs_of_view, pairs_to_draw
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.render import appearance_of, check_background
+from a2tg_jax.render import appearance_of, check_background, jitted_render
 from a2tg_jax.texture import Textures
 
 FIRST_ROOM = 1.5
@@ -133,7 +130,9 @@ class Renderer:
         self._known = own[:: -(-len(own) // PLANNED_CAMERAS) or 1]
         self.capacities: dict[Size, int] = dict(capacities or {})
         """Capacities for (splat, tile) pairs by image size, (width, height)."""
-        self._plan(checked_cameras(cameras))
+        for camera in checked_cameras(cameras):
+            size = camera.width, camera.height
+            self.capacities[size] = max(self.capacities.get(size, 0), capacity_for(self._num_pairs(camera)))
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{width}×{height}" for width, height in self.capacities) or "no size yet"
@@ -154,38 +153,12 @@ class Renderer:
             output, needed = self._draw(camera)
         return output
 
-    def _plan(self, cameras: list[Camera]) -> None:
-        """Plan capacities for all these cameras."""
-        for camera in cameras:
-            size = camera.width, camera.height
-            self.capacities[size] = max(self.capacities.get(size, 0), capacity_for(self._num_pairs(camera)))
-
     def _num_pairs(self, camera: Camera) -> int:
         return pairs_of_view(self._gaussians, camera, self._appearance, self._settings, self._num_live)
 
     def _draw(self, camera: Camera) -> tuple[RenderOutput, Array]:
         settings = dataclasses.replace(self._settings, capacity=self.capacities[camera.width, camera.height])
-        draw = _jitted_draw()
-        return draw(
-            self._gaussians, self._num_live, camera, self._appearance, self._background, settings, self._has_geometry
-        )
-
-
-@functools.cache
-def _jitted_draw() -> Callable[..., tuple[RenderOutput, Array]]:
-    """Return the jitted drawing function; its cache counts the compilations."""
-
-    def draw(
-        gaussians: Gaussians,
-        num_live: Array | None,
-        camera: Camera,
-        appearance: Appearance,
-        background: Array,
-        settings: RenderSettings,
-        has_geometry: bool,
-    ) -> tuple[RenderOutput, Array]:
-        return render_traced(
-            gaussians, camera, appearance, background, settings, has_geometry=has_geometry, num_live=num_live
-        )
-
-    return jax.jit(draw, static_argnums=(5, 6))
+        return jitted_render()(
+            self._gaussians, camera, self._appearance, self._background, settings,
+            has_geometry=self._has_geometry, num_live=self._num_live,
+        )  # fmt: skip

@@ -1,6 +1,6 @@
 """Textures of mixed resolutions as they are stored and trained: a `core.table.Table` of texels.
 
-`appearance.lookup` defines how a texture is shown and where (u, v) is in it; `core.bilinear` interpolates.
+`appearance.parts` defines how a texture is shown and where (u, v) is in it; `core.bilinear` interpolates.
 
 N Gaussians; texture i is [Tv, Tu, 4] = signed RGB residual and alpha factor; u indexes columns (Tu), v rows (Tv).
 Textures of one resolution share a bucket [capacity, Tv, Tu, 4], whose rows past the used ones are padding.

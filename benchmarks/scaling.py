@@ -33,13 +33,12 @@ import numpy as np
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
-from a2tg_jax.core.geometry import screen_bounds
-from a2tg_jax.core.pixel_sizes import NEAR_PLANE
-from a2tg_jax.parallel.image_bands import BorderRoom, ImageBands
+from a2tg_jax.core.geometry import NEAR_PLANE, screen_bounds
+from a2tg_jax.parallel.exchange import BorderRoom, ImageBands
 from a2tg_jax.rasterize.kernels.packing import num_numbers
 from a2tg_jax.rasterize.splats import drawn_splats
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
-from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training.registry import with_changes
 from benchmarks.workload import random_scene
 from experiments.lab.markdown import table as markdown

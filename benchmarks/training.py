@@ -9,7 +9,7 @@ import a2tg_jax
 from a2tg_jax import A2tg
 from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import fit_stage, like
 from benchmarks.rendering import measure_view
 

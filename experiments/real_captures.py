@@ -22,7 +22,7 @@ from lab.kept import read_kept
 from scipy.spatial.transform import Rotation
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.rigid import moved_viewmat
+from a2tg_jax.core.cameras import moved_viewmat
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.host.memory import tidy_memory
 from a2tg_jax.results.folder import write_json

@@ -29,7 +29,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.systems.stage1 import TwoStages
+from a2tg_jax.systems.two_stages import TwoStages
 from a2tg_jax.training import Stage, fit_stage
 from a2tg_jax.training.losses import photometric_loss
 

@@ -27,9 +27,8 @@ from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.folder import write_json as write_run_json
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
-from a2tg_jax.systems.bbsplat import BBSplat
+from a2tg_jax.systems.baselines import BBSplat, SuperGaussians
 from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.systems.supergaussians import SuperGaussians
 from a2tg_jax.training import History, save_checkpoint
 
 SYSTEMS = {

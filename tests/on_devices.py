@@ -24,13 +24,12 @@ from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Change, Due, HostEvent, StepEvent
 from a2tg_jax.parallel import exchange as exchanges
 from a2tg_jax.parallel import rows
-from a2tg_jax.parallel.exchange import AXIS, ROOM_OF_A_BAND, exchange_among
-from a2tg_jax.parallel.image_bands import BorderRoom, ImageBands
+from a2tg_jax.parallel.exchange import AXIS, ROOM_OF_A_BAND, BorderRoom, ImageBands, exchange_among
 from a2tg_jax.parallel.rows import on_host, placed_like, readable, rows_moved, sharding_of_rows, spread
 from a2tg_jax.rasterize.capacity import pairs_of_view
 from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.cost import stage_bytes

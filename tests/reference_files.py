@@ -15,8 +15,7 @@ import numpy as np
 
 from a2tg_jax import CompactChoices, load_compact, load_gltf, load_model, save_compact, save_gltf, save_model
 from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture
-from a2tg_jax.appearance.bands import bands_of_dense
-from a2tg_jax.appearance.exponents import log_exponents_of
+from a2tg_jax.appearance.parts import bands_of_dense, log_exponents_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin

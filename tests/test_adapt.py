@@ -14,7 +14,7 @@ from a2tg_jax.core.budget import event_budget
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.table import Shape, plan_places
 from a2tg_jax.events import Due
 from a2tg_jax.model import Model

@@ -9,7 +9,7 @@ import pytest
 
 from a2tg_jax import Gaussians2dMcmc, align_poses, color_fit, evaluate, fit, synthetic_scene
 from a2tg_jax.cli.main import main
-from a2tg_jax.core.rigid import moved_viewmat
+from a2tg_jax.core.cameras import moved_viewmat
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.training.corrections import Exposure, exposed
 from a2tg_jax.training.options import Corrections

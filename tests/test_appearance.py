@@ -23,10 +23,9 @@ from a2tg_jax.appearance import (
     template_of,
 )
 from a2tg_jax.appearance.base import clear_rows
-from a2tg_jax.appearance.copies import share
 from a2tg_jax.appearance.files import arrays_of, with_arrays
-from a2tg_jax.core.gaussians import logit
-from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.core.gaussians import logit, share
+from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.events import gather_rows
 from a2tg_jax.texture import allocate_textures
 

@@ -20,9 +20,7 @@ from a2tg_jax import (
     textures_from_arrays,
 )
 from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture
-from a2tg_jax.appearance.bands import bands_of_dense
-from a2tg_jax.appearance.exponents import curves_of, falloff_of, shapes_of
-from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
+from a2tg_jax.appearance.parts import bands_of_dense, curves_of, falloff_of, nearest_gaussians, shapes_of
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import WHITE, Origin

@@ -13,15 +13,14 @@ import a2tg_jax as a2tg
 from a2tg_jax import Model
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, allocate_appearance
-from a2tg_jax.appearance.exponents import exponents_of
 from a2tg_jax.appearance.files import arrays_of
+from a2tg_jax.appearance.parts import exponents_of
 from a2tg_jax.core.budget import bytes_of, event_budget
 from a2tg_jax.core.pytree import num_compiled
-from a2tg_jax.densify.exponents import LimitExponents
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import HostEvent
 from a2tg_jax.results.record import compared_system
-from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.systems.bytewise import Bytewise, LimitExponents
 from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint
 from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.step import jitted_step

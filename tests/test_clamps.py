@@ -18,11 +18,11 @@ from a2tg_jax.appearance import (
     allocate_appearance,
     projected,
 )
-from a2tg_jax.appearance.exponents import LARGEST_LOG_EXPONENT
+from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.numerics import at_least, within
 from a2tg_jax.core.optim import adam_init, adam_update
-from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.training.start import start_colors
 
 UNIT = TextureOptions(rgb="unit", alpha="global-maximum")

@@ -26,9 +26,8 @@ from a2tg_jax.appearance import (
     allocate_appearance,
     template_of,
 )
-from a2tg_jax.appearance.bands import bands_of_dense
-from a2tg_jax.appearance.exponents import log_exponents_of, shapes_of
 from a2tg_jax.appearance.files import arrays_of
+from a2tg_jax.appearance.parts import bands_of_dense, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.io import coders, compact, quantise

@@ -22,8 +22,8 @@ from a2tg_jax import (
     save_model,
     synthetic_scene,
 )
+from a2tg_jax.core.cameras import moved_viewmat, rotation_exp
 from a2tg_jax.core.optim import adam_init, adam_update
-from a2tg_jax.core.rigid import moved_viewmat, rotation_exp
 from a2tg_jax.io.compact import load_compact
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.training import SYSTEMS

@@ -11,7 +11,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, logit, rotation_matrices
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.partition import partition
+from a2tg_jax.core.pytree import partition
 from a2tg_jax.densify.clone_split import CloneSplitPrune, Edit, OpacityReset, apply_edit, reset_interval
 from a2tg_jax.events import Change, EventInfo, Now, Seen
 from a2tg_jax.model import Model

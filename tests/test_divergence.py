@@ -24,7 +24,7 @@ from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, Bands, allocate_appearance
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import step
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.divergence import _not_finite, largest_loss

@@ -14,8 +14,7 @@ from toy_system import Rings
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.partition import combine, partition
-from a2tg_jax.core.pytree import num_compiled
+from a2tg_jax.core.pytree import combine, num_compiled, partition
 from a2tg_jax.results.forecast import forecast_run
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.training.reports import StageEffects

@@ -20,7 +20,7 @@ from a2tg_jax import (
     transform_gaussians,
 )
 from a2tg_jax.appearance import Appearance, Exponents, Texture, allocate_appearance, template_of
-from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
+from a2tg_jax.appearance.parts import nearest_gaussians
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.init_file import check_init, write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource

@@ -8,7 +8,7 @@ import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 
 from a2tg_jax.core.geometry import homographies, screen_bounds
-from a2tg_jax.parallel.image_bands import BorderRoom, ImageBands
+from a2tg_jax.parallel.exchange import BorderRoom, ImageBands
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, tile_rectangles
 
 TILE = 8

@@ -16,7 +16,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import sh_basis
-from a2tg_jax.core.transform import sh_rotation, transform_gaussians
+from a2tg_jax.core.similarity import sh_rotation, transform_gaussians
 from a2tg_jax.io.archive import read_archive, read_archive_header, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
 from a2tg_jax.io.model_file import save_model

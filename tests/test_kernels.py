@@ -16,8 +16,7 @@ from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import Appearance, Texture, TextureOptions, gaussian_cutoff
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import homographies
-from a2tg_jax.core.partition import combine, partition
-from a2tg_jax.core.pytree import pytree, static
+from a2tg_jax.core.pytree import combine, partition, pytree, static
 from a2tg_jax.rasterize.kernels.native import composite as native
 from a2tg_jax.rasterize.kernels.native import threads
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs

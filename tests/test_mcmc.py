@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax.appearance.copies import DEAD_OPACITY, share, stacked_integral
-from a2tg_jax.core.gaussians import Gaussians, logit, rotation_matrices
+from a2tg_jax.core.gaussians import DEAD_OPACITY, Gaussians, logit, rotation_matrices, share, stacked_integral
 from a2tg_jax.mcmc import draw_hosts, grow, perturb, relocate
 
 KEY = jax.random.key(0)

@@ -13,7 +13,7 @@ from a2tg_jax.host.memory import (
     tidy_memory,
 )
 from a2tg_jax.host.operating_system import trim_heap
-from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training.session import Session
 from a2tg_jax.training.step import jitted_step
 

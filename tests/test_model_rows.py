@@ -18,8 +18,8 @@ from a2tg_jax.appearance import (
     Texture,
     allocate_appearance,
 )
-from a2tg_jax.appearance.bands import bands_of_dense
 from a2tg_jax.appearance.base import check_appearance
+from a2tg_jax.appearance.parts import bands_of_dense
 from a2tg_jax.core.table import Table
 from a2tg_jax.events import gather_moments, gather_rows
 from a2tg_jax.model import Model

@@ -12,7 +12,6 @@ SAME_MEANING = {
     "tile_lists": "XLA and native loops",
     "mean_score": "XLA and native loops",
     "value_and_slopes": "XLA and native loops",
-    "check_same": "for any processes, and for those of an exchange",
     "main": "the command line, and its start",
 }
 """Functions that several modules define, and what they have in common."""

@@ -44,7 +44,7 @@ from a2tg_jax.results.folder import (
 )
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.results.run_training import MOST_RESTORED, RunOptions, train_run
-from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import DivergedError, find_system, load_checkpoint, save_checkpoint
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.loop import StageRun

@@ -20,9 +20,8 @@ from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.parallel import liveness, rows
-from a2tg_jax.parallel.liveness import Liveness, accept, connect, listen
-from a2tg_jax.parallel.processes import LOST, is_of_collectives
+from a2tg_jax.parallel import processes, rows
+from a2tg_jax.parallel.processes import LOST, Liveness, accept, connect, is_of_collectives, listen
 from a2tg_jax.results import several_processes
 from a2tg_jax.results.folder import RunFolder, create_run, resuming_command
 from a2tg_jax.results.history import read_history
@@ -104,7 +103,7 @@ p.joined(p.ProcessPlace("127.0.0.1:{free_port()}", 2, 0, 60.0)).__enter__()
 @pytest.fixture
 def three(monkeypatch):
     """The connections of three processes, and what ends each of them."""
-    monkeypatch.setattr(liveness, "GRACE", 0.0)
+    monkeypatch.setattr(processes, "GRACE", 0.0)
     listener, port, key = listen()
     found = {}
     accepting = threading.Thread(target=lambda: found.update(accept(listener, key, 3)))
@@ -141,7 +140,7 @@ def test_processes_that_live_are_left_alone(three):
     everyone = watched(three, (0, 1, 2))
     time.sleep(3 * SECONDS)
     for one in everyone:
-        one.leave()
+        one.end(processes.BYE)
     for connections in three[0]:
         for connection in connections.values():
             connection.close()
@@ -150,10 +149,10 @@ def test_processes_that_live_are_left_alone(three):
 
 
 def test_processes_that_are_interrupted_together_end_by_themselves(three, monkeypatch):
-    monkeypatch.setattr(liveness, "INTERRUPTED_GRACE", SECONDS)
+    monkeypatch.setattr(processes, "INTERRUPTED_GRACE", SECONDS)
     everyone, ends = watched(three, (0, 1, 2)), three[1]
-    everyone[1].interrupt()
-    everyone[0].interrupt()
+    everyone[1].end(processes.INTERRUPTED)
+    everyone[0].end(processes.INTERRUPTED)
     until(lambda: ends[2])
     assert ends == [[], [], ["process 0 of 3 was interrupted"]]
 
@@ -162,11 +161,11 @@ def test_processes_that_are_interrupted_together_end_by_themselves(three, monkey
 def test_errors_of_one_process_end_the_others(three, reason):
     everyone, ends = watched(three, (0, 1, 2)), three[1]
     if reason:
-        everyone[2].fail(reason)
+        everyone[2].end(processes.FAILED, reason)
         until(lambda: ends[0] and ends[1])
         assert ends[0] == ends[1] == ["process 2 of 3 failed: no scene"]
     else:
-        everyone[0].quit()
+        everyone[0].end(processes.QUIT)
         until(lambda: ends[1] and ends[2])
         assert ends[1] == ends[2] == [""]
 

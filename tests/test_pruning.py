@@ -15,10 +15,10 @@ from test_view_dependence import banded
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
-from a2tg_jax.core.partition import partition
+from a2tg_jax.core.pytree import partition
 from a2tg_jax.data import View
 from a2tg_jax.densify import pruning
-from a2tg_jax.densify.pruning import Prune, blending_weights
+from a2tg_jax.densify.pruning import Prune, shown_in
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Due
 from a2tg_jax.model import Model
@@ -33,12 +33,12 @@ def test_weights_are_those_of_the_oracle(seed):
     expected = oracle.render(scene).weights.sum(axis=(1, 2))
     model = Model(as_gaussians(scene, "float64"))
     camera = as_camera(scene, "float64")
-    once = blending_weights(model, [seen_from(camera)])
+    once = shown_in(model, [seen_from(camera)]).weights
     np.testing.assert_allclose(once, expected, rtol=1e-9, atol=1e-9)
     assert (expected > 1).sum() > 3
     # Pixels that a mask leaves out do not count, in one view of two.
     mask = np.random.default_rng(seed).random((scene.height, scene.width)) < 0.5
-    masked = blending_weights(model, [seen_from(camera, mask), seen_from(camera)])
+    masked = shown_in(model, [seen_from(camera, mask), seen_from(camera)]).weights
     shown = (oracle.render(scene).weights * mask).sum(axis=(1, 2))
     np.testing.assert_allclose(masked, shown + expected, rtol=1e-9, atol=1e-9)
 
@@ -49,11 +49,11 @@ def test_weights_are_summed_over_views_of_any_size():
         a2tg.synthetic_scene(num_views=3, width=24, height=16).train[0].camera,
     )
     views = [seen_from(one) for one in (camera, dataclasses.replace(camera, width=20, height=10), camera)]
-    parts = [blending_weights(model, [view]) for view in views]
-    np.testing.assert_allclose(blending_weights(model, views), sum(parts), rtol=1e-6)
+    parts = [shown_in(model, [view]).weights for view in views]
+    np.testing.assert_allclose(shown_in(model, views).weights, sum(parts), rtol=1e-6)
     with pytest.raises(ValueError, match="at least one view"):
-        blending_weights(model, [])
-    assert blending_weights(Model(model.gaussians[:0]), views).shape == (0,)
+        _ = shown_in(model, [])
+    assert shown_in(Model(model.gaussians[:0]), views).weights.shape == (0,)
 
 
 def seen_from(camera, mask=None) -> View:
@@ -77,7 +77,7 @@ def pruned(event: Prune):
 @pytest.mark.parametrize("share", [0.8, 0.9])
 def test_those_that_show_least_go_and_all_of_a_gaussian_moves_along(share):
     model, camera, statistics, change = pruned(Prune(share=share))
-    weights = blending_weights(model, [seen_from(camera)])
+    weights = shown_in(model, [seen_from(camera)]).weights
     left = int(change.model.num_live)
     assert left == model.num - round(share * model.num)
     kept, gone = change.rows[:left], change.rows[left : model.num]

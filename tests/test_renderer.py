@@ -24,7 +24,7 @@ from a2tg_jax.core.cameras import Camera, crop_camera, resize_camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.data import View
-from a2tg_jax.renderer import _jitted_draw
+from a2tg_jax.render import jitted_render
 
 
 def cloud(num: int = 300) -> Gaussians:
@@ -43,15 +43,14 @@ def flight(num: int, size: tuple[int, int] = (48, 32)) -> list[Camera]:
 
 def test_a_flight_of_200_views_compiles_three_times_at_most():
     gaussians = cloud(2000)
-    renderer, before = Renderer(gaussians, has_geometry=False), num_compiled(_jitted_draw())
+    renderer, before = Renderer(gaussians, has_geometry=False), num_compiled(jitted_render())
     pairs = [plan_render(gaussians, camera).capacity for camera in flight(20)]
     assert max(pairs) > 4 * pairs[0], "the flight is to need more room on its way"
-    for index, camera in enumerate(flight(200)):
-        output = renderer(camera)
-        assert not output.overflow
-        if index % 40 == 39:
-            np.testing.assert_array_equal(output.color, render_image(gaussians, camera).color)
-    assert 2 <= num_compiled(_jitted_draw()) - before <= 3
+    frames = [(camera, renderer(camera)) for camera in flight(200)]
+    assert not any(output.overflow for _, output in frames)
+    assert 2 <= num_compiled(jitted_render()) - before <= 3
+    for camera, output in frames[39::40]:
+        np.testing.assert_array_equal(output.color, render_image(gaussians, camera).color)
 
 
 @pytest.mark.parametrize("is_told", [True, False])
@@ -60,22 +59,22 @@ def test_cameras_that_are_known_compile_once(is_told):
     gaussians, cameras = cloud(2100 if is_told else 2200), flight(10, (40, 24))
     model = Model(gaussians) if is_told else Model(gaussians, origin=Origin.of_cameras(flight(10, (20, 12))))
     renderer = Renderer(model, cameras=cameras if is_told else (), has_geometry=False)
-    before = num_compiled(_jitted_draw())
+    before = num_compiled(jitted_render())
     for camera in cameras:
         renderer(camera)
-    assert num_compiled(_jitted_draw()) - before == 1
+    assert num_compiled(jitted_render()) - before == 1
 
 
 def test_several_sizes_and_models_of_one_shape():
     cameras = [resize_camera(camera, *size) for camera in flight(4)[:3] for size in ((24, 16), (16, 24))]
-    before = num_compiled(_jitted_draw())
+    before = num_compiled(jitted_render())
     for shift in (0.0, 0.1):
         gaussians = dataclasses.replace(cloud(), means=cloud().means + shift)
         renderer = Renderer(gaussians, cameras=cameras, has_geometry=False)
         for camera in cameras:
             assert renderer(camera).color.shape == (camera.height, camera.width, 3)
         assert set(renderer.capacities) == {(24, 16), (16, 24)}
-    assert num_compiled(_jitted_draw()) - before == 2
+    assert num_compiled(jitted_render()) - before == 2
 
 
 def test_a_model_with_all_that_belongs_to_it():

@@ -19,7 +19,7 @@ from PIL import Image
 from test_results import NAMES, circle, some_history, some_result
 
 from a2tg_jax.appearance import Appearance, Bands, Texture
-from a2tg_jax.appearance.bands import empty_bands
+from a2tg_jax.appearance.parts import empty_bands
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.host.source_commit import source_commit

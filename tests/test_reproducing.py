@@ -13,7 +13,7 @@ from a2tg_jax.densify.clone_split import CloneSplitPrune
 from a2tg_jax.host.machine import Machine, this_machine
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.rasterize.kernels import choice
-from a2tg_jax.systems.gaussians_2d import Gaussians2d
+from a2tg_jax.systems.baselines import Gaussians2d
 
 FIRST = A2tg(
     stage1_iterations=24,

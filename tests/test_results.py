@@ -53,11 +53,8 @@ from a2tg_jax.results.summary import (
     summary_text,
 )
 from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.systems.bbsplat import BBSplat
+from a2tg_jax.systems.baselines import BBSplat, Gaussians2d, Gaussians2dMcmc, TexturedGaussians
 from a2tg_jax.systems.bytewise import Bytewise
-from a2tg_jax.systems.gaussians_2d import Gaussians2d
-from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
-from a2tg_jax.systems.textured_gaussians import TexturedGaussians
 from a2tg_jax.training import History, LearningRates, find_system, like
 
 RECORD = RunRecord(SceneSource("/scenes/a b", downscale=2), "a2tg", A2tg.preset("quick"), ("gaussians-2d-mcmc",))

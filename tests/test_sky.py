@@ -12,7 +12,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.core.gaussians import SH_C0, rotation_matrices
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.densify.pruning import blending_weights
+from a2tg_jax.densify.pruning import shown_in
 from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS
@@ -129,7 +129,7 @@ class TestSky:
         assert sines.min() > -0.25 and (sines < -0.1).any()
 
     def test_it_shows(self, scene, sky):
-        weights = blending_weights(a2tg.Model(sky), scene.train)
+        weights = shown_in(a2tg.Model(sky), scene.train).weights
         assert weights.min() > 1 and 0.6 * 3 * WIDTH * HORIZON < weights.sum() < 1.1 * 3 * WIDTH * HORIZON
 
 

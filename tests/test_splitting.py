@@ -13,7 +13,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState, adam_init
-from a2tg_jax.core.partition import partition
+from a2tg_jax.core.pytree import partition
 from a2tg_jax.densify.splitting import (
     SplitByGradient,
     SplitStatistics,

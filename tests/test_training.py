@@ -30,7 +30,7 @@ from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
 from a2tg_jax.core.pytree import num_compiled, pytree
 from a2tg_jax.core.table import Shape
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.gaussians_2d_mcmc import Gaussians2dMcmc
+from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import LearningRates, LossConfig, Stage, fit_stage, like, loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.loop import StageRun

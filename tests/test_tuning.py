@@ -13,7 +13,7 @@ from test_compaction import SCENE, a_model
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Appearance, Exponents, allocate_appearance, files
-from a2tg_jax.core.rigid import moved_viewmat
+from a2tg_jax.core.cameras import moved_viewmat
 from a2tg_jax.data import Scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import tuning

@@ -19,7 +19,7 @@ from PIL import Image
 from small_values import some_gaussians
 from test_compact import textured
 
-from a2tg_jax.appearance import exponents
+from a2tg_jax.appearance import parts
 from a2tg_jax.cli.main import main
 from a2tg_jax.data import synthetic_scene
 from a2tg_jax.data.scene import origin_of_scene
@@ -248,7 +248,7 @@ def test_the_policy_allows_the_page_its_own_script_and_style_and_nothing_else():
 def test_the_page_and_the_renderer_have_kernels_of_the_same_numbers():
     found = re.search(r"const float OFFSET = ([\d.]+), LARGEST_LOG_EXPONENT = ([\d.]+);", viewer_html())
     assert found is not None
-    assert tuple(map(float, found.groups())) == (exponents.OFFSET, exponents.LARGEST_LOG_EXPONENT)
+    assert tuple(map(float, found.groups())) == (parts.OFFSET, parts.LARGEST_LOG_EXPONENT)
 
 
 def test_a_page_holds_a_scene():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax.parallel.views_at_once import map_views, of_all_views, of_own_view, value_and_grad_of_views
+from a2tg_jax.parallel.exchange import map_views, of_all_views, of_own_view, value_and_grad_of_views
 
 
 def drawn_together(x):

@@ -15,8 +15,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.data.depth_files import find_depths, read_depths
 from a2tg_jax.data.synthetic import exact_depths
-from a2tg_jax.densify.floaters import are_near
-from a2tg_jax.densify.pruning import blending_weights, shown_in
+from a2tg_jax.densify.pruning import are_near, shown_in
 from a2tg_jax.events import Due
 from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.training import SYSTEMS
@@ -285,7 +284,7 @@ class TestFloaters:
         turned = dataclasses.replace(camera, viewmat=camera.viewmat.at[0, 3].add(0.7))
         views = [a2tg.View(str(index), each, picture) for index, each in enumerate((camera, turned))]
         found = shown_in(model, views, least=2.0)
-        alone = [blending_weights(model, [view]) for view in views]
+        alone = [shown_in(model, [view]).weights for view in views]
         np.testing.assert_array_equal(found.num_views, sum(weights >= 2.0 for weights in alone))
         assert len(set(found.num_views.tolist())) > 1
         change = a2tg.PruneFloaters(min_views=2, least=2.0).apply(

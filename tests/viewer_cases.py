@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOptions
-from a2tg_jax.appearance.bands import bands_of_dense
+from a2tg_jax.appearance.parts import bands_of_dense
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin

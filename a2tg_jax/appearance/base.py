@@ -23,18 +23,24 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance.bands import Bands, Coefficients
-from a2tg_jax.appearance.copies import share
-from a2tg_jax.appearance.exponents import Exponents, curves_of, reach_of
-from a2tg_jax.appearance.lookup import Texture, TextureOptions
-from a2tg_jax.appearance.part import Factor, Part, Residual
+from a2tg_jax.appearance.parts import (
+    Bands,
+    Coefficients,
+    Exponents,
+    Factor,
+    Part,
+    Residual,
+    Texture,
+    TextureOptions,
+    curves_of,
+    reach_of,
+)
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import FLOATS, described
-from a2tg_jax.core.gaussians import Gaussians, logit
+from a2tg_jax.core.gaussians import Gaussians, logit, share
 from a2tg_jax.core.numerics import at_least
-from a2tg_jax.core.partition import partition
-from a2tg_jax.core.pytree import pytree, static
+from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
 from a2tg_jax.core.table import Table, check_places, check_table, is_table
 from a2tg_jax.texture import NEUTRAL_TEXEL, Textures

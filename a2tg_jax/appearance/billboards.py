@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance.base import Appearance
-from a2tg_jax.appearance.part import Factor, Residual
+from a2tg_jax.appearance.parts import Factor, Residual
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_divide

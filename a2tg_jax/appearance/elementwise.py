@@ -15,8 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance.base import Appearance, check_arrays_given, empty_values, without_arrays
-from a2tg_jax.appearance.exponents import Curve, falloff_of
-from a2tg_jax.appearance.part import Factor, Residual
+from a2tg_jax.appearance.parts import Curve, Factor, Residual, falloff_of
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.checks import check_kind, described
 from a2tg_jax.core.gaussians import Gaussians

@@ -13,15 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance.bands import (
+from a2tg_jax.appearance.base import Appearance, allocate_appearance, array_fields
+from a2tg_jax.appearance.parts import (
     MAX_DEGREE,
     Bands,
+    Exponents,
     bands_of_dense,
     degrees_of_sizes,
     dense_bands,
 )
-from a2tg_jax.appearance.base import Appearance, allocate_appearance, array_fields
-from a2tg_jax.appearance.exponents import Exponents
 from a2tg_jax.core.gaussians import no_rows
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.table import Table, is_table

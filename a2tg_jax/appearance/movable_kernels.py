@@ -17,10 +17,9 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance.base import Appearance, gaussian_cutoff
-from a2tg_jax.appearance.copies import LARGEST_OPACITY, share
-from a2tg_jax.appearance.part import Factor, Residual
+from a2tg_jax.appearance.parts import Factor, Residual
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import Gaussians, logit
+from a2tg_jax.core.gaussians import LARGEST_OPACITY, Gaussians, logit, share
 from a2tg_jax.core.pytree import pytree
 
 NUM_KERNELS = 4

@@ -1,4 +1,4 @@
-"""From splats to pixels: homographies, the ray-splat intersection, and tight bounds on the screen.
+"""From splats to pixels: homographies, the ray-splat intersection, tight bounds on the screen, sizes in pixels.
 
 M [3, 3] takes (u, v, 1), in standard deviations of the splat, to homogeneous pixels: equation (1) of 2DGS as a 3×3
 matrix, M = K·[Rc·R₀·s_x | Rc·R₁·s_y | Rc·μ + t]. Its last row gives the depth. N splats, rows M₀, M₁, M₂.
@@ -6,7 +6,7 @@ matrix, M = K·[Rc·R₀·s_x | Rc·R₁·s_y | Rc·μ + t]. Its last row gives 
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +14,25 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, rotation_columns
+
+FILTER_VARIANCE = 0.5
+"""Variance in pixels² of the low-pass filter: ρ₂ = 2·|(x, y) − c|²."""
+NEAR_PLANE = 0.2
+"""Default depth from which splats are drawn."""
+
+
+def pixel_sizes(means: Any, scales: Any, viewmat: Any, K: Any) -> Any:
+    """Return the smaller standard deviation of Gaussians in pixels [N]; 0 before the near plane.
+
+    Args:
+      means: [N, 3], NumPy or JAX.
+      scales: [N, 2] standard deviations.
+      viewmat, K: [4, 4] and [3, 3] of a camera.
+    """
+    depths = means @ viewmat[2, :3] + viewmat[2, 3]
+    focal = (K[0, 0] * K[1, 1]) ** 0.5
+    return (depths > NEAR_PLANE).astype(depths.dtype) * scales.min(axis=1) * focal / depths.clip(NEAR_PLANE)
+
 
 POLYGON_SIDES = 8
 BOUND_SLACK = 1e-2

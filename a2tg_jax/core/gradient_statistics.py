@@ -44,8 +44,7 @@ class GradientStatistics:
 
     @staticmethod
     def init(num: int, dtype: DTypeLike = jnp.float32, like: Array | None = None) -> "GradientStatistics":
-        """Return empty sums for `num` Gaussians, whose rows are spread as those of an array `like` (None: on one
-        device)."""
+        """Return empty sums for `num` Gaussians, spread like the rows of an array; None: on one device."""
         return GradientStatistics(zeros_beside(like, (num,), dtype), zeros_beside(like, (num,), jnp.int32))
 
     def observe(self, norms: Array, is_visible: Array) -> "GradientStatistics":

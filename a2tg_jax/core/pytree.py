@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, TypeVar, dataclass_transform, overload
 
 import jax
+import jax.numpy as jnp
 
 T = TypeVar("T")
 MARK = "_registered_pytree"
@@ -91,3 +92,30 @@ def check_pytree(name: str, value: object) -> None:
 def num_compiled(jitted: Any) -> int:
     """Return the number of compiled programs of a function of `jax.jit` in this process."""
     return int(jitted._cache_size())
+
+
+# Floats of a pytree, which training differentiates and changes, apart from the rest: `jax.grad` rejects integers, such
+# as the places of textures.
+#
+#     floats, rest = partition(model)
+#     gradient = jax.grad(lambda floats: loss(combine(floats, rest)))(floats)
+
+
+def partition(tree: T) -> tuple[T, T]:
+    """Return a pytree with its float arrays only, None in place of all other leaves, and one with the others only."""
+
+    def is_float(leaf: Any) -> bool:
+        dtype = getattr(leaf, "dtype", None)
+        return isinstance(leaf, float) if dtype is None else jnp.issubdtype(dtype, jnp.floating)
+
+    floats: T = jax.tree.map(lambda leaf: leaf if is_float(leaf) else None, tree)
+    rest: T = jax.tree.map(lambda leaf: None if is_float(leaf) else leaf, tree)
+    return floats, rest
+
+
+def combine(floats: T, rest: T) -> T:
+    """Return the pytree that `partition` split, or one with other floats."""
+    whole: T = jax.tree.map(
+        lambda one, other: other if one is None else one, floats, rest, is_leaf=lambda leaf: leaf is None
+    )
+    return whole

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from a2tg_jax.core.capture_geometry import LEAST_FACING
-from a2tg_jax.core.pixel_sizes import NEAR_PLANE
+from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.similarity import camera_centers
 
 NUM_RANDOM_POINTS = 10_000

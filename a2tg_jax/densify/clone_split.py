@@ -17,8 +17,7 @@ from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.partition import partition
-from a2tg_jax.core.pytree import pytree, static
+from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.events import (
     Change,
     EventInfo,

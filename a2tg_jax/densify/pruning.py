@@ -2,7 +2,8 @@
 
 The measure of a Gaussian is the sum of its blending weights w = α·T over the counted pixels of the training views: the
 share of its colour in the pictures. Densification leaves many Gaussians that are hidden or too faint to matter. Other
-events use statistics of the steps; this one renders, because a weight is no gradient of the loss.
+events use statistics of the steps; this one renders, because a weight is no gradient of the loss. `PruneFloaters`
+prunes Gaussians that matter in too few training views, or are close before a camera.
 """
 
 import dataclasses
@@ -63,24 +64,19 @@ class Prune(HostEvent):
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
-        num, left = model.num, self._num_left(model.num)
-        weights = blending_weights(model, due.views)
+        num = model.num
+        left = num - round(num * float(self.share)) if self.keep is None else min(num, self.keep)
+        if left < LEAST_LEFT:
+            warnings.warn(
+                f"nothing is pruned, for {left} of {counted(num, 'Gaussian')} would be left, and training needs "
+                f"{LEAST_LEFT}: lower the share",
+                stacklevel=2,
+            )
+            left = num
+        weights = shown_in(model, due.views).weights
         is_kept = np.zeros(num, bool)
         is_kept[np.argsort(-weights[:num], kind="stable")[:left]] = True
         return keep_rows(model, moments, state, is_kept)
-
-    def _num_left(self, num: int) -> int:
-        if self.keep is not None:
-            return min(num, self.keep)
-        left = num - round(num * float(self.share))
-        if left >= LEAST_LEFT:
-            return left
-        warnings.warn(
-            f"nothing is pruned, for {left} of {counted(num, 'Gaussian')} would be left, and training needs "
-            f"{LEAST_LEFT}: lower the share",
-            stacklevel=3,
-        )
-        return num
 
 
 def during_growth(at: tuple[float, ...], num_iterations: int, growth: Times) -> tuple[float, ...]:
@@ -97,26 +93,19 @@ class Contributions(NamedTuple):
     """[N] number of the views in which Σ α·T is large enough."""
 
 
-def blending_weights(model: Model, views: Sequence[View]) -> np.ndarray:
-    """Return [N] Σ α·T of each Gaussian over the pixels of all views that count, in pixels (host).
-
-    Args:
-      model: N rows; spare rows have weight 0.
-      views: at least one; only their cameras and masks are used.
-
-    Raises:
-      ValueError: if there is no view.
-    """
-    return shown_in(model, views).weights
-
-
 def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contributions:
     """Return how much each Gaussian shows, and in how many views it shows as much as `least` pixels (host).
 
     The devices over which the model's rows are spread draw each view together. If they are of several processes, all
     of these call it, and get the numbers of the first one, since GPUs may round sums differently each time.
 
-    Args, Raises: as of `blending_weights`.
+    Args:
+      model: N rows; spare rows have weight 0.
+      views: at least one; only their cameras and masks are used.
+      least: Σ α·T from which a Gaussian counts as shown in a view.
+
+    Raises:
+      ValueError: if there is no view.
     """
     if not views:
         raise ValueError("views must hold at least one view; got none")
@@ -190,3 +179,84 @@ def _weights(
     found, _ = jax.lax.scan(of_view, (nothing[:, 0], none), (cameras, counted))
     shown: tuple[Array, Array] = spread(None if settings.exchange is None else settings.exchange.mesh, found)
     return shown
+
+
+# Floaters
+
+
+@pytree
+class PruneFloaters(HostEvent):
+    """Event that prunes the Gaussians that show in fewer training views than asked for, or stand close before one.
+
+    Each view can hang splats before its own camera that no other view contradicts. It uses the cameras of the scene,
+    not refined ones.
+    """
+
+    min_views: int = static(default=2)
+    """Least number of training views in which a Gaussian must show, at least 2; others are pruned. 0: off."""
+    near: float = static(default=0.0)
+    """Least depth of a Gaussian before each camera that sees it, in units of the normalised world, in which cameras are
+    about 1 from what they see, such as 0.2. 0: off."""
+    least: float = static(default=1.0)
+    """Least Σ α·T, in pixels, with which a Gaussian counts as shown in a view."""
+    at: tuple[float, ...] = static(default=(0.4, 0.6, 0.8))
+    """Fractions of the stage at which Gaussians are pruned; 1: at its end. In a system, those after the last growth are
+    left out."""
+
+    def check_options(self) -> None:
+        if self.min_views:
+            check_number("min_views", self.min_views, least=2)
+        check_number("near", self.near, least=0)
+        check_number("least", self.least, least=0)
+        if not self.at:
+            raise ValueError("at must hold at least one fraction of the stage; got none")
+        self.iterations(1)
+
+    def iterations(self, num_iterations: int) -> tuple[int, ...]:
+        return iterations_at(self.at, num_iterations, with_end=True)
+
+    def num_programs(self, num_iterations: int) -> int:
+        return 2  # Rows keep their number; tile lists grow with the Gaussians.
+
+    def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
+        num, means = model.num, on_host(model.gaussians.means)[: model.num]
+        is_kept = np.ones(num, bool)
+        if self.min_views:
+            num_views = shown_in(model, due.views, self.least).num_views[:num]
+            is_kept = num_views >= min(self.min_views, len(due.views))
+        if self.near:
+            is_kept &= ~are_near(means, due.views, self.near)
+        if is_kept.sum() < LEAST_LEFT:
+            warnings.warn(
+                f"no floaters are pruned, for {is_kept.sum()} of {num:,} Gaussians would be left, and training needs "
+                f"{LEAST_LEFT}: lower near or min_views",
+                stacklevel=2,
+            )
+            is_kept[:] = True
+        return keep_rows(model, moments, state, is_kept)
+
+
+def are_near(means: np.ndarray, views: Sequence[View], near: float) -> np.ndarray:
+    """Return [N] whether a point lies within the picture of a view, at a smaller depth than `near`.
+
+    The picture of a lens that is no pinhole is the smallest rectangle in the image plane that holds all its rays.
+
+    Args:
+      means: [N, 3] points.
+      views: V views.
+      near: limit of the depth.
+    """
+    found = np.zeros(len(means), bool)
+    for camera in (view.camera for view in views):
+        viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+        x, y, z = viewmat[:3, :3] @ means.T + viewmat[:3, 3:]
+        depth = np.where(z > 0, z, np.nan)
+        column, row, _ = K @ np.stack([x / depth, y / depth, np.ones_like(z)])
+        (left, top), (right, bottom) = np.zeros(2), np.asarray([camera.width, camera.height])
+        if camera.rays is not None:
+            rays = np.asarray(camera.rays, np.float64).reshape(-1, 2)
+            rays = rays[np.isfinite(rays).all(axis=1)]
+            (left, top), (right, bottom) = rays.min(axis=0, initial=np.inf), rays.max(axis=0, initial=-np.inf)
+        is_inside = (column >= left) & (column <= right) & (row >= top) & (row <= bottom)
+        found |= is_inside & (z < near)
+    return found

@@ -20,11 +20,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.appearance.copies import shared_opacities
-from a2tg_jax.core.gaussians import logit
+from a2tg_jax.core.gaussians import logit, shared_opacities
+from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.densify.clone_split import SPLIT_SHRINK, split_in_half
 from a2tg_jax.events import Change, EventInfo, Now, Seen, Statistic, clear_moments, gather_rows

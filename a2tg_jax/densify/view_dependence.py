@@ -5,6 +5,7 @@ over views of ∂L/∂colour · Y(direction). Residuals that many views share ad
 """
 
 import dataclasses
+import itertools
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import in_words
-from a2tg_jax.appearance.bands import MAX_DEGREE, Coefficients, degrees_of_sizes, floats_of_band, sizes_of_degrees
+from a2tg_jax.appearance.parts import MAX_DEGREE, Coefficients, degrees_of_sizes, floats_of_band, sizes_of_degrees
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, MOST_ROOM, bytes_of, event_budget, within_budget
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.numerics import normalize
@@ -37,8 +38,7 @@ class ViewDependence:
 
     @staticmethod
     def init(num: int, dtype: Any = jnp.float32, like: Array | None = None) -> "ViewDependence":
-        """Return empty sums for `num` Gaussians, whose rows are spread as those of an array `like` (None: on one
-        device)."""
+        """Return empty sums for `num` Gaussians, spread like the rows of an array; None: on one device."""
         return ViewDependence(zeros_beside(like, (num, 16, 3), dtype), zeros_beside(like, (), jnp.int32))
 
     def observe(self, means: Array, centers: Array, colors: Array) -> "ViewDependence":
@@ -58,10 +58,8 @@ class ViewDependence:
     def strengths(self) -> np.ndarray:
         """Return [N, 3] norm of the average gradient at the coefficients of degree 1, 2 and 3 (host)."""
         total, views = on_host(self.total), max(1, int(self.views))
-        return np.stack([np.linalg.norm(total[:, band] / views, axis=(1, 2)) for band in BAND_SLICES], axis=1)
-
-
-BAND_SLICES = tuple(slice(NUM_BASES[degree - 1], NUM_BASES[degree]) for degree in (1, 2, 3))
+        bands = [total[:, first:end] / views for first, end in itertools.pairwise(NUM_BASES)]
+        return np.stack([np.linalg.norm(band, axis=(1, 2)) for band in bands], axis=1)
 
 
 @pytree
@@ -126,7 +124,9 @@ class AdaptDegrees(HostEvent):
                 f"{in_words(model.appearance)} cannot raise degrees: the stage needs Appearance(bands=Bands())"
             )
         degrees = without_idle(table, base, self.idle)
-        used = model.num_bytes - saved_bytes(model.degrees[:num], degrees[:num])
+        floats = 3 * np.asarray(NUM_BASES)
+        saved = BYTES_PER_FLOAT * int((floats[model.degrees[:num]] - floats[degrees[:num]]).sum())
+        used = model.num_bytes - saved
         budget = event_budget(bytes_of(self.budget_mb), used, due.index, due.count)
         degrees[:num] = raised_degrees(degrees[:num], state.strengths()[:num], budget, self.highest)
         table, moments = resize(table, sizes_of_degrees(degrees, base), moments, room=table.shape)
@@ -169,12 +169,6 @@ def without_idle(table: Coefficients, base_degree: int, idle: float) -> np.ndarr
             energy = np.square(values[:, values.shape[1] - last :]).sum(axis=(1, 2)) / (12 * np.pi)
             degrees[rows[energy < idle**2]] -= 1
     return degrees
-
-
-def saved_bytes(degrees: np.ndarray, lower: np.ndarray) -> int:
-    """Return the bytes that Gaussians of some degrees [N] save at lower degrees [N] (host)."""
-    floats = np.asarray([3 * NUM_BASES[degree] for degree in range(MAX_DEGREE + 1)])
-    return BYTES_PER_FLOAT * int((floats[degrees] - floats[lower]).sum())
 
 
 def raised_degrees(degrees: np.ndarray, strengths: np.ndarray, budget: float, highest: int = MAX_DEGREE) -> np.ndarray:

@@ -19,10 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance.bands import MAX_DEGREE
-from a2tg_jax.appearance.exponents import curves_of, falloff_of
-from a2tg_jax.appearance.lookup import texel_coordinates
-from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
+from a2tg_jax.appearance.parts import MAX_DEGREE, curves_of, falloff_of, nearest_gaussians, texel_coordinates
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, floats_per_gaussian, logit, rotation_matrices

@@ -13,7 +13,7 @@ from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.data.world import scene_scale
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.systems.gaussians_2d import Gaussians2d
+from a2tg_jax.systems.baselines import Gaussians2d
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.fitting import BACKGROUNDS
 from a2tg_jax.training.stage import Background

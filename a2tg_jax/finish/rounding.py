@@ -15,13 +15,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.appearance.bands import MAX_DEGREE
-from a2tg_jax.appearance.exponents import LARGEST_LOG_EXPONENT, MOST_SHARE
+from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MAX_DEGREE, MOST_SHARE
 from a2tg_jax.core.gaussians import Gaussians, logit
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.partition import combine, partition
-from a2tg_jax.core.pytree import pytree
+from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import Change, Now, StepEvent
 from a2tg_jax.io.compact import LEAST_OPACITY, CompactChoices, Grids

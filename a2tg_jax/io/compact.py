@@ -20,8 +20,7 @@ from typing import Any, Self
 import numpy as np
 
 from a2tg_jax.appearance import Appearance
-from a2tg_jax.appearance.bands import MAX_DEGREE
-from a2tg_jax.appearance.exponents import log_exponents_of, shapes_of
+from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.host.atomic import replacing

@@ -12,8 +12,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance.copies import LARGEST_OPACITY
-from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.gaussians import LARGEST_OPACITY, Gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity

@@ -9,9 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
-from a2tg_jax.appearance.bands import MAX_DEGREE
-from a2tg_jax.appearance.exponents import log_exponents_of, shapes_of
-from a2tg_jax.appearance.lookup import EXTENT
+from a2tg_jax.appearance.parts import EXTENT, MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.gltf_reader import Document

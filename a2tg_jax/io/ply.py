@@ -21,12 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.lib.recfunctions import append_fields
 
-from a2tg_jax.appearance.copies import LARGEST_OPACITY
-from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
-from a2tg_jax.core.gaussians import SH_C0, Gaussians, check_gaussians, logit, rotation_matrices
+from a2tg_jax.appearance.parts import nearest_gaussians
+from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gaussians, logit, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.core.transform import transform_gaussians
+from a2tg_jax.core.similarity import Similarity, transform_gaussians
 from a2tg_jax.data.ply_header import OFFSET, header_lines, offset_of, read_vertex_header
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax.appearance.exponents import log_exponents_of, shapes_of
+from a2tg_jax.appearance.parts import log_exponents_of, shapes_of
 from a2tg_jax.io import quantise
 from a2tg_jax.io.model_rows import Rows
 from a2tg_jax.io.quantise import Contraction, Ends

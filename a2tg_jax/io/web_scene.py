@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for, in_words
-from a2tg_jax.appearance.bands import MAX_DEGREE
+from a2tg_jax.appearance.parts import MAX_DEGREE
 from a2tg_jax.core.capture_geometry import central_camera
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin

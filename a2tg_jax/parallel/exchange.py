@@ -1,10 +1,11 @@
 """How splats reach the pixels that need them: compositing on several devices.
 
 N rows of splats are sharded over D devices, N/D each. G views are drawn at once, where G divides D. Each image is cut
-into D/G bands of whole rows of tiles, one for each device, with about as many pairs in each (`image_bands`). By one
+into D/G bands of whole rows of tiles, one for each device, with about as many pairs in each (`ImageBands`). By one
 `all_to_all` every device sends to every other one the splats that reach its band, a fixed number of rows; JAX
 transposes it, which brings the gradients back. A splat that reaches two bands travels twice. The pixels then go to the
-devices that an even cut of the image gives them to.
+devices that an even cut of the image gives them to, because JAX divides arrays evenly; mostly that is a few rows to the
+neighbours.
 
 The received rows keep the order of the model, so that a band is composited as it is on one device.
 """
@@ -12,24 +13,174 @@ The received rows keep the order of the model, so that a band is composited as i
 import dataclasses
 import functools
 import math
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import screen_bounds
-from a2tg_jax.parallel.image_bands import BorderRoom, ImageBands
-from a2tg_jax.parallel.rows import mesh_of
-from a2tg_jax.parallel.views_at_once import of_all_views, of_own_view
+from a2tg_jax.parallel.rows import everywhere, mesh_of, placed, sharding_of_rows
 from a2tg_jax.rasterize.compositor import Composited, composite, list_tiles
 from a2tg_jax.rasterize.kernels.packing import pack_splats, unpack_splats
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats
-from a2tg_jax.rasterize.tile_pixels import TilePixels, band_pixels
-from a2tg_jax.rasterize.tiles import tile_rectangles
+from a2tg_jax.rasterize.tile_pixels import TilePixels, band_pixels, tile_pixels
+from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
+
+EMPTY_TILES = 10
+"""Rows of tiles without pairs that together cost as much as a mean row. Their cost keeps borders near an even cut in an
+image that is mostly empty; in return the fullest band may have a tenth more pairs."""
+COST_BITS = 29
+"""Bits of the cost of an image."""
+
+
+class BorderRoom(NamedTuple):
+    """Rows of pixels by which a border between two bands may lie off that of an even cut; static."""
+
+    above: int
+    below: int
+
+
+class Hop(NamedTuple):
+    """Pixels that each device sends to the one of another band of its view; all static."""
+
+    bands: int
+    """Number of bands to the other one; negative upwards."""
+    first: int
+    """First of the rows of pixels, in the other one's share of an even cut."""
+    rows: int
+
+
+class ImageBands(NamedTuple):
+    """Bands of each view; all static."""
+
+    whole: TileGrid
+    """Grid of a view."""
+    num: int
+    """Number B of bands of a view."""
+    room: BorderRoom
+    """Room for borders."""
+
+    @staticmethod
+    def of(grid: TileGrid, num: int, room: BorderRoom | None = None) -> "ImageBands":
+        """Return the bands of a view; without a room, that for any borders."""
+        # A border lies at most at the end of the tiles, and in an even cut at most at the end of the devices' rows.
+        most = max(grid.rows * grid.tile_size, num * -(-grid.height // num)) if num > 1 else 0
+        return ImageBands(grid, num, BorderRoom(*(min(most, own) for own in room or (most, most))))
+
+    @property
+    def even_height(self) -> int:
+        """Rows of pixels that each device has of an even cut; the last ones may lie below the image."""
+        return -(-self.whole.height // self.num)
+
+    @property
+    def own(self) -> TileGrid:
+        """Grid with room for any of the bands."""
+        size = self.whole.tile_size
+        rows = -(-(self.even_height + self.room.above + self.room.below) // size)
+        return self.whole._replace(height=min(rows * size, self.whole.height))
+
+    def pixels(self, rays: Array | None) -> TilePixels | None:
+        """Return the pixels of all tiles, and of so many below the image that any band has its own grid of them; None
+        of a pinhole camera."""
+        return None if rays is None else tile_pixels(rays, self.whole.tile_size, self.whole.rows + self.own.rows)
+
+    def pairs_of_rows(self, boxes: Rectangles) -> Array:
+        """Return the number of pairs in each row of tiles, [rows] int32."""
+        end = boxes.y0 + boxes.counts // jnp.maximum(boxes.columns, 1)
+        columns = jnp.where(boxes.counts > 0, boxes.columns, 0)
+        ends = jnp.zeros(self.whole.rows + 1, jnp.int32).at[boxes.y0].add(columns).at[end].add(-columns)
+        return jnp.cumsum(ends)[:-1]
+
+    def borders(self, pairs: Array) -> Array:
+        """Return the first row of tiles of each band, and the end of the last one: [B + 1] int32, ascending.
+
+        Args:
+          pairs: number of pairs in each row of tiles, [rows] int32.
+        """
+        rows = self.whole.rows
+        if self.num == 1:
+            return jnp.asarray([0, rows], jnp.int32)
+        pairs = jnp.maximum(pairs, 0)
+        bits = 32 - jax.lax.clz(jnp.max(pairs)) + rows.bit_length()
+        pairs = pairs >> jnp.maximum(bits - COST_BITS, 0)
+        cost = pairs + jnp.sum(pairs) // (rows * EMPTY_TILES) + 1
+        ends = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(cost)])
+        number = jnp.arange(self.num + 1, dtype=jnp.int32)
+        wanted = ends[-1] // self.num * number + ends[-1] % self.num * number // self.num
+        after = jnp.searchsorted(ends, wanted, method="compare_all").astype(jnp.int32)
+        before = jnp.maximum(after - 1, 0)
+        return jnp.where(wanted - ends[before] < ends[after] - wanted, before, after)
+
+    def sums(self, pairs: Array, borders: Array) -> Array:
+        """Return the number of pairs in each band, [B] int32, of those in each row of tiles [rows]."""
+        ends = jnp.concatenate([jnp.zeros(1, pairs.dtype), jnp.cumsum(pairs)])
+        return jnp.diff(ends[borders])
+
+    def even_borders(self) -> Array:
+        """Return the borders of bands that are equally high, as `borders` does."""
+        height = -(-self.whole.rows // self.num)
+        return jnp.minimum(jnp.arange(self.num + 1, dtype=jnp.int32) * height, self.whole.rows)
+
+    def reached(self, boxes: Rectangles, borders: Array) -> Array:
+        """Return [B, n] whether the box of each splat reaches each band."""
+        end = boxes.y0 + boxes.counts // jnp.maximum(boxes.columns, 1)
+        is_reached = (boxes.y0[None] < borders[1:, None]) & (end[None] > borders[:-1, None])
+        return is_reached & (boxes.counts > 0)[None]
+
+    def room_for(self, borders: Array) -> Array:
+        """Return [2] int32: the room that borders need above, and below."""
+        number = jnp.arange(1, self.num, dtype=jnp.int32)
+        moved = borders[1:-1] * self.whole.tile_size - number * self.even_height
+        return jnp.maximum(jnp.stack([jnp.max(-moved, initial=0), jnp.max(moved, initial=0)]), 0)
+
+    def pixels_of(self, borders: Array, band: Array) -> tuple[Array, Array]:
+        """Return the first row of pixels of a band, and the end of its last one, of those in the image."""
+        first, end = borders[band] * self.whole.tile_size, borders[band + 1] * self.whole.tile_size
+        return first, jnp.minimum(end, self.whole.height)
+
+    def hops(self) -> Iterator[Hop]:
+        """Yield what devices send, to others and to themselves, so that each has its rows of an even cut."""
+        height = self.even_height
+        yield Hop(0, 0, height)
+        for number in range(1, self.num):
+            below, above = (min(height, room - (number - 1) * height) for room in (self.room.below, self.room.above))
+            if below > 0:
+                yield Hop(number, 0, below)
+            if above > 0:
+                yield Hop(-number, height - above, above)
+
+    def to_even(self, image: Array, borders: Array, device: Array, num_views: int, axis: str) -> Array:
+        """Return the pixels [C, `even_height`, W] of this device in an even cut, from the bands of all devices.
+
+        Args:
+          image: pixels [C, `own.height`, W] from the first row of this device's band.
+          borders: of its view.
+          device: its index along the axis.
+          num_views: number of views, of `num` devices each, one after the other.
+          axis: of the mesh, inside `shard_map`.
+        """
+        band, height = device % self.num, self.even_height
+        first, end = self.pixels_of(borders, band)
+        even = jnp.zeros((image.shape[0], height, image.shape[2]), image.dtype)
+        for hop in self.hops():
+            top = (band + hop.bands) * height + hop.first
+            rows = top + jnp.arange(hop.rows, dtype=jnp.int32)
+            # Rows of others are read outside the image, where there are zeros.
+            places = rows - first + jnp.where(rows < end, 0, image.shape[1])
+            sent: Array = image.at[:, places].get(
+                mode="fill", fill_value=0, wrap_negative_indices=False, unique_indices=True, indices_are_sorted=True
+            )
+            if hop.bands:
+                own = [d for d in range(self.num * num_views) if 0 <= d % self.num + hop.bands < self.num]
+                sent = jax.lax.ppermute(sent, axis, [(d, d + hop.bands) for d in own])
+            even = even.at[:, hop.first : hop.first + hop.rows].add(sent)
+        return even
+
 
 AXIS = "rows"
 """Axis of the mesh along which rows of splats, and bands of pixels, are spread over devices."""
@@ -48,7 +199,7 @@ class Exchange:
     border_room: BorderRoom | None = None
     """Room for the borders between bands; None: for any borders."""
     views_at_once: int = 1
-    """Number of views that are drawn at once (`views_at_once`); a divisor of D."""
+    """Number of views that are drawn at once (`value_and_grad_of_views`); a divisor of D."""
 
     @property
     def num(self) -> int:
@@ -89,7 +240,7 @@ def composite_on_devices(
     Args:
       settings, splats, texels, regions, cutoff, jacobian, probe: as for `composite`.
       exchange: the D devices. If they draw several views at once, this is called for each of them under
-        `views_at_once.value_and_grad_of_views`.
+        `value_and_grad_of_views`.
       capacity: number of pairs of a whole image.
       rays: [H, W, 2] of the lens (`Camera.rays`); None of a pinhole.
     """
@@ -113,20 +264,14 @@ def _composite_views(
     splats, probe = jax.tree.map(jax.vmap(exchange.filled_up), (splats, probe))
     cutoff = jax.vmap(functools.partial(exchange.filled_up, value=-1.0))(cutoff)
     regions = jax.tree.map(exchange.filled_up, regions)
-    share = share_of_a_band(num_bands)
-    room = _Room(
-        pairs=math.ceil(capacity * share), pairs_share=share,
-        rows=min(cutoff.shape[1] // exchange.num, max(1, math.ceil(capacity * exchange.rows_per_pair))),
-        rows_share=exchange.rows_per_pair,
-    )  # fmt: skip
     bands = ImageBands.of(settings.grid, num_bands, exchange.border_room)
-    on_device = functools.partial(_composite_band, settings, bands, room)
-    rows, of_views, everywhere = P(AXIS), P(None, AXIS), P()
+    on_device = functools.partial(_composite_band, settings, exchange, capacity, bands)
+    rows, of_views, whole = P(AXIS), P(None, AXIS), P()
     channels, transmittance, num_pairs, overflow = jax.shard_map(
         on_device,
         mesh=exchange.mesh,
-        in_specs=(of_views, rows, of_views, of_views, everywhere, everywhere, everywhere),
-        out_specs=(P(None, AXIS), P(AXIS), everywhere, everywhere),
+        in_specs=(of_views, rows, of_views, of_views, whole, whole, whole),
+        out_specs=(of_views, rows, whole, whole),
         check_vma=False,  # The loops of XLA do not say which devices their carries differ on.
     )(splats, regions, jax.lax.stop_gradient(cutoff), probe, texels, jacobian, bands.pixels(rays))
     height, width = settings.grid.height, settings.grid.width
@@ -141,29 +286,23 @@ def share_of_a_band(num_bands: int) -> float:
     return min(1.0, ROOM_OF_A_BAND / num_bands)
 
 
-class _Room(NamedTuple):
-    """Room on each device; static."""
-
-    pairs: int
-    """Pairs of a band."""
-    pairs_share: float
-    """`pairs`, as a share of the capacity."""
-    rows: int
-    """Rows that a device sends to each other one."""
-    rows_share: float
-    """`rows`, as a share of the capacity."""
-
-
 def _composite_band(
-    settings: CompositingSettings, bands: ImageBands, room: _Room, splats: Splats,
+    settings: CompositingSettings, exchange: Exchange, capacity: int, bands: ImageBands, splats: Splats,
     regions: TextureRegion | None, cutoff: Array, probe: Array, texels: Array, jacobian: Array,
     pixels: TilePixels | None,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Return channels [C, h, W] and transmittance [h, W] of this device's pixels, the capacity needed, the overflow."""
+    pairs_share, (num_views, num) = share_of_a_band(bands.num), cutoff.shape
+    most_pairs = math.ceil(capacity * pairs_share)
+    most_sent = min(num, max(1, math.ceil(capacity * exchange.rows_per_pair)))
     borders, reached = _cut(settings, bands, jax.lax.stop_gradient(splats.M), cutoff, pixels)
     num_sent = jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32))
-    chosen, chosen_of_views = _chosen_rows(reached, room.rows)
-    send = functools.partial(_send, chosen_of_views)
+    # The rows that reach each of D bands, [D, most_sent], among [n] and among [G·n] rows; n and G·n stand for none.
+    rows_of = functools.partial(jnp.nonzero, size=most_sent, fill_value=num)
+    chosen: Array = jax.vmap(jax.vmap(lambda mask: rows_of(mask)[0].astype(jnp.int32)))(reached)
+    starts = jnp.arange(num_views, dtype=jnp.int32)[:, None, None] * num
+    of_views = jnp.where(chosen < num, chosen + starts, num_views * num).reshape(-1, most_sent)
+    send, chosen = functools.partial(_send, of_views), chosen.reshape(-1, most_sent)
 
     splats, cutoff, probe = jax.tree.map(lambda x: x.reshape(cutoff.size, *x.shape[2:]), (splats, cutoff, probe))
     packed = send(jnp.concatenate([pack_splats(splats, True), probe], axis=1))
@@ -184,15 +323,15 @@ def _composite_band(
     # A band that moved too far overflows; until then it must not reach beyond the memory of its grid.
     height = jnp.minimum(end - top, bands.own.height)
     own = settings._replace(grid=bands.own)
-    lists = list_tiles(own, jax.lax.stop_gradient(splats.M), cutoff, room.pairs, pixels, height)
+    lists = list_tiles(own, jax.lax.stop_gradient(splats.M), cutoff, most_pairs, pixels, height)
     channels, transmittance = composite(own, splats, texels, regions, cutoff, lists, jacobian, probe)
     if bands.num > 1:
         image = jnp.concatenate([channels, transmittance[None]])
         image = bands.to_even(image, borders[view], index, len(borders), AXIS)
         channels, transmittance = image[:-1], image[-1]
-    needed = jnp.maximum(lists.num_pairs / room.pairs_share, num_sent / room.rows_share)
+    needed = jnp.maximum(lists.num_pairs / pairs_share, num_sent / exchange.rows_per_pair)
     is_moved_too_far = jnp.any(jax.vmap(bands.room_for)(borders) > jnp.asarray(bands.room))
-    overflow = lists.overflow | (num_sent > room.rows) | is_moved_too_far
+    overflow = lists.overflow | (num_sent > most_sent) | is_moved_too_far
     overflow = jax.lax.pmax(overflow.astype(jnp.int32), AXIS) > 0
     return channels, transmittance, jax.lax.pmax(needed.astype(jnp.float32), AXIS), overflow
 
@@ -218,24 +357,6 @@ def _cut(
     return borders, jax.vmap(bands.reached)(boxes, borders)
 
 
-def _chosen_rows(reached: Array, most: int) -> tuple[Array, Array]:
-    """Return the rows that reach each of D bands, up to a number C of them, [D, C]: in [n] rows, and in [G·n] rows.
-
-    Args:
-      reached: [G, D/G, n] whether each row reaches each band of its view.
-      most: C; places that are left hold n, and G·n.
-    """
-    num_views, _, num = reached.shape
-
-    def of_band(mask: Array) -> Array:
-        return jnp.nonzero(mask, size=most, fill_value=num)[0].astype(jnp.int32)
-
-    chosen: Array = jax.vmap(jax.vmap(of_band))(reached)
-    starts = jnp.arange(num_views, dtype=jnp.int32)[:, None, None] * num
-    of_views = jnp.where(chosen < num, chosen + starts, num_views * num)
-    return chosen.reshape(-1, most), of_views.reshape(-1, most)
-
-
 def _send(chosen: Array, x: Array, fill: float = 0.0) -> Array:
     """Send the chosen rows [D, C] of an array [n, ...] to each device; return the rows received [D·C, ...]."""
     rows = jnp.take(x, chosen.reshape(-1), axis=0, mode="fill", fill_value=fill)
@@ -246,3 +367,135 @@ def _send(chosen: Array, x: Array, fill: float = 0.0) -> Array:
 def _shifted(M: Array, top: Array) -> Array:
     """Return homographies [N, 3, 3] to pixels counted from row `top`."""
     return M.at[:, 1].add(-top.astype(M.dtype) * M[:, 2])
+
+
+# Several views that devices draw at once: a function of one view under `jax.vmap`, whose devices they share. All is
+# written for one view. Where the views meet, in `composite_on_devices`, each of them gets all of them (`of_all_views`),
+# and takes its own from the result (`of_own_view`). Derivatives are taken around the `jax.vmap`, since views that share
+# their devices are drawn, and differentiated, together.
+
+
+VIEWS_AXIS = "views_at_once"
+"""Axis of `jax.vmap` along which the views are that are drawn at once."""
+
+
+def value_and_grad_of_views(loss: Callable[..., tuple[Array, Any]], num_views: int, axes: Any) -> Callable[..., Any]:
+    """Return what `jax.value_and_grad(loss, (0, 1, 2, 3), has_aux=True)` is for one view, for G views at once.
+
+    Results have a leading axis [G, ...], but for the gradient in `appearance`, a mean over the views.
+
+    Args:
+      loss: of (gaussians, appearance, rows, probe, view), which returns a scalar and any auxiliary value. `rows` and
+        `view` are those of the views [G, ...]; the others are shared.
+      num_views: G.
+      axes: of the view, for `jax.vmap`.
+    """
+
+    def of_views(gaussians: Any, appearance: Any, rows: Any, probe: Any, views: Any) -> tuple[Array, Any]:
+        of_each = jax.vmap(loss, in_axes=(0, None, 0, 0, axes), axis_name=VIEWS_AXIS)
+        values, aux = of_each(gaussians, appearance, rows, probe, views)
+        return jnp.sum(values), (values, aux)
+
+    def differentiated(gaussians: Any, appearance: Any, rows: Any, probe: Any, views: Any) -> Any:
+        # Each view has its own copy of what events want the gradient of each view in.
+        copy = lambda x: jnp.broadcast_to(x, (num_views, *x.shape))  # noqa: E731
+        gaussians, probe = jax.tree.map(copy, (gaussians, probe))
+        with_gradients = jax.value_and_grad(of_views, argnums=(0, 1, 2, 3), has_aux=True)
+        (_, told), (of_gaussians, sums, *others) = with_gradients(gaussians, appearance, rows, probe, views)
+        return told, (of_gaussians, jax.tree.map(lambda x: x / num_views, sums), *others)
+
+    return differentiated
+
+
+def map_views(function: Callable[[Any], tuple[Any, Any]], views: Any, num_at_once: int) -> tuple[Any, Any]:
+    """Return what `jax.lax.map` does, of a function of G views [G, ...] at a time.
+
+    Each of the G groups of devices draws V/G views in a row, whose photographs alone it needs
+    (`pictures.sharding_of_batch`).
+
+    Args:
+      function: returns results of the views [G, ...], and results that they share.
+      views: [V, ...].
+      num_at_once: G, which divides V.
+
+    Returns:
+      The results of the views [V, ...], and the shared ones [V/G, ...].
+    """
+    rounds = jax.tree.map(lambda x: x.reshape(num_at_once, -1, *x.shape[1:]).swapaxes(0, 1), views)
+    of_views, shared = jax.lax.map(function, rounds)
+    of_views = jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(-1, *x.shape[2:]), of_views)
+    return of_views, shared
+
+
+def of_all_views(tree: Any) -> Any:
+    """Return the arrays [G, ...] of all views that are drawn at once."""
+    return jax.tree.map(lambda x: jax.lax.all_gather(x, VIEWS_AXIS), tree)
+
+
+def of_own_view(views: Any) -> Any:
+    """Return this view's part of arrays [G, ...] of all views."""
+    return _own(views, jax.lax.axis_index(VIEWS_AXIS))
+
+
+@jax.custom_batching.custom_vmap
+def _own(views: Any, index: Array) -> Any:
+    return jax.tree.map(lambda x: x[index], views)
+
+
+@_own.def_vmap
+def _all(size: int, is_batched: Any, views: Any, index: Array) -> tuple[Any, Any]:
+    # Indexing would be a gather, for which XLA may bring all views to every device.
+    return views, jax.tree.map(lambda _: True, views)
+
+
+# Photographs of the training views on the devices that draw them (host)
+
+
+VIEW_AXIS = "views"
+"""Axis of a mesh of the same devices along which the views are that are drawn at once."""
+PICTURES = ("images", "alphas", "masks", "depths")
+"""Fields of a batch [V, H, ...] of which each device needs those that it draws. It has the others whole."""
+
+
+def sharding_of_batch(exchange: Exchange, num_views: int, height: int) -> NamedSharding:
+    """Return where the pictures [V, H, ...] of a batch are: each on the devices that draw its view, which share its
+    rows of pixels if their number divides H.
+
+    The g-th of G groups of devices draws the g-th part of the views, one after the other.
+    """
+    num_groups = exchange.views_at_once
+    if num_groups == 1:
+        return sharding_of_rows(exchange.mesh, (num_views, height), axis=1)
+    devices = exchange.mesh.devices.reshape(num_groups, -1)
+    mesh = Mesh(devices, (VIEW_AXIS, AXIS), axis_types=(jax.sharding.AxisType.Auto,) * 2)
+    return NamedSharding(mesh, P(VIEW_AXIS, None if height % devices.shape[1] else AXIS))
+
+
+def are_drawn_here(exchange: Exchange | None, num_views: int, height: int) -> list[bool]:
+    """Return whether this process's devices draw at least a part of each view of a batch."""
+    if exchange is None:
+        return [True] * num_views
+    sharding = sharding_of_batch(exchange, num_views, height)
+    parts = sharding.addressable_devices_indices_map((num_views, height)).values()
+    drawn = {view for part in parts if part is not None for view in range(num_views)[part[0]]}
+    return [view in drawn for view in range(num_views)]
+
+
+def on_devices(exchange: Exchange, photographs: Any, *, is_batch: bool) -> Any:
+    """Return `training.batches.Photographs` with their pictures spread over the devices, the rest on every device.
+
+    Args:
+      exchange: the D devices.
+      photographs: V views. The rays of their lens stay where they are.
+      is_batch: whether they are a batch, of which other processes' devices may draw a part (`are_drawn_here`).
+        Otherwise all devices share each picture's rows of pixels, if D divides them.
+    """
+    placed_fields = {}
+    for name, field in photographs._asdict().items():
+        if name in PICTURES and field is not None:
+            shape = field.shape[:2]
+            own = sharding_of_batch(exchange, *shape) if is_batch else sharding_of_rows(exchange.mesh, shape, axis=1)
+            placed_fields[name] = placed(field, own)
+        elif name != "rays":
+            placed_fields[name] = everywhere(exchange.mesh, field)
+    return photographs._replace(**placed_fields)

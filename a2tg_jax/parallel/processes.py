@@ -1,12 +1,20 @@
-"""Several processes that train one scene together: they join by `jax.distributed`, watch each other, and leave."""
+"""Several processes that train one scene together: they join by `jax.distributed`, watch each other, and leave.
+
+They watch each other over TCP: each reports that it lives, and notices who has ended or fallen silent. The first
+process has a connection to every other one, and reports whom it has lost. Everything runs in threads, because a
+training waits for a lost process inside XLA and cannot be interrupted there.
+"""
 
 import contextlib
 import os
+import queue
 import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from multiprocessing import AuthenticationError
+from multiprocessing.connection import Connection, answer_challenge, deliver_challenge
 from typing import NamedTuple, NoReturn
 
 import jax
@@ -15,7 +23,134 @@ from jax.experimental import multihost_utils
 
 from a2tg_jax.host.operating_system import own_output_only, wait_in_abort
 from a2tg_jax.host.text import shortened
-from a2tg_jax.parallel.liveness import Liveness, accept, connect, listen
+
+BEATS = 5
+"""Number of signs of life within the time after which a silent process is lost."""
+GRACE = 2.0
+"""Seconds in which a process that fails with the others can tell its own error."""
+INTERRUPTED_GRACE = 300.0
+"""Seconds in which a process that is interrupted with the others can write its last checkpoint."""
+LOOK_SECONDS = 0.1
+"""Seconds between two looks at who has arrived."""
+ALIVE, BYE, FAILED, INTERRUPTED, OTHER_LOST, QUIT = b".", b"b", b"f", b"i", b"l", b"q"
+"""Kinds of messages; a text follows FAILED and OTHER_LOST."""
+
+
+class Liveness:
+    """Connections of one process to those that must live as long as it does."""
+
+    def __init__(self, others: Mapping[int, Connection], count: int, seconds: float, on_end: Callable[[str], None]):
+        """Args:
+        others: connections by the number of the process.
+        count: number of all processes.
+        seconds: time after which a silent process is lost.
+        on_end: called in a thread with the reason once another process is lost, or with "" if the first one asks to
+          end quietly. It ends the process.
+        """
+        self._others, self._count, self._seconds, self._on_end = dict(others), count, seconds, on_end
+        self._ending, self._sending = threading.Lock(), threading.Lock()
+        self._is_left = threading.Event()
+        for number, connection in self._others.items():
+            threading.Thread(target=self._listen, args=(number, connection), daemon=True).start()
+        threading.Thread(target=self._beat, daemon=True).start()
+
+    def end(self, kind: bytes, reason: str = "") -> None:
+        """Report the end of this process to the others.
+
+        BYE: it needs them no more, and they not it. INTERRUPTED: it was asked to end, as they should be. FAILED: it
+        ends by an error of its own, the reason. QUIT: they are to end quietly.
+        """
+        if kind != FAILED:
+            self._is_left.set()
+        self._say(kind + reason.encode())
+
+    def _say(self, message: bytes) -> None:
+        with self._sending:
+            for number, connection in list(self._others.items()):
+                try:
+                    connection.send_bytes(message)
+                except OSError:
+                    self._others.pop(number, None)  # `_listen` reports it.
+
+    def _beat(self) -> None:
+        while not self._is_left.wait(self._seconds / BEATS):
+            self._say(ALIVE)
+
+    def _listen(self, number: int, connection: Connection) -> None:
+        reason = f"was not heard from for {self._seconds:g} s"
+        try:
+            while connection.poll(self._seconds):
+                message = connection.recv_bytes()
+                kind, text = message[:1], message[1:].decode()
+                if kind == BYE:
+                    return
+                if kind == FAILED:
+                    time.sleep(GRACE)
+                    reason = f"failed: {text}"
+                    break
+                if kind == INTERRUPTED:
+                    self._is_left.wait(INTERRUPTED_GRACE)
+                    reason = "was interrupted"
+                    break
+                if kind in (OTHER_LOST, QUIT):
+                    return self._end(text)
+        except (EOFError, OSError, TypeError):  # TypeError: Python's, of a connection that is closed during a read
+            reason = "has ended"
+        self._end(f"process {number} of {self._count} {reason}")
+
+    def _end(self, reason: str) -> None:
+        with self._ending:
+            if self._is_left.is_set():
+                return
+            self._is_left.set()
+            if reason:
+                self._say(OTHER_LOST + reason.encode())
+            self._on_end(reason)
+
+
+def accept(listener: socket.socket, key: bytes, count: int) -> dict[int, Connection]:
+    """Return the connections of processes 1 to `count` - 1, each of which first sends its number.
+
+    Strangers, who lack the key or send nothing, are turned away and keep nobody waiting.
+    """
+    arrived: queue.SimpleQueue[tuple[int, Connection]] = queue.SimpleQueue()
+    found: dict[int, Connection] = {}
+
+    def admit(guest: socket.socket) -> None:
+        with contextlib.suppress(AuthenticationError, EOFError, OSError):
+            connection = Connection(guest.detach())
+            deliver_challenge(connection, key)
+            answer_challenge(connection, key)
+            arrived.put((int.from_bytes(connection.recv_bytes(), "big"), connection))
+
+    with listener:
+        listener.settimeout(LOOK_SECONDS)
+        while len(found) < count - 1:
+            with contextlib.suppress(OSError):  # TimeoutError is one.
+                threading.Thread(target=admit, args=listener.accept()[:1], daemon=True).start()
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    found.update([arrived.get_nowait()])
+    return found
+
+
+def connect(host: str, port: int, key: bytes, number: int) -> dict[int, Connection]:
+    """Return the connection of process `number` to the first."""
+    connection = Connection(socket.create_connection((host, port)).detach())
+    answer_challenge(connection, key)
+    deliver_challenge(connection, key)
+    connection.send_bytes(number.to_bytes(4, "big"))
+    return {0: connection}
+
+
+def listen() -> tuple[socket.socket, int, bytes]:
+    """Return a listener on a free port, that port, and a key for those who may connect: by IPv4, and IPv6 if it is
+    there."""
+    has_both = socket.has_dualstack_ipv6()
+    family = socket.AF_INET6 if has_both else socket.AF_INET
+    listener = socket.create_server(("", 0), family=family, backlog=64, dualstack_ipv6=has_both)
+    return listener, int(listener.getsockname()[1]), os.urandom(32)
+
 
 JOIN_SECONDS = 300
 """Time in which all processes must have started."""
@@ -71,7 +206,7 @@ class Team:
         """End the common work; this process goes on alone."""
         if self._liveness is not None:
             multihost_utils.sync_global_devices("leave")
-            self._liveness.leave()
+            self._liveness.end(BYE)
             self._liveness = None
             jax.distributed.shutdown()
 
@@ -83,12 +218,12 @@ class Team:
         if is_of_collectives(error):
             time.sleep(2 * self._seconds)  # `_end` comes first.
         elif isinstance(error, KeyboardInterrupt) and self.has_met:
-            liveness.interrupt()
+            liveness.end(INTERRUPTED)
         elif self.is_first:
-            liveness.quit()
+            liveness.end(QUIT)
         else:
             is_interrupted = isinstance(error, KeyboardInterrupt)
-            liveness.fail("it was interrupted" if is_interrupted else shortened(str(error), MOST_TOLD))
+            liveness.end(FAILED, "it was interrupted" if is_interrupted else shortened(str(error), MOST_TOLD))
             time.sleep(self._seconds)
 
     def _end(self, reason: str) -> NoReturn:

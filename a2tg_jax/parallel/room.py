@@ -18,8 +18,7 @@ from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.geometry import screen_bounds
-from a2tg_jax.parallel.exchange import Exchange, share_of_a_band
-from a2tg_jax.parallel.image_bands import BorderRoom, ImageBands
+from a2tg_jax.parallel.exchange import BorderRoom, Exchange, ImageBands, share_of_a_band
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.splats import drawn_splats
 from a2tg_jax.rasterize.supersampling import finer
@@ -96,6 +95,6 @@ def exchange_with_room(
 def with_wider_borders(exchange: Exchange, height: int, tile_size: int) -> Exchange:
     """Return the exchange with about twice the room for borders in images of some rows of pixels."""
     assert exchange.border_room is not None
-    room = exchange.border_room.wider()
+    room = BorderRoom(*(2 * rows + 1 for rows in exchange.border_room))
     covers_image = min(room) >= height + tile_size
     return dataclasses.replace(exchange, border_room=None if covers_image else room)

@@ -7,8 +7,8 @@ from jax import Array
 
 from a2tg_jax.appearance import TextureOptions
 from a2tg_jax.core.checks import check_int, check_kind, check_number, short_repr
+from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.notebook_display import as_bytes, enlarged, png
-from a2tg_jax.core.pixel_sizes import NEAR_PLANE
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.parallel.exchange import Exchange

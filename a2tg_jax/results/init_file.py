@@ -10,7 +10,7 @@ import numpy as np
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.transform import transform_gaussians
+from a2tg_jax.core.similarity import transform_gaussians
 from a2tg_jax.data import Scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host.regular_files import is_regular

@@ -8,7 +8,7 @@ from a2tg_jax.appearance import Appearance, TexelRates, Texture, TextureOptions
 from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian, megabytes_of
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.mcmc import Mcmc, Noise
-from a2tg_jax.systems.stage1 import (
+from a2tg_jax.systems.two_stages import (
     FLOATS_PER_TEXEL,
     QUICK,
     QUICK_CAP,

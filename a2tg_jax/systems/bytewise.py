@@ -4,19 +4,47 @@ import dataclasses
 import math
 from typing import Any, ClassVar, Self
 
+import jax.numpy as jnp
+
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, Bands, Exponents, TexelRates, Texture, TextureOptions
+from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MOST_SHARE
 from a2tg_jax.core.budget import MEGABYTE, bytes_of, bytes_per_gaussian
 from a2tg_jax.core.checks import check_number
-from a2tg_jax.densify.exponents import LimitExponents
+from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.densify.view_dependence import AdaptDegrees
-from a2tg_jax.events import Event
+from a2tg_jax.events import Change, Event, Now, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import Noise, densify_times
-from a2tg_jax.systems.stage1 import PRUNING, QUICK, SMOKE, TwoStages, pruned
+from a2tg_jax.model import Model
+from a2tg_jax.systems.two_stages import PRUNING, QUICK, SMOKE, TwoStages, pruned
 from a2tg_jax.training.stage import Stage
+
+
+@pytree
+class LimitExponents(StepEvent):
+    """Lower limit of the exponents of kernels (`Appearance.exponents`), after every iteration."""
+
+    least: float = 0.6
+    """Smallest exponent of a kernel, 0 to 1. Smaller ones have longer tails, which take longer to draw; up to 1/e it
+    limits nothing."""
+
+    num_keys = 0
+
+    def check_options(self) -> None:
+        check_number("least", self.least, least=0, most=1)
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
+        if (shapes := model.appearance.shapes) is None:
+            raise ValueError("LimitExponents needs kernels with exponents, such as Appearance(exponents=Exponents())")
+        share = jnp.log(jnp.asarray(self.least, shapes.dtype)) / LARGEST_LOG_EXPONENT
+        least = jnp.arctanh(jnp.clip(share, -MOST_SHARE, MOST_SHARE))
+        appearance = model.appearance.with_shapes(jnp.maximum(shapes, least))
+        return Change(dataclasses.replace(model, appearance=appearance), moments, state)
+
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
 
@@ -61,26 +89,28 @@ class Bytewise(TwoStages):
         return self.base_degree
 
     def stages(self) -> tuple[Stage, ...]:
-        has_texture, most = bool(self.texture_share), self.lookup.max_alpha
+        most = self.lookup.max_alpha
         plain = Appearance(exponents=Exponents() if self.kernel_rate else None, max_alpha=most)
-        rates: dict[str, Any] = {"exponents": self.kernel_rate} if self.kernel_rate else {}
-        first = self.growing_stage(self._growth(), plain, rates or None)
-        # Textures are empty at first.
-        texture = Texture(None, (0, 0), self.lookup) if has_texture else None
-        detailed = dataclasses.replace(plain, texture=texture, bands=Bands(), max_alpha=None if has_texture else most)
-        rates = {**rates, "bands": self.view_dependence_rate}
-        rates |= {"texture": TexelRates(self.texel_rate, 0.0)} if has_texture else {}
-        return first, self.later_stage("details", detailed, self._details(), rates)
-
-    def _growth(self) -> tuple[Event, ...]:
-        """Return the events that fill all bytes, prune during growth, and finally make room for details."""
+        kernels: dict[str, Any] = {"exponents": self.kernel_rate} if self.kernel_rate else {}
+        limits = (self.exponents,) if self.kernel_rate and self.exponents.least else ()
+        # Growth fills all bytes; the end of the first stage makes room for details.
         grow = dataclasses.replace(self.densify, cap=self._num_gaussians())
+        pruning = pruned(self.prune, self.stage1_iterations, densify_times)
         last = (Prune(keep=self._num_kept()),) if self._share else ()
-        return Noise(), grow, *pruned(self.prune, self.stage1_iterations, densify_times), *last, *self._limits()
-
-    def _limits(self) -> tuple[Event, ...]:
-        """Return the event that limits the exponents of kernels, if they are trained and have a limit."""
-        return (self.exponents,) if self.kernel_rate and self.exponents.least else ()
+        first = self.growing_stage((Noise(), grow, *pruning, *last, *limits), plain, kernels or None)
+        # Degrees rise up to their share of the bytes; textures, empty at first, take the rest.
+        events: list[Event] = []
+        rates = kernels | {"bands": self.view_dependence_rate}
+        detailed = dataclasses.replace(plain, bands=Bands())
+        if self.view_dependence_share:
+            budget, highest = self._megabytes_before_texels(), min(self.sh_degree, self.view_dependence.highest)
+            events.append(dataclasses.replace(self.view_dependence, budget_mb=budget, highest=highest))
+        if self.texture_share:
+            budget = self._num_bytes() / MEGABYTE
+            events.append(dataclasses.replace(self.details, select="budget", budget_mb=budget))
+            rates |= {"texture": TexelRates(self.texel_rate, 0.0)}
+            detailed = dataclasses.replace(detailed, texture=Texture(None, (0, 0), self.lookup), max_alpha=None)
+        return first, self.later_stage("details", detailed, (*events, *limits), rates)
 
     @property
     def _share(self) -> float:
@@ -89,7 +119,7 @@ class Bytewise(TwoStages):
 
     def _num_gaussians(self) -> int:
         """Return the number of Gaussians that fill all bytes."""
-        num = self.budget_cap(self._floats_of_kernel)
+        num = self.budget_cap(bool(self.kernel_rate))  # One float of a Gaussian for the shape of its kernel.
         return self.densify.cap if num is None else num
 
     def _num_kept(self) -> int:
@@ -112,23 +142,7 @@ class Bytewise(TwoStages):
     @property
     def _own_bytes(self) -> int:
         """Bytes of a Gaussian without degrees and texels."""
-        return int(bytes_per_gaussian(self.base_degree, self._floats_of_kernel))
-
-    @property
-    def _floats_of_kernel(self) -> int:
-        """Floats of a Gaussian for the shape of its kernel."""
-        return 1 if self.kernel_rate else 0
-
-    def _details(self) -> tuple[Event, ...]:
-        """Return the events of degrees, up to their share of the bytes, then of texels for the rest."""
-        events: list[Event] = []
-        if self.view_dependence_share:
-            most, highest = self._megabytes_before_texels(), min(self.sh_degree, self.view_dependence.highest)
-            events.append(dataclasses.replace(self.view_dependence, budget_mb=most, highest=highest))
-        if self.texture_share:
-            megabytes = self._num_bytes() / MEGABYTE
-            events.append(dataclasses.replace(self.details, select="budget", budget_mb=megabytes))
-        return (*events, *self._limits())
+        return int(bytes_per_gaussian(self.base_degree, bool(self.kernel_rate)))
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
@@ -168,7 +182,18 @@ class Bytewise(TwoStages):
                 f"view_dependence_share must be 0 where all Gaussians have the highest degree, {self.sh_degree}, "
                 f"already: set it so, or lower base_degree; got {self.view_dependence_share}"
             )
-        self._check_times()
+        shares = {"view_dependence": self.view_dependence_share, "details": self.texture_share}
+        times = {
+            path: getattr(self, path).iterations(self.stage2_iterations) for path, share in shares.items() if share
+        }
+        for path, found in times.items():
+            if not found:
+                raise ValueError(f"{path}.at must say when its share of the bytes is spent; it is empty")
+        if len(times) == 2 and times["view_dependence"][-1] > times["details"][0]:
+            raise ValueError(
+                "view_dependence.at must be over when textures begin to take the rest of the bytes, at "
+                f"details.at {shortened(self.details.at)}; got {shortened(self.view_dependence.at)}"
+            )
         if self._num_gaussians() < 2 or self._num_kept() < 2:
             size = self.densify.cap if self.memory_budget is None else self.memory_budget
             raise ValueError(f"{self._limit} must leave room for 2 Gaussians beside degrees and textures; got {size}")
@@ -184,19 +209,4 @@ class Bytewise(TwoStages):
             raise ValueError(
                 f"{self._limit} has room for {most:,} Gaussians when the stage 'details' begins, and {num:,} are "
                 "given: raise it, or give fewer"
-            )
-
-    def _check_times(self) -> None:
-        """Refuse shares without a time to spend them, and degrees that change after textures took the bytes."""
-        shares = {"view_dependence": self.view_dependence_share, "details": self.texture_share}
-        times = {
-            path: getattr(self, path).iterations(self.stage2_iterations) for path, share in shares.items() if share
-        }
-        for path, found in times.items():
-            if not found:
-                raise ValueError(f"{path}.at must say when its share of the bytes is spent; it is empty")
-        if len(times) == 2 and times["view_dependence"][-1] > times["details"][0]:
-            raise ValueError(
-                "view_dependence.at must be over when textures begin to take the rest of the bytes, at "
-                f"details.at {shortened(self.details.at)}; got {shortened(self.view_dependence.at)}"
             )

@@ -13,7 +13,7 @@ from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.table import Table, is_table
 from a2tg_jax.host.machine import ALONE, Devices, Machine, this_machine
 from a2tg_jax.host.text import counted, shortened

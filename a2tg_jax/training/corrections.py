@@ -14,12 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.cameras import Camera, moved_viewmat
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.core.rigid import moved_viewmat
 from a2tg_jax.training.returned import check_kept, check_scalar
 
 T = TypeVar("T")

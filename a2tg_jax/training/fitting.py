@@ -7,7 +7,7 @@ from typing import Any
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind, kind_of
-from a2tg_jax.core.forks import check_process
+from a2tg_jax.core.gaussians import check_process
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.host import signals

@@ -14,9 +14,9 @@ from a2tg_jax.core.checks import check_kind, check_literal, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.numerics import safe_norm
-from a2tg_jax.core.partition import combine, partition
+from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.model import Model, check_is_model
-from a2tg_jax.parallel import views_at_once
+from a2tg_jax.parallel.exchange import value_and_grad_of_views
 from a2tg_jax.rasterize.capacity import with_capacity
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
@@ -209,8 +209,6 @@ def differentiate(
     probe = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if has_probe else None
     with_gradients = jax.value_and_grad(of_floats, argnums=(0, 1, 2, 3), has_aux=True)
     if settings.exchange is not None and settings.exchange.views_at_once > 1:
-        with_gradients = views_at_once.value_and_grad_of_views(
-            of_floats, settings.exchange.views_at_once, _axes_of(view)
-        )
+        with_gradients = value_and_grad_of_views(of_floats, settings.exchange.views_at_once, _axes_of(view))
     (value, (told, num_pairs)), gradients = with_gradients(model.gaussians, floats, view.rows, probe, view)
     return Differentiated(value, told, num_pairs, *gradients)

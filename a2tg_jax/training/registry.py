@@ -11,11 +11,11 @@ from a2tg_jax.training.options import System
 
 SYSTEMS = {
     "a2tg": "a2tg_jax.systems.a2tg:A2tg",
-    "gaussians-2d": "a2tg_jax.systems.gaussians_2d:Gaussians2d",
-    "gaussians-2d-mcmc": "a2tg_jax.systems.gaussians_2d_mcmc:Gaussians2dMcmc",
-    "textured-gaussians": "a2tg_jax.systems.textured_gaussians:TexturedGaussians",
-    "supergaussians": "a2tg_jax.systems.supergaussians:SuperGaussians",
-    "bbsplat": "a2tg_jax.systems.bbsplat:BBSplat",
+    "gaussians-2d": "a2tg_jax.systems.baselines:Gaussians2d",
+    "gaussians-2d-mcmc": "a2tg_jax.systems.baselines:Gaussians2dMcmc",
+    "textured-gaussians": "a2tg_jax.systems.baselines:TexturedGaussians",
+    "supergaussians": "a2tg_jax.systems.baselines:SuperGaussians",
+    "bbsplat": "a2tg_jax.systems.baselines:BBSplat",
     "bytewise": "a2tg_jax.systems.bytewise:Bytewise",
 }
 """Module and class of each system of this library, imported on demand."""

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
-from a2tg_jax.appearance.nearest_gaussians import nearest_gaussians
+from a2tg_jax.appearance.parts import nearest_gaussians
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
-from a2tg_jax.core.partition import combine, partition
-from a2tg_jax.core.pixel_sizes import FILTER_VARIANCE, pixel_sizes
+from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
+from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.data.observations import check_observed_points
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.data.start_points import Sight, unseeing

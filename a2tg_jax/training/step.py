@@ -20,12 +20,11 @@ from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
-from a2tg_jax.core.partition import combine, partition
-from a2tg_jax.core.pytree import pytree
+from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
 from a2tg_jax.model import Model
+from a2tg_jax.parallel.exchange import map_views
 from a2tg_jax.parallel.rows import spread
-from a2tg_jax.parallel.views_at_once import map_views
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import (

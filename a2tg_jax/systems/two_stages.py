@@ -6,8 +6,7 @@ from typing import Any
 
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity
-from a2tg_jax.densify.floaters import PruneFloaters
-from a2tg_jax.densify.pruning import Prune, during_growth
+from a2tg_jax.densify.pruning import Prune, PruneFloaters, during_growth
 from a2tg_jax.events import Event, StepEvent, Times
 from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
@@ -54,31 +53,25 @@ class TwoStages(System):
         name: str = "gaussians",
     ) -> Stage:
         """Return a first stage, in which the degree of spherical harmonics rises and floaters are pruned."""
-        return Stage(
-            name=name,
-            appearance=appearance,
-            events=(*events, *self._floaters_pruned(events)),
-            losses=self.loss.terms(),
-            rates=self.rates,
-            iterations=self.stage1_iterations,
-            appearance_rate=appearance_rate,
-            corrections=self.corrections_of(0),
-            raises_sh_degree=True,
-        )
+        return self._stage(0, name, appearance, (*events, *self._floaters_pruned(events)), appearance_rate)
 
     def later_stage(
         self, name: str, appearance: Appearance, events: tuple[Event, ...] = (), appearance_rate: Any = None
     ) -> Stage:
         """Return a second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
+        return self._stage(1, name, appearance, events, appearance_rate)
+
+    def _stage(self, index: int, name: str, appearance: Appearance, events: tuple[Event, ...], rate: Any) -> Stage:
         return Stage(
             name=name,
             appearance=appearance,
             events=events,
-            losses=self.loss.terms(is_first=False),
+            losses=self.loss.terms(is_first=index == 0),
             rates=self.rates,
-            iterations=self.stage2_iterations,
-            appearance_rate=appearance_rate,
-            corrections=self.corrections_of(1),
+            iterations=(self.stage1_iterations, self.stage2_iterations)[index],
+            appearance_rate=rate,
+            corrections=self.corrections_of(index),
+            raises_sh_degree=index == 0,
         )
 
     def continued(self, first: Stage) -> tuple[Stage, ...]:

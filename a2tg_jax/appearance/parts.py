@@ -1,0 +1,507 @@
+"""Optional parts of an appearance: a texture, the exponents of kernels, bands of spherical harmonics.
+
+The base class `Part`, then the texture of A²TG, kernels with an exponent per Gaussian (and the Gaussian nearest to
+each), and spherical harmonics with a degree per Gaussian.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal, NamedTuple, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike, DTypeLike
+
+from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.core.checks import check_number
+from a2tg_jax.core.gaussians import LARGEST_OPACITY, Gaussians, logit
+from a2tg_jax.core.numerics import normalize, within
+from a2tg_jax.core.pytree import pytree, static
+from a2tg_jax.core.sh import NUM_BASES, sh_basis
+from a2tg_jax.core.table import Places, Size, Table, check_places, check_table
+from a2tg_jax.parallel.rows import on_host, placed_like
+from a2tg_jax.texture import NEUTRAL_TEXEL, Textures, allocate_textures, check_textures
+
+
+class Part:
+    """Part of an appearance: static options, and arrays with a row for each Gaussian, None until they are allocated."""
+
+    def allocate(self, gaussians: Gaussians) -> Self:
+        """Return the part with initial arrays for N Gaussians (host)."""
+        raise NotImplementedError
+
+    def project(self) -> Self:
+        """Return the part with its numbers moved to where they are allowed, after an update; traceable."""
+        return self
+
+    def rates(self, rate: Any) -> Any:
+        """Return Adam's learning rates, a prefix of the part's tree of floats."""
+        return rate
+
+    def check(self, gaussians: Gaussians) -> None:
+        """Raise ValueError unless the arrays fit the Gaussians (host)."""
+
+
+Residual = tuple[Array, ...] | None
+"""Added to the D colours; None stands for 0."""
+Factor = Array | None
+"""Multiplies alpha; None stands for 1."""
+
+
+# The texture of A²TG: where (u, v) is in a splat's texture, and how its RGB and alpha change the splat. `texture`
+# stores textures, `core.bilinear` interpolates them. The renderer gets all of them one after the other as texels
+# [T, 4], each row by row.
+
+
+EXTENT = 3.0
+"""Half the side of a texture, in standard deviations."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TextureOptions:
+    """Conventions of textures. The defaults follow the paper's text, `official()` the authors' program."""
+
+    uv: Literal["texel-centre", "align-corners"] = "texel-centre"
+    """Place of the texels: centres at half-texel offsets over ±3σ, or the outer ones exactly at ±3σ."""
+    outside: Literal["clamp", "identity"] = "clamp"
+    """Texture beyond ±3σ: the edge texel continues, or nothing shows (RGB 0, alpha 1)."""
+    rgb: Literal["signed", "unit"] = "signed"
+    """RGB residuals of either sign, or clipped to [0, 1]."""
+    uv_gradient: bool = True
+    """Whether gradients flow through the lookup position into the geometry."""
+    initial_rgb: float = 0.0
+    """Initial RGB."""
+    alpha: Literal["projected", "global-maximum"] = "projected"
+    """Alpha factors clamped to [0, 1] after each update; or any numbers, divided by the largest of all textures and
+    clipped to [0, 1] when shown."""
+    max_alpha: float = 0.99
+    """Upper limit of a splat's alpha."""
+
+    def check_options(self) -> None:
+        """Raise ValueError, beginning with the name of the field, if a number is out of range."""
+        check_number("initial_rgb", self.initial_rgb, least=-1, most=1)
+        check_number("max_alpha", self.max_alpha, least=1e-3, most=0.9999)
+
+    @staticmethod
+    def official() -> "TextureOptions":
+        """Return the conventions of the authors' program."""
+        return TextureOptions("align-corners", "identity", "unit", False, 0.1, "global-maximum", max_alpha=0.999)
+
+
+class TexelRates(NamedTuple):
+    """Learning rates of texels by the size of their texture."""
+
+    larger: Any
+    """Rate of textures of more than one texel."""
+    single: Any
+    """Rate of textures of one texel, which only change the colour and opacity of their Gaussian."""
+
+
+@pytree
+class Texture(Part):
+    """RGB residual and alpha factor from a texture of each splat."""
+
+    texels: Textures | None = None
+    """Textures of N Gaussians; None until allocated."""
+    start: tuple[int, int] = static(default=(1, 1))
+    """Initial (Tv, Tu) of every texture, each 1 to 16; (0, 0): no textures until they grow."""
+    options: TextureOptions = static(default=TextureOptions())
+    """Conventions of the textures."""
+
+    def allocate(self, gaussians: Gaussians) -> "Texture":
+        sizes = np.broadcast_to(np.asarray(self.start, np.int64), (gaussians.num, 2))
+        texels = allocate_textures(sizes, rgb=self.options.initial_rgb, dtype=gaussians.means.dtype)
+        return dataclasses.replace(self, texels=texels)
+
+    def check(self, gaussians: Gaussians) -> None:
+        assert self.texels is not None
+        check_textures(self.texels, gaussians.num)
+        check_places(self.texels)
+
+    def rates(self, rate: Any) -> Any:
+        """Return one rate for all texels, or those of `TexelRates`."""
+        if not isinstance(rate, TexelRates):
+            return rate
+        assert self.texels is not None
+        is_single = [size == (1, 1) for size in self.texels.bucket_sizes]
+        buckets = tuple(rate.single if single else rate.larger for single in is_single)
+        return dataclasses.replace(self, texels=dataclasses.replace(self.texels, buckets=buckets))
+
+    def project(self) -> "Texture":
+        """Return textures with alpha factors clamped to [0, 1], and RGB too if it is unsigned.
+
+        Alpha that is divided by its maximum has no upper bound. What `shown` would clip is clipped here as well, which
+        changes no image: beyond the bounds, where gradients are 0, texels would stay for ever.
+        """
+        options = self.options
+        most_alpha = jnp.inf if options.alpha == "global-maximum" else 1.0
+        least, most = (0.0, 1.0) if options.rgb == "unit" else (-jnp.inf, jnp.inf)
+
+        def projected(texels: Array) -> Array:
+            bounds = (
+                jnp.asarray([rgb] * 3 + [alpha], texels.dtype) for rgb, alpha in ((least, 0.0), (most, most_alpha))
+            )
+            return jnp.clip(texels, *(bound[None, None, None] for bound in bounds))
+
+        assert self.texels is not None
+        buckets = tuple(map(projected, self.texels.buckets))
+        return dataclasses.replace(self, texels=dataclasses.replace(self.texels, buckets=buckets))
+
+    def shown(self) -> Textures:
+        """Return RGB residuals and alpha factors as they are shown, from the trained texels.
+
+        Buckets and rows out of range are clamped.
+        """
+        assert self.texels is not None
+        textures, options = self.texels.nearest_places(), self.options
+        if options.rgb == "signed" and options.alpha == "projected":
+            return textures
+        divisor = _largest_alpha(textures) + 1e-6 if options.alpha == "global-maximum" else None
+
+        def shown(texels: Array) -> Array:
+            rgb, alpha = texels[..., :3], texels[..., 3:]
+            rgb = within(rgb, 0.0, 1.0) if options.rgb == "unit" else rgb
+            alpha = alpha if divisor is None else within(alpha / divisor, 0.0, 1.0)
+            return jnp.concatenate([rgb, alpha], axis=-1)
+
+        return dataclasses.replace(textures, buckets=tuple(map(shown, textures.buckets)))
+
+    def atlas(self) -> tuple[Array, TextureRegion]:
+        """Return all texels [T, 4], and the N places of the textures among them.
+
+        An empty texture has a region of no texels and changes nothing.
+        """
+        textures = self.shown()
+        areas = [height * width for height, width in textures.bucket_sizes]
+        capacities = [bucket.shape[0] for bucket in textures.buckets]
+        starts = np.cumsum([0] + [capacity * area for capacity, area in zip(capacities, areas, strict=True)])[:-1]
+        bucket_starts, bucket_areas = jnp.asarray(starts, jnp.int32), jnp.asarray(areas, jnp.int32)
+        sizes = jnp.asarray(textures.bucket_sizes, jnp.int32)[textures.bucket]
+        offsets = bucket_starts[textures.bucket] + textures.row * bucket_areas[textures.bucket]
+        texels = [bucket.reshape(-1, 4) for bucket in textures.buckets if bucket.size]
+        none = jnp.asarray([NEUTRAL_TEXEL], textures.buckets[0].dtype)
+        return jnp.concatenate(texels or [none]), TextureRegion(offsets, sizes[:, 0], sizes[:, 1])
+
+    def peaks(self) -> Array:
+        """Return the largest alpha factor [N] of each splat; only for bounds, without gradient."""
+        textures = self.shown()
+        capacities = [bucket.shape[0] for bucket in textures.buckets]
+        peaks = jnp.stack([_padded_peaks(bucket, max(capacities)) for bucket in textures.buckets])
+        peaks = jax.lax.stop_gradient(peaks[textures.bucket, textures.row])
+        return jnp.maximum(peaks, 1.0) if self.options.outside == "identity" else peaks
+
+    # Element-wise, without the texels
+
+    def position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
+        """Return the lookup position (x, y) in texels, clamped to [0, width − 1] and [0, height − 1]."""
+        if not self.options.uv_gradient:
+            u, v = jax.lax.stop_gradient((u, v))
+        width, height = region.width.astype(u.dtype), region.height.astype(v.dtype)
+        return texel_coordinates(u, width, self.options.uv), texel_coordinates(v, height, self.options.uv)
+
+    def shade(self, values: tuple[Array, ...], u: Array, v: Array) -> tuple[Residual, Factor]:
+        """Return colour residual and alpha factor at (u, v), from the four values looked up there."""
+        red, green, blue, alpha = values
+        if self.options.outside == "identity":
+            is_inside = (jnp.abs(u) <= EXTENT) & (jnp.abs(v) <= EXTENT)
+            red, green, blue = (jnp.where(is_inside, channel, 0.0) for channel in (red, green, blue))
+            alpha = jnp.where(is_inside, alpha, 1.0)
+        return (red, green, blue), alpha
+
+
+def _largest_alpha(textures: Textures) -> Array:
+    """Return the largest alpha of all texels without padding, or 1 if all textures are empty.
+
+    Several equal maxima share the gradient.
+    """
+    alphas = [jnp.ones(1, textures.buckets[0].dtype)] if not any(bucket.size for bucket in textures.buckets) else []
+    for index, bucket in enumerate(textures.buckets):
+        num_used = jnp.sum(textures.bucket == index, dtype=jnp.int32)
+        is_used = jnp.arange(bucket.shape[0], dtype=jnp.int32) < num_used
+        alphas.append(jnp.where(is_used[:, None, None], bucket[..., 3], -jnp.inf).reshape(-1))
+    return jnp.max(jnp.concatenate(alphas))
+
+
+def _padded_peaks(bucket: Array, length: int) -> Array:
+    """Return the largest alpha [length] of each texture of a bucket: 1 if empty, 0 past the capacity."""
+    if not bucket.size:
+        return jnp.ones(length, bucket.dtype)
+    peaks = jnp.max(bucket[..., 3], axis=(1, 2))
+    return jnp.pad(peaks, (0, length - peaks.shape[0]))
+
+
+def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
+    """Return the position of u, in standard deviations, among the `size` texels of its axis, in [0, size − 1]."""
+    unit = (u * (1 / EXTENT) + 1) * 0.5
+    x = unit * (size - 1) if convention == "align-corners" else unit * size - 0.5
+    return jnp.clip(x, 0.0, size - 1)
+
+
+# Kernels with an exponent per Gaussian, instead of the Gaussian falloff. A generalised Gaussian has an exponent β:
+# β = 1 is the Gaussian, a larger one is flat in the middle and ends at an edge, a smaller one is peaked and has long
+# tails (GES, Hamdi et al., 2024). At squared distance ρ, in standard deviations, the falloff is
+#
+#     exp(−((ρ + δ)^β − δ^β) / ((2 + δ)^β − δ^β)),   δ = 0.02
+#
+# which is 1 at the centre and 1/e at ρ = 2 for every β, as a Gaussian's is. δ keeps the slope at the centre finite.
+
+
+OFFSET = 0.02
+"""δ, in squared standard deviations."""
+LARGEST_LOG_EXPONENT = 1.0
+"""Largest logarithm of an exponent, and of its inverse."""
+MOST_SHARE = 1 - 1e-7
+"""Largest tanh of a shape that is read, so that the shape is finite."""
+MOST_ROUNDED = 1.5
+"""Largest tanh of a shape in a file: half the coarsest step beyond the range."""
+LARGEST_RHO = 1e6
+"""Squared distance beyond which the falloff is 0 in any case; its powers stay finite up to there."""
+
+
+@pytree
+class Exponents(Part):
+    """Shapes of the kernels."""
+
+    shapes: Array | None = None
+    """[N] shapes s of the exponents exp(tanh s); 0 is a Gaussian. None until allocated."""
+
+    def allocate(self, gaussians: Gaussians) -> "Exponents":
+        return dataclasses.replace(self, shapes=jnp.zeros(gaussians.num, gaussians.means.dtype))
+
+    def check(self, gaussians: Gaussians) -> None:
+        if self.shapes is None or self.shapes.shape != (gaussians.num,):
+            found = None if self.shapes is None else list(self.shapes.shape)
+            raise ValueError(f"shapes must be [{gaussians.num}], one for each Gaussian; got {found}")
+
+
+class Curve(NamedTuple):
+    """The exponent of the falloff as a function of ρ: scale·((ρ + δ)^β − start)."""
+
+    exponents: Array
+    """β [N]."""
+    scales: Array
+    """[N] inverse of its increase from ρ = 0 to 2, so that it is 1 there."""
+    starts: Array
+    """[N] δ^β."""
+
+
+def exponents_of(shapes: Array) -> Array:
+    """Return the exponents β = exp(tanh s), in (1/e, e), of shapes."""
+    return jnp.exp(LARGEST_LOG_EXPONENT * jnp.tanh(shapes))
+
+
+def log_exponents_of(shapes: np.ndarray) -> np.ndarray:
+    """Return the logarithms of the exponents of shapes, within ±1, as files keep them (host)."""
+    return LARGEST_LOG_EXPONENT * np.tanh(np.asarray(shapes, np.float64))
+
+
+def shapes_of(log_exponents: np.ndarray) -> np.ndarray:
+    """Return the shapes of logarithms of exponents in a file (host).
+
+    Logarithms that rounding has moved beyond ±1 are cut to ±1.
+
+    Raises:
+      ValueError: if one is NaN or farther out than rounding moves it.
+    """
+    shares = np.asarray(log_exponents, np.float64) / LARGEST_LOG_EXPONENT
+    if not (np.abs(shares) <= MOST_ROUNDED).all():
+        raise ValueError(f"the logarithms of the exponents of kernels must be within ±{LARGEST_LOG_EXPONENT:g}")
+    return np.arctanh(np.clip(shares, -MOST_SHARE, MOST_SHARE))
+
+
+def curves_of(shapes: Array) -> Curve:
+    """Return the curves of shapes [N]."""
+    exponents = exponents_of(shapes)
+    starts = jnp.exp(exponents * np.log(OFFSET))
+    return Curve(exponents, 1 / (jnp.exp(exponents * np.log(2 + OFFSET)) - starts), starts)
+
+
+def falloff_of(curve: Curve, rho: Array) -> Array:
+    """Return kernels at squared distances, which broadcast with the numbers of the curve."""
+    rho = jnp.minimum(rho, LARGEST_RHO)
+    return jnp.exp(-curve.scales * (jnp.exp(curve.exponents * jnp.log(rho + OFFSET)) - curve.starts))
+
+
+def reach_of(curve: Curve, bound: Array) -> Array:
+    """Return the squared distance [N] at which kernels are as small as a Gaussian is at `bound`; not positive where
+    the bound is not."""
+    reach = jnp.maximum(bound, 0.0) / (2 * curve.scales) + curve.starts
+    return jnp.where(bound > 0, jnp.exp(jnp.log(reach) / curve.exponents) - OFFSET, bound)
+
+
+# Spherical harmonics with a degree per Gaussian, beyond the degree that all Gaussians have. Band l holds the 2l + 1
+# coefficients of degree l. All Gaussians have the bands of `Gaussians.sh`. One of a higher degree has a block of all
+# bands between in a `core.table.Table`; one without takes no bytes there.
+
+
+MAX_DEGREE = 3
+
+
+@pytree(repr=False)
+class Coefficients(Table):
+    """Blocks [K, 3] of the coefficients that each Gaussian has beyond those of all; K is 0 without any."""
+
+    owners: tuple[Array, ...] = ()
+    """[capacity] int32 Gaussian of each row of each bucket; N for a row of padding."""
+
+    num_sides: ClassVar[int] = 1
+    padding: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def placed(cls, buckets: Sequence[Any], places: Places) -> Self:
+        bucket, row, num = on_host(places.bucket), on_host(places.row), places.bucket.shape[0]
+        owners = []
+        for index, blocks in enumerate(buckets):
+            own = np.full(len(blocks), num, np.int32)
+            own[row[bucket == index]] = np.flatnonzero(bucket == index)
+            owners.append(placed_like(own, places.bucket))
+        return cls(tuple(map(jnp.asarray, buckets)), *places, tuple(owners))
+
+    @staticmethod
+    def resized(blocks: np.ndarray, size: Size) -> np.ndarray:
+        """Return blocks [M, K, 3] with other numbers of coefficients: kept ones stay, new ones are 0 (host)."""
+        missing = max(0, size[0] - blocks.shape[1])
+        return np.pad(blocks, ((0, 0), (0, missing), (0, 0)))[:, : size[0]]
+
+
+@pytree
+class Bands(Part):
+    """View dependence of a degree per Gaussian."""
+
+    coefficients: Coefficients | None = None
+    """Coefficients of N Gaussians; None until allocated."""
+
+    def allocate(self, gaussians: Gaussians) -> "Bands":
+        degrees = np.full(gaussians.num, gaussians.sh_degree)
+        return dataclasses.replace(self, coefficients=empty_bands(degrees, gaussians.sh_degree, gaussians.means.dtype))
+
+    def check(self, gaussians: Gaussians) -> None:
+        assert self.coefficients is not None
+        check_table(self.coefficients, gaussians.num, "bands.coefficients")
+        check_places(self.coefficients, "bands.coefficients")
+        possible = {number - NUM_BASES[gaussians.sh_degree] for number in NUM_BASES[gaussians.sh_degree :]}
+        if unknown := {size for (size,) in self.coefficients.bucket_sizes} - possible:
+            raise ValueError(
+                f"bands.coefficients have blocks of {min(unknown)} coefficients, which no degree above "
+                f"{gaussians.sh_degree}, the degree of the Gaussians, has"
+            )
+
+    def color_sums(self, gaussians: Gaussians, center: Array, degree: Any) -> Array:
+        """Return the sums [N, 3] that the bands add to Σ Y_l·sh_l, before 0.5 is added and negatives are cut off.
+
+        Args:
+          gaussians: N Gaussians, of which degree and means are read.
+          center: [3] camera centre in the world.
+          degree: highest degree used; may be traced.
+        """
+        table, base, means = self.coefficients, gaussians.sh_degree, gaussians.means
+        assert table is not None
+        total = jnp.zeros(means.shape, jnp.result_type(means, center, *table.buckets))
+        for blocks, owners in zip(table.buckets, table.owners, strict=True):
+            if not blocks.size:
+                continue
+            bases = sh_basis(normalize(means[jnp.minimum(owners, table.num - 1)] - center[None, :]))
+            colors = jnp.zeros((len(blocks), 3), total.dtype)
+            for band in range(base + 1, MAX_DEGREE + 1):
+                first, last = NUM_BASES[band - 1], NUM_BASES[band]
+                if blocks.shape[1] < last - NUM_BASES[base]:
+                    break
+                basis = jnp.where(jnp.asarray(degree) >= band, bases[:, first:last], 0.0)
+                own = blocks[:, first - NUM_BASES[base] : last - NUM_BASES[base]]
+                colors = colors + jnp.sum(basis[:, :, None] * own, axis=1)
+            total = total.at[owners].add(colors, mode="drop")
+        return total
+
+
+def floats_of_band(degree: int) -> int:
+    """Return the floats of a band of one Gaussian: 9, 15 and 21 for degree 1, 2 and 3."""
+    return 3 * (2 * degree + 1)
+
+
+def sizes_of_degrees(degrees: np.ndarray, base_degree: int) -> np.ndarray:
+    """Return the sizes [N, 1] of the blocks of Gaussians of the given degrees.
+
+    Raises:
+      ValueError: if a degree is out of range.
+    """
+    if degrees.size and not base_degree <= degrees.min() <= degrees.max() <= MAX_DEGREE:
+        raise ValueError(f"degrees must be in {base_degree}..3; got {degrees.min()}..{degrees.max()}")
+    sizes: np.ndarray = np.asarray(NUM_BASES)[degrees] - NUM_BASES[base_degree]
+    return sizes[:, None]
+
+
+def degrees_of_sizes(sizes: np.ndarray, base_degree: int) -> np.ndarray:
+    """Return the degrees [N] of Gaussians with blocks of the given sizes [N, 1]."""
+    return np.searchsorted(NUM_BASES, sizes[:, 0] + NUM_BASES[base_degree])
+
+
+def empty_bands(degrees: ArrayLike, base_degree: int, dtype: DTypeLike = jnp.float32) -> Coefficients:
+    """Return coefficients of zero for Gaussians of the given degrees [N] (host)."""
+    return Coefficients.allocate(sizes_of_degrees(np.asarray(degrees), base_degree), (0.0, 0.0, 0.0), dtype)
+
+
+def dense_bands(coefficients: Coefficients, base_degree: int) -> np.ndarray:
+    """Return all coefficients above the base degree [N, K, 3], zeros above a Gaussian's degree; K is that of degree 3
+    (host)."""
+    dtype = coefficients.buckets[0].dtype if coefficients.buckets else np.float32
+    dense = np.zeros((coefficients.num, NUM_BASES[MAX_DEGREE] - NUM_BASES[base_degree], 3), dtype)
+    for blocks, owners in zip(coefficients.buckets, coefficients.owners, strict=True):
+        rows = on_host(owners)
+        is_used = rows < coefficients.num
+        dense[rows[is_used], : blocks.shape[1]] = on_host(blocks)[is_used]
+    return dense
+
+
+def bands_of_dense(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> Coefficients:
+    """Invert `dense_bands`, given the degrees [N]: coefficients above a Gaussian's degree are dropped (host)."""
+    dense = np.asarray(dense)
+    table = empty_bands(degrees, base_degree, dense.dtype)
+    filled = []
+    for blocks, owners in zip(table.buckets, table.owners, strict=True):
+        rows, values = np.asarray(owners), np.zeros(blocks.shape, dense.dtype)
+        is_used = rows < table.num
+        values[is_used] = dense[rows[is_used], : blocks.shape[1]]
+        filled.append(jnp.asarray(values))
+    return dataclasses.replace(table, buckets=tuple(filled))
+
+
+# The Gaussian nearest to a kernel, for files that have Gaussians only. Of all Gaussians a·exp(−ρ/2k) it has the least
+# squared difference from the kernel over the plane: for a given k, the best a is ⟨f, g⟩/⟨g, g⟩ with g = exp(−ρ/2k) and
+# ⟨g, g⟩ = k, and the best k maximises ⟨f, g⟩²/k. Both are tabulated over the logarithm of the exponent.
+
+
+LEAST_OPACITY = 1e-6
+NUM_SHAPES, NUM_SCALES, NUM_PLACES = 41, 121, 2001
+LARGEST_PLACE = 12.0
+"""Distance, in standard deviations, up to which kernels are compared."""
+LEAST_LOG_SCALE, MOST_LOG_SCALE = -0.3, 0.9
+"""Range of the logarithms of √k."""
+
+
+def nearest_gaussians(gaussians: Gaussians, shapes: np.ndarray) -> Gaussians:
+    """Return the Gaussians nearest to kernels of the given shapes [N]: other scales and opacities (host)."""
+    log_exponents, peaks, log_scales = _table()
+    own = log_exponents_of(shapes)
+    opacities = np.asarray(gaussians.opacities, np.float64) * np.interp(own, log_exponents, peaks)
+    dtype = gaussians.means.dtype
+    limited = jnp.asarray(np.clip(opacities, LEAST_OPACITY, LARGEST_OPACITY), dtype)
+    larger = np.asarray(gaussians.log_scales) + np.interp(own, log_exponents, log_scales)[:, None]
+    return dataclasses.replace(gaussians, logit_opacities=logit(limited), log_scales=jnp.asarray(larger, dtype))
+
+
+@functools.cache
+def _table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return logarithms of exponents in order, and of the nearest Gaussian of each a and the logarithm of √k."""
+    log_exponents = np.linspace(-LARGEST_LOG_EXPONENT, LARGEST_LOG_EXPONENT, NUM_SHAPES)
+    radii = np.linspace(0, LARGEST_PLACE, NUM_PLACES)
+    curves = curves_of(jnp.asarray(shapes_of(log_exponents))[:, None])
+    kernels = np.asarray(falloff_of(curves, jnp.asarray(radii**2)[None]), np.float64)
+    log_scales = np.linspace(LEAST_LOG_SCALE, MOST_LOG_SCALE, NUM_SCALES)
+    squares = np.exp(2 * log_scales)
+    weighted = np.exp(-0.5 * radii**2 / squares[:, None]) * radii * (2 * radii[1])
+    products = kernels @ weighted.T
+    best = np.argmax(products**2 / squares, axis=1)
+    return log_exponents, products[np.arange(NUM_SHAPES), best] / squares[best], log_scales[best]
