@@ -15,7 +15,7 @@ import sys
 import tempfile
 
 from a2tg_jax.cli import main as cli
-from a2tg_jax.host.memory import memory_peak
+from a2tg_jax.host.machine import memory_peak
 from a2tg_jax.results.forecast import forecast_run
 from benchmarks.large_scene import write_scene
 from experiments.lab import markdown

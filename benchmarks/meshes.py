@@ -20,7 +20,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.core.similarity import transform_gaussians
 from a2tg_jax.data.synthetic import exact_points, still_life
-from a2tg_jax.host.memory import memory_peak
+from a2tg_jax.host.machine import memory_peak
 from a2tg_jax.mesh.blocks import BlockGrid
 from a2tg_jax.mesh.depth_maps import rendered_depth
 from a2tg_jax.mesh.extract import GRID_BYTES

@@ -24,7 +24,7 @@ from lab.kept import KeptFigures, parser_of
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian
-from a2tg_jax.host.memory import tidy_memory
+from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.training import SYSTEMS, find_system
 
 NUM_POINTS = (20_000, 100_000, 300_000)

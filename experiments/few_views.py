@@ -24,7 +24,7 @@ from lab.interrupts import interruptible
 from lab.kept import KeptFigures, parser_of
 
 import a2tg_jax as a2tg
-from a2tg_jax.host.memory import tidy_memory
+from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.training import find_system
 from a2tg_jax.training.registry import with_changes
 

@@ -31,7 +31,7 @@ from a2tg_jax.data.lenses import KeptLens, Lens
 from a2tg_jax.data.lighting import light
 from a2tg_jax.data.surfaces import Surface, trace_rays
 from a2tg_jax.data.synthetic import SAMPLE_OFFSETS, camera_path, still_life, viewmat_to_target
-from a2tg_jax.host.memory import tidy_memory
+from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.training.registry import with_changes
 
 SIZE = 208, 156

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 import a2tg_jax as a2tg
 from a2tg_jax.core.cameras import moved_viewmat
 from a2tg_jax.core.similarity import camera_centers
-from a2tg_jax.host.memory import tidy_memory
+from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.results.folder import write_json
 from a2tg_jax.results.run_evaluation import refined_views
 from a2tg_jax.training.corrections import exposed

@@ -27,7 +27,7 @@ from lab.outdoors import outdoors
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_depths
-from a2tg_jax.host.memory import tidy_memory
+from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.training.registry import with_changes
 
 SIZE = 128, 96

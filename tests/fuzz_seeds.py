@@ -12,8 +12,7 @@ from fuzz_readers import PICTURES
 from PIL import Image
 from small_models import some_checkpoint, some_model
 from test_captures import write_metashape, write_polycam_with_depth, write_realityscan, write_record3d
-from test_data_colmap import CAMERAS
-from test_data_colmap import write_scene as write_colmap
+from test_data_colmap import CAMERAS, write_scene as write_colmap
 from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write_json, write_ply
 from test_io import write_ply as write_splats
 from test_others import OTHERS
@@ -23,8 +22,7 @@ from a2tg_jax import save_compact, save_gltf, save_model, save_ply
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.io.ply import ATTRIBUTES
 from a2tg_jax.model import Model
-from a2tg_jax.results.folder import RunFolder, create_run
-from a2tg_jax.results.folder import write_json as write_run_json
+from a2tg_jax.results.folder import RunFolder, create_run, write_json as write_run_json
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.systems.baselines import BBSplat, SuperGaussians

@@ -22,8 +22,7 @@ from a2tg_jax.appearance.base import cutoff_of
 from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Change, Due, HostEvent, StepEvent
-from a2tg_jax.parallel import exchange as exchanges
-from a2tg_jax.parallel import rows
+from a2tg_jax.parallel import exchange as exchanges, rows
 from a2tg_jax.parallel.exchange import AXIS, ROOM_OF_A_BAND, BorderRoom, ImageBands, exchange_among
 from a2tg_jax.parallel.rows import on_host, placed_like, readable, rows_moved, sharding_of_rows, spread
 from a2tg_jax.rasterize.capacity import pairs_of_view

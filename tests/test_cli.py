@@ -20,8 +20,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from a2tg_jax.cli import doctor
-from a2tg_jax.cli import main as cli
+from a2tg_jax.cli import doctor, main as cli
 from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host import startup

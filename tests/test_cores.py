@@ -8,9 +8,8 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 
 import a2tg_jax
 from a2tg_jax import render_image
-from a2tg_jax.host import cores
-from a2tg_jax.rasterize.kernels.native import composite as native
-from a2tg_jax.rasterize.kernels.native import threads
+from a2tg_jax.host import machine
+from a2tg_jax.rasterize.kernels.native import composite as native, threads
 
 CGROUPS = {
     "version 2, in a container": ("0::/", {"cpu.max": "150000 100000"}, 1.5),
@@ -41,8 +40,8 @@ CGROUPS = {
 
 @pytest.fixture(autouse=True)
 def untouched(monkeypatch):
-    monkeypatch.setattr(cores, "_chosen", None)
-    monkeypatch.delenv(cores.VARIABLE, raising=False)
+    monkeypatch.setattr(machine, "_chosen", None)
+    monkeypatch.delenv(machine.VARIABLE, raising=False)
 
 
 @pytest.mark.parametrize("name", CGROUPS)
@@ -51,27 +50,27 @@ def test_quotas_of_control_groups(tmp_path, name):
     for path, text in {"proc/self/cgroup": groups, **{f"sys/fs/cgroup/{k}": v for k, v in files.items()}}.items():
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text(text + "\n")
-    assert cores.cpu_quota(tmp_path) == expected
+    assert machine.cpu_quota(tmp_path) == expected
 
 
 def test_without_control_groups_there_is_no_quota(tmp_path):
-    assert cores.cpu_quota(tmp_path) == math.inf
+    assert machine.cpu_quota(tmp_path) == math.inf
 
 
 @pytest.mark.parametrize(("quota", "expected"), [(0.2, 1), (1.5, 2), (3.0, 3), (99.0, 8), (math.inf, 8)])
 def test_the_default_is_what_the_process_may_use(monkeypatch, quota, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
-    monkeypatch.setattr(cores, "_own_quota", lambda: quota)
-    assert cores.num_threads() == expected
+    monkeypatch.setattr(machine, "cpu_quota", lambda: quota)
+    assert machine.num_threads() == expected
 
 
 def test_what_is_set_precedes_the_environment(monkeypatch):
-    monkeypatch.setenv(cores.VARIABLE, "3")
-    assert cores.num_threads() == 3
+    monkeypatch.setenv(machine.VARIABLE, "3")
+    assert machine.num_threads() == 3
     a2tg_jax.set_num_threads(5)
-    assert cores.num_threads() == 5
+    assert machine.num_threads() == 5
     a2tg_jax.set_num_threads(None)
-    assert cores.num_threads() == 3
+    assert machine.num_threads() == 3
 
 
 @pytest.mark.parametrize("wrong", [0, -1, 1.5, True, "2"])
@@ -82,7 +81,7 @@ def test_wrong_numbers_are_refused(wrong):
 
 @pytest.mark.parametrize("wrong", ["0", "-1", "two"])
 def test_a_wrong_environment_is_named(monkeypatch, wrong):
-    monkeypatch.setenv(cores.VARIABLE, wrong)
+    monkeypatch.setenv(machine.VARIABLE, wrong)
     with pytest.raises(ValueError, match=rf"A2TG_NUM_THREADS must be a positive integer; got '{wrong}'"):
         a2tg_jax.configure_cpu(use_cache=False)
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.core.similarity import camera_centers
-from a2tg_jax.data import Similarity
+from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.world import normalizing_similarity, scene_scale
 
 

@@ -16,7 +16,7 @@ from a2tg_jax.cli import main as cli
 from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.data import Picture
 from a2tg_jax.densify.pruning import Prune
-from a2tg_jax.host import memory, progress_bars
+from a2tg_jax.host import machine, progress_bars
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results import forecast
 from a2tg_jax.results.forecast import (
@@ -314,7 +314,7 @@ def test_an_event_has_the_new_state_beside_the_old_one():
 def test_on_a_cpu_the_memory_that_is_free_counts(monkeypatch):
     monkeypatch.setattr(forecast, "memory_limit", lambda: 123 * MB)
     assert allowed_memory(None) == 123 * MB and allowed_memory(1.0) == 1
-    assert memory.memory_limit() > MB
+    assert machine.memory_limit() > MB
 
 
 @pytest.mark.parametrize(

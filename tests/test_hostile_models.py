@@ -16,10 +16,8 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.table import check_places
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.npz import read_npz
-from a2tg_jax.io.archive import FORMAT as CHECKPOINT
-from a2tg_jax.io.archive import read_archive, write_archive
-from a2tg_jax.io.model_file import FORMAT as MODEL
-from a2tg_jax.io.model_file import load_model, save_model
+from a2tg_jax.io.archive import FORMAT as CHECKPOINT, read_archive, write_archive
+from a2tg_jax.io.model_file import FORMAT as MODEL, load_model, save_model
 from a2tg_jax.io.ply import load_ply, save_ply
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.measure.metrics import load_lpips

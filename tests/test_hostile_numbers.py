@@ -13,8 +13,7 @@ from test_hostile_models import GAUSSIANS, refused, spoiled, with_number
 import a2tg_jax as a2tg
 from a2tg_jax import load_compact, load_ply, save_compact, save_gltf, save_ply
 from a2tg_jax.io import ply
-from a2tg_jax.io.model_file import FORMAT as MODEL
-from a2tg_jax.io.model_file import load_model, save_model
+from a2tg_jax.io.model_file import FORMAT as MODEL, load_model, save_model
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render

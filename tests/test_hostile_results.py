@@ -224,8 +224,8 @@ def test_texts_are_measured_before_they_are_parsed(parse, text):
     assert num_bytes < 6 * len(text) + 10**6 and num_bytes < 70e6 and seconds < 5
 
 
-def test_brackets_and_dots_in_strings_do_not_count():
-    deep = "[" * 100 + "." * 100
+def test_brackets_in_strings_do_not_count():
+    deep = "[" * 100
     told = json.dumps({'a"' + deep: ["\\", deep, '\\"' + deep]})
     assert parse_json(told) == json.loads(told)
     text = f"a = '{deep}' # {deep}\nb = \"\\\"{deep}\"\nc = \"\"\"\n\"{deep}\"\"\"\nd = '''{deep}'''\n'{deep}' = 1\n"
@@ -235,7 +235,7 @@ def test_brackets_and_dots_in_strings_do_not_count():
 
 def test_brackets_may_be_as_deep_as_is_said():
     assert parse_json("[" * DEEPEST + "]" * DEEPEST)
-    with pytest.raises(ValueError, match="nested too deeply"):
+    with pytest.raises(ValueError, match="nested more than"):
         parse_json("[" * (DEEPEST + 1) + "]" * (DEEPEST + 1))
 
 

@@ -10,10 +10,16 @@ import numpy as np
 import pytest
 from hostile_files import put
 from PIL import Image
-from test_data_colmap import CAMERAS
-from test_data_colmap import write_scene as write_colmap
-from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write_json, write_ply
-from test_data_transforms import write_scene as write_transforms
+from test_data_colmap import CAMERAS, write_scene as write_colmap
+from test_data_transforms import (
+    FOCAL,
+    SIZE,
+    write_blender,
+    write_frames,
+    write_json,
+    write_ply,
+    write_scene as write_transforms,
+)
 
 from a2tg_jax.data import load_scene
 from a2tg_jax.data.colmap_binary import read_binary

@@ -17,8 +17,7 @@ from a2tg_jax.appearance import Appearance, Texture, TextureOptions, gaussian_cu
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import homographies
 from a2tg_jax.core.pytree import combine, partition, pytree, static
-from a2tg_jax.rasterize.kernels.native import composite as native
-from a2tg_jax.rasterize.kernels.native import threads
+from a2tg_jax.rasterize.kernels.native import composite as native, threads
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.texture import textures_from_arrays

@@ -10,8 +10,7 @@ from skimage.metrics import structural_similarity
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.rasterize.kernels import choice, scores, windows
-from a2tg_jax.rasterize.kernels.native import ssim as kernel
-from a2tg_jax.rasterize.kernels.native import threads
+from a2tg_jax.rasterize.kernels.native import ssim as kernel, threads
 from a2tg_jax.training.losses import (
     depth_normals,
     mean_opacity,

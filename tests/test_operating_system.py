@@ -1,7 +1,6 @@
 """Each system's way of a call, with the modules and functions of the others taken away."""
 
 import gc
-import math
 import os
 import signal
 import socket
@@ -11,8 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from a2tg_jax.host import cores, operating_system, signals
-from a2tg_jax.host.memory import memory_limit
+from a2tg_jax.host import machine, operating_system, signals
 
 SYSTEMS = ("linux", "darwin", "win32")
 NOT_LOCKED, TAKEN, NO_LOCKS = None, "taken", OSError(95, "Operation not supported")
@@ -63,28 +61,16 @@ def test_folders_are_flushed_except_on_windows(monkeypatch, tmp_path):
     assert len(flushed) < 2
 
 
-def test_a_system_without_sighup_ends_by_sigterm(monkeypatch):
-    monkeypatch.setattr(signal, "SIGHUP", 1, raising=False)
-    assert operating_system.ending_signals() == (signal.SIGTERM, 1)
-    monkeypatch.delattr(signal, "SIGHUP")
-    assert operating_system.ending_signals() == (signal.SIGTERM,)
-
-
-def test_cores_and_memory_without_linux(monkeypatch, tmp_path):
+def test_cores_and_features_without_linux(monkeypatch, tmp_path):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 7)
     assert operating_system.num_cores() == 7
-    sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 1000}
-    monkeypatch.setattr(os, "sysconf", sizes.get, raising=False)
-    assert memory_limit(tmp_path) == 4_096_000
-    monkeypatch.delattr(os, "sysconf")
-    assert memory_limit(tmp_path) == operating_system.UNKNOWN_MEMORY
-    assert operating_system.processor_features(tmp_path / "cpuinfo") == frozenset()
+    assert machine.processor_features(tmp_path / "cpuinfo") == frozenset()
 
 
 def test_features_are_those_of_the_first_processor(tmp_path):
     (tmp_path / "cpuinfo").write_text("processor\t: 0\nflags\t\t: fpu avx2\n\nprocessor\t: 1\nflags\t\t: fpu\n")
-    assert operating_system.processor_features(tmp_path / "cpuinfo") == {"fpu", "avx2"}
+    assert machine.processor_features(tmp_path / "cpuinfo") == {"fpu", "avx2"}
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
@@ -93,13 +79,6 @@ def test_a_port_is_never_shared(monkeypatch, system):
     with socket.socket() as listening:
         operating_system.allow_recent_port(listening)
         assert bool(listening.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR)) == (system != "win32")
-
-
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_only_linux_is_asked_for_control_groups(monkeypatch, system):
-    monkeypatch.setattr(sys, "platform", system)
-    monkeypatch.setattr(cores, "cpu_quota", lambda root: 2.0)
-    assert cores._own_quota.__wrapped__() == (2.0 if system == "linux" else math.inf)
 
 
 @pytest.mark.parametrize("library", [SimpleNamespace(), None])

@@ -11,8 +11,7 @@ import pytest
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import MovableKernels, allocate_appearance
-from a2tg_jax.cli import main as cli
-from a2tg_jax.cli import mesh
+from a2tg_jax.cli import main as cli, mesh
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.results.checks import check_export, check_new, check_output

@@ -355,7 +355,7 @@ def test_a_preset_takes_other_values_of_options():
 
 
 def test_the_first_ctrl_c_is_noted_and_the_second_interrupts():
-    with pytest.raises(KeyboardInterrupt), signals.ctrl_c_noted() as is_interrupted:
+    with pytest.raises(KeyboardInterrupt), signals.noted((signals.CTRL_C,)) as is_interrupted:
         assert not is_interrupted()
         signal.raise_signal(signal.SIGINT)
         assert is_interrupted()
@@ -364,7 +364,7 @@ def test_the_first_ctrl_c_is_noted_and_the_second_interrupts():
 
 
 def test_a_noted_ctrl_c_is_not_lost_at_the_end():
-    with pytest.raises(KeyboardInterrupt), signals.ctrl_c_noted():
+    with pytest.raises(KeyboardInterrupt), signals.noted((signals.CTRL_C,)):
         signal.raise_signal(signal.SIGINT)
 
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.host.cores import VARIABLE, num_threads
-from a2tg_jax.host.memory import memory_limit
+from a2tg_jax.host.machine import VARIABLE, memory_limit, num_threads
 from a2tg_jax.host.operating_system import cuda_of_driver
 from a2tg_jax.host.startup import compilation_cache_folder
 from a2tg_jax.rasterize.kernels import choice

@@ -26,7 +26,6 @@ from a2tg_jax.cli.train import Demo, Train, other_systems_text, tell_result, tra
 from a2tg_jax.cli.view import Export, ViewCommand
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
-from a2tg_jax.host.field_docs import without_fields
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.host.urls import is_url
@@ -237,7 +236,6 @@ def _fail(message: str) -> int:
     return 2
 
 
-@without_fields()
 def _parse(name: str, arguments: list[str]) -> Command:
     """Return the command that the arguments ask for. System, preset and file are read first: they set the defaults.
 

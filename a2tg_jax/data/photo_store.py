@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from a2tg_jax.data.decoding import read_pixels
-from a2tg_jax.host.memory import memory_limit
+from a2tg_jax.host.machine import memory_limit
 from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.startup import cache_folder
 

@@ -9,7 +9,7 @@ import numpy as np
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.progress import clock
 from a2tg_jax.data.staging import CameraGroup, Rig, Staged
-from a2tg_jax.host.cores import num_threads
+from a2tg_jax.host.machine import num_threads
 from a2tg_jax.host.progress_bars import counting
 
 Matching = Literal["auto", "exhaustive", "sequential"]

@@ -14,14 +14,14 @@ from a2tg_jax.host.operating_system import flush_folder
 PARTIAL = re.compile(r"\.(.+)\.\d+\.partial")
 """Name pattern of a partial file: the name of the final file, and the process."""
 STALE_SECONDS = 3600.0
-"""Age without a change after which a partial file counts as that of a killed process."""
+"""Age without a change after which a partial file is assumed to be left by a killed process."""
 NO_ROOM = frozenset({errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)})
 """Errors of a full disk and of a used-up quota."""
 
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside `path` to write to, and rename it to `path` if the block succeeds.
+    """Yield a temporary path next to `path` to write to, and rename it to `path` if the block succeeds.
 
     If the process is killed or the machine loses power, the old file or none is left, never half of one. Missing parent
     folders are made. Partial files that killed processes left of the same file are deleted after an hour; a process
@@ -32,12 +32,16 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    _drop_stale(path)
+    with contextlib.suppress(OSError):  # Another process may delete them, and another user's stay.
+        for partial, whole in _left_over_once(path.absolute().parent).items():
+            if whole == path.absolute() and time.time() - partial.stat().st_mtime > STALE_SECONDS:
+                partial.unlink()
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         with named_if_full(path):
             yield temporary
-            _flush(temporary)
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
             os.replace(temporary, path)
             flush_folder(path.parent)
     finally:
@@ -62,27 +66,10 @@ def left_over(folder: Path) -> dict[Path, Path]:
     return {entry: final_of(entry) for entry in folder.iterdir() if PARTIAL.fullmatch(entry.name)}
 
 
+_left_over_once = functools.lru_cache(maxsize=64)(left_over)  # Folders of frames are long.
+
+
 def final_of(path: Path) -> Path:
-    """Return the file that a partial file was to become, and any other as it is."""
+    """Return the file that a partial file was to become; any other path is returned unchanged."""
     match = PARTIAL.fullmatch(path.name)
     return path.with_name(match[1]) if match else path
-
-
-@functools.lru_cache(maxsize=64)
-def _left_over_once(folder: Path) -> dict[Path, Path]:
-    """Call `left_over` once per folder and process: folders of frames are long."""
-    return left_over(folder)
-
-
-def _drop_stale(path: Path) -> None:
-    """Delete the partial files of killed processes of one file, if they can be found and deleted."""
-    path = path.absolute()
-    with contextlib.suppress(OSError):  # Another process may delete them, and another user's stay.
-        for partial, whole in _left_over_once(path.parent).items():
-            if whole == path and time.time() - partial.stat().st_mtime > STALE_SECONDS:
-                partial.unlink()
-
-
-def _flush(path: Path) -> None:
-    with open(path, "rb+") as file:
-        os.fsync(file.fileno())

@@ -1,4 +1,4 @@
-"""Untrusted JSON and TOML: size and depth are checked before parsing, and numbers must be finite."""
+"""Untrusted JSON and TOML: sizes are checked before parsing, depth after it, and numbers must be finite."""
 
 import json
 import math
@@ -6,8 +6,6 @@ import re
 import tomllib
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from a2tg_jax.host.regular_files import read_regular
 from a2tg_jax.host.text import shortened
@@ -23,18 +21,6 @@ DEEPEST = 64
 MOST_BRACKETS = 2_000_000
 """Largest number of lists and objects: an empty one takes 64 bytes of memory for 3 of text."""
 
-TOML_STRING = re.compile(
-    rb'"""(?:[^\\]|\\(?:.|\Z))*?(?:"""|\Z)'
-    rb"|'''.*?(?:'''|\Z)"
-    rb'|"[^"\\\n]*(?:\\[^\n][^"\\\n]*)*"?'
-    rb"|'[^'\n]*'?|#[^\n]*",
-    re.DOTALL,
-)
-TOML_WORD = re.compile(rb"[\[\]{}=,\n]")
-STEPS = np.zeros(256, np.int8)
-STEPS[[*b"[{"]], STEPS[[*b"]}"]] = 1, -1
-"""Change of depth by each byte."""
-
 
 def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
     """Return the value of a JSON text.
@@ -49,7 +35,8 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
     """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     _check_size(data, MOST_BYTES)
-    _check_brackets(_outside_strings(data))
+    if (found := data.count(b"[") + data.count(b"{")) > MOST_BRACKETS:
+        raise ValueError(f"it has {found:,} brackets; {MOST_BRACKETS:,} are the most that is read")
 
     def constant(name: str) -> float:
         if not allow_nan:
@@ -61,7 +48,12 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
         return value if math.isfinite(value) else constant(digits)
 
     text = data.decode("utf-8-sig", "surrogatepass")
-    return json.loads(text, parse_constant=constant, parse_int=_integer, parse_float=number)
+    try:
+        value = json.loads(text, parse_constant=constant, parse_int=_integer, parse_float=number)
+    except RecursionError:
+        value = _too_deep()
+    _check_depth(value)
+    return value
 
 
 def read_object(file: Path) -> dict[str, Any]:
@@ -90,11 +82,13 @@ def parse_toml(data: bytes) -> dict[str, Any]:
       ValueError: saying in a few words what is wrong.
     """
     _check_size(data, MOST_TOML_BYTES)
-    outside = TOML_STRING.sub(b"", data)
-    _check_brackets(np.frombuffer(outside, np.uint8))
-    if max(word.count(b".") for word in TOML_WORD.split(outside)) >= DEEPEST:
+    # The parser takes quadratic time for a key of many names.
+    if max(word.count(b".") for word in re.split(rb"[\[\]{}=,\n]", data)) >= DEEPEST:
         raise ValueError(f"a key is nested more than {DEEPEST} deep")
-    table = tomllib.loads(data.decode("utf-8"))
+    try:
+        table = tomllib.loads(data.decode("utf-8"))
+    except RecursionError:
+        table = _too_deep()
     _check_depth(table)
     return table
 
@@ -110,38 +104,16 @@ def _check_size(data: bytes, most: int) -> None:
         raise ValueError(f"it has {len(data):,} bytes; {most:,} are the most that is read")
 
 
-def _outside_strings(data: bytes) -> np.ndarray:
-    """Return the bytes of a JSON text outside its strings, brackets included."""
-    letters = np.frombuffer(data.replace(b"\\\\", b"").replace(b'\\"', b""), np.uint8)
-    num_quotes = np.cumsum(letters == ord('"'), dtype=np.uint8)  # Wraps, which keeps it even or odd.
-    outside: np.ndarray = letters[num_quotes % 2 == 0]
-    return outside
-
-
-def _check_brackets(outside: np.ndarray) -> None:
-    """Raise ValueError if there are too many brackets, or more than `DEEPEST` nested ones.
-
-    The parser refuses unmatched ones.
-    """
-    steps = STEPS[outside]
-    steps = steps[steps != 0]
-    if len(steps) > MOST_BRACKETS:
-        raise ValueError(f"it has {len(steps):,} brackets; {MOST_BRACKETS:,} are the most that is read")
-    if np.cumsum(steps, dtype=np.int32).max(initial=0) > DEEPEST:
-        raise ValueError(f"its brackets are nested too deeply, more than {DEEPEST} deep")
-
-
 def _check_depth(value: object) -> None:
-    """Raise ValueError if lists and mappings, by brackets or dots, are nested more than `DEEPEST` deep."""
+    """Raise ValueError if lists and mappings are nested more than `DEEPEST` deep."""
     level = [value]
     for _ in range(DEEPEST):
-        level = [inner for held in level for inner in _held(held)]
+        lists = [list(held.values()) if isinstance(held, dict) else held for held in level]
+        level = [inner for held in lists if isinstance(held, list) for inner in held if isinstance(inner, dict | list)]
         if not level:
             return
-    raise ValueError(f"its brackets are nested more than {DEEPEST} deep")
+    _too_deep()
 
 
-def _held(value: Any) -> Any:
-    """Return the lists and objects in one."""
-    values = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return (inner for inner in values if isinstance(inner, dict | list))
+def _too_deep() -> Any:
+    raise ValueError(f"its brackets are nested more than {DEEPEST} deep") from None

@@ -1,18 +1,172 @@
-"""Machine of a run. Beside the options it decides the last bits: versions, processor, device, threads."""
+"""The machine of this process: threads, memory and processor, and what of it decides the last bits of a result."""
 
+import contextlib
 import dataclasses
+import functools
+import hashlib
+import itertools
+import math
+import os
+import platform
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import psutil
 from jaxlib.version import __version__ as jaxlib_version
 
-from a2tg_jax.host.cores import VARIABLE, num_threads
-from a2tg_jax.host.startup import processor_key
+from a2tg_jax.host.operating_system import num_cores, trim_heap
+
+VARIABLE = "A2TG_NUM_THREADS"
+LARGEST_SHARE = 0.6
+"""Share of the memory mappings allowed to a process beyond which compiled programs are dropped."""
+MEMORY_FILES = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
+"""File names of a control group's limit and use, in version 2 and in version 1."""
+
+_chosen: int | None = None
+
+
+def set_num_threads(num_threads: int | None) -> None:
+    """Set the number of threads of native loops, from their next call on; XLA's own threads are not affected.
+
+    Only the last bits of gradients depend on it.
+
+    Args:
+      num_threads: at least 1; None: A2TG_NUM_THREADS of the environment, or else all cores that the process may use.
+
+    Raises:
+      ValueError: if the number is not a positive integer.
+    """
+    global _chosen
+    if num_threads is not None and (type(num_threads) is not int or num_threads < 1):
+        raise ValueError(f"num_threads must be a positive integer or None; got {num_threads!r}")
+    _chosen = num_threads
+
+
+def num_threads() -> int:
+    """Return the number of threads: the one set, the one in the environment, or one per usable core.
+
+    Raises:
+      ValueError: if the environment's is not a positive integer.
+    """
+    if _chosen is not None:
+        return _chosen
+    wanted = os.environ.get(VARIABLE)
+    if not wanted:
+        return max(1, math.ceil(min(num_cores(), cpu_quota())))
+    if not wanted.isdecimal() or int(wanted) < 1:
+        raise ValueError(f"the environment's {VARIABLE} must be a positive integer; got {wanted!r}")
+    return int(wanted)
+
+
+def control_groups(root: Path, controller: str) -> list[Path]:
+    """Return the folders of Linux's control groups (containers, jobs, services) of this process, innermost first.
+
+    A group's limit holds for all groups in it. In a container the path of the group may be that of the machine outside,
+    whose folders do not exist. Then the limit is at the top.
+
+    Args:
+      root: root of the file system, with proc/self/cgroup and sys/fs/cgroup.
+      controller: "cpu" or "memory".
+    """
+    try:
+        lines = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return []
+    folders: list[Path] = []
+    for _, controllers, path in (line.split(":", 2) for line in lines if line.count(":") >= 2):
+        if not controllers or controller in controllers.split(","):
+            top = root / "sys/fs/cgroup" / controllers
+            here = top / path.lstrip("/")
+            folders += [folder for folder in (here, *here.parents) if folder.is_relative_to(top)]
+    return folders
+
+
+@functools.cache
+def cpu_quota(root: Path = Path("/")) -> float:
+    """Return the number of processors that control groups grant this process; inf without a limit."""
+    quotas = [math.inf]
+    for folder in control_groups(root, "cpu"):
+        with contextlib.suppress(OSError, ValueError, ZeroDivisionError):  # "max", or no limit that can be read
+            if (folder / "cpu.max").is_file():
+                quota, period = (folder / "cpu.max").read_text().split()
+            else:  # version 1
+                quota, period = ((folder / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
+            quotas += [int(quota) / int(period)] if int(quota) > 0 else []
+    return min(quotas)
+
+
+def memory_limit(root: Path = Path("/")) -> int:
+    """Return the bytes of memory that this process may use in all: its own, and what is free now (host).
+
+    Limits of control groups count. A group's cache of files counts as free.
+    """
+    left: list[int] = [psutil.virtual_memory().available]
+    for folder, (limit, usage) in itertools.product(control_groups(root, "memory"), MEMORY_FILES):
+        with contextlib.suppress(OSError, ValueError):  # of the other version, or "max"
+            room = int((folder / limit).read_text()) - int((folder / usage).read_text())
+            stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+            left.append(room + int(stat.get("total_inactive_file", stat.get("inactive_file", 0))))
+    return int(psutil.Process().memory_info().rss) + max(0, min(left))
+
+
+def memory_peak() -> int:
+    """Return the peak memory of this process in bytes; 0 if the system does not report it (host)."""
+    # Not getrusage, which also counts the program that started this one.
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
+    return 0
+
+
+def tidy_memory() -> None:
+    """Return free memory, 100 to 200 MB with glibc, and keep room for programs, after one was compiled."""
+    trim_heap()
+    keep_room_for_programs()
+
+
+def keep_room_for_programs(processes: Path = Path("/proc")) -> bool:
+    """Drop all compiled programs of JAX if the process is about to run out of memory mappings.
+
+    Linux allows vm.max_map_count of them, 65,530 by default, and XLA takes hundreds for every program. Without one it
+    waits for ever. Programs in use are compiled again.
+
+    Args:
+      processes: /proc; on systems without one nothing happens.
+
+    Returns:
+      Whether programs were dropped.
+    """
+    try:
+        most = int((processes / "sys/vm/max_map_count").read_text())
+        with open(processes / "self/maps", "rb") as maps:
+            is_full = sum(1 for _ in maps) > LARGEST_SHARE * most
+    except (OSError, ValueError):
+        return False
+    if is_full:
+        jax.clear_caches()
+    return is_full
+
+
+def processor_features(file: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
+    """Return the processor's features as Linux lists them; macOS and Windows list none."""
+    try:
+        lines = file.read_text().splitlines()
+    except OSError:
+        return frozenset()
+    return frozenset(next((line.split(":", 1)[1].split() for line in lines if line.startswith("flags")), []))
+
+
+def processor_key() -> str:
+    """Return a short text shared by processors that run the same compiled code."""
+    processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(processor_features()))}"
+    return hashlib.sha256(processor.encode()).hexdigest()[:12]
 
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """Machine and software that computed a result."""
+    """Machine and software that computed a result. Besides the options they decide its last bits."""
 
     jax: str
     """Version."""
@@ -27,16 +181,15 @@ class Machine:
 
     def differences(self, now: "Machine") -> list[str]:
         """Return the differences to another machine that change the last bits, with a remedy if there is one."""
-        told = [
+        found = [
             f"{name} is {getattr(now, name)} and was {getattr(self, name)}"
             for name in ("jax", "jaxlib", "device", "processor")
             if getattr(self, name) != getattr(now, name)
         ]
         if self.threads != now.threads and now.device.startswith("cpu"):
-            told.append(
-                f"there are {now.threads} threads and were {self.threads} ({VARIABLE}={self.threads} keeps them)"
-            )
-        return told
+            kept = f"{VARIABLE}={self.threads} keeps them"
+            found.append(f"there are {now.threads} threads and were {self.threads} ({kept})")
+        return found
 
 
 @dataclasses.dataclass(frozen=True)

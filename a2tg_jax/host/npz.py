@@ -72,7 +72,7 @@ def _read_array(file: IO[bytes], name: str, size: int) -> np.ndarray:
         raise ValueError(f"{name} claims the shape {shape} of {dtype}, but has {left} bytes")
     flat = np.empty(math.prod(shape), dtype)
     target = flat.view(np.uint8)
-    for start in range(0, left, CHUNK):
+    for start in range(0, left, CHUNK):  # A zip keeps what it has unpacked of one call in memory.
         piece = target[start : start + CHUNK]
         if file.readinto(memoryview(piece)) != len(piece):  # type: ignore[attr-defined, arg-type]
             raise ValueError(f"{name} is cut off")

@@ -1,4 +1,4 @@
-"""Calls that differ between Linux, macOS and Windows. No other module of the host asks which system it runs on."""
+"""Calls that differ between Linux, macOS and Windows. No other module checks which system it runs on."""
 
 import contextlib
 import ctypes
@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TextIO
 
-UNKNOWN_MEMORY = 2**63 - 1
-"""Memory of a machine that does not report it."""
 LOCKED_BYTE = 1 << 30
 """Position of the byte that Windows locks: past the end, as Windows keeps others from reading what is locked."""
 HANDLER_SIZE = 1024
@@ -53,16 +51,11 @@ def flush_folder(folder: Path) -> None:
         return
     number = os.open(folder, os.O_RDONLY)
     try:
-        # Some file systems of networks refuse it; they keep names in another way.
+        # Some network file systems refuse it; they keep names in another way.
         with contextlib.suppress(OSError):
             os.fsync(number)
     finally:
         os.close(number)
-
-
-def reading_flags() -> int:
-    """Return the flags to open a file for reading bytes: never waiting for a pipe's writer, never changing newlines."""
-    return os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 def allow_recent_port(listening: socket.socket) -> None:
@@ -74,16 +67,11 @@ def allow_recent_port(listening: socket.socket) -> None:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
 
 
-def ending_signals() -> tuple[int, ...]:
-    """Return the signals, besides Ctrl-C's, that ask a process to end. Windows has no SIGHUP."""
-    return tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
-
-
 @contextlib.contextmanager
 def signal_handlers_kept() -> Iterator[None]:
     """Restore the C handlers of all signals after the block, in which a library may replace them.
 
-    Python's `signal.getsignal` does not see those. Windows has no sigaction; there nothing is restored.
+    Python's `signal.getsignal` does not report those. Windows has no sigaction; there nothing is restored.
     """
     sigaction: Any = getattr(_c_library(), "sigaction", None)
     before = {}
@@ -103,39 +91,6 @@ def num_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def has_control_groups() -> bool:
-    """Return whether the system limits processes by control groups, as Linux does."""
-    return sys.platform == "linux"
-
-
-def machine_memory() -> int:
-    """Return bytes of memory of the machine. Windows does not report them here."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else UNKNOWN_MEMORY
-
-
-def memory_numbers(file: Path) -> dict[str, int]:
-    """Return the bytes in a file of Linux's /proc with lines "Name: 123 kB"; empty without such a file."""
-    try:
-        lines = [line.replace(":", " ").split() for line in file.read_text().splitlines()]
-    except OSError:
-        return {}
-    return {line[0]: 1024 * int(line[1]) for line in lines if line[2:] == ["kB"] and line[1].isdecimal()}
-
-
-def memory_mappings(processes: Path) -> tuple[int, int] | None:
-    """Return the number of memory mappings of this process, and Linux's limit; None if the system reports neither.
-
-    Args:
-      processes: /proc.
-    """
-    try:
-        limit = int((processes / "sys/vm/max_map_count").read_text())
-        with open(processes / "self/maps", "rb") as maps:
-            return sum(1 for _ in maps), limit
-    except (OSError, ValueError):
-        return None
-
-
 def trim_heap() -> None:
     """Have the C library return the free memory that it caches. Only glibc has a function for that."""
     trim = getattr(_c_library(), "malloc_trim", None)
@@ -144,9 +99,9 @@ def trim_heap() -> None:
 
 
 def wait_in_abort() -> None:
-    """Have abort() wait some seconds before it ends the process, so that another thread can tell why and end it.
+    """Have abort() wait some seconds before it ends the process, so that another thread can say why and end it.
 
-    XLA aborts the process once it hears of the end of another one. Windows keeps its abort().
+    XLA aborts the process when another one ends. Windows keeps its abort().
     """
     library = _c_library()
     if library is not None:
@@ -157,17 +112,16 @@ def wait_in_abort() -> None:
 
 def own_output_only() -> None:
     """Drop what C++ libraries write to stdout and stderr; `sys.stdout` and `sys.stderr` keep their places."""
-    sys.stdout, sys.stderr = (_moved(stream, number) for number, stream in ((1, sys.stdout), (2, sys.stderr)))
 
+    def moved(stream: TextIO, number: int) -> TextIO:
+        stream.flush()
+        kept = os.fdopen(os.dup(number), "w", buffering=1, encoding=stream.encoding, errors=stream.errors)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, number)
+        os.close(nowhere)
+        return kept
 
-def _moved(stream: TextIO, number: int) -> TextIO:
-    """Return the stream on a descriptor of its own, and leave its old one to be dropped."""
-    stream.flush()
-    kept = os.fdopen(os.dup(number), "w", buffering=1, encoding=stream.encoding, errors=stream.errors)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, number)
-    os.close(nowhere)
-    return kept
+    sys.stdout, sys.stderr = moved(sys.stdout, 1), moved(sys.stderr, 2)
 
 
 @functools.cache
@@ -178,20 +132,10 @@ def _c_library() -> Any:
         return None
 
 
-def processor_features(file: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
-    """Return the processor's features as Linux lists them; macOS and Windows list none."""
-    try:
-        lines = file.read_text().splitlines()
-    except OSError:
-        return frozenset()
-    return frozenset(next((line.split(":", 1)[1].split() for line in lines if line.startswith("flags")), []))
-
-
 def has_display() -> bool:
     """Return whether a browser can open: macOS and Windows always have a display, Linux with X or Wayland."""
-    if sys.platform in ("win32", "darwin"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    is_always = sys.platform in ("win32", "darwin")
+    return is_always or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def cuda_of_driver() -> tuple[int, int] | None:

@@ -20,14 +20,7 @@ def has_terminal() -> bool:
 
 
 def progress_over(items: Sequence[Item], title: str, unit: str, *, is_shown: bool = True) -> Iterator[Item]:
-    """Yield items, and show how many are done.
-
-    Args:
-      items: any.
-      title: word before the numbers.
-      unit: word for one item.
-      is_shown: without, nothing is shown.
-    """
+    """Yield items, and show how many are done as `counting` does."""
     with counting(title, len(items), unit, is_shown=is_shown) as counter:
         for item in items:
             yield item
@@ -36,11 +29,13 @@ def progress_over(items: Sequence[Item], title: str, unit: str, *, is_shown: boo
 
 @contextmanager
 def counting(title: str, total: int | None, unit: str, *, is_shown: bool = True) -> Iterator["tqdm | PlainCounter"]:
-    """Show how many items are done, which `update(number)` of the result tells.
+    """Show how many items are done; the result's `update(number)` counts them.
 
     Args:
-      title, unit, is_shown: as of `progress_over`.
+      title: word before the numbers.
       total: number of items; None if it is not known.
+      unit: word for one item.
+      is_shown: whether anything is shown.
     """
     if is_shown and not has_terminal():
         yield PlainCounter(title, total)
@@ -65,14 +60,14 @@ class PlainCounter:
             self._last_line = self._done, time.perf_counter()
 
 
-def is_line_due(done: int, total: int, told: int, at: float) -> bool:
+def is_line_due(done: int, total: int, printed: int, at: float) -> bool:
     """Return whether a plain line is due.
 
     Args:
-      done: items so far.
-      total: all of them; 0 if their number is not known.
-      told: items at the last line.
+      done: number of items so far.
+      total: number of all items; 0 if it is not known.
+      printed: number of items at the last line.
       at: time of the last line, by `time.perf_counter`.
     """
-    is_next = done - told >= PLAIN_SHARE * total and time.perf_counter() - at >= PLAIN_SECONDS
+    is_next = done - printed >= PLAIN_SHARE * total and time.perf_counter() - at >= PLAIN_SECONDS
     return is_next or done == total

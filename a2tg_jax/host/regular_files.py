@@ -11,18 +11,12 @@ from io import BufferedReader
 from pathlib import Path
 from typing import cast
 
-from a2tg_jax.host.operating_system import reading_flags
-from a2tg_jax.host.remote_files import (
-    fetched,
-    is_remote,
-    is_remote_file,
-    is_remote_folder,
-    remote_names,
-    remote_size,
-)
+from a2tg_jax.host.remote_files import fetched, is_remote, is_remote_file, is_remote_folder, remote_names, remote_size
 
 MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
+READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+"""Flags to open a file for reading bytes: never waiting for a pipe's writer, never changing newlines."""
 
 
 def is_regular(path: str | os.PathLike[str]) -> bool:
@@ -54,22 +48,21 @@ def names_in(folder: Path) -> list[str]:
 
 
 def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTES) -> BufferedReader:
-    """Open a regular file for reading bytes.
-
-    Args:
-      path: the file.
-      most_bytes: size above which it is refused.
+    """Open a regular file for reading bytes, of at most a given size.
 
     Raises:
       OSError: if it cannot be opened.
       ValueError: naming the path, if it is not a regular file, or is larger.
     """
     if is_remote(path):
-        return _open_remote(cast(Path, path), most_bytes)
+        size = remote_size(cast(Path, path))
+        if size is not None and size > most_bytes:
+            raise ValueError(_too_large(path, size, most_bytes))
+        return fetched(cast(Path, path), size, most_bytes)
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise ValueError(_refusal(path))
     # It may have been replaced by a pipe meanwhile, for whose writer this does not wait.
-    file = open(os.open(path, reading_flags()), "rb")  # noqa: SIM115 - the caller closes it
+    file = open(os.open(path, READING), "rb")  # noqa: SIM115 - the caller closes it
     status = os.fstat(file.fileno())
     if stat.S_ISREG(status.st_mode) and status.st_size <= most_bytes:
         return file
@@ -87,14 +80,6 @@ def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file."""
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _open_remote(path: Path, most_bytes: int) -> BufferedReader:
-    """Open the fetched bytes of a remote file. Raises as `open_regular`."""
-    size = remote_size(path)
-    if size is not None and size > most_bytes:
-        raise ValueError(_too_large(path, size, most_bytes))
-    return fetched(path, size, most_bytes)
 
 
 def _refusal(path: str | os.PathLike[str]) -> str:

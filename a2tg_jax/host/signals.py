@@ -13,28 +13,27 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
-from a2tg_jax.host.operating_system import ending_signals
-
 CTRL_C = signal.SIGINT
-ENDING = ending_signals()
+ENDING = (CTRL_C, *(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)))
+"""Signals that end a process; Windows has no SIGHUP."""
 SOON = 0.02
 """Seconds after which a signal is sent once more."""
 
 
 class Stopped(KeyboardInterrupt):
-    """The process was asked to end."""
+    """A signal ended the work."""
 
     def __init__(self, number: int, advice: str = ""):
         """Args:
-        number: of the signal.
-        advice: how to go on with the stopped work.
+        number: number of the signal.
+        advice: how to continue the stopped work.
         """
         super().__init__(signal.Signals(number).name)
         self.number, self.advice = int(number), advice
 
     @staticmethod
     def of(interrupt: KeyboardInterrupt) -> "Stopped":
-        """Return the end that an interrupt asked for: Ctrl-C, unless it says another."""
+        """Return an interrupt of another kind as the end by Ctrl-C."""
         return interrupt if isinstance(interrupt, Stopped) else Stopped(CTRL_C)
 
     @property
@@ -48,58 +47,32 @@ def raised() -> Iterator[None]:
     """Have SIGTERM and SIGHUP raise `Stopped` within the block, as Ctrl-C raises KeyboardInterrupt."""
 
     def stop(number: int, frame: object) -> None:
-        raise Stopped(number)
+        raise KeyboardInterrupt if number == CTRL_C else Stopped(number)
 
-    with _handled_by(stop, ENDING), _handled_by(_interrupt, (CTRL_C,)):
+    with _handled_by(stop, ENDING):
         yield
 
 
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
-
-
 @contextlib.contextmanager
-def noted() -> Iterator[Callable[[], bool]]:
+def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
     """Note the first signal within the block, and raise `Stopped` at the second.
 
     Yield a function that returns whether there was one. At the end of the block a noted signal raises `Stopped`.
+    Programs that handle a signal themselves keep their handler.
     """
-    numbers: list[int] = []
+    found: list[int] = []
 
     def note(number: int, frame: object) -> None:
-        numbers.append(number)
-        if len(numbers) > 1:
+        found.append(number)
+        if len(found) > 1:
             raise Stopped(number)
 
-    with _handled_by(note, (CTRL_C, *ENDING)):
-        try:
-            yield lambda: bool(numbers)
-        except KeyboardInterrupt:
-            raise Stopped(numbers[-1] if numbers else CTRL_C) from None
-    if numbers:
-        raise Stopped(numbers[-1])
-
-
-@contextlib.contextmanager
-def ctrl_c_noted() -> Iterator[Callable[[], bool]]:
-    """Note the first Ctrl-C within the block; the second raises KeyboardInterrupt, and so does the end of the block.
-
-    Yield a function that returns whether there was one. Programs that handle Ctrl-C themselves keep their handler.
-    """
-    numbers: list[int] = []
-
-    def note(number: int, frame: object) -> None:
-        numbers.append(number)
-        if len(numbers) > 1:
-            raise KeyboardInterrupt
-
-    before = signal.getsignal(CTRL_C)
-    handler = before.handler if isinstance(before, _Heard) else before
-    is_own = handler not in (signal.default_int_handler, _interrupt)
-    with contextlib.nullcontext() if is_own else _handled_by(note, (CTRL_C,)):
-        yield lambda: bool(numbers)
-    if numbers:
-        raise KeyboardInterrupt
+    default = (signal.default_int_handler, signal.SIG_DFL)
+    own = tuple(n for n in numbers if (old := signal.getsignal(n)) in default or isinstance(old, _Heard))
+    with _handled_by(note, own):
+        yield lambda: bool(found)
+    if found:
+        raise Stopped(found[-1])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,12 +82,16 @@ class _Heard:
     handler: Callable[..., Any]
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        if not _ignores_exceptions(frame):
-            self.handler(number, frame)
-            return
-        again = threading.Timer(SOON, _send, (number,))
-        again.daemon = True
-        again.start()
+        callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
+        above = frame
+        while above is not None:
+            if above.f_code in callbacks:
+                again = threading.Timer(SOON, _send, (number,))
+                again.daemon = True
+                again.start()
+                return
+            above = above.f_back
+        self.handler(number, frame)
 
 
 def _send(number: int) -> None:
@@ -123,16 +100,6 @@ def _send(number: int) -> None:
         signal.pthread_kill(main, number)
     else:
         signal.raise_signal(number)
-
-
-def _ignores_exceptions(frame: FrameType | None) -> bool:
-    """Return whether a frame runs within a callback of the garbage collector."""
-    callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
-    while frame is not None:
-        if frame.f_code in callbacks:
-            return True
-        frame = frame.f_back
-    return False
 
 
 @contextlib.contextmanager

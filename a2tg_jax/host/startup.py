@@ -1,15 +1,13 @@
 """Settings of JAX before its first computation. The library itself never changes them."""
 
-import hashlib
 import os
-import platform
 from pathlib import Path
 
 import jax
 from jaxlib.version import __version__ as jaxlib_version
 
-from a2tg_jax.host import cores
-from a2tg_jax.host.operating_system import processor_features
+from a2tg_jax.host import machine
+from a2tg_jax.host.machine import processor_features, processor_key
 
 CHECKED_JAX_VERSIONS = ((0, 10), (0, 11), (0, 12))
 """Versions known to have the flags below; an unknown flag would end the process."""
@@ -30,14 +28,14 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
       use_cache: keep compiled programs in `compilation_cache_folder()`, so that the next process starts in seconds,
         unless JAX has a cache already. If XLA would print pages for every cached program, its log is reduced to fatal
         errors (`silence_xla`).
-      num_threads: of native loops (`set_num_threads`); None leaves what is set.
+      num_threads: number of threads of native loops (`set_num_threads`); None leaves what is set.
 
     Raises:
       ValueError: if the number of threads, here or in the environment, is not a positive integer.
     """
     if num_threads is not None:
-        cores.set_num_threads(num_threads)
-    cores.num_threads()
+        machine.set_num_threads(num_threads)
+    machine.num_threads()
     features = processor_features()
     add_xla_flags(cpu_flags(features, jax.__version_info__[:2]))
     if use_cache and jax.config.values["jax_compilation_cache_dir"] is None:
@@ -83,12 +81,6 @@ def cache_folder() -> Path:
 def compilation_cache_folder() -> Path:
     """Return the folder of compiled programs, one per processor and jaxlib: code for one may not run on another.
 
-    It lies in `cache_folder()` and may be deleted at any time.
+    It is in `cache_folder()` and may be deleted at any time.
     """
     return cache_folder() / f"jaxlib-{jaxlib_version}-{processor_key()}"
-
-
-def processor_key() -> str:
-    """Return a short text shared by processors that run the same compiled code."""
-    processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(processor_features()))}"
-    return hashlib.sha256(processor.encode()).hexdigest()[:12]

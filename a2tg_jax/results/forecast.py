@@ -12,9 +12,7 @@ import jax
 from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.data import Scene
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
-from a2tg_jax.host.cores import num_threads
-from a2tg_jax.host.machine import default_platform
-from a2tg_jax.host.memory import memory_limit
+from a2tg_jax.host.machine import default_platform, memory_limit, num_threads
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import RunRecord

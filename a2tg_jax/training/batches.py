@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike
 
 from a2tg_jax.data.observations import ObservedPoints, stacked_points
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
-from a2tg_jax.host.cores import num_threads
+from a2tg_jax.host.machine import num_threads
 from a2tg_jax.parallel.exchange import Exchange, are_drawn_here, on_devices
 from a2tg_jax.parallel.rows import asked_by_any, everywhere
 

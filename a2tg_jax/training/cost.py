@@ -14,8 +14,7 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.data.scene import Scene, View, ray_bytes
 from a2tg_jax.events import HostEvent, StepEvent
-from a2tg_jax.host.cores import num_threads
-from a2tg_jax.host.machine import default_platform
+from a2tg_jax.host.machine import default_platform, num_threads
 from a2tg_jax.training.batches import NO_EXTRAS, Extras, plan_batches, view_bytes
 from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.options import System

@@ -124,7 +124,7 @@ def fit(
         check_resume(resume, system, first)
     session = Session() if session is None else session
     results: list[StageResult] = []
-    with signals.ctrl_c_noted() as is_interrupted:
+    with signals.noted((signals.CTRL_C,)) as is_interrupted:
         for index in range(first, len(stages)):
             start = results[-1].model if results else None
             result = _train_stage(

@@ -5,7 +5,7 @@ import functools
 import itertools
 from collections.abc import Callable, Sequence
 
-from a2tg_jax.host.cores import num_threads as num_threads
+from a2tg_jax.host.machine import num_threads as num_threads
 
 Span = tuple[int, int]
 """First item, and the end, which is excluded."""
