@@ -10,8 +10,10 @@ _known: set[str] = set()
 
 def list_fields() -> None:
     """Have each class of this package that was imported so far list its fields in its docstring."""
-    for name in [name for name in sys.modules if name.startswith("a2tg_jax.") and name not in _known]:
+    for name in {name for name in sys.modules if name.startswith("a2tg_jax.")} - _known:
         _known.add(name)
+        if name.startswith("a2tg_jax.cli."):
+            continue  # There fields are options, which the help lists.
         for found in list(vars(sys.modules[name]).values()):
             own = vars(found).get("__doc__") if isinstance(found, type) and found.__module__ == name else None
             if isinstance(own, str):
