@@ -170,7 +170,7 @@ def test_another_system_learns_them(scene):
 
 
 def test_a_system_that_does_not_ask_for_them_is_refused(scene):
-    with pytest.raises(ValueError, match="refine_poses is asked for, but no stage of Toy learns it"):
+    with pytest.raises(ValueError, match="refine_poses is on, but no stage of Toy learns it"):
         fit(scene, Toy(refine_poses=True), progress=False)
     with pytest.raises(ValueError, match=r"corrections.pose.rate must be at least 0"):
         corrections = dataclasses.replace(SYSTEM.corrections, pose=PoseRefinement(rate=-1.0))

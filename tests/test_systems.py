@@ -307,7 +307,7 @@ def test_the_cap_of_alphas_is_the_same_in_both_stages():
 def test_a_training_without_gaussians_left_tells_what_to_change(scene, name, reason):
     system = tiny(name, initial_opacity=0.001, rates={"logit_opacities": 0.0})
     advice = "check the cameras and points of the scene, or lower rates.logit_opacities"
-    with pytest.raises(ValueError, match=rf"^training cannot go on at iteration \d+ .*: {reason}; {advice}$"):
+    with pytest.raises(ValueError, match=rf"^training cannot continue at iteration \d+ .*: {reason}; {advice}$"):
         a2tg.fit(scene, system, progress=False)
 
 

@@ -56,11 +56,11 @@ class Photographs(NamedTuple):
     masks: Array | None = None
     """[V, H, W] bool, True at pixels that count; None if all do."""
     depths: Array | None = None
-    """[V, H, W] float32 depth maps, NaN where unknown; None unless asked for."""
+    """[V, H, W] float32 depth maps, NaN where unknown; None unless a loss term reads them."""
     rays: Array | None = None
     """[H, W, 2] rays of the lens (`Camera.rays`); None of a pinhole."""
     points: ObservedPoints | None = None
-    """Observed points [V, S]; None unless asked for."""
+    """Observed points [V, S]; None unless a loss term reads them."""
 
     def of(self, views: Array | None) -> "Photographs":
         """Return the views of some indices; None: all."""
@@ -79,7 +79,7 @@ class BatchOrder:
         views: of one scene.
         batch_size: views of an iteration.
         seed: of the order.
-        number: index of the order among those of this seed.
+        number: which order of this seed, from 0.
         """
         self.kinds, self._batch_size = kinds_of(views), batch_size
         """Image size and lens of each view."""
@@ -112,7 +112,7 @@ class BatchPlan(NamedTuple):
     is_resident: bool
     """All of them stay on the device, with the rays of their lenses."""
     keeps_rays: bool
-    """The rays of all lenses stay on the device. Otherwise those of a batch come with it."""
+    """The rays of all lenses stay on the device. Otherwise each batch brings its own."""
     batch_bytes: int
     """Bytes of the largest batch."""
     num_ahead: int
@@ -172,11 +172,11 @@ class PhotoStore:
         self.is_resident = not asked_by_any(self._mesh, not plan.is_resident)
 
     def batch(self, iteration: int) -> tuple[Photographs, np.ndarray | None]:
-        """Return photographs of one kind that include those of an iteration, and their int32 indices among them, or
-        None if they are just those of the iteration.
+        """Return photographs of one kind that include the iteration's, and int32 indices of these; None if there are no
+        others.
 
         Raises:
-          ValueError, OSError: if a photograph that was left where it lies has gone, has changed or cannot be read.
+          ValueError, OSError: if a photograph that was not copied has gone, has changed or cannot be read.
         """
         indices, kinds = self._order.indices(iteration), self._order.kinds
         kind = kinds[indices[0]]
@@ -194,8 +194,8 @@ class PhotoStore:
         return batch, np.asarray([kinds[:index].count(kind) for index in indices], np.int32)
 
     def _placed(self, kind: tuple[int, int, int], batch: Photographs) -> Photographs:
-        """Return photographs of a kind on the devices, with the rays of their lens, which stay there if those of all
-        lenses fit."""
+        """Return photographs of a kind on the devices, with the rays of their lens, which stay there if the rays of
+        all lenses fit."""
         rays = self._rays.get(kind, batch.rays)
         if rays is not None and kind not in self._rays:
             rays = jax.device_put(rays) if self._mesh is None else everywhere(self._mesh, rays)
@@ -266,7 +266,7 @@ def stack_views(
       among: views that decide the structure: if one of that size has opacities or a mask, every stack of that size has
         them, and each has room for as many points as the view with the most. None: `views`.
       extras: what is loaded with them. Depths are NaN where a view has no map.
-      are_read: whether the pictures of each view are read; those of the others are zeros. None: all.
+      are_read: whether the pictures of each view are read; other pictures are zeros. None: all.
     """
     size = views[0].picture.size
     alike = [view for view in among or views if view.picture.size == size]
@@ -307,7 +307,7 @@ def _stacked(
     num: int, size: tuple[int, int], arrays: Mapping[int, np.ndarray], dtype: DTypeLike = np.uint8,
     channels: tuple[int, ...] = (),
 ) -> np.ndarray:  # fmt: skip
-    """Return so many arrays [H, W, ...] in one, those at some places and zeros at the others.
+    """Stack arrays at the given indices into zeros of shape [num, H, W, ...].
 
     Its memory is aligned, so that `jax.device_put` adopts it on CPUs without a copy.
     """

@@ -31,7 +31,7 @@ from a2tg_jax.training.step import EXPLODED, TrainState, initial_state
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class History:
-    """Log of a training, one entry every so many iterations; arrays of one length."""
+    """Log of a training, one entry every 10 iterations; arrays of one length."""
 
     stage: np.ndarray
     """Stage, from 1."""
@@ -70,7 +70,7 @@ class History:
         return float(self.seconds[-1]) if len(self.seconds) else 0.0
 
     def with_point(self, /, *point: float, **terms: float) -> "History":
-        """One more row, its values in the order of the fields, and those of loss terms by name."""
+        """One more row: values in the order of the fields, and loss terms by name."""
         own = dict(zip(COLUMNS, point, strict=True))
         return self.followed_by(History.of_rows([own | {f"{TERM}{name}": value for name, value in terms.items()}]))
 
@@ -120,7 +120,7 @@ class Checkpoint:
     machine: Machine | None = None
     """Machine on which it was saved; None if unknown or not saved yet."""
     devices: Devices = ALONE
-    """Devices that trained it; it can go on with others."""
+    """Devices that trained it; other devices can resume it."""
     num_refused: int = 0
     """Number of Gaussians so far that were not added for lack of room."""
 
@@ -143,7 +143,7 @@ class Checkpoint:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Training was stopped between two iterations. It can go on from the checkpoint."""
+    """Training was stopped between two iterations. The checkpoint resumes it."""
 
     def __init__(self, checkpoint: Checkpoint):
         """Args:
@@ -151,7 +151,7 @@ class Interrupted(KeyboardInterrupt):
         """
         super().__init__(
             f"training stopped after iteration {checkpoint.iteration:,} of stage {checkpoint.stage + 1}; the model is "
-            "error.checkpoint.model, and fit(scene, system, resume=error.checkpoint) goes on"
+            "error.checkpoint.model, and fit(scene, system, resume=error.checkpoint) continues"
         )
         self.checkpoint = checkpoint
 
@@ -250,7 +250,7 @@ SHOWN = "shown/"
 
 
 def _rest(state: TrainState) -> tuple[object, ...]:
-    """Return the part of a checkpoint beside Gaussians and appearance."""
+    """Return the rest of a checkpoint, after Gaussians and appearance."""
     return state.moments, state.model.num_live, state.events, state.iteration, state.status, state.corrections
 
 
@@ -333,7 +333,7 @@ def check_history(history: History) -> None:
 def check_resume(resume: Checkpoint, system: System, index: int) -> None:
     """Raise ValueError unless the checkpoint is of that stage of that system."""
     if resume.stage != index:
-        raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to go on")
+        raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to be resumed")
     if resume.system == system:
         return
     before, now, advice = type(resume.system), type(system), ""

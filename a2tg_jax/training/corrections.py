@@ -1,4 +1,4 @@
-"""Corrections: the exposure and the pose of each training photograph, learned beside the model.
+"""Corrections: the exposure and the pose of each training photograph, learned together with the model.
 
 A correction has one row of numbers for each training view. Inside the step it changes the camera of the render or the
 rendered colours. The rows are part of the training state, not of the model. Like an event, a correction is a frozen
@@ -145,7 +145,7 @@ def exposed(exposure: Array, color: Array) -> Array:
 def initial_corrections(
     corrections: Sequence[Correction], names: Sequence[str], origin: Origin | None, dtype: Any
 ) -> tuple[CorrectionState, ...]:
-    """Return the states before a stage: those of the earlier stage, or neutral ones.
+    """Return the states before a stage: from the earlier stage, or neutral ones.
 
     Args:
       corrections: of the stage.
@@ -181,7 +181,7 @@ def check_corrections(states: Sequence[CorrectionState], num_views: int) -> None
         if len(state.rows) != num_views:
             raise ValueError(
                 f"the checkpoint has corrections of {len(state.rows)} training views, but the scene has {num_views}: "
-                "go on with the scene that it was made from"
+                "resume with the scene that it was made from"
             )
 
 

@@ -41,7 +41,7 @@ CORRECTION_COPIES = 8
 """Copies of the rows of a correction: what the stage began with, rows and moments before and after a step, gradients.
 """
 VIEW_PER_ROW, VIEW_PER_PIXEL = 140, 5
-"""Bytes of each view of a batch, beside its gradient of the model."""
+"""Bytes of each view of a batch, without its gradient of the model."""
 TRAVELLING_ROW = 164
 """Bytes of a row that a device receives, and of its gradient."""
 PAIRS_PER_TILE = 90
@@ -103,7 +103,7 @@ def forecast_stages(
     Args:
       scene: its photographs and points.
       system: with its options.
-      num_given: Gaussians of a file in place of the first stage, which takes nothing then; None: it is trained.
+      num_given: Gaussians of a file instead of the first stage, which takes nothing then; None: it is trained.
       num_devices: number of devices that train together; bytes are of all of them.
     """
     stages = system.stages()
@@ -166,14 +166,14 @@ def stage_bytes(
     return Bytes(
         photographs=held_bytes(scene) + fed_bytes(scene.train, batch, stage.extras),
         model=(STATES + 1) * model_bytes,  # what the stage began with stays
-        gradients=max(of_step, STATES * model_bytes * is_changed),  # An event has the new state beside the old one.
+        gradients=max(of_step, STATES * model_bytes * is_changed),  # An event holds the old state and the new one.
         pixels=largest * (images * per_pixel + VIEW_PER_PIXEL * (batch - 1)) + at_once * STEP_PER_PAIR * pairs,
         corrections=correction_bytes(stage.corrections, len(scene.train), largest),
     )
 
 
 def correction_bytes(corrections: Sequence[Correction], num_views: int, num_pixels: int) -> float:
-    """Return the bytes of the corrections of so many training views, the largest of which has so many pixels."""
+    """Return the bytes of the corrections of the training views, the largest of which has `num_pixels`."""
     per_view = sum(BYTES_PER_FLOAT * correction.neutral.size for correction in corrections)
     per_pixel = sum(correction.bytes_per_pixel for correction in corrections)
     return CORRECTION_COPIES * num_views * per_view + num_pixels * per_pixel

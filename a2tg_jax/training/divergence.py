@@ -15,7 +15,7 @@ from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.step import Attempt, StepSettings, attempt
 
 EXPLOSION = 100.0
-"""A loss that is larger than so many times that of the stage's first logged iteration is an explosion, …"""
+"""A loss that exceeds the stage's first logged loss by this factor is an explosion, …"""
 SMALL_LOSS = 10.0
 """… unless it is no larger than this."""
 TOLD_ROWS = 5

@@ -99,19 +99,19 @@ def fit(
     Args:
       scene: from `load_scene` or `synthetic_scene`.
       system: stages and options, such as `A2tg.preset("quick")`.
-      resume: a checkpoint of the same system to go on from.
+      resume: a checkpoint of the same system.
       on_checkpoint: called with the state every `checkpoint_every` iterations and at the end of each stage. The next
         iteration reuses the state's buffers, so save or copy it in the call.
       checkpoint_every: None: at the end of each stage only.
       on_log: called with each new row of the history, every 10 iterations: a dictionary of numbers, with the names of
         the columns of `History.to_dict`.
       progress: show a progress bar.
-      is_stopped: asked between steps and after the last. If it returns True, `on_checkpoint` is called a last time and
+      is_stopped: called between steps and after the last. If it returns True, `on_checkpoint` is called a last time and
         `Interrupted` is raised. The first Ctrl-C does the same, unless the program handles it.
       session: what trainings of this process share, compiled shapes and devices; None: a new one.
 
     Raises:
-      Interrupted: if training is stopped; a KeyboardInterrupt with the `checkpoint` to go on from.
+      Interrupted: if training is stopped; a KeyboardInterrupt with the `checkpoint` to resume from.
       DivergedError: if the loss or a gradient is not finite, or the loss explodes; the error holds the state before.
       ValueError: if options contradict each other, the scene or the checkpoint.
     """
@@ -185,13 +185,13 @@ def fit_stage(
       start: the model to start from; None: Gaussians at the scene's points.
       title: of the progress bar; None: the stage's name.
       num_restored: number of times the stage went back because it diverged; each number gives another order of the
-        views. None: that of the checkpoint, or 0.
+        views. None: the checkpoint's number, or 0.
       watch: called between steps with the stage under way (`training.loop.Watch`).
     """
     _check_arguments(scene, system, resume, checkpoint_every)
     stages = system.stages()
     if not 0 <= index < len(stages):
-        raise ValueError(f"index must be that of one of the {len(stages)} stages, from 0; got {index}")
+        raise ValueError(f"index must be in 0..{len(stages) - 1}, one of the stages; got {index}")
     check_loss_data(scene.train, stages[index : index + 1])
     if resume is not None:
         check_resume(resume, system, index)

@@ -31,7 +31,7 @@ class ViewGradients(NamedTuple):
     value: Array
     """The loss, a scalar."""
     gradient: Model
-    """Its gradient in all floats of the model, with None in place of integers (`partition`)."""
+    """Its gradient in all floats of the model, with None for integers (`partition`)."""
     norms: Array
     """[N] norms of Σ_pixels |∂L/∂mean|, through the Gaussian factor alone (A²TG, gradient-driven selection). Other
     statistics differentiate by the position on the screen, in units of half an image."""
@@ -70,7 +70,7 @@ def view_gradients(
       background: [3] colour; None is the model's own.
       settings: with a capacity under jit (`plan_render`); an eager call finds its own.
       has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
-      sh_degree: degree in place of that of the settings; may be traced.
+      sh_degree: overrides the settings' degree; may be traced.
       statistic: kind of position that it differentiates by (`rasterize.pixel.positional_gradient`).
 
     Raises:
@@ -97,14 +97,14 @@ def view_gradients(
     statistics, is_visible = read_probe(found.probe, statistic, camera.width, camera.height)
     floats, _ = partition(model)
     gradient = dataclasses.replace(floats, gaussians=found.gaussians, appearance=found.appearance)
-    return ViewGradients(found.value, gradient, safe_norm(statistics), is_visible, found.told, found.num_pairs)
+    return ViewGradients(found.value, gradient, safe_norm(statistics), is_visible, found.auxiliary, found.num_pairs)
 
 
 def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callable[..., tuple[Any, Model]]:
     """Return a function of a model that gives a loss and its gradient in all floats of the model.
 
     `jax.value_and_grad` refuses a model with integers, such as the places of textures. The gradient is a model with
-    None in place of these: the floats of `partition(model)`, which an optimizer updates and `combine` puts back.
+    None for these: the floats of `partition(model)`, which an optimizer updates and `combine` puts back.
 
     Args:
       loss: of a model, and of any further arguments, which are not differentiated; a scalar.
@@ -152,7 +152,7 @@ class Differentiated(NamedTuple):
 
     value: Array
     """The loss, a scalar."""
-    told: Any
+    auxiliary: Any
     """Second result of the loss function."""
     num_pairs: Array
     """Number of pairs, the least capacity."""
@@ -188,7 +188,7 @@ def differentiate(
       settings: with a capacity under jit.
       has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
       sh_degree: overrides the settings'; may be traced.
-      statistic: of which position the probe tells; None without a probe.
+      statistic: position that the probe measures; None without a probe.
       has_probe: gather the statistic.
     """
 
@@ -203,12 +203,12 @@ def differentiate(
             gaussians, seen.camera, shown.appearance, view.background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=model.num_live, probe=probe, statistic=statistic,
         )  # fmt: skip
-        value, told = loss(shown, seen, output)
-        return value, (told, num_pairs)
+        value, auxiliary = loss(shown, seen, output)
+        return value, (auxiliary, num_pairs)
 
     probe = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if has_probe else None
     with_gradients = jax.value_and_grad(of_floats, argnums=(0, 1, 2, 3), has_aux=True)
     if settings.exchange is not None and settings.exchange.views_at_once > 1:
         with_gradients = value_and_grad_of_views(of_floats, settings.exchange.views_at_once, _axes_of(view))
-    (value, (told, num_pairs)), gradients = with_gradients(model.gaussians, floats, view.rows, probe, view)
-    return Differentiated(value, told, num_pairs, *gradients)
+    (value, (auxiliary, num_pairs)), gradients = with_gradients(model.gaussians, floats, view.rows, probe, view)
+    return Differentiated(value, auxiliary, num_pairs, *gradients)

@@ -124,7 +124,7 @@ class StageRun:
         index: which of its stages, from 0.
         start: the model to start from; None where `resume` is given.
         resume: a checkpoint of this stage (`checkpoint.check_resume`).
-        num_restored: which order of the views, from 0; None: that of the checkpoint, or the first.
+        num_restored: which order of the views, from 0; None: the checkpoint's order, or the first.
         session: what trainings of this process share; None: a new one.
         """
         self.session = Session() if session is None else session
@@ -141,7 +141,7 @@ class StageRun:
         copied = jnp.array if self.mesh is None else np.array
         if resume is None:
             if start is None:
-                raise ValueError("a stage needs a model to start from, or a checkpoint to go on from")
+                raise ValueError("a stage needs a model to start from, or a checkpoint to resume")
             model = padded(jax.tree.map(copied, start.live), self.stage, system, self.session.num_devices)
             names = [view.name for view in self.views]
             state = initial_state(self.stage, spread(self.mesh, model), names, start.origin)
@@ -235,7 +235,7 @@ class StageRun:
         bar = ProgressBar(title or self.stage.name, iteration, end, is_shown=progress, may_grow=may_grow)
         with contextlib.closing(self.photographs), bar:
             while iteration < end:
-                # The host acts next after so many launched steps, an event, or a checkpoint.
+                # The Python side acts next after `launched` steps, an event, or a checkpoint.
                 stops = [iteration + self.launched - iteration % self.launched, end]
                 stops += [due for due in self._due_on_host() if due > iteration]
                 if checkpoint_every is not None:
@@ -350,7 +350,7 @@ class StageRun:
         return dataclasses.replace(settings, capacity=self.capacities[size], exchange=self.exchanges.get(size))
 
     def _capacity(self, size: Size, pairs: float) -> int:
-        """Return a capacity for so many pairs in views of a size, one that the session knows if possible."""
+        """Return a capacity for a number of pairs in views of a size, one that the session has if possible."""
         stage = self.stage.name, self.stage.appearance, self.state.model.gaussians.num
         return self.session.capacity((*stage, *size), capacity_for(int(pairs)))
 
@@ -373,12 +373,12 @@ class StageRun:
         events = [event for event in self.stage.events if isinstance(event, StepEvent) and event.impossible]
         reasons = "; or ".join(f"{self.system.path_of(event)}: {event.impossible}" for event in events)
         raise ValueError(
-            f"training cannot go on {where}: {reasons}; check the cameras and points of the scene, or lower "
+            f"training cannot continue {where}: {reasons}; check the cameras and points of the scene, or lower "
             "rates.logit_opacities"
         )
 
     def _widen(self, size: Size, num_pairs: float) -> None:
-        """Make room for views of a size with so many pairs or, if there was enough, for the borders between bands."""
+        """Make room for `num_pairs` in views of a size or, if there was enough, for the borders between bands."""
         exchange = self.exchanges.get(size)
         if exchange is None or exchange.border_room is None or num_pairs > SURELY_FITTING * self.capacities[size]:
             self.capacities[size] = self._capacity(size, num_pairs * GROWTH_ROOM)

@@ -89,7 +89,7 @@ def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product:
 def normal_consistency(normal: Array, depth: Array, alpha: Array, camera: Camera) -> Array:
     """2DGS's normal consistency: the mean over pixels of Σ_i ω_i·(1 - n_i·n_depth) = alpha - normal·n_depth.
 
-    n_depth is the normal of the rendered depth. Pixels at the image border, or beside an empty pixel, have no such
+    n_depth is the normal of the rendered depth. Pixels at the image border, or next to an empty pixel, have no such
     normal and count as 0.
 
     Args:
@@ -167,7 +167,7 @@ def check_same_shape(image: Array, target: Array) -> None:
 
 
 def _hint(value: object) -> str:
-    """Return what to say in place of a value that is no image, if it has one."""
+    """Return what to pass instead of a value that is no image but has one."""
     if hasattr(value, "color"):
         return "say output.color"
     return "say view_image(view, background)" if hasattr(value, "picture") else ""
@@ -181,8 +181,8 @@ def _live_mean(values: Array, num_live: Array | int) -> Array:
 
 
 def back_project(depth: Array, camera: Camera) -> Array:
-    """Return the world points [H, W, 3] of the pixels at depths [H, W] along the camera's z axis; those of pixels
-    without a ray have no meaning."""
+    """Return the world points [H, W, 3] of the pixels at depths [H, W] along the camera's z axis; pixels
+    without a ray give points without meaning."""
     height, width = depth.shape
     x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
     if camera.rays is not None:

@@ -54,7 +54,7 @@ class LossConfig:
     depth_kind: DepthKind = "inverse"
     """Meaning of depth maps: inverse depth up to scale and shift (monocular networks), or depth up to scale."""
     points_weight: float = 0.0
-    """Rendered inverse depth against that of the points that COLMAP observed in each photograph."""
+    """Rendered inverse depth against the inverse depth of the points that COLMAP observed in each photograph."""
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a number is out of range."""
@@ -151,7 +151,7 @@ class System:
     middle, whatever it is."""
     memory_budget: float | str | None = None
     """Memory budget of the model: 1.5MB, 800kB, 2GB, or a number of MB (10^6 bytes). The model stays within it at every
-    iteration and ends within 0.5 % of it. It sets the number of Gaussians and texels, in place of densify.cap."""
+    iteration and ends within 0.5 % of it. It sets the number of Gaussians and texels, instead of densify.cap."""
     background: Literal["black", "white", "random"] = "black"
     """Background of renders, and of transparent photographs."""
     sh_degree: int = 3
@@ -248,7 +248,7 @@ class System:
 
         Args:
           name: "paper", "quick", "smoke", or another that the system has.
-          **options: other values of options; those of a group as a dictionary.
+          **options: other values of options; a group's as a dictionary.
 
         Raises:
           ValueError: if there is no such preset, or an option is unknown or of another type.
@@ -334,7 +334,7 @@ class System:
             )
 
     def _check_learned(self, stages: Sequence[Stage]) -> None:
-        """Refuse corrections that are asked for and would do nothing."""
+        """Refuse corrections that would do nothing."""
         if self.corrections.exposure_kind != "affine" and not self.exposure:
             raise ValueError(
                 f"corrections.exposure_kind is {self.corrections.exposure_kind!r}, but nothing is learned of it: "
@@ -343,7 +343,7 @@ class System:
         if (self.exposure or self.refine_poses) and not any(stage.corrections for stage in stages):
             name = "exposure" if self.exposure else "refine_poses"
             raise ValueError(
-                f"{name} is asked for, but no stage of {type(self).__name__} learns it: compose its stages with "
+                f"{name} is on, but no stage of {type(self).__name__} learns it: compose its stages with "
                 "corrections=self.corrections_of(0), (1), …"
             )
 
@@ -377,7 +377,7 @@ class System:
         """
 
     def check_given_number(self, num: int) -> None:
-        """Do what `check_number` does, for Gaussians of a file in place of the first stage, and refuse more than the
+        """Do what `check_number` does, for Gaussians of a file instead of the first stage, and refuse more than the
         memory budget has room for. It calls `check_number` unless overridden."""
         self.check_number(num)
         self.check_given_bytes(num)

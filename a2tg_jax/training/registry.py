@@ -1,4 +1,4 @@
-"""Systems by name: those of this library, and others as package.module:NAME."""
+"""Systems by name: the library's, and others as package.module:NAME."""
 
 import importlib
 import sys

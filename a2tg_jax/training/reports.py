@@ -80,7 +80,7 @@ class Pace:
         return f"{told}{self._total - done:,}, {compiling}{growing}"
 
     def left(self, done: int) -> datetime.timedelta | None:
-        """Return the remaining time, that of known compilations included; None before a step was timed."""
+        """Return the remaining time, known compilations included; None before a step was timed."""
         if self._steps == 0:
             return None
         of_steps = (self._total - done) * self._seconds / self._steps
@@ -156,7 +156,7 @@ LEAST_ITERATIONS = 200
 NUM_COMPARED = 16
 """Iterations before the check whose PSNR is averaged."""
 NEARLY_FLAT = 40.0
-"""Photographs that one colour shows to so many dB tell nothing of whether a model has learned."""
+"""Photographs that one colour shows this well, in dB, say nothing about whether a model has learned."""
 ADVICE = (
     "Look whether the points and cameras fit (cameras.png of a2tg sfm; in a2tg view RUN, photographs beside the render "
     "from their cameras), then try fewer initial_gaussians, a lower initial_opacity or "
@@ -207,7 +207,7 @@ class LearningCheck:
 
 
 def has_learned(psnr: float, flat: float) -> bool:
-    """Return whether a PSNR is above that of flat colours (`flat_psnr`); always, if the photographs are nearly flat."""
+    """Return whether a PSNR is above `flat_psnr`; always, if the photographs are nearly flat."""
     return psnr > flat or flat > NEARLY_FLAT
 
 
@@ -226,7 +226,7 @@ def flat_psnr(target: Array, mask: Array | None = None) -> Array:
 
 
 MANY_PROGRAMS = 3
-"""Compilations because of one event after which it is told how to keep shapes."""
+"""Compilations because of one event after which a warning says how to keep shapes."""
 
 
 @dataclasses.dataclass

@@ -35,7 +35,7 @@ LOWEST = -0.2
 NOWHERE = 9.0
 """Coordinate of cells without a ray, far from all unit directions."""
 NUMS_TRIED = 20_000, 200_000
-"""Directions all around that tell where the part is; the second number if too few of the first are in it."""
+"""Directions all around that find the part; the second number if too few of the first are in it."""
 LEAST_FOUND = 5
 """Smallest number of these that must be in the part."""
 NEAR = 3.0
@@ -259,10 +259,10 @@ def even_directions(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tup
 
     Args:
       num: how many.
-      is_sky: returns [M] bool for directions [M, 3]. It is asked about `NUMS_TRIED` and about those nearby.
+      is_sky: returns [M] bool for directions [M, 3]. Called for `NUMS_TRIED` directions and those near the sky.
 
     Raises:
-      ValueError: if there is hardly any, or the sky is too small for so many.
+      ValueError: if there is nearly no sky, or it is too small for that many.
     """
     coarse, tried = _coarse(is_sky)
     near, share = cKDTree(coarse), len(coarse) / tried
@@ -295,7 +295,7 @@ def _coarse(is_sky: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, int
 
 
 def spacing(num: int) -> float:
-    """Return the angle between neighbours of so many directions all around."""
+    """Return the angle between neighbours of `num` directions all around."""
     return float(np.sqrt(4 * np.pi / num))
 
 

@@ -76,7 +76,7 @@ class LossTerm(Protocol):
 
     One that reads the render's depth, normal or distortion has `has_geometry = True`; one that reads the depth maps of
     the photographs has `has_depths = True`, and one that reads the reconstruction's points has `has_points = True`.
-    The history records it by its `name`, or that of its class. One of several summands may have a method `parts` with
+    The history records it by its `name`, or its class's. One of several summands may have a method `parts` with
     the same arguments, which returns them by name.
     """
 
@@ -129,11 +129,11 @@ class Stage:
 
     @property
     def extras(self) -> Extras:
-        """Data that loss terms read beside the photographs, as `Target.depth` and `Target.points`."""
+        """Data that loss terms read besides the photographs, as `Target.depth` and `Target.points`."""
         return Extras(*(any(getattr(term, f"has_{name}", False) for term in self.losses) for name in Extras._fields))
 
     def floats_shown(self, sh_degree: int) -> float:
-        """Return the floats that a Gaussian of a degree shows beside its own when the stage begins (host)."""
+        """Return the floats of appearance that a Gaussian of a degree has when the stage begins (host)."""
         few = no_rows(64, NUM_BASES[sh_degree])
         return count_floats(allocate_appearance(self.appearance, jax.random.key(0), few), few.num) / few.num
 
@@ -160,7 +160,7 @@ class Stage:
             )
         kinds = sorted({event.statistic for event in self.events if event.statistic is not None})
         if len(kinds) > 1:
-            raise ValueError(f"the events of one stage must want one statistic; those of {self.name!r} want {kinds}")
+            raise ValueError(f"the events of one stage must use one statistic; the events of {self.name!r} use {kinds}")
         with fields_of(f"stage {self.name!r}: rates"):
             self.rates.check_options()
         for event in self.events:
@@ -230,7 +230,7 @@ class Clock(NamedTuple):
     """Largest loss; the step is not taken beyond it."""
 
     def progress(self, iteration: Array) -> Array:
-        """Return the share of the stage that so many finished iterations are; traced."""
+        """Return the share of the stage that a number of finished iterations is; traced."""
         return jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) * self.per_iteration, 0.0, 1.0)
 
 

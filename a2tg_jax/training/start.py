@@ -113,7 +113,7 @@ def check_start(scene: Scene, system: System, num_given: int | None = None) -> N
     Args:
       scene: its photographs and points.
       system: with its options.
-      num_given: Gaussians of a file in place of the first stage; None: it is trained.
+      num_given: Gaussians of a file instead of the first stage; None: it is trained.
 
     Raises:
       ValueError: naming the options to change.
@@ -142,7 +142,7 @@ def check_loss_data(views: tuple[View, ...], stages: Sequence[Stage]) -> None:
     if extras.depths and all(view.depth is None for view in views):
         raise ValueError(
             "loss.depth_weight, or a custom term, needs depth maps, but no training view has one: put them as "
-            "NAME.npy or NAME.png into the folder depths beside images, or leave it out"
+            "NAME.npy or NAME.png into the folder depths next to images, or leave it out"
         )
     if extras.points and all(view.points is None for view in views):
         raise ValueError(
@@ -218,8 +218,8 @@ def _rows_needed(stage: Stage, num: int, system: System) -> int:
 
 
 def initial_number(scene: Scene, system: System, first: Stage) -> int:
-    """Return the number of initial Gaussians: as requested, up to one for each point beside those of the sky, and up to
-    the room of the first stage."""
+    """Return the number of initial Gaussians: as requested, up to one for each point besides the sky's, and up to the
+    room of the first stage."""
     room = len(scene.points) + system.sky_gaussians
     num = min(system.initial_gaussians or room, room)
     caps = [most for event in first.events if (most := event.most_gaussians) is not None]
@@ -236,7 +236,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
 
     If the model's appearance has the stage's options, its arrays are kept; otherwise new ones are allocated, but for
     the shapes of kernels. A stage without shapes takes the nearest Gaussians, with a warning. The number of devices
-    divides that of the rows.
+    divides the number of rows.
 
     Raises:
       ValueError: if Gaussians were to be added to a model whose textures have grown.
@@ -245,7 +245,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     room = -(-_rows_needed(stage, num, system) // num_devices) * num_devices
     if shapes is not None and stage.appearance.exponents is None:
         warnings.warn(
-            f"stage {stage.name!r} has no shapes of kernels: it takes the Gaussians nearest to those of the model",
+            f"stage {stage.name!r} has no shapes of kernels: it takes the Gaussians nearest to the model's kernels",
             stacklevel=2,
         )
         gaussians = nearest_gaussians(gaussians, np.asarray(shapes))

@@ -64,7 +64,7 @@ class TrainState:
 
 @dataclasses.dataclass(frozen=True)
 class StepSettings:
-    """Settings that a step is compiled for, beside its stage; hashable."""
+    """Settings that a step is compiled for, besides its stage; hashable."""
 
     render: RenderSettings
     """Render settings with a capacity."""
@@ -98,7 +98,7 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
       stage: which.
       model: with the rows and the appearance of the stage; the state is spread over devices as its rows are.
       names: of the training views.
-      origin: of the model that the stage starts from; its corrections go on.
+      origin: of the model that the stage starts from; its corrections continue.
     """
     return TrainState(
         model=model,
@@ -260,26 +260,26 @@ def batch_gradients(
         target = Target(seen.camera, photograph, seen.background, mask, clock.progress(iteration - 1), depth, points)
         color = corrected_color(seen.corrections, seen.rows, output.color)
         output = dataclasses.replace(output, color=_black_outside(mask, color))
-        told: dict[str, Array] = {}
+        parts_by_name: dict[str, Array] = {}
         values: list[Array] = []
         for index, term in enumerate(stage.losses):
             parts = term_parts(term, shown, target, output)
             for name, part in parts.items():
                 check_scalar(f"stage {stage.name!r}: losses[{index}]", part)
-                told[name if name not in told else f"{name}_{index + 1}"] = part
+                parts_by_name[name if name not in parts_by_name else f"{name}_{index + 1}"] = part
             values.append(functools.reduce(jnp.add, parts.values()))
         if added := penalties(seen.corrections, seen.rows):
-            told["corrections"] = functools.reduce(jnp.add, added)
+            parts_by_name["corrections"] = functools.reduce(jnp.add, added)
         value = functools.reduce(jnp.add, [*values, *added])
         error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
-        return value, (error, output.overflow, told)
+        return value, (error, output.overflow, parts_by_name)
 
     def gradients_of(arrays: tuple[Any, ...]) -> tuple[BatchGradients, Any]:
         """Return the gradients of a view, apart from those in the appearance; or of several views that share these."""
         viewmat, K, background, rows, pictures = arrays
         view = TracedView(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows, pictures)
         found = differentiate(loss, model, view, settings, **options)
-        error, overflow, terms = found.told
+        error, overflow, terms = found.auxiliary
         grads: Any = (found.gaussians, None, found.rows)
         own = BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe, terms)
         return own, found.appearance

@@ -78,7 +78,7 @@ class Term:
     weight: float = 1.0
     has_geometry: bool = static(default=False)
     """Whether the function reads `output.depth`, `normal` or `distortion`, which are rendered only on demand: unless a
-    term of the stage asks for them, reading them raises ValueError."""
+    term of the stage needs them, reading them raises ValueError."""
     has_depths: bool = static(default=False)
     """Whether the function reads `target.depth`, the depth map of the photograph."""
     has_points: bool = static(default=False)
@@ -91,7 +91,7 @@ class Term:
 
     @property
     def name(self) -> str:
-        """Name in the history: that of the function."""
+        """Name in the history: the function's."""
         return getattr(self.function, "__name__", type(self.function).__name__).strip("<>")
 
 
