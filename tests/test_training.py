@@ -304,7 +304,7 @@ def test_wrong_arguments_of_fit_are_refused(scene, trained):
         fit(scene, Gaussians2dMcmc(stage1_iterations=4), resume=checkpoint, progress=False)
     with pytest.raises(ValueError, match="checkpoint_every must be at least 1; got 0"):
         fit(scene, CONFIG, checkpoint_every=0, progress=False)
-    with pytest.raises(ValueError, match="index must be in 0..1"):
+    with pytest.raises(ValueError, match=r"index must be in 0\.\.1"):
         fit_stage(scene, CONFIG, 2, progress=False)
 
 
