@@ -52,7 +52,5 @@ class Convert:
         if not self.bake and options != BakeOptions():
             raise ValueError("--bake-growth and --bake-iterations have no effect without --bake: add it")
         baking = options if self.bake else None
-        result = convert(
-            self.source, self.out, self.model, baking=baking, float64=self.float64, overwrite=self.overwrite
-        )
-        print(result.text)
+        told = convert(self.source, self.out, self.model, baking=baking, float64=self.float64, overwrite=self.overwrite)
+        print(told)

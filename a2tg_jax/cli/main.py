@@ -30,9 +30,8 @@ from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.config_json import flatten_config
-from a2tg_jax.io.formats import FORMATS
-from a2tg_jax.results.checks import check_export, check_output, check_weights
-from a2tg_jax.results.compression import SUFFIX, check_compact, compress, compression_text, default_output
+from a2tg_jax.results.checks import check_weights
+from a2tg_jax.results.compression import compress
 from a2tg_jax.results.folder import json_text, open_run, opened
 from a2tg_jax.results.info import describe_run, run_facts
 from a2tg_jax.results.run_training import LESS_MEMORY, measure
@@ -130,18 +129,12 @@ class Compress:
     """Replace the output file. The default of a run is always replaced once a2tg compress has written it."""
 
     def run(self) -> None:
-        name = self.source.name.lower()
-        if not self.source.is_dir() and name.endswith(tuple(FORMATS)) and not name.endswith(".npz"):
-            told = ", which is compressed already" if name.endswith(SUFFIX) else ""
-            raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(self.source))}{told}")
-        default = default_output(self.source)
-        out = self.out or default
-        check_compact(out)
-        check_output(out)
-        check_export(out, default, "--out", overwrite=self.overwrite)
         tell = functools.partial(print, flush=True)
-        found = compress(self.source, out, max_loss=self.max_loss, tune_iterations=self.tune_iterations, on_start=tell)
-        print(compression_text(found))
+        found = compress(
+            self.source, self.out, max_loss=self.max_loss, tune_iterations=self.tune_iterations,
+            overwrite=self.overwrite, on_start=tell,
+        )  # fmt: skip
+        print(found.text)
 
 
 @dataclasses.dataclass(frozen=True)

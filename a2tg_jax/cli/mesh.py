@@ -11,7 +11,7 @@ from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.checks import check_export, check_not_source, check_output
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.meshing import TEXTURED_FACES, MeshOptions, TextureSource, write_mesh
-from a2tg_jax.results.viewing import open_source
+from a2tg_jax.results.model_source import open_source
 
 
 @dataclasses.dataclass(frozen=True)

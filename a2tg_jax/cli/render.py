@@ -10,9 +10,9 @@ from a2tg_jax.cli.arguments import LastModel, defaulting_to
 from a2tg_jax.host.text import counted
 from a2tg_jax.results.checks import check_output
 from a2tg_jax.results.folder import open_run
-from a2tg_jax.results.frame_folder import FrameFolder
 from a2tg_jax.results.frames import (
     FRAMES_PER_SECOND,
+    FrameFolder,
     Route,
     check_rate,
     parse_size,

@@ -12,10 +12,9 @@ from a2tg_jax.cli.arguments import LastModel
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.results.checks import check_new, check_not_source, check_output, check_separate
-from a2tg_jax.results.live_viewer import shown_live
-from a2tg_jax.results.ply_export import check_ply, export_ply
-from a2tg_jax.results.viewing import open_source, routes_of
-from a2tg_jax.results.web_export import check_page, export_web, exported_text, page_files
+from a2tg_jax.results.exporting import check_page, check_ply, export_ply, export_web
+from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.viewing import routes_of, shown_live
 from a2tg_jax.training.loop import Watch
 from a2tg_jax.web.server import LOOPBACK, serve
 
@@ -103,7 +102,7 @@ class Export:
                 photographs=self.photographs,
                 overwrite=self.overwrite,
             )
-            print(exported_text(result))
+            print(result.text)
         if self.ply is not None:
             print(export_ply(source, self.ply, float64=self.float64))
 
@@ -115,14 +114,10 @@ class Export:
 
     def _check_web(self, web: Path) -> None:
         check_output(web)
-        is_file = check_page(web, single_file=self.single_file, photographs=self.photographs)
+        files = check_page(web, single_file=self.single_file, photographs=self.photographs, overwrite=self.overwrite)
         if self.ply is not None:
-            # A PLY file may lie in the folder of a page.
-            check_separate(web if is_file else web / "index.html", self.ply, "--web and --ply")
-        files = page_files(web, single_file=is_file)
+            check_separate(files[0], self.ply, "--web and --ply")  # A PLY file may be in the folder of a page.
         check_not_source(files, self.source, "--web")
-        for file in files:
-            check_new(file, "--web", overwrite=self.overwrite)
 
 
 def in_browser(scene: Scene) -> AbstractContextManager[Watch]:

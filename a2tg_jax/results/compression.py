@@ -1,6 +1,7 @@
 """Compression of a model: the smallest compact file within a loss, and a table of the choices tried."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -9,7 +10,6 @@ from a2tg_jax.data import Scene
 from a2tg_jax.finish.compaction import (
     ASSUMED_PSNR,
     LADDER,
-    Ladder,
     Loss,
     TooMuchLostError,
     Trial,
@@ -18,27 +18,23 @@ from a2tg_jax.finish.compaction import (
     measure_choices,
     smallest_within,
 )
-from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tune, Tuned, TunedFiles, smallest_tuned, tune_compact
+from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tuned, TunedFiles, smallest_tuned, tune_compact
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.text import in_bytes
+from a2tg_jax.host.text import in_bytes, shortened
 from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
-from a2tg_jax.io.model_file import load_model
+from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
-from a2tg_jax.results.record import read_record
-from a2tg_jax.results.run_evaluation import refined_views, settings_of
+from a2tg_jax.results.checks import check_export, check_output
+from a2tg_jax.results.exporting import loss_text
+from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.run_evaluation import refined_views
 from a2tg_jax.results.summary import aligned
-from a2tg_jax.results.web_export import loss_told
+from a2tg_jax.training import System
 
 SUFFIX = ".a2tgz"
-PARTS = (
-    "all", "half", "one third", "one quarter", "one fifth", "one sixth", "one seventh", "one eighth", "one ninth",
-    "one tenth",
-)  # fmt: skip
-"""Names of 1/1, 1/2, 1/3, …"""
 MOST_VIEWS = 16
 """Largest number of training views measured, evenly chosen."""
 
@@ -55,29 +51,24 @@ class Compressed:
     chosen: Trial
     measures: tuple[str, ...]
     """Names of the loss measures of the trials."""
-    tuned: Sequence[Trial] = ()
-    """Files of tuned models, in the order of trial."""
-    diverged: str | None = None
-    """Error that ended the search for tuned files; None: there was none."""
+    tuned: TunedFiles
+    """Files of tuned models, and the error that ended their search, if any."""
 
-
-def default_output(source: Path) -> Path:
-    """Return the file that `compress` writes beside the model of a run folder, or beside a model's file.
-
-    Raises:
-      FileNotFoundError: if there is no such model.
-    """
-    if source.is_dir():
-        return _last_model(open_run(source))[0].with_suffix(SUFFIX)
-    if not is_regular(source):
-        raise FileNotFoundError(f"{source}: no such file or folder")
-    return source.with_suffix(SUFFIX)
-
-
-def check_compact(out: Path) -> None:
-    """Raise ValueError if `out` is a folder or has another suffix than a2tgz."""
-    if out.is_dir() or out.suffix.lower() != SUFFIX:
-        raise ValueError(f"out must be the path of a file that ends in {SUFFIX}; got {out}")
+    @property
+    def text(self) -> str:
+        """Table of all choices tried, the bits of the tuned files, and at the end a line about the file."""
+        groups = dict.fromkeys(trial.group for trial in self.trials)
+        named = [(f"{trial.group} {trial.precision}", trial) for trial in self.trials]
+        named += [(f"tuned {number}", trial) for number, trial in enumerate(self.tuned.tried, 1)]
+        named.append(("chosen", self.chosen))
+        rows = [["kept as", "bytes", *(f"dB lost, {measure}" for measure in self.measures)]]
+        rows += [[name, f"{trial.num_bytes:,}", *(f"{loss:.3f}" for loss in trial.losses)] for name, trial in named]
+        bits = [f"{name}: {_bits(trial, groups)}" for name, trial in named[len(self.trials) :]]
+        if self.tuned.diverged:
+            bits.insert(-1, f"tuning ended early, what was found before is kept: {self.tuned.diverged}")
+        share = f"1/{self.model.num_bytes / self.chosen.num_bytes:.1f} of the model's numbers"
+        size = f"{in_bytes(self.chosen.num_bytes)} on disk, {share}, {loss_text(self.chosen.losses[0])}"
+        return "\n".join([*aligned(list(zip(*rows, strict=True))), *bits, f"{self.path}: {size}"])
 
 
 def compress(
@@ -86,11 +77,12 @@ def compress(
     *,
     max_loss: float = 0.05,
     tune_iterations: int = 0,
+    overwrite: bool = False,
     on_start: Callable[[str], None] = lambda _: None,
 ) -> Compressed:
     """Write the smallest compact file of a model within a given loss.
 
-    Losses are those of PSNR on the training views of a run. If the photographs are missing, or a model's file is
+    Losses are losses of PSNR on the training views of a run. If the photographs are missing, or a model's file is
     given, they are estimated from renders, for a model with `ASSUMED_PSNR`.
 
     Args:
@@ -99,47 +91,58 @@ def compress(
       max_loss: in dB.
       tune_iterations: iterations of training with rounding for each choice of bits that is tried so
         (`finish.tuning.smallest_tuned`); 0: the model's numbers are only rounded.
+      overwrite: whether an existing file is replaced that this function did not write into the run's folder.
       on_start: called with how much there is to try, once the arguments are checked.
 
     Raises:
       FileNotFoundError: if there is no such model, or no photographs to tune it with.
-      ValueError: if a compact file cannot hold it, nothing loses so little, `out` is a folder or has another suffix
-        than a2tgz, or a model's file is to be tuned.
+      FileExistsError: if the file exists.
+      ValueError: if a compact file cannot hold the model, nothing loses so little, `out` is a folder or has another
+        suffix than a2tgz, or a model's file is to be tuned.
     """
-    run = open_run(source) if source.is_dir() else None
-    path, settings = (source, RenderSettings()) if run is None else _last_model(run)
-    model = load_model(path)
-    check_encodable(model.appearance)
-    out = path.with_suffix(SUFFIX) if out is None else out
+    name = source.name.lower()
+    if not source.is_dir() and name.endswith(tuple(FORMATS)) and not name.endswith(".npz"):
+        told = ", which is compressed already" if name.endswith(SUFFIX) else ""
+        raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(source))}{told}")
     if not 0 <= max_loss < math.inf:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
-    check_compact(out)
-    scene = None if run is None else _scene_of(run)
-    tune = _tune(source, run, scene, tune_iterations) if tune_iterations else None
-    losses = _losses(model, scene, settings)
+    if tune_iterations < 0:
+        raise ValueError(f"tune_iterations must be at least 0; got {tune_iterations}")
+    if out is not None and (out.is_dir() or out.suffix.lower() != SUFFIX):
+        raise ValueError(f"out must be the path of a file that ends in {SUFFIX}; got {out}")
+    opened = open_source(source)
+    model, default = opened.model, opened.path.with_suffix(SUFFIX)
+    out = default if out is None else out
+    check_output(out)
+    check_export(out, default, "--out", overwrite=overwrite)
+    check_encodable(model.appearance)
+    scene, tune = opened.load_scene(), None
+    if tune_iterations:
+        if opened.system is None:
+            raise ValueError(f"tune_iterations needs the photographs of a run folder; {source} is a file")
+        if scene is None:
+            raise FileNotFoundError(f"tune_iterations needs the photographs of {source}, which are missing")
+        tune = functools.partial(_tuned, scene, opened.system, tune_iterations)
+    losses = _losses(model, scene, opened.settings)
     ladder, measures = LADDER if tune is None else TUNED_LADDER, list(losses.values())
-    on_start(_plan_told(ladder, tune_iterations))
+    tunings = f", then training up to {MOST_TUNINGS} times" if tune else ""
+    ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
+    on_start(f"trying {ways}{tunings}; on a CPU this takes minutes")
     trials = measure_choices(model, measures, ladder)
-    untuned = _untuned(model, measures, max_loss, trials, may_fail=tune is not None)
-    found = TunedFiles([]) if tune is None else smallest_tuned(model, measures, max_loss, trials, tune)
+    untuned, found = None, TunedFiles([])
+    try:
+        untuned = smallest_within(model, measures, max_loss, trials)
+    except TooMuchLostError:
+        if tune is None:
+            raise
+    if tune is not None:
+        found = smallest_tuned(model, measures, max_loss, trials, tune)
     chosen, data = _smaller(model, untuned, found, max_loss)
-    if run is not None and out == path.with_suffix(SUFFIX):
-        run.own(out)
+    if source.is_dir() and out == default:
+        RunFolder(source).own(out)
     with replacing(out) as temporary:
         temporary.write_bytes(data)
-    return Compressed(out, model, trials, chosen, tuple(losses), found.tried, found.diverged)
-
-
-def _untuned(
-    model: Model, losses: Sequence[Loss], max_loss: float, trials: Sequence[Trial], *, may_fail: bool
-) -> Trial | None:
-    """Return the smallest file without tuning; None if there is none within the loss, and that may be."""
-    try:
-        return smallest_within(model, losses, max_loss, trials)
-    except TooMuchLostError:
-        if may_fail:
-            return None
-        raise
+    return Compressed(out, model, trials, chosen, tuple(losses), found)
 
 
 def _smaller(model: Model, untuned: Trial | None, found: TunedFiles, max_loss: float) -> tuple[Trial, bytes]:
@@ -159,52 +162,9 @@ def _smaller(model: Model, untuned: Trial | None, found: TunedFiles, max_loss: f
     raise TooMuchLostError(f"max_loss must be larger: no file, tuned or not, is within it; got {max_loss}{told}{ended}")
 
 
-def _plan_told(ladder: Ladder, tune_iterations: int) -> str:
-    """Return what there is to try, in words."""
-    tunings = f", then training up to {MOST_TUNINGS} times" if tune_iterations else ""
-    ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
-    return f"trying {ways}{tunings}; on a CPU this takes minutes"
-
-
-def _tune(source: Path, run: RunFolder | None, scene: Scene | None, iterations: int) -> Tune:
-    """Return the function that tunes the model of a run.
-
-    Raises:
-      FileNotFoundError: if the run's photographs are missing.
-      ValueError: if there is no run, or the iterations are negative.
-    """
-    if iterations < 0:
-        raise ValueError(f"tune_iterations must be at least 0; got {iterations}")
-    if run is None:
-        raise ValueError(f"tune_iterations needs the photographs of a run folder; {source} is a file")
-    if scene is None:
-        raise FileNotFoundError(f"tune_iterations needs the photographs of {source}, which are missing")
-    plan = read_record(run).plan
-    system = plan[plan.main[-1]].system
-
-    def tune(model: Model, choices: CompactChoices, number: int) -> Tuned:
-        title = f"tuning {number} of up to {MOST_TUNINGS}"
-        return tune_compact(model, scene, system, choices, iterations=iterations, progress=True, title=title)
-
-    return tune
-
-
-def _last_model(run: RunFolder) -> tuple[Path, RenderSettings]:
-    """Return the path and render settings of the main system's last model."""
-    plan = read_record(run).plan
-    planned = plan[plan.main[-1]]
-    path = run.model(planned.name)
-    if not is_regular(path):
-        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with: {resuming_command(run)}")
-    return path, settings_of(planned.system)
-
-
-def _scene_of(run: RunFolder) -> Scene | None:
-    """Return the scene, or None if its photographs are missing."""
-    try:
-        return read_record(run).scene.load()
-    except FileNotFoundError:
-        return None
+def _tuned(scene: Scene, system: System, iterations: int, model: Model, choices: CompactChoices, number: int) -> Tuned:
+    title = f"tuning {number} of up to {MOST_TUNINGS}"
+    return tune_compact(model, scene, system, choices, iterations=iterations, progress=True, title=title)
 
 
 def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict[str, Loss]:
@@ -223,35 +183,6 @@ def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict
     return {f"if {ASSUMED_PSNR:g} dB": loss_beside_renders(model, cameras, settings=settings)}
 
 
-def compression_text(result: Compressed) -> str:
-    """Return a table of all choices tried, the bits of the tuned files, and at the end a line about the file."""
-    chosen, model = result.chosen, result.model
-    groups = dict.fromkeys(trial.group for trial in result.trials)
-    rows = [[f"{trial.group} {trial.precision}", *_figures(trial)] for trial in result.trials]
-    columns = zip(
-        ["kept as", "bytes", *(f"dB lost, {measure}" for measure in result.measures)],
-        *rows,
-        *([f"tuned {number}", *_figures(trial)] for number, trial in enumerate(result.tuned, 1)),
-        ["chosen", *_figures(chosen)],
-        strict=True,
-    )
-    bits = [f"tuned {number}: {_kept(trial, groups)}" for number, trial in enumerate(result.tuned, 1)]
-    ended = [f"tuning ended early, what was found before is kept: {result.diverged}"] if result.diverged else []
-    share = f"{part_told(model.num_bytes / chosen.num_bytes)} of the model's numbers"
-    told = f"{result.path}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_told(chosen.losses[0])}"
-    return "\n".join([*aligned(list(columns)), *bits, *ended, f"chosen: {_kept(chosen, groups)}", told])
-
-
-def _kept(trial: Trial, groups: Collection[str]) -> str:
-    """Return the bits of those of the groups that a model has."""
+def _bits(trial: Trial, groups: Collection[str]) -> str:
+    """Return the bits of each group that a model has."""
     return ", ".join(f"{group} {getattr(trial.choices, group)}" for group in GROUPS if group in groups)
-
-
-def part_told(ratio: float) -> str:
-    """Return "one eighth" for a ratio near 8, and "1/14" for one that has no short name."""
-    whole = round(ratio)
-    return PARTS[whole - 1] if 1 <= whole <= len(PARTS) else f"1/{whole}"
-
-
-def _figures(trial: Trial) -> list[str]:
-    return [f"{trial.num_bytes:,}", *(f"{loss:.3f}" for loss in trial.losses)]

@@ -23,38 +23,7 @@ from a2tg_jax.io.formats import (
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
 from a2tg_jax.results.checks import check_new, check_output
-from a2tg_jax.results.viewing import open_source
-
-
-@dataclasses.dataclass(frozen=True)
-class Converted:
-    """A converted model, and its bytes before and after."""
-
-    source: Path
-    out: Path
-    model: Model
-    bytes_before: int
-    bytes_after: int
-    lost: tuple[str, ...]
-    seconds: float
-    baked: str = ""
-    """Result of baking, in words."""
-
-    @property
-    def text(self) -> str:
-        """Summary in a line or two."""
-        ratio = self.bytes_after / max(self.bytes_before, 1)
-        sizes = f"{in_bytes(self.bytes_after)} from {in_bytes(self.bytes_before)} ({ratio:.2f} times)"
-        lines = [f"{self.out}: {counted(self.model.num, 'Gaussian')}, {sizes}, {self.seconds:.1f} s"]
-        if self.baked:
-            lines.insert(0, self.baked)
-        if self.lost:
-            lines.append(f"not kept by this format: {', '.join(self.lost)}")
-        if unseen := unseen_elsewhere(self.model, self.out):
-            lines.append(f"not shown by other programs: {unseen}")
-        if self.model.origin is not None and not format_of(self.out).keeps_origin:
-            lines.append("world: the original one, in its units and axes")
-        return "\n".join(lines)
+from a2tg_jax.results.model_source import open_source
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,8 +49,8 @@ def convert(
     baking: BakeOptions | None = None,
     float64: bool = False,
     overwrite: bool = False,
-) -> Converted:
-    """Write a model in the format of another suffix.
+) -> str:
+    """Write a model in the format of another suffix, and return a summary.
 
     Args:
       source: a run folder or a file of any known format.
@@ -98,7 +67,14 @@ def convert(
     writer_of(out)  # Baking takes minutes.
     if float64 and format_of(out).save is not save_ply:
         raise ValueError(f"--float64 needs an OUT that ends in .ply and is not packed; got {out}")
-    _check_files(source, out, overwrite=overwrite)
+    sources = {file.resolve() for file in files_of(source)}
+    for file in files_written(out):
+        if file.is_dir():
+            raise ValueError(f"{file} is a folder; give the path of a file")
+        if file.resolve() in sources:
+            whole = "the source" if file == out else f"part of the source and would be written beside {out}"
+            raise ValueError(f"{file} is {whole}: choose another name")
+        check_new(file, "OUT", overwrite=overwrite)
     check_output(out)
     if baking is not None:
         baking.check()
@@ -109,20 +85,18 @@ def convert(
         save_ply(out, model, float64=True)
     else:
         save_splats(out, model)
-    lost, seconds = tuple(lost_by(model, out)), time.perf_counter() - start
-    return Converted(source, out, model, opened.num_bytes, file_bytes(out), lost, seconds, baked)
-
-
-def _check_files(source: Path, out: Path, *, overwrite: bool) -> None:
-    """Raise unless all files of the output may be written."""
-    sources = {file.resolve() for file in files_of(source)}
-    for file in files_written(out):
-        if file.is_dir():
-            raise ValueError(f"{file} is a folder; give the path of a file")
-        if file.resolve() in sources:
-            whole = "the source" if file == out else f"part of the source and would be written beside {out}"
-            raise ValueError(f"{file} is {whole}: choose another name")
-        check_new(file, "OUT", overwrite=overwrite)
+    ratio = file_bytes(out) / max(opened.num_bytes, 1)
+    sizes = f"{in_bytes(file_bytes(out))} from {in_bytes(opened.num_bytes)} ({ratio:.2f} times)"
+    seconds = time.perf_counter() - start
+    lines = [baked] if baked else []
+    lines.append(f"{out}: {counted(model.num, 'Gaussian')}, {sizes}, {seconds:.1f} s")
+    if lost := lost_by(model, out):
+        lines.append(f"not kept by this format: {', '.join(lost)}")
+    if unseen := unseen_elsewhere(model, out):
+        lines.append(f"not shown by other programs: {unseen}")
+    if model.origin is not None and not format_of(out).keeps_origin:
+        lines.append("world: the original one, in its units and axes")
+    return "\n".join(lines)
 
 
 def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str]:

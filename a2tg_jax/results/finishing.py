@@ -1,5 +1,6 @@
 """Finishing of a trained run in a new run folder: textures shrink, and colours move towards the least squared error."""
 
+import contextlib
 import dataclasses
 import shutil
 from collections.abc import Iterator, Mapping
@@ -9,16 +10,17 @@ from typing import Any
 from a2tg_jax.data import Scene
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
-from a2tg_jax.host.atomic import final_of, replacing
+from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, sha256_of
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
 from a2tg_jax.results.finish_options import FinishOptions
-from a2tg_jax.results.folder import RunFolder, check_free, claimed, read_json, resuming_command, write_json
+from a2tg_jax.results.folder import RunFolder, check_free, claimed, read_json, write_json
+from a2tg_jax.results.model_source import finished_stage, settings_of
 from a2tg_jax.results.plan import PlannedStage
-from a2tg_jax.results.record import RunRecord, read_record, write_record
-from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, refined_views, settings_of
+from a2tg_jax.results.record import write_record
+from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, refined_views
 from a2tg_jax.results.summary import RunResult, aligned
 from a2tg_jax.training.registry import system_to_dict
 
@@ -77,18 +79,14 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
       ValueError: if the model has nothing to shrink or polish, or an option is out of range.
     """
     options.check()
-    record = read_record(source)
-    planned = record.plan[record.plan.main[-1]]
-    path = source.model(planned.name)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{source.path} has no finished {planned.name}; continue with: {resuming_command(source)}"
-        )
-    run, told = RunFolder(out), _told(source, planned, options)
+    record, planned = finished_stage(source)
+    finished_stages(source, record.plan)
+    path, run = source.model(planned.name), RunFolder(out)
+    origin = {"source": str(source.path.resolve()), "model": planned.name, "sha256": sha256_of(path)}
+    told = {**origin, **dataclasses.asdict(options)}
     _is_written(run, told)
     model, scene = load_model(path), record.scene.load()
     _check(model, planned, options)
-    finished_stages(source, record.plan)
     with claimed(run):
         is_written = _is_written(run, told)  # Another process may have been here meanwhile.
         changed = [("finished", load_model(run.model(planned.name)))] if is_written else _changed(model, scene, options)
@@ -97,43 +95,32 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
             models[name], steps[name] = after, _measured(after, scene, planned)
         if not is_written:
             run.clear()
-            _write_run(run, source, record, planned, models[kept_step(steps)], told)
+            write_json(run.own(run.finish), told)
+            for name in record.plan.names:
+                for find in (RunFolder.model, RunFolder.history):
+                    if find(source, name).is_file() and find(source, name) != path:
+                        with replacing(run.own(find(run, name))) as copy:
+                            shutil.copyfile(find(source, name), copy)
+            system = {"system": system_to_dict(planned.system)}
+            save_model(run.own(run.model(planned.name)), models[kept_step(steps)], system)
+            write_record(run, record)  # Last: it makes the folder a run.
         result = evaluate_run(run, scene, lpips_weights=lpips_weights)
     return Finished(steps, result)
-
-
-def _told(source: RunFolder, planned: PlannedStage, options: FinishOptions) -> dict[str, Any]:
-    """Return the content of finish.json: from which model of which run the new one is made, and how."""
-    origin = {"source": str(source.path.resolve()), "model": planned.name}
-    return {**origin, "sha256": sha256_of(source.model(planned.name)), **dataclasses.asdict(options)}
 
 
 def _is_written(run: RunFolder, told: Mapping[str, Any]) -> bool:
     """Return whether a process was killed in a folder after it had done the same and written the model.
 
-    Raises:
-      FileExistsError: if there is anything in the folder but what such a process left.
+    Args:
+      run: the folder.
+      told: content of finish.json, which was begun there; otherwise the folder must be free.
     """
-    if not _is_begun(run, told):
-        check_free(run.path, in_use="is not empty; choose another --out")
-        return False
-    if run.record.is_file():
-        return True
-    own = {run.path / name for name in run.written()}
-    other = next((path for path in run.path.rglob("*") if path.is_file() and final_of(path) not in own), None)
-    if other is not None:
-        raise FileExistsError(f"{other} is not of the finishing that was begun there: move it, or choose another --out")
+    is_begun = not run.report.is_file() and run.finish.name in run.written() and is_regular(run.finish)
+    with contextlib.suppress(ValueError):
+        if is_begun and read_json(run.finish) == told:
+            return run.record.is_file()
+    check_free(run.path, in_use="is not empty; choose another --out")
     return False
-
-
-def _is_begun(run: RunFolder, told: Mapping[str, Any]) -> bool:
-    """Return whether a process was killed in a folder while it did the same."""
-    if run.report.is_file() or run.finish.name not in run.written() or not is_regular(run.finish):
-        return False
-    try:
-        return bool(read_json(run.finish) == told)
-    except ValueError:
-        return False
 
 
 def _changed(model: Model, scene: Scene, options: FinishOptions) -> Iterator[tuple[str, Model]]:
@@ -170,22 +157,3 @@ def _measured(model: Model, scene: Scene, planned: PlannedStage) -> Measured:
     ]
     assert psnrs[0] is not None
     return Measured(model.num_bytes, psnrs[0], psnrs[1])
-
-
-def _write_run(
-    run: RunFolder,
-    source: RunFolder,
-    record: RunRecord,
-    planned: PlannedStage,
-    model: Model,
-    told: Mapping[str, Any],
-) -> None:
-    """Write finish.json, models, histories and record of the new run; the record last, which makes it one."""
-    write_json(run.own(run.finish), told)
-    for name in record.plan.names:
-        for find in (RunFolder.model, RunFolder.history):
-            if find(source, name).is_file() and (find is RunFolder.history or name != planned.name):
-                with replacing(run.own(find(run, name))) as copy:
-                    shutil.copyfile(find(source, name), copy)
-    save_model(run.own(run.model(planned.name)), model, {"system": system_to_dict(planned.system)})
-    write_record(run, record)

@@ -1,10 +1,14 @@
-"""Frames of a finished run, and a video: its test views, or a path past the cameras, around the subject or by hand."""
+"""Frames of a finished run, and a video: its test views, or a path past the cameras, around the subject or by hand.
 
+Their folder has a list of what renders wrote there. Nothing else is replaced or deleted without `overwrite`.
+"""
+
+import contextlib
 import dataclasses
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -13,22 +17,67 @@ from PIL import Image
 from a2tg_jax.core.cameras import Camera, crop_camera
 from a2tg_jax.core.capture_geometry import turntable
 from a2tg_jax.core.paths import path_through, smooth_path
+from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.progress_bars import progress_over
+from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.path_file import load_views
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.folder import RunFolder, resuming_command
-from a2tg_jax.results.frame_folder import FRAME_NAME, FrameFolder
+from a2tg_jax.results.checks import check_new
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import picture_names, save_animation, to_uint8, write_png
-from a2tg_jax.results.record import read_record
-from a2tg_jax.results.run_evaluation import settings_of
+from a2tg_jax.results.model_source import open_source
 
 Route = Literal["test", "smooth", "orbit"]
 FRAMES_PER_SECOND = 30
 LARGEST_SIDE = 8192
 WEBP_QUALITY = 80
+LIST = ".a2tg-frames"
+"""Name of the list."""
+MOST_BYTES = 1 << 26
+FRAME_NAME = "frame_%04d.png"
+"""File name of a flight's frame by its number, as Python and ffmpeg write it."""
+FRAME = re.compile(r"frame_\d{4,}\.png")
+
+
+class FrameFolder:
+    """Folder into which frames and videos are rendered, with a list of their names."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    @property
+    def listed(self) -> list[str]:
+        """Names of the files that renders wrote."""
+        if not is_regular(self.path / LIST):
+            return []
+        lines = read_regular(self.path / LIST, MOST_BYTES).decode(errors="surrogateescape").splitlines()
+        return list(dict.fromkeys(lines))
+
+    def check(self, names: Iterable[str], *, overwrite: bool) -> None:
+        """Raise FileExistsError if a file would be replaced, without `overwrite`, that no render wrote."""
+        for name in set(names) - set(self.listed):
+            check_new(self.path / name, "--out", overwrite=overwrite)
+
+    @contextlib.contextmanager
+    def writing(self, name: str) -> Iterator[Path]:
+        """Yield a temporary path, as `replacing` does, for a file of the folder, and list the file."""
+        with replacing(self.path / name) as temporary:
+            yield temporary
+            with open(self.path / LIST, "a", encoding="utf-8", errors="surrogateescape") as file:
+                file.write(f"{name}\n")
+
+    def tidy(self, rendered: Collection[str], *, drops_frames: bool) -> None:
+        """List each file once, and delete the frames of flights that this render did not write if `drops_frames`."""
+        names = self.listed
+        if drops_frames:
+            for name in names:
+                if name not in rendered and FRAME.fullmatch(name):
+                    (self.path / name).unlink(missing_ok=True)
+        with replacing(self.path / LIST) as temporary:
+            left = [f"{name}\n" for name in names if (self.path / name).is_file()]
+            temporary.write_text("".join(left), encoding="utf-8", errors="surrogateescape")
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -57,7 +106,7 @@ def render_frames(
     supersample: int = 1,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write one PNG per frame and return their paths. The photographs are not needed: a model knows its cameras.
+    """Write one PNG per frame and return their paths. The photographs are not needed.
 
     Args:
       run: an opened run folder.
@@ -80,18 +129,14 @@ def render_frames(
         raise ValueError(f"the number of frames must be at least 1; got {num_frames}")
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"{out} is a file; choose a folder for the frames with --out")
-    plan = read_record(run).plan
-    planned = plan[plan.main[-1] if name is None else name]
-    if not run.model(planned.name).is_file():
-        raise FileNotFoundError(f"{run.path} has no finished {planned.name}; continue with: {resuming_command(run)}")
-    model = load_model(run.model(planned.name))
-    cameras = dict(_cameras(model, route, num_frames))
+    source = open_source(run.path, name)
+    cameras = dict(_cameras(source.model, route, num_frames))
     if size is not None:
         cameras = {file_name: crop_camera(camera, *size) for file_name, camera in cameras.items()}
     folder = FrameFolder(out)
     folder.check(cameras, overwrite=overwrite)
-    settings = dataclasses.replace(settings_of(planned.system), supersample=supersample)
-    renderer = Renderer(model, cameras=cameras.values(), settings=settings, has_geometry=False)
+    settings = dataclasses.replace(source.settings, supersample=supersample)
+    renderer = Renderer(source.model, cameras=cameras.values(), settings=settings, has_geometry=False)
     for file_name, camera in progress_over(list(cameras.items()), "frames", "frame"):
         with folder.writing(file_name) as temporary:
             write_png(temporary, to_uint8(renderer(camera).color))

@@ -28,7 +28,7 @@ from a2tg_jax.mesh.simplify import check_simplifying, simplify_mesh
 from a2tg_jax.mesh.texturing import Picture, texture_mesh
 from a2tg_jax.mesh.triangles import Mesh
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.viewing import Source
+from a2tg_jax.results.model_source import Source
 
 GRID_SHARE = 0.5
 """Share of the free memory that voxels may take by default."""

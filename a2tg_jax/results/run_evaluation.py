@@ -24,7 +24,6 @@ from a2tg_jax.io.web_scene import encode_web_scene, is_viewable
 from a2tg_jax.measure.alignment import align_poses
 from a2tg_jax.measure.evaluation import Evaluation, evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.checks import check_held_out
 from a2tg_jax.results.figures import write_figures
@@ -39,6 +38,7 @@ from a2tg_jax.results.images import (
     side_by_side,
     to_uint8,
 )
+from a2tg_jax.results.model_source import settings_of
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import HeldOut, read_record
 from a2tg_jax.results.report import Comparison, write_report
@@ -119,11 +119,6 @@ def finished_stages(run: RunFolder, plan: RunPlan) -> list[str]:
             again = f"put it back, or train it again with: {resuming_command(run)}"
             raise FileNotFoundError(f"{run.model(name)} is missing, and a later model of the run is there: {again}")
     return names
-
-
-def settings_of(system: System) -> RenderSettings:
-    """Return the render settings of a system's models."""
-    return RenderSettings(tile_size=system.tile_size)
 
 
 def refined_views(views: tuple[View, ...], model: Model) -> tuple[View, ...]:

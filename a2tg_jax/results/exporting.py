@@ -1,4 +1,4 @@
-"""Export of the viewer with a scene, for a web server or as one file, and the loss of its scene file."""
+"""Export of a model: the viewer with a scene, for a web server or as one file, and Gaussians as PLY."""
 
 import dataclasses
 import json
@@ -12,11 +12,14 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_on_views
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import counted, in_bytes
+from a2tg_jax.io.formats import lost_by
+from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.checks import check_new
 from a2tg_jax.results.folder import read_json, remove_if_empty
-from a2tg_jax.results.viewing import ServedPhotographs, Source, middle_of, scene_or_warning
+from a2tg_jax.results.model_source import Source, middle_of
+from a2tg_jax.results.viewing import ServedPhotographs
 from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html, viewer_html_with
 
 MOST_VIEWS = 8
@@ -39,41 +42,24 @@ class Exported:
     losses: Mapping[str, float]
     """Loss of the scene file in dB of PSNR, by what it is measured on."""
 
-
-def export_web(
-    source: Source, out: Path, *, single_file: bool = False, photographs: bool = False, overwrite: bool = False
-) -> Exported:
-    """Write a page that shows a model: a folder for any web server, or one file that opens from the disk.
-
-    Args:
-      source: the model.
-      out: the folder, which is made; or the file. A name that ends in .html is a file's, unless a folder lies there.
-      single_file: one file, whatever its name.
-      photographs: into the folder go the cameras' photographs too.
-      overwrite: whether existing files are replaced. Photographs of an earlier page that this one lacks are deleted.
-
-    Raises:
-      FileExistsError: if a folder is wanted where a file lies, or a file where a folder lies, or a file exists.
-      ValueError: if browsers cannot show the model, or photographs are requested but missing, or requested in one file.
-    """
-    single_file = check_page(out, single_file=single_file, photographs=photographs)
-    data = source.encoded
-    files = {out: viewer_html_with(data).encode()} if single_file else _files_of(source, out, photographs)
-    for path in files:
-        check_new(path, "--web", overwrite=overwrite)
-    old = set() if single_file else set(_photographs_in(out))
-    for path, content in files.items():
-        with replacing(path) as temporary:
-            temporary.write_bytes(content)
-    for path in old - set(files):
-        path.unlink(missing_ok=True)
-        remove_if_empty(path.parent, out)
-    page, total = out if single_file else out / "index.html", sum(map(len, files.values()))
-    return Exported(page, len(data), len(files), total, source.model, _losses_of(source))
+    @property
+    def text(self) -> str:
+        """Summary of the files written, their size and their loss."""
+        model, size = self.model, self.num_bytes
+        ratio = f"1/{model.num_bytes / max(size, 1):.1f} of the model's {in_bytes(model.num_bytes)}"
+        others = "" if self.num_files == 1 else f" with {counted(self.num_files - 1, 'file')} beside it"
+        return "\n".join(
+            [
+                f"{model.num:,} Gaussians, whose scene takes {in_bytes(size)}, {ratio}",
+                *(f"{loss_text(loss)}, {measure}" for measure, loss in self.losses.items()),
+                f"{self.path}: {in_bytes(self.total_bytes)}{others}",
+            ]
+        )
 
 
-def check_page(out: Path, *, single_file: bool, photographs: bool) -> bool:
-    """Return whether the page is to be one file. Arguments and errors are those of `export_web`."""
+def check_page(out: Path, *, single_file: bool, photographs: bool, overwrite: bool) -> list[Path]:
+    """Return the files of a page, photographs left out: one, or several in a folder. Arguments and errors as in
+    `export_web`."""
     single_file = single_file or (out.suffix.lower() == ".html" and not out.is_dir())
     if single_file and photographs:
         raise ValueError("--photographs needs a folder: leave out --single-file, and .html at the end of --web")
@@ -83,23 +69,50 @@ def check_page(out: Path, *, single_file: bool, photographs: bool) -> bool:
         raise FileExistsError(f"{out} is a file; choose a folder with --web, or a name that ends in .html for one file")
     if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
         raise ValueError(f"{out} holds a page other than the viewer's; choose another folder with --web")
-    return single_file
+    files = [out] if single_file else [out / name for name in ("index.html", SCENE_NAME, PHOTOGRAPHS_NAME)]
+    for file in files:
+        check_new(file, "--web", overwrite=overwrite)
+    return files
 
 
-def page_files(out: Path, *, single_file: bool) -> list[Path]:
-    """Return the files of a page, photographs left out."""
-    return [out] if single_file else [out / name for name in ("index.html", SCENE_NAME, PHOTOGRAPHS_NAME)]
+def export_web(
+    source: Source, out: Path, *, single_file: bool = False, photographs: bool = False, overwrite: bool = False
+) -> Exported:
+    """Write a page that shows a model: a folder for any web server, or one file that opens from the disk.
 
+    Args:
+      source: the model.
+      out: the folder, which is made; or the file. A name that ends in .html is a file's, unless there is such a folder.
+      single_file: one file, whatever its name.
+      photographs: into the folder go the cameras' photographs too.
+      overwrite: whether existing files are replaced. Photographs of an earlier page that this one lacks are deleted.
 
-def _photographs_in(folder: Path) -> list[Path]:
-    """Return the photographs that the page in a folder lists; none without a page."""
-    try:
-        return [folder / photograph_name(int(index)) for index in read_json(folder / PHOTOGRAPHS_NAME)]
-    except (OSError, ValueError, TypeError):
-        return []
+    Raises:
+      FileExistsError: if a folder is where a file is to be written, or a file where a folder is, or a file exists.
+      ValueError: if browsers cannot show the model, or photographs are requested but missing, or requested in one file.
+    """
+    page, *others = check_page(out, single_file=single_file, photographs=photographs, overwrite=overwrite)
+    data = source.encoded
+    files, old = {page: viewer_html_with(data).encode()}, set()
+    if others:
+        files = _files_of(source, out, photographs)
+        for path in files:
+            check_new(path, "--web", overwrite=overwrite)
+        try:
+            old = {out / photograph_name(int(index)) for index in read_json(out / PHOTOGRAPHS_NAME)}
+        except (OSError, ValueError, TypeError):
+            pass  # There was no page.
+    for path, content in files.items():
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
+    for path in old - set(files):
+        path.unlink(missing_ok=True)
+        remove_if_empty(path.parent, out)
+    return Exported(page, len(data), len(files), sum(map(len, files.values())), source.model, _losses_of(source))
 
 
 def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:
+    """Return the content of the files of a folder, the page last, so that it never shows what is not there yet."""
     files = {out / SCENE_NAME: source.encoded}
     views: list[int] = []
     if photographs:
@@ -108,33 +121,21 @@ def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]
             raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
         files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in found.views}
         views = sorted(found.views)
-    files[out / PHOTOGRAPHS_NAME] = json.dumps(views).encode()
-    return files | {out / "index.html": viewer_html().encode()}
+    return {**files, out / PHOTOGRAPHS_NAME: json.dumps(views).encode(), out / "index.html": viewer_html().encode()}
 
 
-def exported_text(result: Exported) -> str:
-    """Return a summary of the files written, their size and their loss."""
-    model, size = result.model, result.num_bytes
-    ratio = f"1/{model.num_bytes / max(size, 1):.1f} of the model's {in_bytes(model.num_bytes)}"
-    lines = [f"{model.num:,} Gaussians, whose scene takes {in_bytes(size)}, {ratio}"]
-    lines += [f"{loss_told(loss)}, {measure}" for measure, loss in result.losses.items()]
-    beside = "" if result.num_files == 1 else f" with {counted(result.num_files - 1, 'file')} beside it"
-    lines.append(f"{result.path}: {in_bytes(result.total_bytes)}{beside}")
-    return "\n".join(lines)
-
-
-def loss_told(loss: float) -> str:
+def loss_text(loss: float) -> str:
     """Return a loss of PSNR in dB as "0.067 dB of PSNR lost", and a negative one as gained."""
     return f"{abs(loss):.3f} dB of PSNR {'gained' if loss < 0 else 'lost'}"
 
 
 def _losses_of(source: Source) -> dict[str, float]:
-    """Return the loss of the file: on photographs if there are any, otherwise beside renders."""
+    """Return the loss of the file: on photographs if there are any, otherwise against renders."""
     if not source.model.num:
         return {}
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
     again = decode_web_scene(source.encoded).model
-    scene = scene_or_warning(source.load_scene)
+    scene = source.load_scene_or_warn()
     if scene is not None:
         views = {"training views": scene.train, "test views": scene.test}
         chosen = {name: found[:: -(-len(found) // MOST_VIEWS)] for name, found in views.items() if found}
@@ -160,3 +161,22 @@ def _ring(model: Model) -> list[Camera]:
         viewmat[:3, 3] = viewmat[:3, :3] @ (2.5 * radius * forward - centre)
         cameras.append(Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), width, height))
     return cameras
+
+
+def check_ply(out: Path) -> None:
+    """Raise ValueError if `out` is a folder or has another suffix than ply."""
+    if out.is_dir() or out.suffix.lower() != ".ply":
+        raise ValueError(f"--ply must be the path of a file that ends in .ply; got {out}")
+
+
+def export_ply(source: Source, out: Path, *, float64: bool = False) -> str:
+    """Write the Gaussians of a model as programs for 3DGS read them, and return a summary, with what PLY does not keep.
+
+    `float64` is as in `save_ply`.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_ply(out, source.model, float64=float64)
+    lines = [f"file: {out}: {source.model.num:,} Gaussians"]
+    if lost := lost_by(source.model, ".ply"):  # --bake is an option of another command.
+        lines.append(f"not kept by this format: {', '.join(lost).replace('--bake', 'a2tg convert --bake')}")
+    return "\n".join(lines)
