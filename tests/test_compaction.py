@@ -97,7 +97,7 @@ def test_the_command_on_a_model(tmp_path, monkeypatch, capsys):
     text = capsys.readouterr().out
     size = (tmp_path / "scene.a2tgz").stat().st_size
     assert load_compact(tmp_path / "scene.a2tgz").num == a_model().num
-    part = compression.part_told(a_model().num_bytes / size)
+    part = f"1/{a_model().num_bytes / size:.1f}"
     assert text.startswith("trying up to ") and "on a CPU this takes minutes\n" in text
     told = f"{tmp_path / 'scene.a2tgz'}: {in_bytes(size)} on disk, {part} of the model's numbers, 0."
     assert text.splitlines()[-1].startswith(told) and text.endswith(" dB of PSNR lost\n")
@@ -109,11 +109,6 @@ def test_a_file_without_its_run_is_not_tuned(tmp_path, capsys):
     assert cli.main(["compress", str(tmp_path / "scene.npz"), "--tune-iterations", "10"]) == 2
     assert "--tune-iterations needs the photographs of a run folder" in capsys.readouterr().err
     assert not list(tmp_path.glob("*.a2tgz"))
-
-
-@pytest.mark.parametrize(("ratio", "told"), [(7.9, "one eighth"), (1.2, "all"), (2.4, "half"), (13.8, "1/14")])
-def test_parts_have_names(ratio, told):
-    assert compression.part_told(ratio) == told
 
 
 @pytest.mark.parametrize(

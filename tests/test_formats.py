@@ -37,9 +37,9 @@ from a2tg_jax.io.model_file import number_in_file
 from a2tg_jax.results import init_file, run_training
 from a2tg_jax.results.folder import RunFolder, create_run
 from a2tg_jax.results.init_file import check_init, write_first_stage
+from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.results.run_training import RunOptions, begin_run
-from a2tg_jax.results.viewing import open_source
 
 OTHERS = [".ply", ".ksplat", *SUFFIXES]
 TEXTURES = "textures (--bake turns them into plain splats)"

@@ -15,8 +15,8 @@ from a2tg_jax.appearance import Billboards, allocate_appearance
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.model import Model
-from a2tg_jax.results.live_viewer import SECONDS, SHARE, LiveView, shown_live
 from a2tg_jax.results.run_training import unseen
+from a2tg_jax.results.viewing import SECONDS, SHARE, LiveView, shown_live
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.checkpoint import History
 from a2tg_jax.training.loop import never

@@ -29,12 +29,13 @@ from a2tg_jax.io.model_file import save_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
-from a2tg_jax.results import web_export
+from a2tg_jax.results import exporting
+from a2tg_jax.results.exporting import export_web, loss_text
 from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
+from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
-from a2tg_jax.results.viewing import ServedPhotographs, Source, open_source, routes_of
-from a2tg_jax.results.web_export import export_web, exported_text, loss_told
+from a2tg_jax.results.viewing import ServedPhotographs, routes_of
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serve, served
@@ -314,12 +315,12 @@ def test_a_folder_and_a_single_file(tmp_path):
     assert result.path == tmp_path / "site" / "index.html" and result.path.read_text(encoding="utf-8") == viewer_html()
     scene = (tmp_path / "site" / "scene.a2tgw").read_bytes()
     assert len(scene) == result.num_bytes and decode_web_scene(scene).model.num == source.model.num
-    assert list(result.losses) == ["were it a model of 30 dB"] and "dB of PSNR lost" in exported_text(result)
-    assert exported_text(result).endswith(f"{result.path}: {in_bytes(result.total_bytes)} with 2 files beside it")
+    assert list(result.losses) == ["were it a model of 30 dB"] and "dB of PSNR lost" in result.text
+    assert result.text.endswith(f"{result.path}: {in_bytes(result.total_bytes)} with 2 files beside it")
     assert (tmp_path / "site" / "photographs.json").read_bytes() == b"[]"
     for _ in range(2):  # The second time, it replaces the first.
         one = export_web(source, tmp_path / "one.html", overwrite=True)
-    assert exported_text(one).endswith(f"one.html: {in_bytes(one.path.stat().st_size)}")
+    assert one.text.endswith(f"one.html: {in_bytes(one.path.stat().st_size)}")
     assert one.path.read_text(encoding="utf-8") == viewer_html_with(scene)
     with pytest.raises(ValueError, match="no photographs"):
         export_web(source, tmp_path / "with", photographs=True)
@@ -338,7 +339,7 @@ def test_a_failed_export_leaves_the_photographs_of_the_old_page(tmp_path, monkey
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
-        patch.setattr(web_export, "replacing", full)
+        patch.setattr(exporting, "replacing", full)
         export_web(source, tmp_path, overwrite=True)
     assert old.is_file()
     export_web(source, tmp_path, overwrite=True)
@@ -346,8 +347,8 @@ def test_a_failed_export_leaves_the_photographs_of_the_old_page(tmp_path, monkey
 
 
 def test_a_gain_is_not_called_a_loss():
-    assert loss_told(0.0671) == "0.067 dB of PSNR lost"
-    assert loss_told(-0.0671) == "0.067 dB of PSNR gained"
+    assert loss_text(0.0671) == "0.067 dB of PSNR lost"
+    assert loss_text(-0.0671) == "0.067 dB of PSNR gained"
 
 
 def test_a_page_of_someone_else_is_not_replaced(tmp_path):

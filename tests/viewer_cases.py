@@ -23,7 +23,7 @@ from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderOutput
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.viewing import Source
+from a2tg_jax.results.model_source import Source
 from a2tg_jax.texture import textures_from_arrays
 
 NUM = 300

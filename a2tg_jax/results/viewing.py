@@ -33,6 +33,8 @@ from a2tg_jax.web.server import Route, served
 JPEG_QUALITY = 90
 SECONDS = 3.0
 """Shortest time between two snapshots in seconds."""
+NOTED_SECONDS = 0.5
+"""Time between two updates of the figures."""
 SHARE = 0.03
 """Largest share of the time that snapshots take."""
 WAIT = 0.1
@@ -105,7 +107,7 @@ class LiveView:
         now: a clock in seconds.
         """
         self._scene, self._title, self._now = scene, title, now
-        self._due = -np.inf
+        self._due = self._noted = -np.inf
         self._paused, self._lock = threading.Event(), threading.Lock()
         self._encoder: threading.Thread | None = None
         self._scene_bytes: bytes | None = None
@@ -113,18 +115,8 @@ class LiveView:
 
     def __call__(self, run: StageRun, is_stopped: IsStopped) -> float:
         """Record metrics, take a snapshot when one is due, and wait while the training is paused."""
-        history = run.history
-        found: dict[str, Any] = {"stage": run.stage.name, "iterations": run.stage.iterations}
-        if len(history.iteration):
-            found |= {
-                "iteration": int(history.iteration[-1]),
-                "loss": float(history.loss[-1]),
-                "psnr": float(history.psnr[-1]),
-                "num": int(history.num_gaussians[-1]),
-                "bytes": float(history.megabytes[-1]) * 1e6,
-            }
-        with self._lock:
-            self._status |= found
+        if self._now() >= self._noted + NOTED_SECONDS:
+            self._note(run)
         is_free = self._encoder is None or not self._encoder.is_alive()
         if is_free and (self._now() >= self._due or self._paused.is_set()):
             began = self._now()
@@ -153,6 +145,20 @@ class LiveView:
     def _status_json(self) -> bytes:
         with self._lock:
             return json.dumps(self._status | {"is_paused": self._paused.is_set()}).encode()
+
+    def _note(self, run: StageRun) -> None:
+        history, self._noted = run.history, self._now()  # A long history takes time to put together.
+        found: dict[str, Any] = {"stage": run.stage.name, "iterations": run.stage.iterations}
+        if len(history.iteration):
+            found |= {
+                "iteration": int(history.iteration[-1]),
+                "loss": float(history.loss[-1]),
+                "psnr": float(history.psnr[-1]),
+                "num": int(history.num_gaussians[-1]),
+                "bytes": float(history.megabytes[-1]) * 1e6,
+            }
+        with self._lock:
+            self._status |= found
 
     def _encode(self, model: Model, began: float) -> None:
         try:
