@@ -25,7 +25,6 @@ from a2tg_jax.results.forecast import (
     bytes_allowed,
     forecast_run,
     print_forecast,
-    print_quicker,
     quick_flags,
     room_for_photographs,
 )
@@ -104,22 +103,23 @@ def test_rows_and_bytes_are_those_that_training_reaches():
 
 def test_advice_for_splats_of_a_file_is_a_smaller_file():
     scene, system = scene_of(24, 16), a2tg.A2tg.preset("smoke")
-    own = plan_run({"a": system})
+    record = RunRecord(SceneSource("synthetic"), "a2tg", system)
     with pytest.raises(ValueError, match=r"change the --init file \(to a smaller one\), "):
-        print_forecast(scene, own, 3 * 10**9, num_given=10**7)
+        print_forecast(scene, record, 3 * 10**9, num_given=10**7)
 
 
 def test_splats_of_a_file_are_forecast_in_place_of_the_first_stage():
     scene, system = scene_of(24, 16), a2tg.A2tg.preset("smoke")
     first, second = forecast_stages(scene, system, 10**6)
     assert (first.num_rows, first.is_trained, first.seconds, second.num_rows) == (10**6, False, 0, 10**6)
-    plan = plan_run({"a": system, "b": a2tg.Gaussians2d.preset("smoke")})
-    own, given = (forecast_run(scene, plan, num) for num in (None, 10**6))
-    assert own.phases.keys() - given.phases.keys() == {"a-gaussians"}
-    assert given.phases["b-gaussians"].model == own.phases["b-gaussians"].model
+    record = RunRecord(SceneSource("synthetic"), "a2tg", system, ("gaussians-2d",), "smoke")
+    own, given = (forecast_run(scene, record.plan, num) for num in (None, 10**6))
+    assert own.phases.keys() - given.phases.keys() == {"a2tg-gaussians"}
+    other = "gaussians-2d-gaussians"
+    assert given.phases[other].model == own.phases[other].model
     assert given.disk_bytes > own.disk_bytes + 10**6 * 232
-    with pytest.raises(ValueError, match="a-textures: program"):
-        print_forecast(scene, plan, 10**9, num_given=10**6)
+    with pytest.raises(ValueError, match="a2tg-textures: program"):
+        print_forecast(scene, record, 10**9, num_given=10**6)
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -227,30 +227,26 @@ def test_a_system_names_its_own_limit(system, option):
         ("quick", (320, 213), None),
     ],
 )
-def test_a_long_run_is_told_what_is_quicker(monkeypatch, capsys, preset, size, flags):
+def test_a_long_run_is_told_what_is_quicker(monkeypatch, capsys, tmp_path, preset, size, flags):
     monkeypatch.setattr("a2tg_jax.training.cost.num_threads", lambda: 2)
+    monkeypatch.setattr(forecast, "memory_limit", lambda: 10**12)
     record = RunRecord(SceneSource("fox", downscale=2), "a2tg", a2tg.A2tg.preset(preset), preset=preset)
-    print_quicker(scene_of(*size), record)
-    text = capsys.readouterr().out
-    assert (text == "") == (flags is None)
-    assert flags is None or (f"quicker: {flags} takes very roughly " in text and " h" not in text)
+    print_forecast(scene_of(*size), record, None, out=tmp_path)
+    assert (f"\nquicker: {flags} takes minutes\n" in capsys.readouterr().out) == (flags is not None)
+    print_forecast(scene_of(*size), record, None)
+    assert "quicker" not in capsys.readouterr().out, "a resumed run keeps its options"
 
 
 def test_the_downscale_of_quick_runs():
-    assert [quick_flags(side)[2:] for side in (100, 640, 641, 4000)] == [
-        [],
-        [],
-        ["--downscale", "2"],
-        ["--downscale", "7"],
-    ]
+    downscales = {100: "", 640: "", 641: " --downscale 2", 4000: " --downscale 7"}
+    assert {side: quick_flags(side).removeprefix("--preset quick") for side in downscales} == downscales
 
 
 def test_what_is_told():
     told = forecast_with(program=0.5e9, photographs=1e9, model=2e6, pixels=0).text(8e9)
     assert "about 1.50 GB at the peak (a-gaussians: program 500 MB, photographs 1.00 GB, model 2.00 MB" in told
     assert "8.00 GB may be used" in told and "about 3.00 MB in the run folder" in told
-    assert "very roughly 5 min to 20 min of training" in told
-    assert ", and 2 min to 8 min of compiling 40 programs;" in told  # 3 to 12 s each.
+    assert "very roughly 7 min to 28 min on " in told  # 40 programs take 6 s each.
     assert "time" not in dataclasses.replace(forecast_with(), seconds=0).text(8e9)
 
 
@@ -271,18 +267,18 @@ def test_the_model_must_fit_on_one_of_several_devices(monkeypatch):
     monkeypatch.setattr(forecast, "memory_limit", lambda: 10**12)
     scene, capped = scene_of(24, 16), a2tg.Mcmc(cap=10**6)
     pruned = a2tg.Gaussians2dMcmc(densify=capped, prune=Prune(share=0.1, at=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)))
-    found = run_of(scene, pruned)
+    record, found = RunRecord(SceneSource("synthetic"), "gaussians-2d-mcmc", pruned), run_of(scene, pruned)
     assert max(found.whole.values()) == (1 + 4) * 232 * 10**6
     for devices, own in ((1, 4), (4, 1)):
         (plain,) = forecast_stages(scene, Capped(growth=capped), num_devices=devices)
         assert plain.whole_bytes == (1 + own) * plain.model_bytes
     with pytest.raises(ValueError, match=r"the model of .* must fit on one device: .* change densify.cap"):
         found.check_one_device(2e8)
-    print_forecast(scene, plan_run({"a": pruned}), None, 2)
+    print_forecast(scene, record, None, 2)
     monkeypatch.setattr(RunForecast, "check_memory", lambda found, limit: None)
     with pytest.raises(ValueError, match="must fit on one device"):
-        print_forecast(scene, plan_run({"a": pruned}), 2 * 10**8, 2)
-    print_forecast(scene, plan_run({"a": pruned}), 2 * 10**8)
+        print_forecast(scene, record, 2 * 10**8, 2)
+    print_forecast(scene, record, 2 * 10**8)
 
 
 @pytest.mark.parametrize(("batch_size", "at_once"), [(4, 4), (6, 2), (3, 1)])
@@ -343,7 +339,7 @@ def test_photographs_get_a_quarter_of_what_is_allowed():
 
 def test_what_a_run_needs_is_printed(capsys, monkeypatch):
     monkeypatch.setattr(forecast, "memory_limit", lambda: 64 * 10**9)
-    print_forecast(scene_of(24, 16), plan_run({"a": a2tg.A2tg.preset("smoke")}), None)
+    print_forecast(scene_of(24, 16), RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg.preset("smoke")), None)
     memory_line, disk_line, time_line = capsys.readouterr().out.splitlines()
     assert memory_line.startswith("memory: about ") and memory_line.endswith("64.0 GB may be used")
     assert disk_line.startswith("disk: about ") and time_line.startswith("time: very roughly ")

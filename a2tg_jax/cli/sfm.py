@@ -71,7 +71,7 @@ class Sfm:
         save_camera_picture(out, out / CAMERA_PICTURE)
         print(_told(found))
         run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
-        command = shlex.join([*run, *quick_flags(found.longest_side)])
+        command = f"{shlex.join(run)} {quick_flags(found.longest_side)}"
         print(f"cameras: {out / CAMERA_PICTURE}\nscene: {out}; continue with: {command}")
 
     def _places(self) -> tuple[list[Path], Path]:

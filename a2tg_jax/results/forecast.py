@@ -28,7 +28,6 @@ from a2tg_jax.training.cost import (
     StageForecast,
     forecast_stages,
     held_bytes,
-    iteration_seconds,
     largest_view,
 )
 
@@ -76,6 +75,8 @@ class RunForecast:
     """Bytes that one of several devices must have room for, by stage (`StageForecast.whole_bytes`)."""
     num_programs: int = 0
     """Steps that are compiled, as far as events say."""
+    quicker: str = ""
+    """Flags with which the run takes less time; empty if there are none."""
 
     @property
     def peak(self) -> tuple[str, Bytes]:
@@ -91,11 +92,13 @@ class RunForecast:
             f"disk: about {in_bytes(self.disk_bytes)} in the run folder",
         ]
         if self.seconds:
+            seconds = self.seconds + PROGRAM_SECONDS * self.num_programs
             lines.append(
-                f"time: very roughly {_between(self.seconds)} of training on {counted(num_threads(), 'core')}, and "
-                f"{_between(PROGRAM_SECONDS * self.num_programs)} of compiling {counted(self.num_programs, 'program')};"
-                " the first steps of each stage give a better estimate"
+                f"time: very roughly {_duration(seconds / ROUGHLY)} to {_duration(seconds * ROUGHLY)} on "
+                f"{counted(num_threads(), 'core')}; the first steps of each stage give a better estimate"
             )
+            if seconds * ROUGHLY > LONG and self.quicker:
+                lines.append(f"quicker: {self.quicker} takes minutes")
         return "\n".join(lines)
 
     def check_memory(self, limit: float) -> None:
@@ -150,7 +153,10 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
       num_devices: number of devices that train together; memory is the sum over all of them.
     """
     is_host = default_platform() == "cpu"
-    stages = _stages(scene, plan, num_given, num_devices)
+    stages: dict[str, StageForecast] = {}
+    for chain in plan.chains.values():
+        num = num_given if chain[0] == plan.main[0] else None
+        stages |= zip(chain, forecast_stages(scene, plan[chain[-1]].system, num, num_devices), strict=True)
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
     for name, stage in stages.items():
         if stage.is_trained:
@@ -181,64 +187,36 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     )
 
 
-def _stages(scene: Scene, plan: RunPlan, num_given: int | None, num_devices: int = 1) -> dict[str, StageForecast]:
-    """Return the forecast of every stage, by name."""
-    found: dict[str, StageForecast] = {}
-    for chain in plan.chains.values():
-        num = num_given if chain[0] == plan.main[0] else None
-        forecasts = forecast_stages(scene, plan[chain[-1]].system, num, num_devices)
-        found |= dict(zip(chain, forecasts, strict=True))
-    return found
-
-
 def print_forecast(
-    scene: Scene, plan: RunPlan, max_memory: int | None, num_devices: int = 1, num_given: int | None = None,
+    scene: Scene, record: RunRecord, max_memory: int | None, num_devices: int = 1, num_given: int | None = None,
     out: Path | None = None,
 ) -> None:  # fmt: skip
     """Print the forecast of a run. Arguments as in `forecast_run`, and:
 
     Args:
+      record: its systems and the downscale of its photographs.
       max_memory: bytes that the run may use; None: what the machine has available.
-      out: folder of a new run, whose disk must have room for it.
+      out: folder of a new run, whose disk must have room for it; None: the run is resumed.
 
     Raises:
       ValueError: if the run cannot fit, naming the options to change.
     """
-    found, limit = forecast_run(scene, plan, num_given, num_devices), allowed_memory(max_memory, num_devices)
-    if out is not None:
-        found.check_disk(out)
+    found, limit = forecast_run(scene, record.plan, num_given, num_devices), allowed_memory(max_memory, num_devices)
     found.check_memory(limit)
     if num_devices > 1:
         found.check_one_device(allowed_memory(max_memory))
+    if out is not None:
+        found.check_disk(out)
+        side = max(max(view.camera.width, view.camera.height) for view in scene.train)
+        if QUICK in type(record.system).presets() and (record.preset != QUICK or side > QUICK_SIDE):
+            found = dataclasses.replace(found, quicker=quick_flags(side, record.scene.downscale))
     print(found.text(limit), flush=True)
 
 
-def quick_flags(longest_side: int, downscale: int = 1) -> list[str]:
+def quick_flags(longest_side: int, downscale: int = 1) -> str:
     """Return the flags of a quick training with photographs of this longer side, already downscaled by a factor."""
     downscale *= max(1, math.ceil(longest_side / QUICK_SIDE))
-    return ["--preset", QUICK, *(["--downscale", str(downscale)] if downscale > 1 else [])]
-
-
-def print_quicker(scene: Scene, record: RunRecord, num_given: int | None = None) -> None:
-    """Print the flags that make a long run on CPUs quicker, with their forecast; nothing for other runs."""
-    seconds = forecast_run(scene, record.plan, num_given).seconds
-    presets = type(record.system).presets()
-    if seconds * ROUGHLY <= LONG or QUICK not in presets:
-        return
-    side = max(max(view.camera.width, view.camera.height) for view in scene.train)
-    system = dataclasses.replace(presets[QUICK], memory_budget=record.system.memory_budget)
-    plan = dataclasses.replace(record, system=system, preset=QUICK).plan
-    forecasts, further = _stages(scene, plan, num_given), max(1, math.ceil(side / QUICK_SIDE))
-    quick_seconds = sum(
-        planned.stage.iterations
-        * planned.system.batch_size
-        * iteration_seconds(scene.train, forecasts[planned.name].num_rows, further)
-        for planned in plan.stages
-        if forecasts[planned.name].is_trained
-    )
-    if quick_seconds <= seconds / 2:
-        flags = " ".join(quick_flags(side, record.scene.downscale))
-        print(f"quicker: {flags} takes very roughly {_between(quick_seconds)}", flush=True)
+    return f"--preset {QUICK}" + (f" --downscale {downscale}" if downscale > 1 else "")
 
 
 def bytes_allowed(max_memory: float | str | None) -> int | None:
@@ -264,11 +242,6 @@ def _parts(needed: Bytes) -> str:
     """Return the parts of the memory in words; corrections only if there are any."""
     parts = needed._asdict()
     return ", ".join(f"{name} {in_bytes(size)}" for name, size in parts.items() if size or name != "corrections")
-
-
-def _between(seconds: float) -> str:
-    """Return the shortest and the longest time of a rough estimate."""
-    return f"{_duration(seconds / ROUGHLY)} to {_duration(seconds * ROUGHLY)}"
 
 
 def _duration(seconds: float) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.text import in_bytes, shortened
+from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.results.folder import RunFolder, iteration_of, old_run, read_json, resuming_command
 from a2tg_jax.results.record import read_record, repeating_command
@@ -51,8 +51,11 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
     Raises:
       ValueError: if run.toml is damaged or of another version.
     """
-    record = read_record(run)
-    measured, damage = _psnrs_or_damage(run.metrics)
+    record, measured, damage = read_record(run), dict[str, dict[str, float]](), None
+    try:
+        measured = read_psnrs(run.metrics) if is_regular(run.metrics) else {}
+    except ValueError as error:
+        damage = str(error)
     names = record.plan.names
     return {
         "path": str(run.path),
@@ -63,7 +66,7 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
         "is_finished": all(is_regular(run.model(name)) for name in names),
         "stages": [{"name": name, **_stage_facts(run, name), "psnr": measured.get(name)} for name in names],
         "report": str(run.report) if run.report.is_file() else None,
-        "damage": damage or None,
+        "damage": damage,
     }
 
 
@@ -73,26 +76,15 @@ def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
     Raises:
       ValueError: if the file holds anything else in their place.
     """
-    data = read_json(path)
-    models = data.get("models") if isinstance(data, dict) else None
-    if not isinstance(models, dict):
-        raise ValueError(f"{path}: has no models")
-    psnrs: dict[str, dict[str, float]] = {}
-    for name, model in models.items():
-        splits = {split: model[split] for split in SPLITS if split in model} if isinstance(model, dict) else None
-        found = None if splits is None else [isinstance(x, dict) and x.get("psnr") for x in splits.values()]
-        if splits is None or found is None or not all(type(psnr) in (int, float) for psnr in found):
-            raise ValueError(f"{path}: has no PSNR of {shortened(name)}")
-        psnrs[name] = {split: float(psnr) for split, psnr in zip(splits, found, strict=True)}  # type: ignore[arg-type]
-    return psnrs
-
-
-def _psnrs_or_damage(path: Path) -> tuple[dict[str, dict[str, float]], str]:
-    """Return the PSNR in a metrics.json, and what is wrong with the file; nothing without a file."""
+    data, psnrs = read_json(path), dict[str, dict[str, float]]()
     try:
-        return (read_psnrs(path) if is_regular(path) else {}), ""
-    except ValueError as error:
-        return {}, str(error)
+        for name, model in data["models"].items():
+            psnrs[name] = {split: model[split]["psnr"] for split in SPLITS if split in model}
+            if not all(type(psnr) in (int, float) for psnr in psnrs[name].values()):
+                raise TypeError
+    except (KeyError, TypeError, AttributeError):
+        raise ValueError(f"{path}: has no PSNR of its models") from None
+    return psnrs
 
 
 def _stage_facts(run: RunFolder, name: str) -> dict[str, Any]:

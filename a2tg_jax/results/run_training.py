@@ -29,7 +29,7 @@ from a2tg_jax.results.folder import (
     resuming_command,
     set_aside,
 )
-from a2tg_jax.results.forecast import print_forecast, print_quicker, room_for_photographs
+from a2tg_jax.results.forecast import print_forecast, room_for_photographs
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.init_file import check_init, write_first_stage
 from a2tg_jax.results.plan import PlannedStage
@@ -111,8 +111,7 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
         check_start(scene, system, num_given if system is record.system else None)
     if record.system.small_budget:
         warnings.warn(f"{record.system.small_budget}; it is in bytes of the model, such as 20MB", stacklevel=2)
-    print_forecast(scene, record.plan, options.max_memory, options.session.num_devices, num_given, out)
-    print_quicker(scene, record, num_given)
+    print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given, out)
     run = RunFolder(out)
     with claimed(run):
         check_free(out, overwrite=options.overwrite)  # Another process may have been here meanwhile.
@@ -135,7 +134,7 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
         if not first.is_file():
             write_first_stage(run, record, load_splats(Path(record.init)), scene)
         num_given = number_in_file(first)
-    print_forecast(scene, record.plan, options.max_memory, options.session.num_devices, num_given)
+    print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given)
     return _train_and_measure(run, record, scene, options)
 
 
