@@ -716,7 +716,7 @@ def test_render_tells_ffmpeg_the_rate_and_the_frames(tmp_path, monkeypatch):
         "run",
         lambda command, **_: asked.append(command) or Path(command[-1]).touch() or subprocess.CompletedProcess([], 0),
     )
-    assert frames.write_video(paths, tmp_path / "flight.mp4", frames_per_second=12)
+    assert frames.write_video(paths, frames_per_second=12) == tmp_path / "flight.mp4"
     words = dict(itertools.pairwise(asked[0]))
     assert (words["-framerate"], words["-frames:v"]) == ("12", "5")
     assert words["-i"] == str(tmp_path / "frame_%04d.png")

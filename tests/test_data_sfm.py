@@ -20,7 +20,7 @@ from a2tg_jax.data.photo_folder import find_photos
 from a2tg_jax.data.sfm_database import join_rig, list_images
 from a2tg_jax.data.staging import _link, _prefixes, stage
 from a2tg_jax.host import progress_bars
-from a2tg_jax.results.camera_picture import save_camera_picture
+from a2tg_jax.results.figures import save_camera_picture
 
 
 def save_photos(folder, num_photos, width, height):

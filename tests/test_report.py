@@ -26,18 +26,21 @@ from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import Geometry
 from a2tg_jax.render import RenderOutput, RenderSettings
-from a2tg_jax.results.figures import ReportFigure, curves_figure, save_figure, sizes_figure
-from a2tg_jax.results.folder import create_run
-from a2tg_jax.results.images import largest_gain, save_animation
-from a2tg_jax.results.model_pictures import (
+from a2tg_jax.results.figures import (
     FLIGHT_FRAMES,
     TEXTURE_SIDE,
+    ReportFigure,
+    curves_figure,
     depth_picture,
     flight,
     learned_textures,
     level_maps,
     normal_picture,
+    save_figure,
+    sizes_figure,
 )
+from a2tg_jax.results.folder import create_run
+from a2tg_jax.results.images import largest_gain, save_animation
 from a2tg_jax.results.report import SECTIONS, Comparison, write_report
 from a2tg_jax.results.summary import ModelResult
 from a2tg_jax.texture import textures_from_arrays

@@ -18,7 +18,6 @@ from a2tg_jax.results.frames import (
     parse_size,
     render_frames,
     video_name,
-    write_animation,
     write_video,
 )
 
@@ -84,15 +83,9 @@ class Render:
         )
         print(f"wrote {counted(len(paths), 'frame')} to {out}/")
         if self.path != "test":
-            self._write_video(out, paths)
-
-    def _write_video(self, out: Path, frames: list[Path]) -> None:
-        """Write an MP4, or an animated WebP without ffmpeg."""
-        video = out / video_name()
-        if video.suffix == ".mp4":
-            write_video(frames, video, frames_per_second=self.fps)
-            print(f"video: {video}")
-            return
-        print("no video: ffmpeg is not installed; install it for MP4 (apt install ffmpeg, brew install ffmpeg)")
-        write_animation(frames, video, frames_per_second=self.fps)
-        print(f"animation: {video}")
+            video = write_video(paths, frames_per_second=self.fps)
+            if video.suffix == ".mp4":
+                print(f"video: {video}")
+                return
+            print("no video: ffmpeg is not installed; install it for MP4 (apt install ffmpeg, brew install ffmpeg)")
+            print(f"animation: {video}")

@@ -16,8 +16,8 @@ from a2tg_jax.data.photo_folder import holds_photos, is_video
 from a2tg_jax.data.sfm_database import CameraModel, Matching
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
-from a2tg_jax.results.camera_picture import save_camera_picture
 from a2tg_jax.results.checks import check_apart, check_output
+from a2tg_jax.results.figures import save_camera_picture
 from a2tg_jax.results.forecast import quick_flags
 
 

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import LastModel
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
-from a2tg_jax.results.checks import check_new, check_not_source, check_output, check_separate
+from a2tg_jax.results.checks import check_apart, check_new, check_not_source, check_output
 from a2tg_jax.results.exporting import check_page, check_ply, export_ply, export_web
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.viewing import routes_of, shown_live
@@ -116,7 +116,7 @@ class Export:
         check_output(web)
         files = check_page(web, single_file=self.single_file, photographs=self.photographs, overwrite=self.overwrite)
         if self.ply is not None:
-            check_separate(files[0], self.ply, "--web and --ply")  # A PLY file may be in the folder of a page.
+            check_apart(files[0], self.ply)  # A PLY file may be in the folder of a page.
         check_not_source(files, self.source, "--web")
 
 

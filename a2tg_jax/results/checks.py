@@ -42,18 +42,11 @@ def check_output(path: Path) -> None:
         print(f"a2tg: {missing[-1]} does not exist and will be made", file=sys.stderr)
 
 
-def check_apart(out: Path, source: Path) -> None:
-    """Raise ValueError if one of two folders, one to read and one to write, lies in the other."""
-    written, read = out.resolve(), source.resolve()
-    if written.is_relative_to(read) or read.is_relative_to(written):
-        raise ValueError(f"{out} and {source} overlap: choose an output folder outside it")
-
-
-def check_separate(first: Path, second: Path, flags: str) -> None:
-    """Raise ValueError if two outputs are one path, or one lies in the other, naming their flags."""
-    one, other = first.resolve(), second.resolve()
-    if one.is_relative_to(other) or other.is_relative_to(one):
-        raise ValueError(f"{flags} must lie apart; got {first} and {second}")
+def check_apart(out: Path, other: Path) -> None:
+    """Raise ValueError if one of two paths, at least one of which is written, is in the other."""
+    one, two = out.resolve(), other.resolve()
+    if one.is_relative_to(two) or two.is_relative_to(one):
+        raise ValueError(f"{out} and {other} overlap: choose an output folder outside it")
 
 
 def check_new(path: Path, flag: str, *, overwrite: bool) -> None:

@@ -155,8 +155,17 @@ def video_name() -> str:
     return "flight.mp4" if shutil.which("ffmpeg") else "flight.webp"
 
 
-def write_animation(frames: Sequence[Path], path: Path, *, frames_per_second: float = FRAMES_PER_SECOND) -> None:
-    """Make an animated WebP of some frames, which loops. Memory holds one frame at a time."""
+def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER_SECOND) -> Path:
+    """Make a video of a flight next to its frames, with ffmpeg or, without it, as an animated WebP, which loops.
+
+    Args:
+      frames: frame_0000.png … of one folder, without a gap.
+      frames_per_second: its rate.
+
+    Raises:
+      ValueError: if ffmpeg fails.
+    """
+    path, program = frames[0].with_name(video_name()), shutil.which("ffmpeg")
 
     def opened() -> Iterator[Image.Image]:
         for frame in frames:
@@ -165,32 +174,17 @@ def write_animation(frames: Sequence[Path], path: Path, *, frames_per_second: fl
                 yield image
 
     with FrameFolder(path.parent).writing(path.name) as temporary:
-        save_animation(temporary, opened(), frames_per_second, quality=WEBP_QUALITY)
-
-
-def write_video(frames: Sequence[Path], path: Path, *, frames_per_second: float = FRAMES_PER_SECOND) -> bool:
-    """Make an mp4 of a flight with ffmpeg; return False if ffmpeg is not installed.
-
-    Args:
-      frames: frame_0000.png … of one folder, without a gap.
-      path: the video.
-      frames_per_second: its rate.
-
-    Raises:
-      ValueError: if ffmpeg fails.
-    """
-    program = shutil.which("ffmpeg")
-    if program is None:
-        return False
-    even_sides = "pad=ceil(iw/2)*2:ceil(ih/2)*2"
-    source = ["-framerate", str(frames_per_second), "-i", str(frames[0].with_name(FRAME_NAME))]
-    made = ["-frames:v", str(len(frames)), "-vf", even_sides, "-pix_fmt", "yuv420p", "-f", "mp4"]
-    with FrameFolder(path.parent).writing(path.name) as temporary:
+        if program is None:
+            save_animation(temporary, opened(), frames_per_second, quality=WEBP_QUALITY)
+            return path
+        even_sides = "pad=ceil(iw/2)*2:ceil(ih/2)*2"
+        source = ["-framerate", str(frames_per_second), "-i", str(frames[0].with_name(FRAME_NAME))]
+        made = ["-frames:v", str(len(frames)), "-vf", even_sides, "-pix_fmt", "yuv420p", "-f", "mp4"]
         command = [program, "-y", "-loglevel", "error", *source, *made, str(temporary)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise ValueError(f"ffmpeg could not make {path}: {done.stderr.strip()}")
-    return True
+    return path
 
 
 def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tuple[str, Camera]]:

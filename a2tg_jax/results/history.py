@@ -4,7 +4,7 @@ import csv
 import importlib
 import importlib.util
 import io
-from collections.abc import Iterator
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -48,32 +48,22 @@ def read_history(path: Path) -> History:
         raise FileNotFoundError(f"{path} is missing: put it back, or train the stage again")
     with io.TextIOWrapper(open_regular(path, MOST_BYTES), encoding="utf-8", newline="") as file:
         try:
-            rows = csv.reader(file)
-            first = next(rows, [])
+            first = file.readline().rstrip("\r\n").split(",")
             terms = first[len(NAMES) :]
             if tuple(first[: len(NAMES)]) != NAMES or not all(name.startswith(TERM) for name in terms):
                 raise ValueError(f"has the columns {shortened(', '.join(first))}; {', '.join(NAMES)} are wanted")
             if len({*terms}) < len(terms):
                 raise ValueError(f"has a column twice: {shortened(', '.join(terms))}")
-            values = np.fromiter(_numbers(rows, len(first)), np.dtype((np.float64, len(first))))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # A history may be empty.
+                values = np.loadtxt(file, delimiter=",", comments=None, ndmin=2).reshape(-1, len(first))
             is_large = np.abs(values[:, [name != "psnr" for name in first]]) > LARGEST
             if np.isnan(values[:, : len(NAMES)]).any() or is_large.any():
                 raise ValueError("has numbers that are not finite")
-        except (ValueError, csv.Error) as error:
+        except ValueError as error:
             raise ValueError(f"{path}: {shortened(str(error), 200)}; train the stage again") from error
-    return History.of_columns({name: values[:, i].astype(_dtype(name)) for i, name in enumerate(first)})
-
-
-def _numbers(rows: Iterator[list[str]], num: int) -> Iterator[tuple[float, ...]]:
-    """Yield the numbers of each row."""
-    for number, row in enumerate(rows, 1):
-        if len(row) != num:
-            raise ValueError(f"row {number} has {len(row)} of {num} columns")
-        yield tuple(map(float, row))
-
-
-def _dtype(name: str) -> type:
-    return np.int64 if name in INTEGERS else np.float64
+    columns = {name: values[:, place] for place, name in enumerate(first)}
+    return History.of_columns(columns | {name: columns[name].astype(np.int64) for name in INTEGERS})
 
 
 def check_tensorboard() -> None:

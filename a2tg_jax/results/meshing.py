@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.data import view_image
 from a2tg_jax.host.machine import memory_limit
 from a2tg_jax.host.progress_bars import progress_over
@@ -17,7 +18,6 @@ from a2tg_jax.mesh.atlas import check_texture
 from a2tg_jax.mesh.blocks import GridFullError
 from a2tg_jax.mesh.extract import (
     MOST_CLUSTERS,
-    MeshResult,
     NoSurfaceError,
     check_lengths,
     extract_mesh,
@@ -26,7 +26,6 @@ from a2tg_jax.mesh.extract import (
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
 from a2tg_jax.mesh.simplify import check_simplifying, simplify_mesh
 from a2tg_jax.mesh.texturing import Picture, texture_mesh
-from a2tg_jax.mesh.triangles import Mesh
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.model_source import Source
 
@@ -101,25 +100,49 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
     origin = source.model.origin
     if origin is None or not origin.names:
         raise ValueError(f"{source.title} has no cameras to fuse depths from; give a run folder, or a model of a run")
-    pictures = _pictures(source, options.texture)
-    result = _extracted(source, options)
+    pictures = _photographs(source, origin) if options.texture == "photographs" else _renders(source)
+    scale, megabytes = origin.transform.scale, megabytes_of(options.max_memory, "max_memory")
+    try:
+        result = extract_mesh(
+            source.model,
+            resolution=options.resolution,
+            voxel=None if options.voxel is None else options.voxel * scale,
+            radius=None if options.radius is None else options.radius * scale,
+            unbounded=options.unbounded,
+            most_clusters=options.clusters,
+            max_bytes=int(GRID_SHARE * memory_limit()) if megabytes is None else bytes_of(megabytes),
+            settings=source.settings,
+            progress=True,
+        )
+    except GridFullError as error:
+        raise ValueError(f"{str(error).partition(': ')[0]}: {GRID_FULL}") from None
+    except NoSurfaceError as error:
+        raise ValueError(f"{error.told(scale)}: {SMALL_PARTS if error.num_dropped else NO_SURFACE}") from None
     mesh = result.mesh if options.most_faces is None else simplify_mesh(result.mesh, options.most_faces)
     if options.texture != "none":
         print(f"unwrapping {counted(mesh.num_faces, 'face')}", flush=True)
         mesh = texture_mesh(mesh, pictures, size=options.texture_size)
     files = save_mesh(out, mesh, origin.transform)
-    return _summary(result, mesh, origin.transform.scale, files, time.perf_counter() - start)
+    size = in_bytes(sum(file.stat().st_size for file in files))
+    texture = "" if mesh.texture is None else f", a texture of {mesh.texture.shape[1]} × {mesh.texture.shape[0]}"
+    return "\n".join(
+        [
+            f"fused {counted(result.num_views, 'view')} at voxels of {result.voxel / scale:.3g}, within "
+            f"{result.radius / scale:.3g} of the centre ({in_bytes(result.num_bytes)} of voxels)",
+            f"left out {counted(result.num_dropped, 'small part')}",
+            f"mesh: {mesh.num_vertices:,} vertices, {mesh.num_faces:,} faces{texture}, {size}, "
+            f"{time.perf_counter() - start:.0f} s",
+            f"file: {', '.join(map(str, files))}",
+        ]
+    )
 
 
-def _pictures(source: Source, kind: TextureSource) -> Iterator[Picture]:
-    """Return an iterator over the pictures of the training views. Photographs are looked for at once.
+def _photographs(source: Source, origin: Origin) -> Iterator[Picture]:
+    """Return an iterator over the photographs of the training views, which are looked for at once.
 
     Raises:
-      ValueError: if photographs are wanted and missing.
+      ValueError: if they are missing, or kept behind their lens.
     """
-    origin = source.model.origin
-    if kind != "photographs" or origin is None:
-        return _renders(source)
     scene = source.load_scene()
     if scene is None:
         raise ValueError(
@@ -128,8 +151,8 @@ def _pictures(source: Source, kind: TextureSource) -> Iterator[Picture]:
         )
     if any(view.camera.rays is not None for view in scene.train):
         raise ValueError(
-            f"the photographs of {source.title} are kept behind their lens (--lens keep), and a texture needs those of "
-            "pinholes: choose --texture renders"
+            f"the photographs of {source.title} are kept behind their lens (--lens keep), and a texture needs "
+            "pinhole photographs: choose --texture renders"
         )
     cameras = dict(zip(origin.names, origin.cameras, strict=True))
     views = [view for view in scene.train if view.name in cameras]
@@ -145,39 +168,3 @@ def _renders(source: Source) -> Iterator[Picture]:
     renderer = Renderer(source.model, cameras=cameras, settings=source.settings, has_geometry=False)
     for camera in progress_over(cameras, "texture", "view"):
         yield camera, np.asarray(renderer(camera).color), None
-
-
-def _extracted(source: Source, options: MeshOptions) -> MeshResult:
-    scale = 1.0 if source.model.origin is None else source.model.origin.transform.scale
-    megabytes = megabytes_of(options.max_memory, "max_memory")
-    try:
-        return extract_mesh(
-            source.model,
-            resolution=options.resolution,
-            voxel=None if options.voxel is None else options.voxel * scale,
-            radius=None if options.radius is None else options.radius * scale,
-            unbounded=options.unbounded,
-            most_clusters=options.clusters,
-            max_bytes=int(GRID_SHARE * memory_limit()) if megabytes is None else bytes_of(megabytes),
-            settings=source.settings,
-            progress=True,
-        )
-    except GridFullError as error:
-        raise ValueError(f"{str(error).partition(': ')[0]}: {GRID_FULL}") from None
-    except NoSurfaceError as error:
-        raise ValueError(f"{error.told(scale)}: {SMALL_PARTS if error.num_dropped else NO_SURFACE}") from None
-
-
-def _summary(result: MeshResult, mesh: Mesh, scale: float, files: list[Path], seconds: float) -> str:
-    """Return what was made, in lines."""
-    size = in_bytes(sum(file.stat().st_size for file in files))
-    texture = "" if mesh.texture is None else f", a texture of {mesh.texture.shape[1]} × {mesh.texture.shape[0]}"
-    return "\n".join(
-        [
-            f"fused {counted(result.num_views, 'view')} at voxels of {result.voxel / scale:.3g}, within "
-            f"{result.radius / scale:.3g} of the centre ({in_bytes(result.num_bytes)} of voxels)",
-            f"left out {counted(result.num_dropped, 'small part')}",
-            f"mesh: {mesh.num_vertices:,} vertices, {mesh.num_faces:,} faces{texture}, {size}, {seconds:.0f} s",
-            f"file: {', '.join(map(str, files))}",
-        ]
-    )

@@ -35,7 +35,7 @@ from a2tg_jax.results.init_file import check_init, write_first_stage
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, OnNan, RunRecord, read_record, write_record
 from a2tg_jax.results.run_evaluation import evaluate_run
-from a2tg_jax.results.several_processes import check_alike, tell_end, tell_stage
+from a2tg_jax.results.several_processes import check_alike, send_stage
 from a2tg_jax.results.summary import RunResult
 from a2tg_jax.training import (
     Checkpoint,
@@ -226,7 +226,7 @@ def train_run(
             write_history(run.own(run.history(planned.name)), result.history)
             save_model(run.own(run.model(planned.name)), result.model, {"system": system_to_dict(planned.system)})
         run.drop_old_checkpoints(planned.name, keep=0)
-    tell_end()
+    send_stage(None)
 
 
 def _train_stage(
@@ -258,7 +258,7 @@ def _train_stage(
         if start is not None:
             model = load_model(start)
             check_held_out(model, scene, start)
-        tell_stage(planned.name, resumed, start, num_restored)
+        send_stage(planned.name, [resumed, start], num_restored)
         try:
             return fit(
                 planned.system,

@@ -8,8 +8,8 @@ from PIL import Image
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.results.figures import with_flat_colors
 from a2tg_jax.results.images import side_by_side
-from a2tg_jax.results.model_pictures import with_flat_colors
 
 LEAST_WIDTH = 300
 """Least width of an image in a sheet, in pixels."""
