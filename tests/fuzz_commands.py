@@ -17,10 +17,11 @@ REACHED = "all was read"
 
 def write_runs(folder: Path) -> None:
     """A finished run of every system, each with its record, history, metrics and models."""
+    from run_folders import create_run
     from small_models import some_model
 
     from a2tg_jax import save_model
-    from a2tg_jax.results.folder import create_run, write_json
+    from a2tg_jax.results.folder import write_json
     from a2tg_jax.results.history import write_history
     from a2tg_jax.results.record import RunRecord, SceneSource, chosen_system, write_record
     from a2tg_jax.training import History

@@ -19,6 +19,7 @@ import jax
 import numpy as np
 import pytest
 from PIL import Image
+from run_folders import create_run
 
 from a2tg_jax.cli import doctor, main as cli
 from a2tg_jax.cli.train import train_defaults
@@ -29,7 +30,7 @@ from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.results import exporting, finishing, frames, run_training
-from a2tg_jax.results.folder import RunFolder, create_run
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.frames import LIST, FrameFolder
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.model_source import open_source

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from run_folders import create_run
 from small_values import some_gaussians
 
 from a2tg_jax import (
@@ -35,7 +36,7 @@ from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_b
 from a2tg_jax.io.gaussforge_files import SUFFIXES
 from a2tg_jax.io.model_file import number_in_file
 from a2tg_jax.results import init_file, run_training
-from a2tg_jax.results.folder import RunFolder, create_run
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.init_file import check_init, write_first_stage
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from run_folders import create_run
 from small_values import some_gaussians
 
 from a2tg_jax import (
@@ -21,7 +22,6 @@ from a2tg_jax import (
 )
 from a2tg_jax.appearance import Appearance, Exponents, Texture, allocate_appearance, template_of
 from a2tg_jax.appearance.parts import nearest_gaussians
-from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.init_file import check_init, write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training.cost import forecast_stages

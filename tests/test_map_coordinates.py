@@ -9,6 +9,7 @@ import zipfile
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from run_folders import create_run
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
@@ -17,7 +18,6 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.io.gaussforge_files import SUFFIXES
-from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.init_file import write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource
 

@@ -9,13 +9,13 @@ import os
 import numpy as np
 import pytest
 from PIL import Image
+from run_folders import create_run
 
 from a2tg_jax import save_model, synthetic_scene
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.arguments import flag_with_value, in_flags, typed_paths
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.results import run_training
-from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training.start import initial_model

@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from run_folders import create_run
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import MovableKernels, allocate_appearance
@@ -15,7 +16,6 @@ from a2tg_jax.cli import main as cli, mesh
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.results.checks import check_export, check_new, check_output
-from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.forecast import RunForecast
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record

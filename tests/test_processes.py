@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 from on_processes import SHORT, ended, free_port, pair, started, survivor_of, trainings
+from run_folders import create_run
 
 import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli
@@ -23,7 +24,7 @@ from a2tg_jax.io.model_file import load_model
 from a2tg_jax.parallel import processes, rows
 from a2tg_jax.parallel.processes import LOST, Liveness, accept, connect, is_of_collectives, listen
 from a2tg_jax.results import several_processes
-from a2tg_jax.results.folder import RunFolder, create_run, resuming_command
+from a2tg_jax.results.folder import RunFolder, resuming_command
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.training import Session, fit_stage

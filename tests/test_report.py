@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
+from run_folders import create_run
 from test_results import NAMES, circle, some_history, some_result
 
 from a2tg_jax.appearance import Appearance, Bands, Texture
@@ -39,7 +40,6 @@ from a2tg_jax.results.figures import (
     save_figure,
     sizes_figure,
 )
-from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.images import largest_gain, save_animation
 from a2tg_jax.results.report import SECTIONS, Comparison, write_report
 from a2tg_jax.results.summary import ModelResult

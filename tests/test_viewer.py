@@ -16,6 +16,7 @@ import socket
 import numpy as np
 import pytest
 from PIL import Image
+from run_folders import create_run
 from small_values import some_gaussians
 from test_compact import textured
 
@@ -31,7 +32,6 @@ from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results import exporting
 from a2tg_jax.results.exporting import export_web, loss_text
-from a2tg_jax.results.folder import create_run
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record

@@ -263,7 +263,7 @@ def train_defaults(arguments: list[str]) -> Train:
     if out and "--resume" in arguments and "--overwrite" not in arguments:
         # Several processes read the folder at a time; the first one claims it later.
         is_alone = not _value_of("--coordinator", arguments)
-        with opened(out) if is_alone else contextlib.nullcontext(open_run(out)) as run:
+        with opened(Path(out)) if is_alone else contextlib.nullcontext(open_run(Path(out))) as run:
             read_record(run)  # A run that another version refuses is named as such, before its options are read.
             path = path or str(run.record)
             preset = _checked_preset(run, preset)

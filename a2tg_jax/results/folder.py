@@ -25,7 +25,6 @@ import contextlib
 import glob
 import json
 import os
-import re
 import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -145,9 +144,9 @@ class RunFolder:
     def diverged(self, name: str, iteration: int) -> Path:
         return self.path / "diverged" / f"{name}-{iteration:010d}.npz"
 
-    def checkpoints(self, name: str) -> list[Path]:
+    def checkpoints(self, name: str, ending: str = "") -> list[Path]:
         """Return the checkpoints of a stage, oldest first."""
-        return self._checkpoints(name, "")
+        return sorted((self.path / "checkpoints").glob(f"{glob.escape(name)}-{'[0-9]' * 10}.npz{ending}"))
 
     def set_damaged_aside(self, checkpoint: Path) -> Path:
         """Rename an unreadable checkpoint, so that it no longer counts as one."""
@@ -158,17 +157,11 @@ class RunFolder:
     def drop_old_checkpoints(self, name: str, keep: int = KEPT_CHECKPOINTS) -> None:
         """Delete all checkpoints of a stage but the newest `keep`; with keep=0, damaged ones too."""
         old = self.checkpoints(name)[: -keep or None]
-        for path in old if keep else [*old, *self._checkpoints(name, DAMAGED)]:
+        for path in old if keep else [*old, *self.checkpoints(name, DAMAGED)]:
             path.unlink()
         if not keep:
-            with contextlib.suppress(OSError):  # Where other stages have theirs in it.
+            with contextlib.suppress(OSError):  # There may be other stages' checkpoints in it.
                 (self.path / "checkpoints").rmdir()
-
-    def _checkpoints(self, name: str, ending: str) -> list[Path]:
-        pattern = re.compile(re.escape(name) + r"-(\d{6,})\.npz" + re.escape(ending))
-        found = (self.path / "checkpoints").glob(f"{glob.escape(name)}-*.npz{ending}")
-        matches = [(match, path) for path in found if (match := pattern.fullmatch(path.name))]
-        return [path for _, path in sorted(matches, key=lambda pair: int(pair[0][1]))]
 
 
 def iteration_of(checkpoint: Path) -> int:
@@ -176,19 +169,14 @@ def iteration_of(checkpoint: Path) -> int:
     return int(checkpoint.stem.rpartition("-")[2])
 
 
-def check_free(path: str | os.PathLike[str], *, overwrite: bool = False, in_use: str = IN_USE) -> None:
-    """Raise if a new run must not be made in a folder. The folder is not touched.
+def check_free(path: Path, *, overwrite: bool = False, in_use: str = IN_USE) -> None:
+    """Raise FileExistsError if there is something at `path` already that must not be lost. The folder is not touched.
 
     Args:
-      path: the folder.
+      path: the folder, which may hold the run.toml of a run that never began.
       overwrite: whether a run that is in it may be replaced.
-      in_use: error text for a folder that holds a run. It says what the command at hand can do.
-
-    Raises:
-      FileExistsError: if there is something at `path` already that must not be lost: with `overwrite`, anything in a
-        folder that no run was made in.
+      in_use: error text for a folder that holds a run.
     """
-    path = Path(path)
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"{path} is a file; choose another folder with --out")
     run = RunFolder(path)
@@ -202,59 +190,29 @@ def check_free(path: str | os.PathLike[str], *, overwrite: bool = False, in_use:
         raise FileExistsError(f"{path} {in_use}")
 
 
-def create_run(path: str | os.PathLike[str]) -> RunFolder:
-    """Make a new run folder, with its parents.
-
-    Args:
-      path: the folder; an existing one must be empty, or hold no more than the run.toml of a run that never began.
-
-    Raises:
-      FileExistsError: as `check_free` does.
-    """
-    check_free(path)
-    run = RunFolder(Path(path))
-    run.path.mkdir(parents=True, exist_ok=True)
-    run.own(run.marker)
-    return run
-
-
-def open_run(path: str | os.PathLike[str]) -> RunFolder:
-    """Return an existing run folder.
-
-    Raises:
-      FileNotFoundError: if there is none at `path`.
-    """
-    run = RunFolder(Path(path))
+def open_run(path: Path) -> RunFolder:
+    """Return an existing run folder. Raises FileNotFoundError if there is none at `path`."""
+    run = RunFolder(path)
     if not is_regular(run.record):
         raise FileNotFoundError(f"{path} is not a run folder (it has no run.toml); a2tg train --out makes one")
     return run
 
 
 def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
-    """Return the command line that continues the training of a run.
-
-    Args:
-      run: the run folder.
-      devices: those that train it; None: those of its newest checkpoint.
-    """
-    devices = _last_devices(run) if devices is None else devices
+    """Return the command line that continues the training of a run on these devices; None: on those of its newest
+    checkpoint."""
+    if devices is None:
+        devices = ALONE
+        found = sorted((run.path / "checkpoints").glob("*.npz"), key=lambda path: path.stat().st_mtime_ns)
+        with contextlib.suppress(ValueError, OSError):  # It may be damaged.
+            kept = read_archive_header(found[-1]).get("devices", {}) if found else {}
+            devices = config_from_dict(Devices, kept, "devices")
     words = ["a2tg", "train", "--out", str(run.path), "--resume"]
     if devices != ALONE:
         words += ["--devices", str(devices.each)]
     if devices.processes > 1:
         words += ["--coordinator", "HOST:PORT", "--num-processes", str(devices.processes), "--process-id", "I"]
     return shlex.join(words)
-
-
-def _last_devices(run: RunFolder) -> Devices:
-    """Return the devices of the newest checkpoint; one device if there is none, or it cannot be read."""
-    found = sorted((run.path / "checkpoints").glob("*.npz"), key=lambda path: path.stat().st_mtime_ns)
-    if not found:
-        return ALONE
-    try:
-        return config_from_dict(Devices, read_archive_header(found[-1]).get("devices", {}), "devices")
-    except (ValueError, OSError):
-        return ALONE
 
 
 def _is_file(path: Path) -> bool:
@@ -303,14 +261,9 @@ def claimed(run: RunFolder) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def opened(path: str | os.PathLike[str]) -> Iterator[RunFolder]:
-    """Claim an existing run folder.
-
-    Raises:
-      FileNotFoundError: if there is none at `path`.
-      FileExistsError, ValueError: as `claimed` does.
-    """
-    run = RunFolder(Path(path))
+def opened(path: Path) -> Iterator[RunFolder]:
+    """Claim an existing run folder. Raises FileNotFoundError if there is none, and as `claimed`."""
+    run = RunFolder(path)
     if not is_regular(run.marker):
         open_run(path)  # A process that was killed in its first moments left a marker, but no record.
     with claimed(run):
