@@ -141,7 +141,7 @@ def test_one_module_tells_systems_apart():
     """The C library's mathematics has another name on Windows, and a report names the system."""
     asking = re.compile(r"sys\.platform|os\.name\b|import (fcntl|msvcrt|resource)\b|sched_getaffinity")
     found = {dotted(path) for path in MODULES if asking.search(path.read_text(encoding="utf-8"))}
-    assert found == {"host.operating_system", "rasterize.kernels.native.libm", "results.summary"}
+    assert found == {"host.operating_system", "rasterize.kernels.native.libm", "results.report"}
 
 
 def test_import_leaves_jax_alone():

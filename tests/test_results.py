@@ -41,9 +41,7 @@ from a2tg_jax.results.record import (
     repeating_command,
     write_record,
 )
-from a2tg_jax.results.run_evaluation import evaluate_run
-from a2tg_jax.results.run_training import RunOptions, train_run
-from a2tg_jax.results.summary import (
+from a2tg_jax.results.report import (
     ModelResult,
     RunResult,
     bytes_compared,
@@ -52,6 +50,8 @@ from a2tg_jax.results.summary import (
     per_view_json,
     summary_text,
 )
+from a2tg_jax.results.run_evaluation import evaluate_run
+from a2tg_jax.results.run_training import RunOptions, train_run
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.systems.baselines import BBSplat, Gaussians2d, Gaussians2dMcmc, TexturedGaussians
 from a2tg_jax.systems.bytewise import Bytewise

@@ -34,8 +34,8 @@ from a2tg_jax.results.checks import check_weights
 from a2tg_jax.results.compression import compress
 from a2tg_jax.results.folder import json_text, open_run, opened
 from a2tg_jax.results.info import describe_run, run_facts
+from a2tg_jax.results.report import metrics_json
 from a2tg_jax.results.run_training import LESS_MEMORY, measure
-from a2tg_jax.results.summary import metrics_json
 from a2tg_jax.training import SYSTEMS
 
 BROKEN_PIPE = 128 + 13

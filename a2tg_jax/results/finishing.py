@@ -20,8 +20,8 @@ from a2tg_jax.results.folder import RunFolder, check_free, claimed, read_json, w
 from a2tg_jax.results.model_source import finished_stage, settings_of
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import write_record
+from a2tg_jax.results.report import RunResult, aligned
 from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, refined_views
-from a2tg_jax.results.summary import RunResult, aligned
 from a2tg_jax.training.registry import system_to_dict
 
 MOST_VIEWS = 16

@@ -1,9 +1,17 @@
-"""report.html: one page with everything a run found, images, style and script inlined, no network."""
+"""Results of a run: values, metrics.json, the headline table, and report.html, one page with everything.
+
+The page has its pictures, style and script inlined and needs no network.
+"""
 
 import base64
+import dataclasses
 import hashlib
 import inspect
+import platform
+import shutil
+import sys
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import jax
@@ -14,35 +22,255 @@ from a2tg_jax.host.json_text import MOST_TOML_BYTES
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.io.config_json import flatten_config
+from a2tg_jax.measure.evaluation import Evaluation
 from a2tg_jax.results.figures import ReportFigure
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import Crop, file_uri, jpeg_uri
-from a2tg_jax.results.record import repeating_command
-from a2tg_jax.results.summary import (
-    RunResult,
-    bytes_compared,
-    learning_lines,
-    megabytes,
-    minutes,
-    summary_table,
-    versions,
-)
+from a2tg_jax.results.plan import RunPlan
+from a2tg_jax.results.record import RunRecord, repeating_command
 
-SECTIONS = {
-    "summary": "Summary",
-    "pictures": "Pictures",
-    "appearance": "Appearance",
-    "geometry": "Geometry",
-    "curves": "Curves",
-    "views": "Every view",
-    "files": "Files",
-    "configuration": "Configuration",
-    "reproduce": "How to reproduce",
+QUALITIES = ("PSNR (dB)", "SSIM", "LPIPS")
+WAYS = {
+    "color_fit": "colours fitted",
+    "aligned": "poses aligned",
+    "aligned_color_fit": "poses aligned, colours fitted",
 }
+"""Titles of metrics up to exposure and pose, by the suffix of a split in metrics.json: test_color_fit, …"""
+EQUAL_BYTES = 0.01
+"""Largest relative difference of two sizes that are called equal."""
 CROP_ZOOM = 3
 HIGHER_IS_BETTER = ("PSNR", "SSIM", "frames a second")
 LOWER_IS_BETTER = ("LPIPS", "memory")
 """Words in the names of metrics whose best value is marked."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelResult:
+    """Measurements of one stage's model."""
+
+    splits: Mapping[str, Evaluation]
+    """Metrics by their names in metrics.json: of the held-out views, "test" or "validation", if there are any; of the
+    "train" views; then those up to exposure and pose, if a system of the run learns these."""
+    num_gaussians: int
+    num_texels: int
+    """Number of texels; 0 without textures."""
+    num_bytes: int
+    """Bytes of the trained floats without padding: `Model.num_bytes`."""
+    num_published_bytes: int
+    """Bytes as the method's authors count them: `Model.num_published_bytes`."""
+    num_padding_bytes: int
+    """Bytes of padding in the buffers."""
+    seconds: float
+    """Training time of this stage."""
+    sha256: str = ""
+    """SHA-256 of the model's file."""
+
+    @property
+    def train(self) -> Evaluation:
+        return self.splits["train"]
+
+    @property
+    def shown(self) -> Evaluation:
+        """Evaluation of the held-out views, or of the training views if there are none."""
+        return next(iter(self.splits.values()))
+
+
+@dataclasses.dataclass(frozen=True)
+class RunResult:
+    """Results of all finished models of a run."""
+
+    scene: str
+    """Name of the scene."""
+    record: RunRecord
+    plan: RunPlan
+    models: Mapping[str, ModelResult]
+    """Results by the names of their stages."""
+    is_lpips_kept: bool = False
+    """Whether LPIPS was kept from an earlier measurement of the same models."""
+
+    @property
+    def main(self) -> str:
+        """The last finished model of the main system."""
+        return [name for name in self.plan.main if name in self.models][-1]
+
+    @property
+    def before(self) -> list[str]:
+        """The stage that the main model started from, if it has one."""
+        start = self.plan[self.main].start
+        return [] if start is None else [start]
+
+    @property
+    def compared(self) -> list[str]:
+        """The finished last models of the other systems; none before the main system is finished."""
+        last = [chain[-1] for chain in self.plan.chains.values()]
+        return [name for name in last[1:] if name in self.models and self.main == last[0] != name]
+
+    @property
+    def gains(self) -> dict[str, float]:
+        """PSNR of the main model over that of each model it is compared with, in dB."""
+        psnr = self.models[self.main].shown.psnr
+        return {name: psnr - self.models[name].shown.psnr for name in self.compared}
+
+    @property
+    def lpips_network(self) -> str | None:
+        return self.models[self.main].train.lpips_network
+
+
+def metrics_json(result: RunResult) -> dict[str, Any]:
+    """Return the content of metrics.json."""
+    models = {}
+    for name, measured in result.models.items():
+        counts = {key: value for key, value in vars(measured).items() if key != "splits"}
+        splits = {
+            split: {
+                "psnr": found.psnr, "ssim": found.ssim, "lpips": found.lpips, "flat_psnr": found.flat_psnr,
+                "views": len(found.per_view),
+            }
+            for split, found in measured.splits.items()
+        }  # fmt: skip
+        models[name] = {**splits, **counts, "frames_per_second": measured.shown.frames_per_second}
+    return {
+        "scene": result.scene,
+        "main": result.main,
+        "models": models,
+        "gains_db": result.gains,
+        "lpips_network": result.lpips_network,
+        "versions": versions(),
+    }
+
+
+def per_view_json(result: RunResult) -> dict[str, Any]:
+    """Return the content of per_view.json: model → train, test or validation → view → metrics."""
+    return {
+        name: {
+            split: {view.name: {"psnr": view.psnr, "ssim": view.ssim, "lpips": view.lpips} for view in found.per_view}
+            for split, found in measured.splits.items()
+        }
+        for name, measured in result.models.items()
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that the metrics depend on, and the devices."""
+    device = jax.devices()[0]
+    return {
+        "a2tg-jax": version("a2tg-jax"),
+        "jax": version("jax"),
+        "jaxlib": version("jaxlib"),
+        "python": platform.python_version(),
+        "platform": f"{sys.platform} {platform.machine()}",
+        "device": f"{jax.device_count()} × {device.platform}: {device.device_kind}",
+    }
+
+
+def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
+    """Return titles and rows of the headline table: a column for each model, a row for each metric present."""
+    models = list(result.models.values())
+    rows = []
+    for split in dict.fromkeys(split for measured in models for split in measured.splits):
+        views, _, way = split.partition("_")
+        title = f"{views}, {WAYS[way]}:" if way else views
+        cells = zip(*(_qualities(measured.splits.get(split)) for measured in models), strict=True)
+        rows += [[f"{title} {name}", *row] for name, row in zip(QUALITIES, cells, strict=True)]
+    figures = [
+        {
+            "Gaussians": f"{found.num_gaussians:,}",
+            "texels a Gaussian": f"{found.num_texels / found.num_gaussians:.2f}" if found.num_texels else "",
+            "memory (MB)": megabytes(found.num_bytes),
+            "as published (MB)": (
+                megabytes(found.num_published_bytes) if found.num_published_bytes != found.num_bytes else ""
+            ),
+            "padding (MB)": megabytes(found.num_padding_bytes) if found.num_padding_bytes else "",
+            "frames a second": f"{found.shown.frames_per_second:.1f}",
+            "training time": minutes(found.seconds),
+        }
+        for found in models
+    ]
+    rows += [[name, *(column[name] for column in figures)] for name in figures[0]]
+    return ["", *result.models], [row for row in rows if any(row[1:])]
+
+
+def summary_text(result: RunResult, width: int | None = None) -> str:
+    """Return the headline table for a terminal, followed by warnings and gains.
+
+    Args:
+      result: the run.
+      width: in characters; models that do not fit next to each other follow below. None: the terminal's.
+    """
+    titles, rows = summary_table(result)
+    names, *columns = zip(titles, *rows, strict=True)
+    width = width or shutil.get_terminal_size().columns
+    blocks = [[names]]
+    for column in columns:
+        if len(blocks[-1]) > 1 and max(map(len, aligned([*blocks[-1], column]))) > width:
+            blocks.append([names])
+        blocks[-1].append(column)
+    lines = "\n\n".join("\n".join(aligned(block)) for block in blocks).split("\n")
+    if result.lpips_network:
+        kept = ", kept from an earlier measurement of the same models" if result.is_lpips_kept else ""
+        lines.append(f"LPIPS with {result.lpips_network}{kept}")
+    for name in dict.fromkeys(chain[-1] for chain in result.plan.chains.values()):
+        budget = result.plan[name].system.budget_bytes
+        if budget is not None and name in result.models:
+            used = result.models[name].num_bytes
+            lines.append(f"{name} takes {used:,} bytes of its budget of {budget:,} ({100 * used / budget:.2f} %)")
+    lines += learning_lines(result)
+    for name, gain in result.gains.items():
+        lines.append(f"{result.main}: {gain:+.2f} dB over {name}, {bytes_compared(result, name)}")
+    return "\n".join(lines)
+
+
+def bytes_compared(result: RunResult, name: str) -> str:
+    """Return the bytes of the main model against another's, for the line of its gain."""
+    own, other = result.models[result.main].num_bytes, result.models[name].num_bytes
+    if abs(own - other) <= EQUAL_BYTES * other:
+        return f"at equal bytes ({megabytes(own)} MB)"
+    ratio = own / max(other, 1)
+    times = f"{ratio:.1f}" if ratio >= 1.05 else f"{ratio:.2f}"
+    return f"with {times} times its bytes ({megabytes(own)} MB and {megabytes(other)} MB)"
+
+
+def learning_lines(result: RunResult) -> list[str]:
+    """Return a warning for each finished model that does not beat one flat colour per view on its training views."""
+    return [
+        f"{name} did not learn: {measured.train.psnr:.1f} dB on its training views, where one flat colour per view "
+        f"reaches {measured.train.flat_psnr:.1f} dB"
+        for name, measured in result.models.items()
+        if not measured.train.has_learned
+    ]
+
+
+def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return the lines of a table: first column left-aligned, the others right-aligned; empty rows are left out."""
+    name_width, *widths = (max(map(len, column)) for column in columns)
+    lines = []
+    for name, *cells in (line for line in zip(*columns, strict=True) if any(line[1:])):
+        aligned = (cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
+        lines.append("  ".join([name.ljust(name_width), *aligned]).rstrip())
+    return lines
+
+
+def megabytes(num_bytes: int) -> str:
+    """Return a number of bytes in MB, without the unit."""
+    return f"{num_bytes / 1e6:.2f}"
+
+
+def minutes(seconds: float) -> str:
+    """Return a duration as "1 h 2 min", "3 min 4 s" or "5 s"."""
+    whole = round(seconds)
+    if whole >= 3600:
+        return f"{whole // 3600} h {whole % 3600 // 60} min"
+    return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
+
+
+def _qualities(found: Evaluation | None) -> list[str]:
+    """Return PSNR, SSIM and LPIPS; empty for a missing metric."""
+    if found is None:
+        return ["", "", ""]
+    return [f"{found.psnr:.2f}", f"{found.ssim:.4f}", "" if found.lpips is None else f"{found.lpips:.4f}"]
+
+
+# The page
 
 Table = tuple[Sequence[str], Sequence[Sequence[str]], set[tuple[int, int]]]
 """Titles, rows, and the (row, column) of the marked cells."""
@@ -76,29 +304,53 @@ class Comparison(NamedTuple):
 def write_report(
     run: RunFolder, result: RunResult, views: Sequence[Comparison], figures: Mapping[str, Sequence[ReportFigure]]
 ) -> None:
-    """Write report.html from the results, some views, and the figures in the run folder."""
+    """Write report.html from the results, some views, and the figures in the run folder.
+
+    Browsers take its own style and script only, by their hashes: no text of a scene becomes one.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # Its import is slow, and few commands need it.
+    from markupsafe import Markup
+
+    loader = PackageLoader("a2tg_jax.results")
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    policy, inlined = "default-src 'none'; img-src data:", {}
+    for name, suffix in (("style", "css"), ("script", "js")):
+        text = loader.get_source(pages, f"report.{suffix}")[0]
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        policy, inlined[name] = f"{policy}; {name}-src 'sha256-{digest}'", Markup(text)
     main, held_out = result.models[result.main], result.record.scene.held_out
-    num_held_out = len(main.splits[held_out].per_view) if held_out in main.splits else 0
-    page = _page(
-        sections=SECTIONS,
+    # The main model comes first, where a phone shows it.
+    names = sorted(result.models, key=lambda name: name != result.main)
+    titles, rows = summary_table(result)
+    order = [0, *(titles.index(name) for name in names)]
+    rows = [[row[at] for at in order] for row in rows]
+    best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
+    own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
+    leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.system)
+    page = pages.get_template("report.html").render(
+        **inlined,
+        policy=Markup(policy),
         title=f"{next(iter(result.plan.chains))} on {result.scene}",
         about=(inspect.getdoc(type(result.record.system)) or "").split("\n", 1)[0],
-        num_views=len(main.train.per_view) + num_held_out,
-        num_held_out=num_held_out,
-        purpose={"test": "testing", "validation": "validation"}[held_out],
-        viewer=run.viewer.name if run.viewer.is_file() else None,
+        result=result,
+        main=main,
+        held_out=held_out,
         warnings=learning_lines(result),
-        cards=_cards(result, views[0].size if views else None),
-        summary=(summary := _summary(result)),
-        rows_shown=[row[0] for row in summary[1]],
-        lpips_network=result.lpips_network,
+        gains=[(name, bytes_compared(result, name), gain) for name, gain in result.gains.items()],
+        device=jax.devices()[0].platform.upper(),
+        own_time=minutes(own),
+        other_time=minutes(sum(measured.seconds for measured in result.models.values()) - own),
+        megabytes=megabytes,
+        summary=([titles[at] for at in order], rows, best),
+        rows_shown=[row[0] for row in rows],
         corrections={split.partition("_")[2] for split in main.splits},
         comparisons=views,
         figures=figures,
         file_uri=file_uri,
-        views=[(split, *_views(result, split)) for split in (held_out, "train") if split in main.splits],
-        files=_files(run, result),
-        configuration=_configuration(result),
+        views=[(split, *_views(result, names, split)) for split in (held_out, "train") if split in main.splits],
+        model_file=run.model(result.main).relative_to(run.path).as_posix(),
+        is_written=lambda name: (run.path / name).is_file(),
+        configuration=[(name, str(value)) for name, value in leaves.items()],
         versions=versions(),
         commit=source_commit(),
         command=repeating_command(run),
@@ -106,59 +358,6 @@ def write_report(
     )
     with replacing(run.own(run.report)) as temporary:
         temporary.write_text(page, encoding="utf-8")
-
-
-def _page(**content: Any) -> str:
-    """Return the page. Browsers take its own style and script only, by their hashes: no text of a scene becomes one."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # Its import is slow, and few commands need it.
-    from markupsafe import Markup
-
-    loader = PackageLoader("a2tg_jax.results")
-    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    style, script = (loader.get_source(pages, f"report.{kind}")[0] for kind in ("css", "js"))
-    policy = f"default-src 'none'; img-src data:; style-src {_source(style)}; script-src {_source(script)}"
-    inlined = {"style": Markup(style), "script": Markup(script), "policy": Markup(policy)}
-    return pages.get_template("report.html").render(**content, **inlined)
-
-
-def _source(text: str) -> str:
-    """Return the name of an inline style or script in a content security policy."""
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-
-def _cards(result: RunResult, size: tuple[int, int] | None) -> list[tuple[str, str]]:
-    """Return the figures on top of the page; `size` is that of the renders."""
-    last, scene = result.models[result.main], result.record.scene
-    split = scene.held_out.capitalize() if scene.held_out in last.splits else "Training"
-    own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
-    others = sum(measured.seconds for measured in result.models.values()) - own
-    gains = [
-        (f"Gain over {name}, {bytes_compared(result, name)}", f"{gain:+.2f} dB") for name, gain in result.gains.items()
-    ]
-    speed = f"Speed{f' at {size[0]}×{size[1]}' if size else ''}, on this {jax.devices()[0].platform.upper()}"
-    return [
-        (f"{split} PSNR", f"{last.shown.psnr:.2f} dB"),
-        *gains,
-        ("SSIM", f"{last.shown.ssim:.4f}"),
-        ("Gaussians", f"{last.num_gaussians:,}"),
-        ("Memory", f"{megabytes(last.num_bytes)} MB"),
-        (speed, f"{last.shown.frames_per_second:.1f} fps"),
-        ("Training", minutes(own)),
-        *([("Comparisons' training", minutes(others))] if others else []),
-    ]
-
-
-def _main_first(result: RunResult) -> list[str]:
-    """Return the names of the models, the main one first, where a phone shows it."""
-    return sorted(result.models, key=lambda name: name != result.main)
-
-
-def _summary(result: RunResult) -> Table:
-    titles, rows = summary_table(result)
-    order = [0, *(titles.index(name) for name in _main_first(result))]
-    rows = [[row[at] for at in order] for row in rows]
-    best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
-    return [titles[at] for at in order], rows, best
 
 
 def _best(row: Sequence[str]) -> list[int]:
@@ -172,9 +371,8 @@ def _best(row: Sequence[str]) -> list[int]:
     return found if len(found) < len(values) else []
 
 
-def _views(result: RunResult, split: str) -> Table:
+def _views(result: RunResult, names: Sequence[str], split: str) -> Table:
     """Return PSNR and SSIM of each view by each model, with its bytes next to its name."""
-    names = _main_first(result)
     sizes = [f"{name} ({megabytes(result.models[name].num_bytes)} MB)" for name in names]
     found = zip(*(result.models[name].splits[split].per_view for name in names), strict=True)
     rows, best = [], set()
@@ -182,21 +380,3 @@ def _views(result: RunResult, split: str) -> Table:
         rows.append([views[0].name, *(f"{view.psnr:.2f} / {view.ssim:.4f}" for view in views)])
         best |= {(at, column) for column in _best(["PSNR", *(f"{view.psnr:.2f}" for view in views)])}
     return ["view", *sizes], rows, best
-
-
-def _files(run: RunFolder, result: RunResult) -> list[tuple[str, str]]:
-    """Return the files beside the page, and what they are."""
-    told = {
-        run.viewer: "the scene in a browser, to turn and to fly through; one file that opens from the disk",
-        run.model(result.main): "the model, for a2tg and for load_model",
-        run.point_cloud: "the Gaussians for other programs, without textures",
-        run.metrics: "all figures",
-        run.per_view: "the figures of every view",
-        run.record: "the settings of this run",
-    }
-    return [(path.relative_to(run.path).as_posix(), what) for path, what in told.items() if path.is_file()]
-
-
-def _configuration(result: RunResult) -> list[tuple[str, str]]:
-    leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.system)
-    return [(name, str(value)) for name, value in leaves.items()]

@@ -41,8 +41,7 @@ from a2tg_jax.results.images import (
 from a2tg_jax.results.model_source import settings_of
 from a2tg_jax.results.plan import RunPlan
 from a2tg_jax.results.record import HeldOut, read_record
-from a2tg_jax.results.report import Comparison, write_report
-from a2tg_jax.results.summary import ModelResult, RunResult, metrics_json, per_view_json
+from a2tg_jax.results.report import Comparison, ModelResult, RunResult, metrics_json, per_view_json, write_report
 from a2tg_jax.training import System
 from a2tg_jax.training.corrections import learned
 from a2tg_jax.web.page import viewer_html_with

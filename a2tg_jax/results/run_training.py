@@ -34,9 +34,9 @@ from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.init_file import check_init, write_first_stage
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import SYNTHETIC, OnNan, RunRecord, read_record, write_record
+from a2tg_jax.results.report import RunResult
 from a2tg_jax.results.run_evaluation import evaluate_run
 from a2tg_jax.results.several_processes import check_alike, send_stage
-from a2tg_jax.results.summary import RunResult
 from a2tg_jax.training import (
     Checkpoint,
     DivergedError,
