@@ -80,13 +80,13 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     """
     options.check()
     record, planned = finished_stage(source)
-    finished_stages(source, record.plan)
     path, run = source.model(planned.name), RunFolder(out)
     origin = {"source": str(source.path.resolve()), "model": planned.name, "sha256": sha256_of(path)}
     told = {**origin, **dataclasses.asdict(options)}
     _is_written(run, told)
     model, scene = load_model(path), record.scene.load()
     _check(model, planned, options)
+    finished_stages(source, record.plan)
     with claimed(run):
         is_written = _is_written(run, told)  # Another process may have been here meanwhile.
         changed = [("finished", load_model(run.model(planned.name)))] if is_written else _changed(model, scene, options)
