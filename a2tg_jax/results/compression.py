@@ -87,18 +87,16 @@ def compress(
 
     Args:
       source: a run folder, of which the last model is taken; or a model, *.npz.
-      out: the file, *.a2tgz; None is beside the model.
+      out: the file, *.a2tgz; None: next to the model.
       max_loss: in dB.
-      tune_iterations: iterations of training with rounding for each choice of bits that is tried so
+      tune_iterations: iterations of training with rounding for each choice of bits that is tried with it
         (`finish.tuning.smallest_tuned`); 0: the model's numbers are only rounded.
       overwrite: whether an existing file is replaced that this function did not write into the run's folder.
       on_start: called with how much there is to try, once the arguments are checked.
 
     Raises:
-      FileNotFoundError: if there is no such model, or no photographs to tune it with.
-      FileExistsError: if the file exists.
-      ValueError: if a compact file cannot hold the model, nothing loses so little, `out` is a folder or has another
-        suffix than a2tgz, or a model's file is to be tuned.
+      ValueError, OSError: if the model or the photographs to tune it with are missing, the file exists, a compact file
+        cannot hold the model, or nothing loses so little.
     """
     name = source.name.lower()
     if not source.is_dir() and name.endswith(tuple(FORMATS)) and not name.endswith(".npz"):

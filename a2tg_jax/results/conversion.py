@@ -55,14 +55,13 @@ def convert(
     Args:
       source: a run folder or a file of any known format.
       out: the file.
-      name: which model of a run; None is the last of its main system.
+      name: which model of a run; None: the last of its main system.
       baking: how textures become plain splats; None leaves them as they are.
       float64: write the positions of a PLY as float64, as `save_ply` does.
       overwrite: whether an existing file is replaced.
 
     Raises:
-      FileNotFoundError: if there is no such file, or the run's stage is not finished.
-      ValueError: if a format is unknown, or the source cannot be read or written.
+      ValueError, OSError: if a format is unknown, or the source cannot be read or the file not be written.
     """
     writer_of(out)  # Baking takes minutes.
     if float64 and format_of(out).save is not save_ply:

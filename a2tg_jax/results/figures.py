@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -77,15 +76,9 @@ def write_figures(
     run: RunFolder, model: Model, camera: Camera, settings: RenderSettings, histories: Mapping[str, History],
     starts: Mapping[str, int],
 ) -> dict[str, list[ReportFigure]]:  # fmt: skip
-    """Write the figures of a run, and return them by their places in the report.
+    """Write the figures of a run's main model as a camera shows it, and return them by their places in the report.
 
-    Args:
-      run: its folder.
-      model: its main model.
-      camera: view that shows maps, depth and normals.
-      settings: render settings of the model.
-      histories: of the stages, by name.
-      starts: number of iterations before each.
+    `starts` has the number of iterations before each stage.
     """
     found: dict[str, list[ReportFigure]] = {"curves": [], "textures": [], "maps": [], "geometry": [], "flight": []}
 
@@ -95,7 +88,6 @@ def write_figures(
     save_figure(curves := own("curves.png"), curves_figure(histories, starts))
     caption = "Loss and PSNR of the training views seen, with running means."
     found["curves"].append(ReportFigure(curves, caption, "chart"))
-    maps = level_maps(model)
     if model.textures is not None and (model.textures.sizes.prod(axis=1) > 1).any():
         learned = learned_textures(model)
         if learned is not None:
@@ -105,7 +97,7 @@ def write_figures(
         save_figure(sizes := own("sizes.png"), sizes_figure(model.textures.sizes))
         caption = "How many Gaussians have a texture of each resolution."
         found["textures"].append(ReportFigure(sizes, caption, "chart"))
-    for shown in maps:
+    for shown in level_maps(model):
         save_picture(path := own(shown.file), level_picture(model, shown.levels, camera, settings))
         legend = list(zip(map(to_hex, level_colors(len(shown.names))), shown.names, strict=True))
         caption = f"The first view, every Gaussian by {shown.told}; {NOT_HIT}."
@@ -133,12 +125,7 @@ def save_figure(path: Path, figure: Figure) -> None:
 
 
 def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -> Figure:
-    """Plot loss, PSNR, Gaussians and memory over the iterations, with a dashed line where a later stage begins.
-
-    Args:
-      histories: of the stages, by name.
-      starts: number of iterations before each.
-    """
+    """Plot loss, PSNR, Gaussians and memory over the iterations, with a dashed line where a later stage begins."""
     figure = Figure(figsize=(10, 6), layout="constrained")
     colors = dict(zip(histories, itertools.cycle(COLORS), strict=False))
     for axes, (field, title) in zip(figure.subplots(2, 2).flat, CURVES, strict=True):
@@ -170,11 +157,7 @@ def _thinned(column: np.ndarray) -> np.ndarray:
 
 
 def sizes_figure(sizes: np.ndarray) -> Figure:
-    """Return how many Gaussians have a texture of each resolution, as a map of Tv × Tu.
-
-    Args:
-      sizes: [N, 2] integers (Tv, Tu).
-    """
+    """Plot how many Gaussians have a texture of each resolution, as a map of Tv × Tu; sizes are [N, 2] integers."""
     sides = 2 ** np.arange(int(np.log2(max(4, sizes.max()))) + 1)
     counts = np.array([[np.sum((sizes == (tv, tu)).all(axis=1)) for tu in sides] for tv in sides])
     figure = Figure(figsize=(1.2 + 0.95 * len(sides), 0.9 + 0.75 * len(sides)), layout="constrained")
@@ -343,17 +326,16 @@ def flight(model: Model, settings: RenderSettings) -> bytes | None:
 
 
 def save_camera_picture(scene: Path, path: Path) -> None:
-    """Draw the cameras and points of a COLMAP scene folder as a PNG.
-
-    Raises:
-      FileNotFoundError, ValueError: if there is no model, or it cannot be read.
-    """
+    """Draw the cameras and points of a COLMAP scene folder as a PNG. Raises as `read_cameras_and_points`."""
     viewmats, cloud = read_cameras_and_points(scene)
     rotations = viewmats[:, :3, :3]
     centers = -np.einsum("vij,vi->vj", rotations, viewmats[:, :3, 3])
     axes = _upright_axes(rotations)
     middle = np.median(np.concatenate([centers, cloud.points]), axis=0)
-    reach = _reach(centers, cloud.points, middle)
+    # Half the side of the picture: all cameras, and most of the points.
+    far_cameras = float(np.abs(centers - middle).max())
+    far_points = float(np.quantile(np.abs(cloud.points - middle).max(axis=1), 0.9)) if len(cloud.points) else 0.0
+    reach = 1.1 * max(far_cameras, min(far_points, WIDEST * far_cameras), 1e-9)
     step = max(1, len(cloud.points) // MOST_CLOUD_POINTS)
     figure = Figure(figsize=(11, 5.5), layout="constrained")
     for panel, rows, title in zip(
@@ -362,17 +344,14 @@ def save_camera_picture(scene: Path, path: Path) -> None:
         plane = axes[rows]
         x, y = plane @ (cloud.points[::step] - middle).T
         panel.scatter(x, y, s=1, c=cloud.colors[::step] / 255, linewidths=0)
-        _draw_cameras(panel, plane @ (centers - middle).T, plane @ rotations[:, 2].T * (0.06 * reach))
+        # Cameras are joined in the order of their names; short lines are their viewing directions.
+        places, ahead = plane @ (centers - middle).T, plane @ rotations[:, 2].T * (0.06 * reach)
+        panel.plot(*places, color=COLORS[2], linewidth=0.5, alpha=0.5)
+        panel.plot(*np.stack([places, places + ahead], axis=1), color=COLORS[1], linewidth=0.8)
+        panel.scatter(places[0], places[1], s=8, color=COLORS[0], zorder=3)
         panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
         panel.set_title(f"{len(centers)} cameras {title}", fontsize=10)
     save_figure(path, figure)
-
-
-def _draw_cameras(panel: Axes, places: np.ndarray, ahead: np.ndarray) -> None:
-    """Draw places [2, V] with lines in the viewing directions [2, V], joined in the order of their names."""
-    panel.plot(*places, color=COLORS[2], linewidth=0.5, alpha=0.5)
-    panel.plot(*np.stack([places, places + ahead], axis=1), color=COLORS[1], linewidth=0.8)
-    panel.scatter(places[0], places[1], s=8, color=COLORS[0], zorder=3)
 
 
 def _upright_axes(rotations: np.ndarray) -> np.ndarray:
@@ -385,10 +364,3 @@ def _upright_axes(rotations: np.ndarray) -> np.ndarray:
         right = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     right = right / np.linalg.norm(right)
     return np.stack([right, np.cross(up, right), up])
-
-
-def _reach(centers: np.ndarray, points: np.ndarray, middle: np.ndarray) -> float:
-    """Return half the side of the picture: all cameras, and most of the points."""
-    far_cameras = float(np.abs(centers - middle).max())
-    far_points = float(np.quantile(np.abs(points - middle).max(axis=1), 0.9)) if len(points) else 0.0
-    return 1.1 * max(far_cameras, min(far_points, WIDEST * far_cameras), 1e-9)

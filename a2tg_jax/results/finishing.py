@@ -67,12 +67,6 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     Choices are made on training views; held-out views are only measured. If the same finishing was killed in that
     folder, it goes on: with the evaluation if the model was written, otherwise from its beginning.
 
-    Args:
-      source: the run; it is not changed.
-      out: the new run folder, with the record, the histories and the other models of the run.
-      options: what is done.
-      lpips_weights: a weights file for LPIPS; None leaves it out.
-
     Raises:
       FileNotFoundError: if the stage is not finished, or an earlier model or the photographs are missing.
       FileExistsError: if `out` is in use.
@@ -109,12 +103,8 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
 
 
 def _is_written(run: RunFolder, told: Mapping[str, Any]) -> bool:
-    """Return whether a process was killed in a folder after it had done the same and written the model.
-
-    Args:
-      run: the folder.
-      told: content of finish.json, which was begun there; otherwise the folder must be free.
-    """
+    """Return whether a process was killed in a folder after it had done the same, as finish.json says, and written the
+    model. Unless the same was begun there, the folder must be free."""
     is_begun = not run.report.is_file() and run.finish.name in run.written() and is_regular(run.finish)
     with contextlib.suppress(ValueError):
         if is_begun and read_json(run.finish) == told:

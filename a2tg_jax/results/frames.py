@@ -81,11 +81,7 @@ class FrameFolder:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Return width and height of a text such as 1280x720.
-
-    Raises:
-      ValueError: if it is another one, or a side is out of range.
-    """
+    """Return width and height of a text such as 1280x720. Raises ValueError if it is not, or a side is out of range."""
     match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", text)
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(1 <= side <= LARGEST_SIDE for side in size):
@@ -109,7 +105,7 @@ def render_frames(
     """Write one PNG per frame and return their paths. The photographs are not needed.
 
     Args:
-      run: an opened run folder.
+      run: the run folder.
       out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views. What earlier
         renders wrote there is replaced, and frames that a longer path left are deleted.
       route: the test views, a smooth path past all cameras, an orbit around the subject, or a file of views that the
@@ -121,9 +117,7 @@ def render_frames(
       overwrite: whether files are replaced that no render wrote.
 
     Raises:
-      FileNotFoundError: if that stage is not finished, or there is no such path.
-      FileExistsError: if `out` is a file, or a file would be replaced unasked.
-      ValueError: if no frame is wanted, the run has no such stage, or there are no test views and these are wanted.
+      ValueError, OSError: if that stage is not finished, there are no such views or path, or a file is in the way.
     """
     if num_frames < 1:
         raise ValueError(f"the number of frames must be at least 1; got {num_frames}")
@@ -156,15 +150,8 @@ def video_name() -> str:
 
 
 def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER_SECOND) -> Path:
-    """Make a video of a flight next to its frames, with ffmpeg or, without it, as an animated WebP, which loops.
-
-    Args:
-      frames: frame_0000.png … of one folder, without a gap.
-      frames_per_second: its rate.
-
-    Raises:
-      ValueError: if ffmpeg fails.
-    """
+    """Make a video of frame_0000.png … in their folder, with ffmpeg or, without it, as an animated WebP, which loops.
+    Raises ValueError if ffmpeg fails."""
     path, program = frames[0].with_name(video_name()), shutil.which("ffmpeg")
 
     def opened() -> Iterator[Image.Image]:

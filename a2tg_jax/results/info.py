@@ -19,10 +19,7 @@ SPLITS = ("test", "validation", "train")
 def describe_run(run: RunFolder) -> str:
     """Return the scene, the systems, the progress of each stage, its model, and the metrics if there are any.
 
-    Damaged metrics and models are named in place of what they hold.
-
-    Raises:
-      ValueError: if run.toml is damaged or of another version.
+    Damaged metrics and models are named instead of their content. Raises ValueError if run.toml is damaged.
     """
     facts, old = run_facts(run), old_run(run)
     stages, damage = facts["stages"], facts["damage"]
@@ -46,11 +43,8 @@ def describe_run(run: RunFolder) -> str:
 
 
 def run_facts(run: RunFolder) -> dict[str, Any]:
-    """Return what a run folder holds as JSON-able values, a dictionary for each stage.
-
-    Raises:
-      ValueError: if run.toml is damaged or of another version.
-    """
+    """Return what a run folder holds as JSON values, a dictionary for each stage. Raises ValueError if run.toml is
+    damaged."""
     record, measured, damage = read_record(run), dict[str, dict[str, float]](), None
     try:
         measured = read_psnrs(run.metrics) if is_regular(run.metrics) else {}
@@ -71,11 +65,8 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
 
 
 def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
-    """Return the PSNR in a metrics.json: model → test or validation, train → dB.
-
-    Raises:
-      ValueError: if the file holds anything else in their place.
-    """
+    """Return the PSNR in a metrics.json: model → test or validation, train → dB. Raises ValueError if there is anything
+    else."""
     data, psnrs = read_json(path), dict[str, dict[str, float]]()
     try:
         for name, model in data["models"].items():

@@ -71,12 +71,8 @@ class Source:
 
 
 def finished_stage(run: RunFolder, name: str | None = None) -> tuple[RunRecord, PlannedStage]:
-    """Return the record of a run and one of its stages, which is finished; None: the last one of its main system.
-
-    Raises:
-      FileNotFoundError: if that stage is not finished.
-      ValueError: if the run has no such stage.
-    """
+    """Return the record of a run and one of its stages; None: the last one of its main system. Raises ValueError or
+    FileNotFoundError if there is no such stage, or it is not finished."""
     record = read_record(run)
     plan = record.plan
     planned = plan[plan.main[-1] if name is None else name]

@@ -55,11 +55,7 @@ class RunPlan:
         return next(iter(self.chains.values()))
 
     def __getitem__(self, name: str) -> PlannedStage:
-        """Return the stage of a name.
-
-        Raises:
-          ValueError: if the run has no such stage.
-        """
+        """Return the stage of a name. Raises ValueError if the run has none."""
         for planned in self.stages:
             if planned.name == name:
                 return planned
@@ -72,14 +68,8 @@ class RunPlan:
 
 
 def plan_run(systems: Mapping[str, System]) -> RunPlan:
-    """Return the stages of some systems. Two systems share their stages up to the first one that differs.
-
-    Args:
-      systems: by label, the main one first.
-
-    Raises:
-      ValueError: if two stages would have one name.
-    """
+    """Return the stages of systems by label, the main one first. Two systems share their stages up to the first one
+    that differs. Raises ValueError if two stages would have one name."""
     planned: list[PlannedStage] = []
     chains: dict[str, tuple[str, ...]] = {}
     for label, system in systems.items():

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 
@@ -139,36 +139,24 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
 
 
 def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options: RunOptions) -> RunResult:
-    with _advised(run, options.session.devices):
-        check_alike(record, scene, options.session)
-        with signals.noted() as is_stopped, options.watched(scene) as watch:
-            train_run(run, scene, options, is_stopped=is_stopped, watch=watch)
-        if (others := team()) is not None:
-            others.leave()
-        return measure(run, scene, lpips_weights=options.lpips_weights)
-
-
-def measure(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path | None = None) -> RunResult:
-    """Call `evaluate_run`, and delete a replaced run once all stages are trained."""
-    result = evaluate_run(run, scene, lpips_weights=lpips_weights)
-    if len(result.models) == len(result.plan.names):
-        drop_old(run)
-    return result
-
-
-@contextlib.contextmanager
-def _advised(run: RunFolder, devices: Devices) -> Iterator[None]:
-    """Add to whatever ends the training how to continue it. Without a checkpoint, a replaced run is put back."""
+    """Train and measure. Whatever ends the training says how to continue it; without a checkpoint, a replaced run is
+    put back."""
 
     def advice() -> str:
         if put_back_old(run):
             return f"the run that was in {run.path} is untouched"
-        return how_to_go_on(run, devices)
+        return how_to_go_on(run, options.session.devices)
 
-    if (others := team()) is not None:
+    others = team()
+    if others is not None:
         others.advice = advice
     try:
-        yield
+        check_alike(record, scene, options.session)
+        with signals.noted() as is_stopped, options.watched(scene) as watch:
+            train_run(run, scene, options, is_stopped=is_stopped, watch=watch)
+        if others is not None:
+            others.leave()
+        return measure(run, scene, lpips_weights=options.lpips_weights)
     except KeyboardInterrupt as stop:
         number = stop.number if isinstance(stop, signals.Stopped) else signals.CTRL_C
         raise signals.Stopped(number, advice()) from None
@@ -181,14 +169,23 @@ def _advised(run: RunFolder, devices: Devices) -> Iterator[None]:
         raise ValueError(f"{told}; {advice()}") from error
 
 
+def measure(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path | None = None) -> RunResult:
+    """Call `evaluate_run`, and delete a replaced run once all stages are trained."""
+    result = evaluate_run(run, scene, lpips_weights=lpips_weights)
+    if len(result.models) == len(result.plan.names):
+        drop_old(run)
+    return result
+
+
 def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
     """Return the path of the newest checkpoint, and the command that resumes, as `resuming_command`."""
-    names = read_record(run).plan.names
-    checkpoints = [path for name in names for path in run.checkpoints(name)]
-    finished = [run.model(name) for name in names if run.model(name).is_file()]
-    last = f"the last checkpoint is {checkpoints[-1]}" if checkpoints else "there is no checkpoint yet"
-    if finished and not checkpoints:
-        last = f"the last model is {finished[-1]}"
+    names, last = read_record(run).plan.names, "there is no checkpoint yet"
+    for name in names:
+        if run.model(name).is_file():
+            last = f"the last model is {run.model(name)}"
+    for name in names:
+        for path in run.checkpoints(name):
+            last = f"the last checkpoint is {path}"
     return f"{last}; continue with: {resuming_command(run, devices)}"
 
 
@@ -198,13 +195,6 @@ def train_run(
     """Train every stage of the run's record that is not finished yet, from its newest checkpoint.
 
     When a stage ends, its history and its model are written, and its checkpoints deleted.
-
-    Args:
-      run: a run folder with its record.
-      scene: the scene of the record.
-      options: how it is trained.
-      is_stopped: called between steps. Once it returns True, there is a checkpoint and a KeyboardInterrupt.
-      watch: called between steps with the stage under way (`training.loop.Watch`).
 
     Raises:
       ValueError: as `fit` does, or if a checkpoint or model is damaged, of another version, or made with other options
