@@ -31,7 +31,7 @@ from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results import exporting
-from a2tg_jax.results.exporting import export_web, loss_text
+from a2tg_jax.results.exporting import export_web, loss_text, losses_of
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
@@ -311,17 +311,19 @@ def test_a_model_that_knows_no_scene_has_no_photographs():
 
 def test_a_folder_and_a_single_file(tmp_path):
     source = Source(textured(), "a")
-    result = export_web(source, tmp_path / "site")
-    assert result.path == tmp_path / "site" / "index.html" and result.path.read_text(encoding="utf-8") == viewer_html()
+    text, page = export_web(source, tmp_path / "site"), tmp_path / "site" / "index.html"
+    assert page.read_text(encoding="utf-8") == viewer_html()
     scene = (tmp_path / "site" / "scene.a2tgw").read_bytes()
-    assert len(scene) == result.num_bytes and decode_web_scene(scene).model.num == source.model.num
-    assert list(result.losses) == ["were it a model of 30 dB"] and "dB of PSNR lost" in result.text
-    assert result.text.endswith(f"{result.path}: {in_bytes(result.total_bytes)} with 2 files beside it")
+    assert f"whose scene takes {in_bytes(len(scene))}, " in text and "dB of PSNR lost, were it a model of 30 dB" in text
+    assert decode_web_scene(scene).model.num == source.model.num
+    total = sum(file.stat().st_size for file in page.parent.iterdir())
+    assert text.endswith(f"{page}: {in_bytes(total)} with 2 files beside it")
     assert (tmp_path / "site" / "photographs.json").read_bytes() == b"[]"
+    one = tmp_path / "one.html"
     for _ in range(2):  # The second time, it replaces the first.
-        one = export_web(source, tmp_path / "one.html", overwrite=True)
-    assert one.text.endswith(f"one.html: {in_bytes(one.path.stat().st_size)}")
-    assert one.path.read_text(encoding="utf-8") == viewer_html_with(scene)
+        text = export_web(source, one, overwrite=True)
+    assert text.endswith(f"one.html: {in_bytes(one.stat().st_size)}")
+    assert one.read_text(encoding="utf-8") == viewer_html_with(scene)
     with pytest.raises(ValueError, match="no photographs"):
         export_web(source, tmp_path / "with", photographs=True)
     with pytest.raises(ValueError, match="leave out --single-file"):
@@ -358,10 +360,8 @@ def test_a_page_of_someone_else_is_not_replaced(tmp_path):
     assert (tmp_path / "index.html").read_text() == "mine"
 
 
-def test_point_clouds_are_measured_from_cameras_around_them(tmp_path):
-    gaussians = some_gaussians(40)
-    result = export_web(Source(Model(gaussians), "a"), tmp_path / "one.html", single_file=True)
-    assert 0 <= result.losses["were it a model of 30 dB"] < 1
+def test_point_clouds_are_measured_from_cameras_around_them():
+    assert 0 <= losses_of(Source(Model(some_gaussians(40)), "a"))["were it a model of 30 dB"] < 1
 
 
 def test_photographs_are_those_of_the_cameras():
@@ -398,4 +398,4 @@ def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkey
     with warned:
         assert json.loads(routes_of(source)["/photographs.json"].read()) == []
     with warned:
-        assert list(export_web(source, tmp_path / "page.html").losses) == ["were it a model of 30 dB"]
+        assert list(losses_of(source)) == ["were it a model of 30 dB"]

@@ -40,6 +40,6 @@ class Finish:
         check_apart(self.out, self.folder)
         check_output(self.out)
         options = FinishOptions(self.max_loss, self.polish_steps)
-        done = finish_run(open_run(self.folder), self.out, options, lpips_weights=self.lpips_weights)
-        print(done.text)
+        table = finish_run(open_run(self.folder), self.out, options, lpips_weights=self.lpips_weights)
+        print(table)
         print(f"report: {RunFolder(self.out).report}")

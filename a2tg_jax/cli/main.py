@@ -129,12 +129,11 @@ class Compress:
     """Replace the output file. The default of a run is always replaced once a2tg compress has written it."""
 
     def run(self) -> None:
-        tell = functools.partial(print, flush=True)
-        found = compress(
-            self.source, self.out, max_loss=self.max_loss, tune_iterations=self.tune_iterations,
-            overwrite=self.overwrite, on_start=tell,
-        )  # fmt: skip
-        print(found.text)
+        iterations = self.tune_iterations
+        table = compress(
+            self.source, self.out, max_loss=self.max_loss, tune_iterations=iterations, overwrite=self.overwrite
+        )
+        print(table)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -95,14 +95,14 @@ class Export:
             self._check_web(self.web)
         source = open_source(self.source, self.model)
         if self.web is not None:
-            result = export_web(
+            summary = export_web(
                 source,
                 self.web,
                 single_file=self.single_file,
                 photographs=self.photographs,
                 overwrite=self.overwrite,
             )
-            print(result.text)
+            print(summary)
         if self.ply is not None:
             print(export_ply(source, self.ply, float64=self.float64))
 

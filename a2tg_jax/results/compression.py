@@ -1,9 +1,8 @@
 """Compression of a model: the smallest compact file within a loss, and a table of the choices tried."""
 
-import dataclasses
 import functools
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from a2tg_jax.data import Scene
@@ -39,38 +38,6 @@ MOST_VIEWS = 16
 """Largest number of training views measured, evenly chosen."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Compressed:
-    """Compact file, and how it was chosen."""
-
-    path: Path
-    model: Model
-    """Model before compression."""
-    trials: Sequence[Trial]
-    """Trial of each group at each precision."""
-    chosen: Trial
-    measures: tuple[str, ...]
-    """Names of the loss measures of the trials."""
-    tuned: TunedFiles
-    """Files of tuned models, and the error that ended their search, if any."""
-
-    @property
-    def text(self) -> str:
-        """Table of all choices tried, the bits of the tuned files, and at the end a line about the file."""
-        groups = dict.fromkeys(trial.group for trial in self.trials)
-        named = [(f"{trial.group} {trial.precision}", trial) for trial in self.trials]
-        named += [(f"tuned {number}", trial) for number, trial in enumerate(self.tuned.tried, 1)]
-        named.append(("chosen", self.chosen))
-        rows = [["kept as", "bytes", *(f"dB lost, {measure}" for measure in self.measures)]]
-        rows += [[name, f"{trial.num_bytes:,}", *(f"{loss:.3f}" for loss in trial.losses)] for name, trial in named]
-        bits = [f"{name}: {_bits(trial, groups)}" for name, trial in named[len(self.trials) :]]
-        if self.tuned.diverged:
-            bits.insert(-1, f"tuning ended early, what was found before is kept: {self.tuned.diverged}")
-        share = f"1/{self.model.num_bytes / self.chosen.num_bytes:.1f} of the model's numbers"
-        size = f"{in_bytes(self.chosen.num_bytes)} on disk, {share}, {loss_text(self.chosen.losses[0])}"
-        return "\n".join([*aligned(list(zip(*rows, strict=True))), *bits, f"{self.path}: {size}"])
-
-
 def compress(
     source: Path,
     out: Path | None = None,
@@ -78,9 +45,8 @@ def compress(
     max_loss: float = 0.05,
     tune_iterations: int = 0,
     overwrite: bool = False,
-    on_start: Callable[[str], None] = lambda _: None,
-) -> Compressed:
-    """Write the smallest compact file of a model within a given loss.
+) -> str:
+    """Write the smallest compact file of a model within a given loss, and return a table of the choices tried.
 
     Losses are losses of PSNR on the training views of a run. If the photographs are missing, or a model's file is
     given, they are estimated from renders, for a model with `ASSUMED_PSNR`.
@@ -92,7 +58,6 @@ def compress(
       tune_iterations: iterations of training with rounding for each choice of bits that is tried with it
         (`finish.tuning.smallest_tuned`); 0: the model's numbers are only rounded.
       overwrite: whether an existing file is replaced that this function did not write into the run's folder.
-      on_start: called with how much there is to try, once the arguments are checked.
 
     Raises:
       ValueError, OSError: if the model or the photographs to tune it with are missing, the file exists, a compact file
@@ -125,7 +90,7 @@ def compress(
     ladder, measures = LADDER if tune is None else TUNED_LADDER, list(losses.values())
     tunings = f", then training up to {MOST_TUNINGS} times" if tune else ""
     ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
-    on_start(f"trying {ways}{tunings}; on a CPU this takes minutes")
+    print(f"trying {ways}{tunings}; on a CPU this takes minutes", flush=True)
     trials = measure_choices(model, measures, ladder)
     untuned, found = None, TunedFiles([])
     try:
@@ -140,7 +105,27 @@ def compress(
         RunFolder(source).own(out)
     with replacing(out) as temporary:
         temporary.write_bytes(data)
-    return Compressed(out, model, trials, chosen, tuple(losses), found)
+    share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
+    size = f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
+    return "\n".join([*_table(trials, found, chosen, losses), size])
+
+
+def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: Iterable[str]) -> list[str]:
+    """Return the lines of a table of all choices tried, and the bits of the tuned files and the chosen one."""
+    named = [(f"{trial.group} {trial.precision}", trial) for trial in trials]
+    named += [(f"tuned {number}", trial) for number, trial in enumerate(found.tried, 1)]
+    named.append(("chosen", chosen))
+    rows = [["kept as", "bytes", *(f"dB lost, {measure}" for measure in measures)]]
+    rows += [[name, f"{trial.num_bytes:,}", *(f"{loss:.3f}" for loss in trial.losses)] for name, trial in named]
+    groups = {trial.group for trial in trials}
+    kept = [
+        (name, ", ".join(f"{group} {getattr(trial.choices, group)}" for group in GROUPS if group in groups))
+        for name, trial in named[len(trials) :]
+    ]
+    bits = [f"{name}: {told}" for name, told in kept]
+    if found.diverged:
+        bits.insert(-1, f"tuning ended early, what was found before is kept: {found.diverged}")
+    return [*aligned(list(zip(*rows, strict=True))), *bits]
 
 
 def _smaller(model: Model, untuned: Trial | None, found: TunedFiles, max_loss: float) -> tuple[Trial, bytes]:
@@ -179,8 +164,3 @@ def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict
     cameras = [camera for camera, is_test in pairs if not is_test]
     cameras = cameras[:: -(-len(cameras) // MOST_VIEWS) or 1]
     return {f"if {ASSUMED_PSNR:g} dB": loss_beside_renders(model, cameras, settings=settings)}
-
-
-def _bits(trial: Trial, groups: Collection[str]) -> str:
-    """Return the bits of each group that a model has."""
-    return ", ".join(f"{group} {getattr(trial.choices, group)}" for group in GROUPS if group in groups)

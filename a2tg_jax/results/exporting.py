@@ -1,8 +1,8 @@
 """Export of a model: the viewer with a scene, for a web server or as one file, and Gaussians as PLY."""
 
+import contextlib
 import dataclasses
 import json
-from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -27,36 +27,6 @@ MOST_VIEWS = 8
 RING_SIZE = (320, 240)
 
 
-@dataclasses.dataclass(frozen=True)
-class Exported:
-    """Files of an export."""
-
-    path: Path
-    """Path of the page."""
-    num_bytes: int
-    """Bytes of the scene alone."""
-    num_files: int
-    total_bytes: int
-    """Bytes of all files."""
-    model: Model
-    losses: Mapping[str, float]
-    """Loss of the scene file in dB of PSNR, by what it is measured on."""
-
-    @property
-    def text(self) -> str:
-        """Summary of the files written, their size and their loss."""
-        model, size = self.model, self.num_bytes
-        ratio = f"1/{model.num_bytes / max(size, 1):.1f} of the model's {in_bytes(model.num_bytes)}"
-        others = "" if self.num_files == 1 else f" with {counted(self.num_files - 1, 'file')} beside it"
-        return "\n".join(
-            [
-                f"{model.num:,} Gaussians, whose scene takes {in_bytes(size)}, {ratio}",
-                *(f"{loss_text(loss)}, {measure}" for measure, loss in self.losses.items()),
-                f"{self.path}: {in_bytes(self.total_bytes)}{others}",
-            ]
-        )
-
-
 def check_page(out: Path, *, single_file: bool, photographs: bool, overwrite: bool) -> list[Path]:
     """Return the files of a page, photographs left out: one, or several in a folder. Arguments and errors as in
     `export_web`."""
@@ -77,8 +47,9 @@ def check_page(out: Path, *, single_file: bool, photographs: bool, overwrite: bo
 
 def export_web(
     source: Source, out: Path, *, single_file: bool = False, photographs: bool = False, overwrite: bool = False
-) -> Exported:
-    """Write a page that shows a model: a folder for any web server, or one file that opens from the disk.
+) -> str:
+    """Write a page that shows a model: a folder for any web server, or one file that opens from the disk. Return a
+    summary of the files, their size and the loss of the scene file.
 
     Args:
       source: the model.
@@ -98,17 +69,20 @@ def export_web(
         files = _files_of(source, out, photographs)
         for path in files:
             check_new(path, "--web", overwrite=overwrite)
-        try:
+        with contextlib.suppress(OSError, ValueError, TypeError):  # There may be no page.
             old = {out / photograph_name(int(index)) for index in read_json(out / PHOTOGRAPHS_NAME)}
-        except (OSError, ValueError, TypeError):
-            pass  # There was no page.
     for path, content in files.items():
         with replacing(path) as temporary:
             temporary.write_bytes(content)
     for path in old - set(files):
         path.unlink(missing_ok=True)
         remove_if_empty(path.parent, out)
-    return Exported(page, len(data), len(files), sum(map(len, files.values())), source.model, _losses_of(source))
+    model, size, total = source.model, len(data), sum(map(len, files.values()))
+    ratio = f"1/{model.num_bytes / max(size, 1):.1f} of the model's {in_bytes(model.num_bytes)}"
+    lines = [f"{model.num:,} Gaussians, whose scene takes {in_bytes(size)}, {ratio}"]
+    lines += [f"{loss_text(loss)}, {measure}" for measure, loss in losses_of(source).items()]
+    others_text = f" with {counted(len(files) - 1, 'file')} beside it" if others else ""
+    return "\n".join([*lines, f"{page}: {in_bytes(total)}{others_text}"])
 
 
 def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:
@@ -129,8 +103,8 @@ def loss_text(loss: float) -> str:
     return f"{abs(loss):.3f} dB of PSNR {'gained' if loss < 0 else 'lost'}"
 
 
-def _losses_of(source: Source) -> dict[str, float]:
-    """Return the loss of the file: on photographs if there are any, otherwise against renders."""
+def losses_of(source: Source) -> dict[str, float]:
+    """Return the loss of a scene file in dB of PSNR: on photographs if there are any, otherwise against renders."""
     if not source.model.num:
         return {}
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)

@@ -20,7 +20,7 @@ from a2tg_jax.results.folder import RunFolder, check_free, claimed, read_json, w
 from a2tg_jax.results.model_source import finished_stage, settings_of
 from a2tg_jax.results.plan import PlannedStage
 from a2tg_jax.results.record import write_record
-from a2tg_jax.results.report import RunResult, aligned
+from a2tg_jax.results.report import aligned
 from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, refined_views
 from a2tg_jax.training.registry import system_to_dict
 
@@ -38,31 +38,9 @@ class Measured:
     test: float | None
     """PSNR of the test views in dB; None without test views."""
 
-    @property
-    def column(self) -> tuple[str, ...]:
-        """Cells of a table."""
-        return f"{self.num_bytes:,}", f"{self.train:.2f}", "" if self.test is None else f"{self.test:.2f}"
 
-
-@dataclasses.dataclass(frozen=True)
-class Finished:
-    """Models of a run by the name of each step, and the evaluation of the new run."""
-
-    steps: dict[str, Measured]
-    result: RunResult
-
-    @property
-    def text(self) -> str:
-        """Table of bytes and PSNR, before and after each step."""
-        rows = ("", "bytes", "train PSNR (dB)", "held-out PSNR (dB)")
-        lines = aligned([rows, *((name, *found.column) for name, found in self.steps.items())])
-        kept = kept_step(self.steps)
-        is_last = kept == list(self.steps)[-1]
-        return "\n".join(lines if is_last else [*lines, f"kept: {kept}, for polishing lost PSNR on the training views"])
-
-
-def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_weights: Path | None = None) -> Finished:
-    """Finish the last model of a run's main system, and evaluate it in a new run folder.
+def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_weights: Path | None = None) -> str:
+    """Finish the last model of a run's main system, evaluate it in a new run folder, and return a table of each step.
 
     Choices are made on training views; held-out views are only measured. If the same finishing was killed in that
     folder, it goes on: with the evaluation if the model was written, otherwise from its beginning.
@@ -98,8 +76,14 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
             system = {"system": system_to_dict(planned.system)}
             save_model(run.own(run.model(planned.name)), models[kept_step(steps)], system)
             write_record(run, record)  # Last: it makes the folder a run.
-        result = evaluate_run(run, scene, lpips_weights=lpips_weights)
-    return Finished(steps, result)
+        evaluate_run(run, scene, lpips_weights=lpips_weights)
+    columns = [("", "bytes", "train PSNR (dB)", "held-out PSNR (dB)")]
+    for name, found in steps.items():
+        test = "" if found.test is None else f"{found.test:.2f}"
+        columns.append((name, f"{found.num_bytes:,}", f"{found.train:.2f}", test))
+    kept = kept_step(steps)
+    spoiled = [] if kept == name else [f"kept: {kept}, for polishing lost PSNR on the training views"]
+    return "\n".join([*aligned(columns), *spoiled])
 
 
 def _is_written(run: RunFolder, told: Mapping[str, Any]) -> bool:
