@@ -5,26 +5,20 @@ import dataclasses
 import json
 from pathlib import Path
 
-import jax.numpy as jnp
-import numpy as np
-
-from a2tg_jax.core.cameras import Camera
 from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_on_views
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.formats import lost_by
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.model import Model
 from a2tg_jax.results.checks import check_new
 from a2tg_jax.results.folder import read_json, remove_if_empty
-from a2tg_jax.results.model_source import Source, middle_of
+from a2tg_jax.results.model_source import Source
 from a2tg_jax.results.viewing import ServedPhotographs
 from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, photograph_name, viewer_html, viewer_html_with
 
 MOST_VIEWS = 8
 """Largest number of views measured, evenly chosen."""
-RING_SIZE = (320, 240)
 
 
 def check_page(out: Path, *, single_file: bool, photographs: bool, overwrite: bool) -> list[Path]:
@@ -63,9 +57,10 @@ def export_web(
       ValueError: if browsers cannot show the model, or photographs are requested but missing, or requested in one file.
     """
     page, *others = check_page(out, single_file=single_file, photographs=photographs, overwrite=overwrite)
-    data = source.encoded
-    files, old = {page: viewer_html_with(data).encode()}, set()
-    if others:
+    data, old = source.encoded, set()
+    if not others:
+        files = {page: viewer_html_with(data).encode()}
+    else:
         files = _files_of(source, out, photographs)
         for path in files:
             check_new(path, "--web", overwrite=overwrite)
@@ -104,7 +99,7 @@ def loss_text(loss: float) -> str:
 
 
 def losses_of(source: Source) -> dict[str, float]:
-    """Return the loss of a scene file in dB of PSNR: on photographs if there are any, otherwise against renders."""
+    """Return the loss of a scene file in dB of PSNR: on photographs, or else on renders; empty without cameras."""
     if not source.model.num:
         return {}
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
@@ -115,26 +110,12 @@ def losses_of(source: Source) -> dict[str, float]:
         chosen = {name: found[:: -(-len(found) // MOST_VIEWS)] for name, found in views.items() if found}
         model = source.model
         return {name: loss_on_views(model, found, settings=settings)(again) for name, found in chosen.items()}
-    cameras = ([] if source.model.origin is None else source.model.origin.cameras) or _ring(source.model)
+    cameras = [] if source.model.origin is None else source.model.origin.cameras
+    if not cameras:
+        return {}
     cameras = cameras[:: -(-len(cameras) // MOST_VIEWS)]
     loss = loss_beside_renders(source.model, cameras, settings=settings)(again)
     return {f"were it a model of {ASSUMED_PSNR:g} dB": loss}
-
-
-def _ring(model: Model) -> list[Camera]:
-    """Return cameras around the middle of a model that has none."""
-    centre, radius = middle_of(model)
-    width, height = RING_SIZE
-    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
-    cameras = []
-    for angle in np.arange(MOST_VIEWS) * (2 * np.pi / MOST_VIEWS):
-        forward = np.array([np.sin(angle), 0.0, np.cos(angle)])
-        right = np.array([np.cos(angle), 0.0, -np.sin(angle)])
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = np.stack([right, [0.0, 1.0, 0.0], forward])
-        viewmat[:3, 3] = viewmat[:3, :3] @ (2.5 * radius * forward - centre)
-        cameras.append(Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(K, jnp.float32), width, height))
-    return cameras
 
 
 def check_ply(out: Path) -> None:

@@ -49,7 +49,10 @@ class Source:
         """Distance of the near plane; small for files whose world has an unknown size."""
         if (self.model.origin is not None and self.model.origin.names) or not self.model.num:
             return self.settings.near_plane
-        return min(self.settings.near_plane, 0.02 * middle_of(self.model)[1])
+        means = np.asarray(self.model.live.gaussians.means, np.float64)
+        # The radius that holds three quarters of the Gaussians.
+        radius = np.quantile(np.linalg.norm(means - np.median(means, axis=0), axis=1), 0.75)
+        return min(self.settings.near_plane, 0.02 * float(max(radius, 1e-6)))
 
     @functools.cached_property
     def encoded(self) -> bytes:
@@ -123,13 +126,6 @@ def open_source(path: Path, name: str | None = None) -> Source:
 def settings_of(system: System) -> RenderSettings:
     """Return the render settings of a system's models."""
     return RenderSettings(tile_size=system.tile_size)
-
-
-def middle_of(model: Model) -> tuple[np.ndarray, float]:
-    """Return the centre [3] of most means, and the radius that holds three quarters of them."""
-    means = np.asarray(model.live.gaussians.means, np.float64)
-    centre = np.median(means, axis=0)
-    return centre, float(max(np.quantile(np.linalg.norm(means - centre, axis=1), 0.75), 1e-6))
 
 
 def _run_at(folder: Path) -> RunFolder:
