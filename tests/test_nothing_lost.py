@@ -308,7 +308,10 @@ def test_a_full_disk_is_seen_before_training(tmp_path, monkeypatch, capsys):
     usage = shutil.disk_usage(tmp_path)._replace(free=50_000)
     monkeypatch.setattr(forecast.shutil, "disk_usage", lambda path: usage)
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
-    assert "GB for models and checkpoints" in capsys.readouterr().err and not (tmp_path / "run").exists()
+    assert (
+        "for models and checkpoints, but the disk has 50.0 kB" in capsys.readouterr().err
+        and not (tmp_path / "run").exists()
+    )
 
 
 # Checkpoints

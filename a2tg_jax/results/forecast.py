@@ -132,8 +132,8 @@ class RunForecast:
         free = shutil.disk_usage(next(folder for folder in (path, *path.parents) if folder.is_dir())).free
         if self.disk_bytes > free:
             raise ValueError(
-                f"{out} needs {self.disk_bytes / 1e9:.1f} GB for models and checkpoints, but the disk has "
-                f"{free / 1e9:.1f} GB: make room, or choose another --out, fewer Gaussians or fewer --compare"
+                f"{out} needs about {in_bytes(self.disk_bytes)} for models and checkpoints, but the disk has "
+                f"{in_bytes(free)}: make room, or choose another --out, fewer Gaussians or fewer --compare"
             )
 
     def _options(self, largest: str) -> str:
