@@ -56,7 +56,10 @@ def read_history(path: Path) -> History:
                 raise ValueError(f"has a column twice: {shortened(', '.join(terms))}")
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # A history may be empty.
-                values = np.loadtxt(file, delimiter=",", comments=None, ndmin=2).reshape(-1, len(first))
+                values = np.loadtxt(file, delimiter=",", comments=None, ndmin=2)
+            if values.size and values.shape[1] != len(first):
+                raise ValueError(f"has rows of {values.shape[1]} numbers; {len(first)} are wanted")
+            values = values.reshape(-1, len(first))
             is_large = np.abs(values[:, [name != "psnr" for name in first]]) > LARGEST
             if np.isnan(values[:, : len(NAMES)]).any() or is_large.any():
                 raise ValueError("has numbers that are not finite")
