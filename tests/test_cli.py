@@ -532,7 +532,7 @@ def test_export_and_what_view_would_serve(tiny_run, tmp_path, monkeypatch, capsy
     listed = json.loads((tmp_path / "site" / "photographs.json").read_text())
     assert listed and len(list((tmp_path / "site" / "photographs").glob("*.jpg"))) == len(listed)
     (tmp_path / "site" / "photographs" / "mine.jpg").touch()
-    monkeypatch.setattr(exporting, "_losses_of", lambda source: {})
+    monkeypatch.setattr(exporting, "losses_of", lambda source: {})
     assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--overwrite"]) == 0
     assert [path.name for path in (tmp_path / "site" / "photographs").iterdir()] == ["mine.jpg"]
     routes = routes_of(open_source(run.path, "a2tg-gaussians"))

@@ -70,7 +70,12 @@ def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
     default = (signal.default_int_handler, signal.SIG_DFL)
     own = tuple(n for n in numbers if (old := signal.getsignal(n)) in default or isinstance(old, _Heard))
     with _handled_by(note, own):
-        yield lambda: bool(found)
+        try:
+            yield lambda: bool(found)
+        except KeyboardInterrupt as stop:
+            if found:  # What ends the block keeps its class, and says which signal ended it.
+                stop.number = found[-1]  # type: ignore[attr-defined]
+            raise
     if found:
         raise Stopped(found[-1])
 

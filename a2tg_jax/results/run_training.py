@@ -158,7 +158,7 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
             others.leave()
         return measure(run, scene, lpips_weights=options.lpips_weights)
     except KeyboardInterrupt as stop:
-        number = stop.number if isinstance(stop, signals.Stopped) else signals.CTRL_C
+        number = getattr(stop, "number", signals.CTRL_C)
         raise signals.Stopped(number, advice()) from None
     except Exception as error:
         told = error_text(error, LESS_MEMORY)
