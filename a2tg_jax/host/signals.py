@@ -33,8 +33,8 @@ class Stopped(KeyboardInterrupt):
 
     @staticmethod
     def of(interrupt: KeyboardInterrupt) -> "Stopped":
-        """Return an interrupt of another kind as the end by Ctrl-C."""
-        return interrupt if isinstance(interrupt, Stopped) else Stopped(CTRL_C)
+        """Return an interrupt of another kind as the end by the signal that it names, or else by Ctrl-C."""
+        return interrupt if isinstance(interrupt, Stopped) else Stopped(getattr(interrupt, "number", CTRL_C))
 
     @property
     def exit_code(self) -> int:
