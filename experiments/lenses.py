@@ -27,9 +27,8 @@ from PIL import Image
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.lenses import KeptLens, Lens
-from a2tg_jax.data.lighting import light
-from a2tg_jax.data.surfaces import Surface, trace_rays
+from a2tg_jax.data.lenses import Lens
+from a2tg_jax.data.ray_tracing import Surface, light, trace_rays
 from a2tg_jax.data.synthetic import SAMPLE_OFFSETS, camera_path, still_life, viewmat_to_target
 from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.training.registry import with_changes
@@ -46,15 +45,15 @@ BUDGET = 0.3
 USES = ("keep", "undistort")
 
 
-def lens_of(name: str) -> KeptLens:
+def lens_of(name: str) -> Lens:
     """Return a lens by its name."""
     focal, k1 = LENSES[name]
     width, height = SIZE
     params = [focal, focal, width / 2, height / 2, k1, 0.0, 0.0, 0.0]
-    return KeptLens(pycolmap().Camera(model="OPENCV_FISHEYE", width=width, height=height, params=params))
+    return Lens(pycolmap().Camera(model="OPENCV_FISHEYE", width=width, height=height, params=params), is_kept=True)
 
 
-def photograph(surfaces: Sequence[Surface], viewmat: np.ndarray, lens: KeptLens) -> np.ndarray:
+def photograph(surfaces: Sequence[Surface], viewmat: np.ndarray, lens: Lens) -> np.ndarray:
     """Return the image [H, W, 3] uint8 that the lens sees, the mean of a few rays a pixel; black where it has none."""
     width, height = SIZE
     x, y = (grid.ravel() + 0.5 for grid in np.meshgrid(np.arange(width), np.arange(height)))

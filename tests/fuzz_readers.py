@@ -117,7 +117,7 @@ def _picture(folder: Path, file: Path) -> None:
     try:
         from a2tg_jax.data.decoding import read_pixels
     except ImportError:  # Where they were before, so that an older version can be tried too.
-        from a2tg_jax.data.images import read_pixels
+        from a2tg_jax.data.image_files import read_pixels
 
     pixels = read_pixels(file)
     assert pixels.dtype == np.uint8 and pixels.ndim == 3 and pixels.shape[2] in (3, 4) and pixels.size

@@ -199,50 +199,36 @@ def test_alpha_and_greyscale(tmp_path):
     np.testing.assert_allclose(seen, expected, atol=1e-6)
 
 
-def break_missing_path(folder):
-    return folder / "nowhere"
+FOURTH = "images/img_04.png"
 
 
-def break_no_model(folder):
-    shutil.rmtree(folder / "sparse")
-
-
-def break_no_images_folder(folder):
-    (folder / "images").rename(folder / "photos")
-
-
-def break_missing_image(folder):
-    (folder / "images" / "img_04.png").unlink()
-
-
-def break_unreadable_image(folder):
-    (folder / "images" / "img_04.png").write_bytes(b"no image")
-
-
-def break_cut_off_image(folder):
-    file = folder / "images" / "img_04.png"
-    file.write_bytes(file.read_bytes()[:200])
-
-
-def break_aspect(folder):
-    Image.new("RGB", (WIDTH, HEIGHT + 4)).save(folder / "images" / "img_04.png")
-
-
-def break_model_file(folder):
-    (folder / "sparse" / "0" / "images.bin").write_bytes(b"\x05" + bytes(20))
+def put(file, data):
+    file.write_bytes(data)
 
 
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
-        (break_missing_path, FileNotFoundError, "nowhere: no such scene folder$"),
-        (break_no_model, FileNotFoundError, "has no sparse model"),
-        (break_no_images_folder, FileNotFoundError, "no folder 'images'"),
-        (break_missing_image, FileNotFoundError, "img_04.png: no such image"),
-        (break_unreadable_image, ValueError, "img_04.png: cannot be read as an image"),
-        (break_cut_off_image, ValueError, "img_04.png: cannot be read as an image"),
-        (break_aspect, ValueError, "img_04.png: is 128x100, but its camera is 128x96"),
-        (break_model_file, ValueError, "images.bin: is cut off or damaged: number 1 of 5 images"),
+        (lambda folder: folder / "nowhere", FileNotFoundError, "nowhere: no such scene folder$"),
+        (lambda folder: shutil.rmtree(folder / "sparse"), FileNotFoundError, "has no sparse model"),
+        (lambda folder: (folder / "images").rename(folder / "photos") and folder, FileNotFoundError, "no folder 'imag"),
+        (lambda folder: (folder / FOURTH).unlink(), FileNotFoundError, "img_04.png: no such image"),
+        (lambda folder: put(folder / FOURTH, b"no image"), ValueError, "img_04.png: cannot be read as an image"),
+        (
+            lambda folder: put(folder / FOURTH, (folder / FOURTH).read_bytes()[:200]),
+            ValueError,
+            "img_04.png: cannot be read as an image",
+        ),
+        (
+            lambda folder: Image.new("RGB", (WIDTH, HEIGHT + 4)).save(folder / FOURTH),
+            ValueError,
+            "img_04.png: is 128x100, but its camera is 128x96",
+        ),
+        (
+            lambda folder: put(folder / "sparse/0/images.bin", b"\x05" + bytes(20)),
+            ValueError,
+            "images.bin: is cut off or damaged: number 1 of 5 images",
+        ),
     ],
 )
 def test_bad_input_is_named(tmp_path, spoil, error, message):

@@ -13,11 +13,10 @@ import pytest
 from PIL import ExifTags, Image
 from test_data_colmap import write_scene as write_colmap
 
-from a2tg_jax.data import load_scene, progress, run_sfm, sfm, synthetic_scene
+from a2tg_jax.data import load_scene, run_sfm, sfm, synthetic_scene
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_facts, picture_size, read_pixels
 from a2tg_jax.data.photo_folder import find_photos
-from a2tg_jax.data.sfm_database import join_rig, list_images
 from a2tg_jax.data.staging import _link, _prefixes, stage
 from a2tg_jax.host import progress_bars
 from a2tg_jax.results.figures import save_camera_picture
@@ -85,11 +84,7 @@ def cameras_of(found, work):
     """Lists the staged photographs in a database as `run_sfm` does; returns its cameras, and frames of rigs."""
     colmap = pycolmap()
     database = work / "database.db"
-    database.touch()
-    for group in (*found.groups, *(group for rig in found.rigs for group in rig.groups)):
-        list_images(database, found.folder, group, "SIMPLE_RADIAL")
-    for rig in found.rigs:
-        join_rig(database, rig)
+    sfm.list_photos(database, found, "SIMPLE_RADIAL")
     with contextlib.closing(colmap.Database.open(database)) as opened:
         return opened.read_all_cameras(), opened.read_all_frames()
 
@@ -235,7 +230,7 @@ def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):
 @pytest.mark.parametrize("is_terminal", [False, True])
 def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd, monkeypatch, is_terminal):
     """Phases are bars on a terminal and plain lines in a pipe."""
-    for module in (progress_bars, progress):
+    for module in (progress_bars, sfm):
         monkeypatch.setattr(module, "has_terminal", lambda: is_terminal)
     save_photos(tmp_path / "photos", 4, 128, 96)
     with contextlib.suppress(ValueError):  # The phases count, not what they find.

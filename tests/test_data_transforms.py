@@ -496,79 +496,45 @@ def test_blender_without_a_test_file(tmp_path):
     assert [view.name for view in scene.test] == ["train/00", "train/03"]
 
 
-def spoil_json(folder):
-    (folder / "transforms.json").write_text("{")
+def written(change=lambda frames: None, **values):
+    """Function that writes a scene's frames again, changed."""
+
+    def write(folder):
+        frames = write_frames(folder)
+        change(frames)
+        write_json(folder, frames, **values)
+
+    return write
 
 
-def spoil_frames(folder):
-    write_json(folder, [])
+def moved(place, value):
+    return written(lambda frames: frames[2]["transform_matrix"][0].__setitem__(place, value), **FOCAL)
 
 
-def spoil_image(folder):
-    (folder / "images" / "03.png").unlink()
-
-
-def spoil_points(folder):
-    (folder / "sparse_pc.ply").unlink()
-
-
-def spoil_ply(folder):
-    (folder / "sparse_pc.ply").write_bytes(b"solid")
-
-
-def spoil_focal(folder):
-    write_json(folder, write_frames(folder), **SIZE)
-
-
-def spoil_pose(folder):
-    frames = write_frames(folder)
-    frames[2]["transform_matrix"][0][0] = 5.0
-    write_json(folder, frames, **FOCAL)
-
-
-def spoil_nan(folder):
-    frames = write_frames(folder)
-    frames[2]["transform_matrix"][0][3] = float("nan")
-    write_json(folder, frames, **FOCAL)
-
-
-def spoil_shape(folder):
-    frames = write_frames(folder)
-    frames[2]["transform_matrix"] = [1, 2, 3]
-    write_json(folder, frames, **FOCAL)
-
-
-def spoil_model(folder):
-    write_json(folder, write_frames(folder), camera_model="EQUIRECTANGULAR", **FOCAL)
-
-
-def spoil_place(folder):
-    frames = write_frames(folder)
+def all_at_one_place(frames):
     for frame in frames:
         frame["transform_matrix"] = frames[0]["transform_matrix"]
-    write_json(folder, frames, **FOCAL)
-
-
-def spoil_names(folder):
-    frames = write_frames(folder)
-    write_json(folder, [*frames, frames[1]], **FOCAL)
 
 
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
-        (spoil_json, ValueError, "cannot be read as JSON"),
-        (spoil_frames, ValueError, "lists no frames"),
-        (spoil_image, FileNotFoundError, "03.png: no such image"),
-        (spoil_points, FileNotFoundError, "sparse_pc.ply: no such point file"),
-        (spoil_ply, ValueError, "sparse_pc.ply: is not a PLY file"),
-        (spoil_focal, ValueError, "images/00.png: has no focal length"),
-        (spoil_pose, ValueError, "images/02.png: its pose is not a rigid motion"),
-        (spoil_nan, ValueError, "images/02.png: its pose is not finite"),
-        (spoil_shape, ValueError, "images/02.png: its transform_matrix must be"),
-        (spoil_model, ValueError, "camera_model EQUIRECTANGULAR"),
-        (spoil_place, ValueError, "one place"),
-        (spoil_names, ValueError, "lists images/01.png twice"),
+        (lambda folder: (folder / "transforms.json").write_text("{"), ValueError, "cannot be read as JSON"),
+        (lambda folder: write_json(folder, []), ValueError, "lists no frames"),
+        (lambda folder: (folder / "images/03.png").unlink(), FileNotFoundError, "03.png: no such image"),
+        (lambda folder: (folder / "sparse_pc.ply").unlink(), FileNotFoundError, "sparse_pc.ply: no such point file"),
+        (lambda folder: (folder / "sparse_pc.ply").write_bytes(b"solid"), ValueError, "ply: is not a PLY file"),
+        (written(**SIZE), ValueError, "images/00.png: has no focal length"),
+        (moved(0, 5.0), ValueError, "images/02.png: its pose is not a rigid motion"),
+        (moved(3, float("nan")), ValueError, "images/02.png: its pose is not finite"),
+        (
+            written(lambda frames: frames[2].update(transform_matrix=[1, 2, 3]), **FOCAL),
+            ValueError,
+            "images/02.png: its transform_matrix must be",
+        ),
+        (written(camera_model="EQUIRECTANGULAR", **FOCAL), ValueError, "camera_model EQUIRECTANGULAR"),
+        (written(all_at_one_place, **FOCAL), ValueError, "one place"),
+        (written(lambda frames: frames.append(frames[1]), **FOCAL), ValueError, "lists images/01.png twice"),
     ],
 )
 def test_bad_input_is_named(tmp_path, spoil, error, message):

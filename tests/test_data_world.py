@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.similarity import Similarity, camera_centers
-from a2tg_jax.data.world import normalizing_similarity, scene_scale
+from a2tg_jax.data.assembly import normalizing_similarity, scene_scale
 
 
 def look_at(center, target, up=(0.0, 0.0, 1.0)):

@@ -12,8 +12,7 @@ import pytest
 
 from a2tg_jax.cli import main as cli
 from a2tg_jax.data import download
-from a2tg_jax.data.benchmark_sets import BENCHMARK_SETS, BenchmarkSet
-from a2tg_jax.data.download import Archive
+from a2tg_jax.data.download import BENCHMARK_SETS, Archive
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
@@ -176,12 +175,6 @@ def test_what_came_from_elsewhere_is_not_overwritten(server, tmp_path):
     assert fetch(archive, tmp_path / "scenes") and own.read_text() == "new"
 
 
-def test_what_an_earlier_version_unpacked_is_left_alone(server, tmp_path):
-    (tmp_path / "archives").mkdir()
-    (tmp_path / "archives" / "set.unpacked").touch()
-    assert not fetch(archive_of(server, {"a.txt": "a"}), tmp_path) and server.firsts == []
-
-
 def test_tar_archives(server, tmp_path):
     fetch(archive_of(server, {"scan24/a.txt": "a"}, "set.tar.gz"), tmp_path / "scenes")
     assert (tmp_path / "scenes/360_v2/scan24/a.txt").read_text() == "a"
@@ -200,7 +193,7 @@ def test_what_is_not_there_is_an_error(server, tmp_path):
 
 
 def test_the_command_lists_and_fetches(server, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(BENCHMARK_SETS, "tiny", BenchmarkSet("a text", archive_of(server, {"a.txt": "a"})))
+    monkeypatch.setitem(BENCHMARK_SETS, "tiny", archive_of(server, {"a.txt": "a"}, content="a text"))
     assert cli.main(["download", "--list"]) == 0
     told = capsys.readouterr().out
     assert all(f"{name} " in told for name in BENCHMARK_SETS)

@@ -13,7 +13,7 @@ from PIL import Image
 
 from a2tg_jax.data import decoding, run_sfm
 from a2tg_jax.data.decoding import MAX_PIXELS, picture_facts, read_pixels
-from a2tg_jax.data.images import inside, locate_image
+from a2tg_jax.data.image_files import inside, locate_image
 from a2tg_jax.results.images import picture_names, save_picture
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}

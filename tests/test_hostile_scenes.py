@@ -22,9 +22,7 @@ from test_data_transforms import (
 )
 
 from a2tg_jax.data import load_scene
-from a2tg_jax.data.colmap_binary import read_binary
-from a2tg_jax.data.colmap_records import KINDS
-from a2tg_jax.data.colmap_text import read_text
+from a2tg_jax.data.colmap_files import KINDS, read_binary, read_text
 from a2tg_jax.data.lenses import checked_lens
 from a2tg_jax.data.ply_points import read_ply_points
 
@@ -109,7 +107,7 @@ def test_lines_that_are_cut_off_are_noticed(tmp_path, kind):
         ("cameras", "1 PINHOLE 128 96 110 120 70", "PINHOLE has 4 parameters; got 3"),
         ("cameras", "1 MAGIC 128 96 110", "knows no camera model MAGIC"),
         ("cameras", "1 PINHOLE wide 96 110 120 70 40", "line 1"),
-        ("images", "1 1 0 0 0 0 0 0 1", "an image needs 10 words"),
+        ("images", "1 1 0 0 0 0 0 0 1", "it is cut off after 9 words"),
         ("images", "1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 0 1 b.png\n", "the line of its points is missing"),
         (
             "images",
@@ -288,8 +286,8 @@ def test_values_of_wrong_types(tmp_path, values, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[" * 100_000, "nested too deeply"),
-        ('{"frames": [' + '{"a":' * 900 + "1" + "}" * 900 + "]}", "nested more than 64 deep|nested too deeply"),
+        ("[" * 100_000, "nested more than 64 deep"),
+        ('{"frames": [' + '{"a":' * 900 + "1" + "}" * 900 + "]}", "nested more than 64 deep"),
         ('{"frames": [{"file_path": "a", "transform_matrix": 1}], "fl_x": ' + "1" * 401 + "}", "401 digits"),
         ('{"frames": [{"file_path": "a", "transform_matrix": 1}], "fl_x": ' + "1" * 5000 + "}", "5000 digits"),
         ("\xff\xfe", "cannot be read as JSON"),

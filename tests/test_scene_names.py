@@ -20,7 +20,7 @@ from test_data_transforms import (
 )
 
 from a2tg_jax.data import load_scene
-from a2tg_jax.data.images import inside, on_disk
+from a2tg_jax.data.image_files import inside, on_disk
 
 KEPT = 5
 """Rows at the top that masks exclude."""

@@ -6,8 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.data.benchmark_sets import BENCHMARK_SETS
-from a2tg_jax.data.download import fetch
+from a2tg_jax.data.download import BENCHMARK_SETS, fetch
 from a2tg_jax.host.text import did_you_mean
 
 
@@ -39,7 +38,7 @@ class Download:
                 near = did_you_mean(name, BENCHMARK_SETS)
                 raise ValueError(f"there is no data set {name!r}{near or ';'} they are {', '.join(BENCHMARK_SETS)}")
         for name in self.names:
-            archive = BENCHMARK_SETS[name].archive
+            archive = BENCHMARK_SETS[name]
             print(f"{name}: {archive.url}", flush=True)
             is_new = fetch(archive, self.out)
             print(f"{name}: {'unpacked' if is_new else 'is there already'} in {self.out / archive.folder}")
@@ -48,7 +47,7 @@ class Download:
 def _table() -> str:
     rows = []
     for name, known in BENCHMARK_SETS.items():
-        size = known.archive.num_bytes
+        size = known.num_bytes
         told = "      ?" if size is None else f"{size / 1e9:4.1f} GB"
         rows.append(f"{name:<17} {told}  {known.content}")
     return "\n".join([*rows, "Sizes with ? are told by the server before the download."])

@@ -11,9 +11,8 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import defaulting_to
 from a2tg_jax.data import SfmSummary, run_sfm
 from a2tg_jax.data.load import is_scene
-from a2tg_jax.data.other_pictures import CAMERA_PICTURE
-from a2tg_jax.data.photo_folder import holds_photos, is_video
-from a2tg_jax.data.sfm_database import CameraModel, Matching
+from a2tg_jax.data.photo_folder import CAMERA_PICTURE, holds_photos, is_video
+from a2tg_jax.data.sfm import CameraModel, Matching
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.results.checks import check_apart, check_output

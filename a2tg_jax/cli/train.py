@@ -16,7 +16,7 @@ from a2tg_jax.cli.arguments import check_path, defaulting_to, flag_of, flag_with
 from a2tg_jax.cli.process_flags import HEARTBEAT_TIMEOUT, place_of
 from a2tg_jax.cli.view import in_browser
 from a2tg_jax.data.lenses import LensUse
-from a2tg_jax.data.mask_files import AlphaMeaning
+from a2tg_jax.data.masks import AlphaMeaning
 from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.host.text import counted, shortened
 from a2tg_jax.io.config_json import flatten_config

@@ -1,4 +1,5 @@
 from .arrays import scene_from_arrays as scene_from_arrays
+from .assembly import with_validation_views as with_validation_views
 from .load import load_scene as load_scene
 from .masks import Mask as Mask
 from .observations import ObservedPoints as ObservedPoints, observed_points as observed_points
@@ -11,5 +12,4 @@ from .scene import (
     views_by_kind as views_by_kind,
 )
 from .sfm import SfmSummary as SfmSummary, run_sfm as run_sfm
-from .splits import with_validation_views as with_validation_views
 from .synthetic import synthetic_scene as synthetic_scene

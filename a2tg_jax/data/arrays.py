@@ -10,13 +10,12 @@ from numpy.typing import ArrayLike
 from a2tg_jax.core.capture_geometry import nearest_point
 from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked
 from a2tg_jax.core.similarity import camera_centers
-from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, check_test_every, every_kth, rigid_viewmat
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.observations import before_camera, observed_points, pinhole_pixels
 from a2tg_jax.data.photo_store import Picture, how_to_convert
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.data.splits import check_test_every, every_kth
 
 OFF_CENTER = 1.25
 """Least ratio of the size of an image and twice its principal point, on both axes, that is warned of."""
@@ -43,7 +42,7 @@ def scene_from_arrays(
     test_every: int = 8,
     name: str = "arrays",
 ) -> Scene:
-    """Make a scene of images and cameras in any world, which is normalised as that of `load_scene`.
+    """Make a scene of images and cameras in any world, which is normalised as `load_scene` does.
 
     Args:
       images: V images [H, W, 3] or, with straight alpha, [H, W, 4], uint8; sizes may differ. They are not copied.
@@ -125,7 +124,7 @@ def _told_of_values(images: Sequence[object], colors: ArrayLike | None) -> Itera
 
 def _told_of_sizes(shots: Sequence[Shot]) -> str:
     """Return a warning if principal points fit images of another size, which differs on both axes."""
-    sizes = np.array([shot.pixels.shape[1::-1] for shot in shots], float)
+    sizes = np.array([shot.picture.size[::-1] for shot in shots], float)
     twice = np.array([2 * shot.K[:2, 2] for shot in shots])
     is_off = (np.maximum(twice, sizes) > OFF_CENTER * np.minimum(twice, sizes)).all(axis=1)
     if np.count_nonzero(is_off) <= len(shots) / 2:
@@ -171,11 +170,11 @@ def _told_of_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
 
 
 def _share_seen(shots: Sequence[Shot], viewmats: np.ndarray, points: np.ndarray) -> float:
-    """Return the share of all points, averaged over the views, that lie in an image."""
+    """Return the share of all points, averaged over the views, in an image."""
     shares = []
     for shot, viewmat in zip(shots, viewmats, strict=True):
         xy = pinhole_pixels(before_camera(points, viewmat), shot.K)
-        shares.append(np.count_nonzero(((xy >= 0) & (xy < shot.pixels.shape[1::-1])).all(axis=1)) / len(points))
+        shares.append(np.count_nonzero(((xy >= 0) & (xy < shot.picture.size[::-1])).all(axis=1)) / len(points))
     return float(np.mean(shares))
 
 

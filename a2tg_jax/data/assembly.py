@@ -1,29 +1,50 @@
-"""From photographs with poses in the original world to a scene in the normalised one."""
+"""From photographs with poses in the original world to a scene in the normalised one.
+
+Every scene gets the same origin, orientation and size before training. All of it is float64 on the host.
+"""
 
 import dataclasses
 import itertools
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
+from a2tg_jax.core.capture_geometry import LEAST_FACING, nearest_point
+from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.depths import DepthMap
 from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.scene import Scene, View
-from a2tg_jax.data.start_points import NUM_RANDOM_POINTS, Sight, random_points, unseeing
-from a2tg_jax.data.world import normalizing_similarity, scene_scale
 from a2tg_jax.host.text import counted
 
+NUM_RANDOM_POINTS = 10_000
+OBJECT_SHARE = 0.8958
+"""Half the side of an object's cube over half the width that cameras see at its centre: the cube of ±1.3 of NeRF's
+synthetic objects, whose cameras are 4.031 away and see 39.6°."""
+NEAREST, DEEPEST_AROUND = 0.4, 2.0
+"""Depths of random points before cameras around a subject, in units of their distance from it."""
+SHALLOWEST, DEEPEST = 0.5, 10.0
+"""Depths of random points before other cameras."""
+FIRST_LOOK = 10_000
+"""Number of points, evenly chosen, that a view is tried with before all of them."""
 RANDOM_COLOR = 128
 """Mid-grey of random points."""
 FARTHEST = 1e5
 """Largest distance of a camera from the median centre, in units of the median distance."""
+MIN_UP_LENGTH = 1e-3
+"""Shortest mean of the cameras' unit up vectors that still defines up."""
+ZERO_SPREAD = 1e-9
+"""Distance below which cameras count as one place, relative to their distance from the origin."""
+VALIDATION_EVERY = 8
+"""Interval of validation views among the training views."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,15 +55,13 @@ class Shot:
     viewmat: np.ndarray
     """[4, 4] float64 world to camera (OpenCV)."""
     K: np.ndarray
-    """[3, 3] float64 intrinsics in pixels of `pixels`."""
-    pixels: Picture | np.ndarray
-    """[H, W, 3] or [H, W, 4] uint8, with straight alpha."""
+    """[3, 3] float64 intrinsics in pixels of the picture."""
+    picture: Picture
     mask: Mask | None = None
-    """Mask of the pixels that count; None without a mask."""
+    """Pixels that count; None if all do."""
     rays: np.ndarray | None = None
     """[H, W, 2] rays of the pixels, as `Camera.rays` has them, NaN where there is none; None of a pinhole."""
     depth: DepthMap | None = None
-    """Depth map; None without one."""
     panorama: int | None = None
     """Number of the panorama that it was cut from; None of a photograph."""
     points: ObservedPoints | None = None
@@ -67,8 +86,7 @@ def assemble_scene(
 
     Args:
       name: of the scene.
-      train: shots to train on, any order.
-      test: shots to test on; may be empty.
+      train, test: shots to train and to test on, any order.
       cloud: surface points. With fewer than two, or if no training view sees one, random points where the cameras look
         are used, with a warning. Another warning counts training views that see no point.
       source: name of the input in messages.
@@ -76,19 +94,17 @@ def assemble_scene(
         and expected.
 
     Raises:
-      ValueError: if there are fewer than two shots or no training shot, two shots share a name, a pose is not a rigid
-        motion, or all cameras stand at one place.
+      ValueError: if the shots or their poses make no scene.
     """
     shots = sorted([*train, *test], key=lambda shot: shot.name)
     _check_shots(shots, len(train), source)
-    _check_distances(shots, source)
     try:
         transform = normalizing_similarity(np.stack([shot.viewmat for shot in shots]))
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
     centers = camera_centers(np.stack(list(viewmats.values())))
-    sights = [Sight.of(viewmats[shot.name], shot.K, shot.pixels.shape[:2], shot.rays) for shot in train]
+    sights = [Sight.of(viewmats[shot.name], shot.K, shot.picture.size, shot.rays) for shot in train]
     cloud = cloud and _usable(cloud, transform, source)
     points = None if cloud is None or len(cloud.points) < 2 else transform.apply(cloud.points)
     unseen_by = [] if points is None else unseeing(points, sights)
@@ -121,12 +137,79 @@ def assemble_scene(
     )
 
 
-def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
-    """Return the rigid motion nearest to a nearly rigid matrix [4, 4], such as a rounded pose.
+class Sight(NamedTuple):
+    """Part of the world that a view shows."""
 
-    Raises:
-      ValueError: naming `what`, if the matrix is not finite or its rotation is not one.
+    viewmat: np.ndarray
+    """[4, 4] world to camera."""
+    K: np.ndarray
+    """[3, 3]."""
+    low: np.ndarray
+    """[2] smallest x and y in the image plane of K."""
+    high: np.ndarray
+    """[2] largest ones."""
+
+    @staticmethod
+    def of(viewmat: np.ndarray, K: np.ndarray, size: tuple[int, ...], rays: ArrayLike | None) -> "Sight":
+        """Return what a view of (height, width) shows, with `rays` as `Camera.rays` has them."""
+        if rays is None:
+            return Sight(viewmat, K, np.zeros(2), np.array(size[::-1], np.float64))
+        return Sight(viewmat, K, np.nanmin(rays, axis=(0, 1)), np.nanmax(rays, axis=(0, 1)))
+
+    def num_seen(self, points: np.ndarray) -> int:
+        """Return the number of points [P, 3] that are in the picture and not too near to be drawn."""
+        own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        own = own[own[:, 2] > NEAR_PLANE]
+        places = own @ self.K[:2].T / own[:, 2:]
+        return int(((places >= self.low) & (places <= self.high)).all(axis=1).sum())
+
+
+def unseeing(points: np.ndarray, sights: Sequence[Sight]) -> list[int]:
+    """Return the numbers of the views that see none of the points [P, 3]."""
+    some = points[:: max(1, len(points) // FIRST_LOOK)]
+    return [number for number, sight in enumerate(sights) if not (sight.num_seen(some) or sight.num_seen(points))]
+
+
+def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None, seed: int = 0) -> np.ndarray:
+    """Return random points [NUM_RANDOM_POINTS, 3] where cameras look; each view sees some.
+
+    They are in a cube around an object that all views show, or else in the pyramids that the views show.
+
+    Args:
+      sights: of the training views. The origin is the point nearest to their optical axes.
+      object_axes: [3, 3] axes of the cube of a scene that is an object, by columns; None of other scenes.
+      seed: random seed.
     """
+    rng = np.random.default_rng(seed)
+    viewmats = np.stack([sight.viewmat for sight in sights])
+    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    distances = np.linalg.norm(centers, axis=1)
+    slopes = np.stack([(sight.high - sight.low) / np.diag(sight.K)[:2] for sight in sights])
+    if object_axes is not None:
+        half_side = OBJECT_SHARE * np.median(distances * slopes.min(axis=1) / 2)
+        points: np.ndarray = rng.uniform(-half_side, half_side, (NUM_RANDOM_POINTS, 3)) @ object_axes.T
+        if not unseeing(points, sights):
+            return points
+    # Each point is on a random ray of one view, at a random depth, and the views take turns.
+    view = np.arange(NUM_RANDOM_POINTS) % len(sights)
+    low, high = (np.stack([getattr(sight, side) for sight in sights])[view] for side in ("low", "high"))
+    places = np.concatenate([rng.uniform(low, high), np.ones((NUM_RANDOM_POINTS, 1))], axis=1)
+    to_rays = np.linalg.inv(np.stack([sight.K for sight in sights]))[view]
+    share = rng.uniform(size=NUM_RANDOM_POINTS)
+    # Cosine between the optical axis and the direction to the origin: near 1 if cameras stand around a subject.
+    facing = -np.einsum("vi,vi->v", centers, axes) / np.maximum(distances, 1e-12)
+    if np.median(facing) >= LEAST_FACING:
+        depths = (NEAREST + (DEEPEST_AROUND - NEAREST) * share) * np.maximum(distances, SHALLOWEST)[view]
+    else:
+        depths = SHALLOWEST * (DEEPEST / SHALLOWEST) ** share
+    own = np.einsum("pij,pj->pi", to_rays, places) * depths[:, None]
+    offsets: np.ndarray = np.einsum("pji,pj->pi", viewmats[view, :3, :3], own)
+    offsets += centers[view]
+    return offsets
+
+
+def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
+    """Return the rigid motion nearest to a nearly rigid matrix [4, 4], such as a rounded pose. `what` is its name."""
     rotation = viewmat[:3, :3]
     if not (np.abs(viewmat) <= LARGEST_COORDINATE).all():  # False for NaN.
         largest = np.abs(viewmat).max()
@@ -141,7 +224,7 @@ def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
 
 
 def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
-    """Raise ValueError if the shots, sorted by name, make no scene."""
+    """Raise ValueError if the shots, sorted by name, make no scene, or one is so far away that it moves the origin."""
     if len(shots) < 2:
         raise ValueError(f"{source}: has {len(shots)} view(s) with a pose; at least two are needed")
     if num_train < 1:
@@ -151,11 +234,8 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
     for shot, following in itertools.pairwise(shots):
         if shot.name == following.name:
             raise ValueError(f"{source}: lists {shot.name} twice; remove one")
-
-
-def _check_distances(shots: Sequence[Shot], source: str) -> None:
-    """Raise ValueError if a camera is so far away that it would move the origin."""
     centers = camera_centers(np.stack([shot.viewmat for shot in shots]))
+    # Medians, because one camera far away would move a mean towards itself.
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     farthest = int(np.argmax(distances))
     if 0 < FARTHEST * np.median(distances) < distances[farthest]:
@@ -185,7 +265,7 @@ def _are_somewhere(points: np.ndarray) -> np.ndarray:
 
 def _view(shot: Shot, viewmat: np.ndarray, scale: float) -> View:
     """Return the shot with its camera in the normalised world, which is `scale` times as large as the original."""
-    height, width = shot.pixels.shape[:2]
+    height, width = shot.picture.size
     check_calibration(viewmat, shot.K, width, height, shot.name)
     rays: Any = shot.rays  # Views of one lens share the array.
     camera = Camera(jnp.asarray(viewmat, jnp.float32), jnp.asarray(shot.K, jnp.float32), width, height, rays)
@@ -195,4 +275,80 @@ def _view(shot: Shot, viewmat: np.ndarray, scale: float) -> View:
         mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
     mask = None if mask is None or mask.is_full else mask
     points = None if shot.points is None else shot.points.scaled(scale)
-    return View(shot.name, camera, Picture.of(shot.pixels), mask, shot.depth, shot.panorama, points)
+    return View(shot.name, camera, shot.picture, mask, shot.depth, shot.panorama, points)
+
+
+def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
+    """Return the similarity to the normalised world of rigid world-to-camera matrices [V, 4, 4].
+
+    The origin is the point nearest to all optical axes in least squares, or the mean camera centre if the axes are
+    nearly parallel. The mean camera-up becomes +z, unless the ups cancel. The median distance of the cameras from the
+    origin becomes 1.
+    """
+    centers = camera_centers(viewmats)
+    origin = nearest_point(centers, viewmats[:, 2, :3])
+    rotation = np.eye(3)
+    up = -viewmats[:, 1, :3].mean(axis=0)
+    if np.linalg.norm(up) >= MIN_UP_LENGTH:  # The smallest rotation that turns up to +z.
+        up = up / np.linalg.norm(up)
+        axis = np.cross(up, [0.0, 0.0, 1.0])
+        sine = np.linalg.norm(axis)
+        axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+        rotation = Rotation.from_rotvec(axis * np.arctan2(sine, up[2])).as_matrix()
+    zero = ZERO_SPREAD * max(float(np.linalg.norm(centers, axis=1).max()), np.finfo(np.float64).tiny)
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    distance = float(np.median(np.linalg.norm(centers - origin, axis=1)))
+    if min(spread, distance) <= zero:
+        raise ValueError("all cameras stand at one place; photographs from different positions are needed")
+    return Similarity(1.0 / distance, rotation, -rotation @ origin / distance)
+
+
+def scene_scale(centers: np.ndarray) -> float:
+    """Return 1.1 × the largest distance of a camera centre [V, 3] from their mean, the unit of the means' learning
+    rate."""
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+Held = TypeVar("Held", Shot, View)
+"""A photograph before or after its view is made."""
+
+
+def with_validation_views(scene: Scene) -> Scene:
+    """Return the scene for choosing options: every eighth training view is held out instead of the test views.
+
+    Cameras, points and world of the whole scene stay. Test views are left out, so that no choice can see them.
+    The views of a panorama are held out together and count as one.
+
+    Raises:
+      ValueError: if there is one training view, or one panorama, only.
+    """
+    train, held_out = split_views(scene.train, VALIDATION_EVERY)
+    if not train:
+        only = "1" if len(scene.train) == 1 else f"1 panorama, cut into {len(scene.train)} views"
+        raise ValueError(f"{scene.name}: validation views are taken from at least 2 training views; there is {only}")
+    return dataclasses.replace(scene, train=tuple(train), test=tuple(held_out))
+
+
+def check_test_every(test_every: int) -> None:
+    if test_every < 0 or test_every == 1:
+        raise ValueError(f"test_every must be 0 (no test views) or at least 2; got {test_every}")
+
+
+def every_kth(shots: Sequence[Shot], test_every: int) -> tuple[list[Shot], list[Shot]]:
+    """Return (train, test): test shots are 0, k, 2k, … in order of names; none for k = 0. Shots of a panorama count as
+    one."""
+    return split_views(sorted(shots, key=lambda shot: shot.name), test_every)
+
+
+def split_views(views: Sequence[Held], every: int) -> tuple[list[Held], list[Held]]:
+    """Return the views that are kept, and the ones that are held out: 0, k, 2k, …; none for k = 0.
+
+    The views of a panorama count as one. Alone, a held-out view would have training views from the same point.
+    """
+    numbers: dict[tuple[int | None, int], int] = {}
+    kept: list[Held] = []
+    held_out: list[Held] = []
+    for index, view in enumerate(views):
+        number = numbers.setdefault((view.panorama, index if view.panorama is None else 0), len(numbers))
+        (held_out if every and number % every == 0 else kept).append(view)
+    return kept, held_out

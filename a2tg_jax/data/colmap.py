@@ -1,5 +1,6 @@
 """COLMAP scenes: a sparse model (.bin or .txt) beside a folder of images."""
 
+import dataclasses
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,36 +10,37 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.similarity import camera_centers
-from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
-from a2tg_jax.data.colmap_binary import count_binary, read_binary
-from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.colmap_records import KINDS, POINT, FrameRecord, ImageRecord, RigRecord
-from a2tg_jax.data.colmap_text import count_text_images, read_text
-from a2tg_jax.data.depth_files import find_depths
-from a2tg_jax.data.division import Division
-from a2tg_jax.data.images import find_image, inside, map_in_threads, num_readers, on_disk, warn_of_unposed
-from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
-from a2tg_jax.data.mask_files import FOLDER, check_masks, find_mask, mask_to_read
-from a2tg_jax.data.observations import ObservedPoints, before_camera, observed_points
-from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
-from a2tg_jax.data.photo_store import Shelf
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_viewmat
+from a2tg_jax.data.colmap_files import KINDS, POINT, FrameRecord, ImageRecord, RigRecord, num_images, read_file
+from a2tg_jax.data.depths import find_depths
+from a2tg_jax.data.image_files import (
+    find_copies,
+    find_image,
+    inside,
+    map_in_threads,
+    on_disk,
+    warn_of_unposed,
+)
+from a2tg_jax.data.lenses import checked_lens
+from a2tg_jax.data.masks import FOLDER, find_mask, mask_to_read
+from a2tg_jax.data.observations import before_camera, observed_points
+from a2tg_jax.data.photo_reading import Options, Photo, check_masks, read_photos
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
-from a2tg_jax.data.smaller_copies import find_copies
-from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
 from a2tg_jax.host.text import counted
 
 SUFFIXES = (".bin", ".txt")
-"""Suffixes of a model's files, in order of preference."""
+"""Suffixes of a model's files, in COLMAP's order of preference."""
 IMAGES = "images"
 """Folder of photographs in a scene folder."""
 TRIED_NAMES = 10
 """Number of photographs that are looked for in a folder before it is taken for another one."""
 POINTS_PLY = "points3D.ply"
-"""Points of models without COLMAP's points3D."""
+"""Points of models without COLMAP's points3D, such as networks of depth write."""
 SAME_PLACE = 1e-3
-"""Largest distance between the cameras of a panorama, in units of the distance between neighbouring frames."""
+"""Largest distance between the cameras of a panorama, in units of the distance between neighbouring frames. A
+refinement of the rig leaves that much of zero."""
 
 
 class SparseModel(NamedTuple):
@@ -51,11 +53,6 @@ class SparseModel(NamedTuple):
     """[P] `POINT`, by id."""
     rigs: list[RigRecord]
     frames: list[FrameRecord]
-
-    @property
-    def cloud(self) -> PointCloud:
-        """Its points."""
-        return PointCloud(self.points["position"], self.points["color"])
 
 
 def find_models(path: Path) -> list[Path]:
@@ -70,16 +67,13 @@ def _model_of(path: Path) -> Path:
     """Return the folder of the sparse model of a scene folder: itself, or of several the one with the most images.
 
     A warning names the others.
-
-    Raises:
-      FileNotFoundError: if there is none.
     """
     models = find_models(path)
     if not models:
         raise FileNotFoundError(f"{path}: has no sparse model; expected sparse/0 with cameras, images and points3D")
     if len(models) == 1:
         return models[0]
-    counts = {model: _num_images(model) for model in models}
+    counts = {model: num_images(_model_files(model)["images"]) for model in models}
     chosen = path if path in models else max(models, key=lambda model: counts[model])
     told = {
         model: f"{'/'.join(model.parts[len(path.parts) :]) or 'its own'} ({counted(counts[model], 'image')})"
@@ -94,76 +88,62 @@ def _model_of(path: Path) -> Path:
     return chosen
 
 
-def load_colmap(
-    path: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort",
-    division: Division | None = None,
-) -> Scene:  # fmt: skip
+def load_colmap(path: Path, options: Options) -> Scene:
     """Read a COLMAP scene: every registered image as a view, and the sparse points.
 
-    Args:
-      path: the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) may be in it,
-        beside the model, or up to two folders above.
-      downscale, test_every, room, lens: as in `load_scene`.
-      division: processes that call this together; None: one.
-
-    Raises:
-      FileNotFoundError: if there is no model, no folder of images, or an image of the model is missing.
-      ValueError: if the model or an image cannot be read, the aspects of an image and its camera differ, a camera
-        cannot be undistorted, or the views make no scene (`assemble_scene`).
+    The path is the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) may be in it,
+    beside the model, or up to two folders above.
     """
+    downscale = options.downscale
     model = _model_of(path)
     contents = _read_model(model)
     scene, folder = _find_photos(path, model, contents.images, downscale)
     images = [image._replace(name=inside(folder, image.name)) for image in contents.images]
     used = sorted({image.camera_id for image in images})
-    lenses = {key: checked_lens(contents.cameras[key], f"{model}: camera {key}", lens) for key in used}
+    lenses = {key: checked_lens(contents.cameras[key], f"{model}: camera {key}", options.lens) for key in used}
     # Masks and depth maps are beside `images` in the scene.
-    masks = map_in_threads(lambda image: find_mask(scene / IMAGES, image.name, downscale), images, num_readers(folder))
+    masks = map_in_threads(lambda image: find_mask(scene / IMAGES, image.name, downscale), images, place=folder)
     named = [*((folder, image.name) for image in images), *(mask for mask in masks if mask is not None)]
     copies = find_copies(named, downscale, scene)
     photos_folder, still_to_downscale = copies.of(folder)
     files = _located(photos_folder, images, model)
     warn_of_unposed(folder, [image.name for image in images], is_deep=folder != scene)
+    panoramas = _panoramas(contents)
 
-    def photo(image: ImageRecord, file: Path, mask: tuple[Path, str] | None) -> PhotoFiles:
-        return PhotoFiles(
-            image.name, file, still_to_downscale, lambda _: lenses[image.camera_id],
-            error_message=lambda error: f"{file}: its camera model {error}",
-            mask=mask_to_read(mask, copies), depths=find_depths(scene / IMAGES, image.name),
+    def photo(image: ImageRecord, file: Path, mask: tuple[Path, str] | None) -> Photo:
+        return Photo(
+            image.name, viewmat_of(image), file, still_to_downscale, lambda _: lenses[image.camera_id], str(file),
+            mask_to_read(mask, copies), find_depths(scene / IMAGES, image.name), panoramas.get(image.id),
         )  # fmt: skip
 
-    photos = list(map(photo, images, files, masks))
-    found = read_photos(photos, Shelf(room), division, path)
-    cloud, panoramas = contents.cloud, _panoramas(contents)
+    def with_points(shot: Shot, image: ImageRecord) -> Shot:
+        own = image.point_ids[np.isin(image.point_ids, contents.points["id"])]
+        if not len(own):
+            return shot
+        positions = contents.points["position"][np.searchsorted(contents.points["id"], own)]
+        places, (height, width) = before_camera(positions, shot.viewmat), shot.picture.size
+        xy = lenses[image.camera_id].projected(places, shot.K, (width, height))
+        return dataclasses.replace(shot, points=observed_points(xy, places[:, 2], (height, width)))
 
-    def shot(image: ImageRecord, read: Reading) -> Shot:
-        viewmat, mask = viewmat_of(image), read.facts.mask
-        points = _observed_points(image, viewmat, contents.points, lenses[image.camera_id], read)
-        panorama = panoramas.get(image.id)
-        return Shot(image.name, viewmat, read.K, read.picture, mask, read.rays, read.depth, panorama, points)
-
-    shots = [shot(image, read) for image, read in zip(images, found, strict=True)]
+    found = read_photos(list(map(photo, images, files, masks)), options, path)
+    shots = list(map(with_points, found, images))
     check_masks(shots, str(path), scene / FOLDER)
-    train, test = every_kth(shots, test_every)
-    return assemble_scene(scene_name(scene), train, test, _start_cloud(model, cloud), source=str(path))
+    train, test = every_kth(shots, options.test_every)
+    return assemble_scene(scene_name(scene), train, test, _start_cloud(model, contents), source=str(path))
 
 
-def _start_cloud(model: Path, cloud: PointCloud) -> PointCloud:
-    """Return the points to start from: a model's own, or the PLY file that networks of depth write instead."""
-    ply = None if len(cloud.points) else on_disk(model, POINTS_PLY)
-    return cloud if ply is None else read_ply_points(ply)
+def _start_cloud(model: Path, contents: SparseModel) -> PointCloud:
+    """Return the points to start from: a model's own, or of `POINTS_PLY` if it has none."""
+    ply = None if len(contents.points) else on_disk(model, POINTS_PLY)
+    return PointCloud(contents.points["position"], contents.points["color"]) if ply is None else read_ply_points(ply)
 
 
 def read_cameras_and_points(path: Path) -> tuple[np.ndarray, PointCloud]:
-    """Return world-to-camera matrices [V, 4, 4] by name of the image, and the points, without reading images.
-
-    Raises:
-      FileNotFoundError, ValueError: as `load_colmap`.
-    """
+    """Return world-to-camera matrices [V, 4, 4] by name of the image, and the points, without reading images."""
     model = _model_of(path)
     contents = _read_model(model)
     images = sorted(contents.images, key=lambda image: image.name)
-    return np.stack([viewmat_of(image) for image in images]), _start_cloud(model, contents.cloud)
+    return np.stack([viewmat_of(image) for image in images]), _start_cloud(model, contents)
 
 
 def viewmat_of(image: ImageRecord) -> np.ndarray:
@@ -183,17 +163,8 @@ def viewmat_of(image: ImageRecord) -> np.ndarray:
 
 
 def _located(folder: Path, images: Sequence[ImageRecord], model: Path) -> list[Path]:
-    """Return the file of each image of a model.
-
-    Args:
-      folder: the folder of photographs, or of smaller copies.
-      images: of the model.
-      model: its folder.
-
-    Raises:
-      FileNotFoundError: if some are missing, with their number and what to do.
-    """
-    found = map_in_threads(lambda image: find_image(folder, image.name), images, num_readers(folder))
+    """Return the file of each image of a model in a folder. If some are missing, the error says what to do."""
+    found = map_in_threads(lambda image: find_image(folder, image.name), images, place=folder)
     missing = [image.name for image, file in zip(images, found, strict=True) if file is None]
     if missing:
         more = f", and {len(missing) - 1} more of its {len(images)} are missing" if len(missing) > 1 else ""
@@ -213,32 +184,8 @@ def _located(folder: Path, images: Sequence[ImageRecord], model: Path) -> list[P
     return [file for file in found if file is not None]
 
 
-def _observed_points(
-    image: ImageRecord, viewmat: np.ndarray, points: np.ndarray, lens: Lens, read: Reading
-) -> ObservedPoints | None:
-    """Return the points that an image observed, in units of the original world; None if it observed none.
-
-    Args:
-      image: of the model.
-      viewmat: its world-to-camera matrix [4, 4].
-      points: [P] `POINT`, all points of the model by ascending ids.
-      lens: of its photograph.
-      read: the photograph.
-    """
-    own = image.point_ids[np.isin(image.point_ids, points["id"])]
-    if not len(own):
-        return None
-    positions = points["position"][np.searchsorted(points["id"], own)]
-    places, size = before_camera(positions, viewmat), read.picture.size
-    return observed_points(lens.projected(places, read.K, size[::-1]), places[:, 2], size)
-
-
 def _panoramas(model: SparseModel) -> dict[int, int]:
-    """Return the number of the frame of each image whose rig looks around from one point, by the image's id.
-
-    A rig's cameras are at one point if they are within `SAME_PLACE` of it, which is what a refinement of the rig leaves
-    of zero, in units of the median distance of a frame to the nearest other one.
-    """
+    """Return the number of the frame of each image whose rig looks around from one place (`SAME_PLACE`), by its id."""
     frames = {image_id: frame for frame in model.frames for image_id in frame.image_ids}
     places = {frames[image.id].id if image.id in frames else -image.id: viewmat_of(image) for image in model.images}
     reach = 0.0
@@ -254,10 +201,7 @@ def _panoramas(model: SparseModel) -> dict[int, int]:
 
 
 def _model_files(folder: Path) -> dict[str, Path]:
-    """Return the files of the model in a folder by kind, whatever their capitals; none if it has no model.
-
-    COLMAP prefers .bin to .txt.
-    """
+    """Return the files of the model in a folder by kind, whatever their capitals; none if it has no model."""
     names = {name.lower(): name for name in names_in(folder)}
     for suffix in SUFFIXES:
         own = {kind: folder / names[each] for kind in KINDS if (each := f"{kind}{suffix}".lower()) in names}
@@ -267,33 +211,18 @@ def _model_files(folder: Path) -> dict[str, Path]:
     return {}
 
 
-def _num_images(model: Path) -> int:
-    """Return the number of images that a model has or announces."""
-    file = _model_files(model)["images"]
-    return count_binary(file) if file.suffix.lower() == ".bin" else count_text_images(file)
-
-
 def _read_model(model: Path) -> SparseModel:
-    """Return the model in a folder; without a points3D file, it has no points.
-
-    Raises:
-      ValueError: naming the file, if one cannot be read.
-    """
+    """Return the model in a folder; without a points3D file, it has no points."""
     files = _model_files(model)
-    is_binary = files["images"].suffix.lower() == ".bin"
-    found = {kind: (read_binary if is_binary else read_text)(file, kind) for kind, file in files.items()}
-    text = on_disk(model, "images.txt") if is_binary else None
-    if text is not None and (num := count_text_images(text)) != len(found["images"]):
+    found = {kind: read_file(file, kind) for kind, file in files.items()}
+    text = on_disk(model, "images.txt") if files["images"].suffix.lower() == ".bin" else None
+    if text is not None and (num := num_images(text)) != len(found["images"]):
         warnings.warn(
             f"{model}: is read from its .bin files, with {counted(len(found['images']), 'image')}, and not from its "
             f".txt files, with {num}; to read those, move the .bin files away",
             stacklevel=3,
         )
-    cameras = {}
-    for camera in found["cameras"]:
-        cameras[camera.id] = pycolmap().Camera(
-            model=camera.model, width=camera.width, height=camera.height, params=camera.params
-        )
+    cameras = dict(found["cameras"])
     for image in found["images"]:
         if image.camera_id not in cameras:
             raise ValueError(
@@ -322,6 +251,7 @@ def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downsca
         names = sorted((name for name in names_in(base) if name.lower() == IMAGES), reverse=True)  # "images" first
         folder = next((base / name for name in names if is_folder(base / name)), None)
         if folder is not None:
+            # A folder `images` may be another program's, or be part of the names.
             return base, base if holds_some(base) and not holds_some(folder) else folder
         if downscale > 1 and is_folder(base / f"{IMAGES}_{downscale}"):
             return base, base / IMAGES

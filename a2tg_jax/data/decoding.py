@@ -1,7 +1,7 @@
 """Decoding of photographs that may be broken or malicious.
 
-Only formats of photographs are tried, because Pillow knows others, one of which starts a program. HEIC needs a library
-of its own. Size and bits are checked before decoding. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4].
+Only formats of photographs are tried, because Pillow knows others, one of which starts a program. HEIC needs its own
+library. Size and bits are checked before decoding. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4].
 """
 
 import functools
@@ -17,7 +17,6 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from a2tg_jax.host.regular_files import open_regular
-from a2tg_jax.host.remote_files import Unreachable
 from a2tg_jax.host.text import shortened
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
@@ -30,7 +29,7 @@ BITS_PER_SAMPLE = 258
 TIFF_SIZE = 256, 257
 """TIFF tags of the stored width and height."""
 TURNED, SIDEWAYS = range(2, 9), range(5, 9)
-"""EXIF orientations other than upright, and those that exchange width and height."""
+"""EXIF orientations other than upright, and the ones that exchange width and height."""
 AS_STORED = {
     2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
     5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE,
@@ -39,14 +38,12 @@ AS_STORED = {
 """Turn from the upright picture to the stored one, by EXIF orientation."""
 LENS_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 LONGEST_REASON = 200
+LARGEST_LEVEL = {"L": 255, "I;16": 65535, "I": 65535}
+"""Largest level of grey, by Pillow's mode."""
 MOST_BYTES = 1 << 30
-"""Largest size of an image file: that of the largest uncompressed picture."""
+"""Largest size of an image file: the size of the largest uncompressed picture."""
 MAX_PIXELS = 128_000_000
 """Largest width × height of a decoded picture, which takes up to 1 GB."""
-
-
-class PictureRefused(ValueError):
-    """Error for a refused but intact picture."""
 
 
 def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
@@ -67,11 +64,7 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Return (width, height) of an image file as stored, without decoding it, so that it may be larger than others.
-
-    Raises:
-      ValueError: naming the file, if it is no image.
-    """
+    """Return (width, height) of an image file as stored, without decoding it, so that it may be larger than others."""
     with _opened(path, is_decoded=False) as image:
         return _stored_size(image)
 
@@ -119,7 +112,7 @@ def _has_alpha(image: Image.Image) -> bool:
 
 
 def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> None:
-    """Write an image file anew with its pixels turned as EXIF says, as PNG or JPEG by the target's suffix.
+    """Write an image file again with its pixels turned as EXIF says, as PNG or JPEG by the target's suffix.
 
     EXIF data of the camera are kept, because the focal length is among them. Those of a TIFF's layout would be wrong.
     """
@@ -145,52 +138,52 @@ def upright_thumbnail(path: str | os.PathLike[str], side: int) -> tuple[tuple[in
         return upright.size, np.asarray(upright.convert("RGB").convert("L").resize((side, side))).astype(np.float32)
 
 
-def read_depth(path: str | os.PathLike[str]) -> np.ndarray:
-    """Return a depth map [H, W] of whole numbers, of 8 or 16 bits. Raises as `read_pixels` does, and for colours."""
+def read_grey(path: str | os.PathLike[str]) -> tuple[np.ndarray, int]:
+    """Return the levels [H, W] int32 of a greyscale image of 8 or 16 bits, such as a depth map, and the largest level.
+
+    Raises as `read_pixels` does, and for colours.
+    """
     with _opened(path, most_bits=16) as image:
-        if len(image.getbands()) != 1:
-            raise PictureRefused(f"{path}: has colours, but a depth map has one channel; replace or remove it")
-        return np.asarray(image).astype(np.int32)
+        if image.mode not in LARGEST_LEVEL:
+            raise ValueError(
+                f"{path}: must be greyscale, of 8 or 16 bits; its mode is {image.mode}; replace or remove it"
+            )
+        return np.asarray(image).astype(np.int32), LARGEST_LEVEL[image.mode]
 
 
 @contextmanager
 def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool = True) -> Iterator[Image.Image]:
-    """Open an image within the block; every decoding error becomes one ValueError."""
-    try:
-        opened = open_regular(path, MOST_BYTES)
-    except Unreachable:
-        raise
-    except OSError as error:
-        raise _unreadable(path, error) from error
-    with opened as file:
-        yield from _decoded(path, file, most_bits, is_decoded)
+    """Open an image within the block; its size and bits are checked if it is decoded.
 
-
-def _decoded(
-    path: str | os.PathLike[str], file: BufferedReader, most_bits: int, is_decoded: bool
-) -> Iterator[Image.Image]:
-    """Yield the image in an open file, once; its size and bits are checked if it is decoded."""
+    Every decoding error, in the block too, becomes one ValueError.
+    """
     try:
-        with Image.open(file, formats=_formats_of(path, file)) as image:
-            if is_decoded:
-                _check_size(path, image)
-            if is_decoded and most_bits == 8:
-                _check_depth(path, image)
+        with open_regular(path, MOST_BYTES) as file, Image.open(file, formats=_formats_of(path, file)) as image:
+            if is_decoded and image.width * image.height > MAX_PIXELS:
+                raise ValueError(
+                    f"{path}: has {image.width}x{image.height} pixels, and {MAX_PIXELS // 10**6} megapixels is the "
+                    "limit; make it smaller, or put smaller copies of all images beside them (images_2 and "
+                    "--downscale 2)"
+                )
+            if is_decoded and most_bits == 8 and (image.mode.startswith(("I", "F")) or _is_deep(image)):
+                raise ValueError(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")
             yield image
-    except PictureRefused:
-        raise
     except Exception as error:  # what a damaged picture raises goes from SyntaxError to RuntimeError and struct.error
-        raise _unreadable(path, error) from error
+        if str(error).startswith(f"{path}: "):  # The picture was refused, or its store does not answer.
+            raise
+        reason = shortened(str(error) or type(error).__name__, LONGEST_REASON)
+        raise ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from error
 
 
 def _formats_of(path: str | os.PathLike[str], file: BufferedReader) -> tuple[str, ...]:
     """Return the formats to try on an open file."""
+    # HEIC and AVIF files begin with a box "ftyp": its length, its name, and the brands, each of 4 bytes.
     head = file.peek(LONGEST_BOX)[:LONGEST_BOX]
     brands = {head[at : at + 4] for at in range(8, min(len(head), int.from_bytes(head[:4], "big")), 4)}
     if head[4:8] != b"ftyp" or not brands & HEIC_BRANDS:
         return FORMATS
     if not _reads_heic():
-        raise PictureRefused(f"{path}: is a HEIC photograph, which needs pillow-heif: pip install 'a2tg-jax[heic]'")
+        raise ValueError(f"{path}: is a HEIC photograph, which needs pillow-heif: pip install 'a2tg-jax[heic]'")
     return (*FORMATS, "HEIF")
 
 
@@ -202,25 +195,6 @@ def _reads_heic() -> bool:
     except ImportError:
         return False
     return True
-
-
-def _unreadable(path: str | os.PathLike[str], error: Exception) -> ValueError:
-    reason = shortened(str(error) or type(error).__name__, LONGEST_REASON)
-    return ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it")
-
-
-def _check_size(path: str | os.PathLike[str], image: Image.Image) -> None:
-    width, height = image.size
-    if width * height > MAX_PIXELS:
-        raise PictureRefused(
-            f"{path}: has {width}x{height} pixels, and {MAX_PIXELS // 10**6} megapixels is the limit; "
-            "make it smaller, or put smaller copies of all images beside them (images_2 and --downscale 2)"
-        )
-
-
-def _check_depth(path: str | os.PathLike[str], image: Image.Image) -> None:
-    if image.mode.startswith(("I", "F")) or _is_deep(image):
-        raise PictureRefused(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")
 
 
 def _is_deep(image: Image.Image) -> bool:

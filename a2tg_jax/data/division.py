@@ -1,22 +1,22 @@
-"""Work on photographs that several processes divide: each does its share and tells the others the results."""
+"""Work on photographs that several processes divide: each does its share, and all get the results."""
 
 import contextlib
 import dataclasses
-import hashlib
 import itertools
-import json
+import pickle
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import jax
 
-from a2tg_jax.data.images import map_in_threads
-from a2tg_jax.data.masks import Mask
+from a2tg_jax.data.image_files import map_in_threads
 from a2tg_jax.host.text import shortened
 from a2tg_jax.parallel.processes import gather, is_of_collectives
 
-ERRORS = {"FileNotFoundError": FileNotFoundError, "OSError": OSError, "ValueError": ValueError}
-"""Errors of which all processes are told."""
+ERRORS = (FileNotFoundError, OSError, ValueError)
+"""Errors that are raised in all processes."""
+Result = TypeVar("Result")
 
 
 class SharedError(Exception):
@@ -29,7 +29,7 @@ class SharedError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Division:
-    """Processes that do some work together, seen from one of them. All make the same calls in the same order, within
+    """Processes that do some work together, as one of them has it. All make the same calls in the same order, within
     `sharing_errors`."""
 
     index: int
@@ -42,80 +42,69 @@ class Division:
     def exchange(self, step: str, value: Any = None) -> list[Any]:
         """Return the values of all processes, in the order of their numbers.
 
-        Args:
-          step: name of what is exchanged, the same in all processes.
-          value: of this process; it can be written as JSON.
-
-        Raises:
-          SharedError: in every process, if one tells of an error or is at another step.
+        Raise SharedError in every process if one sends an error, or is at another step, by name.
         """
-        parts = self._all({"step": step, "value": value})
-        if any(part["step"] != parts[0]["step"] for part in parts):
-            raise SharedError(_difference([[part["step"]] for part in parts], "steps of loading"))
-        return [part["value"] for part in parts]
+        parts = self._all((step, value))
+        if any(part[0] != parts[0][0] for part in parts):
+            raise SharedError(_difference([part[:1] for part in parts], "steps of loading"))
+        return [part[1] for part in parts]
 
-    def tell(self, error: Exception) -> None:
-        """Tell the other processes of an error, at their next exchange.
-
-        Raises:
-          SharedError: always, in every process.
-        """
-        self._all(_error_to_json(error))
+    def send_error(self, error: Exception) -> None:
+        """Raise a SharedError in every process: in the others at their next exchange."""
+        self._all(_plain(error))
 
     def check_same(self, values: Sequence[str], what: str) -> None:
-        """Compare the values of all processes.
+        """Raise SharedError in every process, with the first difference, unless all have the same values."""
+        found = self.exchange(what, list(values))
+        if any(own != found[0] for own in found):
+            raise SharedError(_difference(found, what))
 
-        Raises:
-          SharedError: in every process, with the first value that differs and the number of the process.
-        """
-        digest = hashlib.sha256(json.dumps(values).encode()).hexdigest()
-        if len(set(self.exchange(f"digest of {what}", digest))) > 1:
-            raise SharedError(_difference(self.exchange(what, values), what))
-
-    def results(
-        self, names: Sequence[str], work: Callable[[int], Any], what: str, num_threads: int | None = None
-    ) -> list[Any]:
-        """Return the results for all items, each found by one process.
-
-        Args:
-          names: of the items, the same in all processes.
-          work: function of an item's number; its result can be written as JSON.
-          what: plural noun for the items.
-          num_threads: number of threads, as in `map_in_threads`.
-
-        Raises:
-          SharedError: in every process, with the error of the first item whose work fails, or if names differ.
-        """
-        self.check_same(names, what)
-
-        def attempt(number: int) -> dict[str, Any]:
-            try:
-                return {"value": work(number)}
-            except (ValueError, OSError) as error:
-                return _error_to_json(error)
-
-        own = map_in_threads(attempt, range(self.index, len(names), self.count), num_threads)
-        parts = self.exchange(f"results of {what}", own)
-        found = [parts[number % self.count][number // self.count] for number in range(len(names))]
-        _raise_first(found)
-        return [each["value"] for each in found]
-
-    def _all(self, own: dict[str, Any]) -> list[dict[str, Any]]:
+    def _all(self, own: Any) -> list[Any]:
         """Return the messages of all processes. Raise SharedError if one of them is an error."""
-        parts = [json.loads(part) for part in self.gather(json.dumps(own).encode())]
+        # The processes of one training run each other's programs anyway, so pickles may be trusted.
+        parts = [pickle.loads(part) for part in self.gather(pickle.dumps(own))]
         _raise_first(parts)
         return parts
 
 
-@contextlib.contextmanager
-def sharing_errors(division: Division | None) -> Iterator[None]:
-    """Raise an error of one process in all of them. Each enters the block, and uses the division within it only.
+def divided(
+    division: Division | None,
+    names: Sequence[str],
+    work: Callable[[int], Result],
+    what: str,
+    place: Path | None = None,
+) -> list[Result]:
+    """Return the results for all items, each made by one process, in threads.
 
     Args:
-      division: processes that enter the block; None: one.
+      division: processes that call this together; None: one.
+      names: of the items, the same in all processes.
+      work: function of an item's number. If it fails, all processes raise the error of the first such item.
+      what: plural noun for the items.
+      place: path that the work reads from, as in `map_in_threads`.
+    """
+    if division is None:
+        return map_in_threads(work, range(len(names)), place=place)
+    division.check_same(names, what)
 
-    Raises:
-      FileNotFoundError, ValueError, OSError: the error of the first process that has one.
+    def attempt(number: int) -> Any:
+        try:
+            return work(number)
+        except ERRORS as error:
+            return _plain(error)
+
+    own = map_in_threads(attempt, range(division.index, len(names), division.count), place=place)
+    parts = division.exchange(f"results of {what}", own)
+    found = [parts[number % division.count][number // division.count] for number in range(len(names))]
+    _raise_first(found)
+    return found
+
+
+@contextlib.contextmanager
+def sharing_errors(division: Division | None) -> Iterator[None]:
+    """Raise an error of one process, the first that has one, in all processes of a division (None: one).
+
+    Each enters the block, and uses the division within it only.
     """
     if division is None:
         yield
@@ -123,9 +112,9 @@ def sharing_errors(division: Division | None) -> Iterator[None]:
     try:
         try:
             yield
-        except (ValueError, OSError) as error:
+        except ERRORS as error:
             if not is_of_collectives(error):
-                division.tell(error)
+                division.send_error(error)
             raise
         division.exchange("end of loading")
     except SharedError as shared:
@@ -138,38 +127,16 @@ def among_processes() -> Division | None:
     return Division(jax.process_index(), count, gather) if count > 1 else None
 
 
-def divided_masks(
-    names: Sequence[str], mask_of: Callable[[int], Mask | None], division: Division | None
-) -> list[Mask | None]:
-    """Return a mask for each photograph, or None, of its pixels; each process reads its share of them.
-
-    Args:
-      names: of the photographs.
-      mask_of: function of a photograph's number.
-      division: processes that call this together; None: one.
-    """
-    if division is None:
-        return [mask_of(number) for number in range(len(names))]
-
-    def mask_to_json(number: int) -> Any:
-        mask = mask_of(number)
-        return None if mask is None else mask.to_json()
-
-    found = division.results(names, mask_to_json, "views")
-    return [None if mask is None else Mask.from_json(mask) for mask in found]
+def _plain(error: Exception) -> Exception:
+    """Return an error of the same text and of a class in `ERRORS`, which can be pickled."""
+    return next(kind for kind in ERRORS if isinstance(error, kind))(str(error))
 
 
-def _error_to_json(error: Exception) -> dict[str, Any]:
-    """Return a message of an error in `ERRORS`."""
-    kind = next(name for name, known in ERRORS.items() if isinstance(error, known))
-    return {"error": kind, "text": str(error)}
-
-
-def _raise_first(messages: Sequence[dict[str, Any]]) -> None:
-    """Raise SharedError with the first error among messages, if there is one."""
-    failed = next((message for message in messages if "error" in message), None)
-    if failed is not None:
-        raise SharedError(ERRORS[failed["error"]](failed["text"]))
+def _raise_first(results: Sequence[Any]) -> None:
+    """Raise SharedError with the first error among results, if there is one."""
+    error = next((result for result in results if isinstance(result, Exception)), None)
+    if error is not None:
+        raise SharedError(error)
 
 
 def _difference(values: Sequence[Sequence[str]], what: str) -> ValueError:

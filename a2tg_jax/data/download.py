@@ -1,6 +1,8 @@
-"""Download of archives: continued where it stopped, checked against a checksum, unpacked within one folder."""
+"""Benchmark data sets: where their authors, or mirrors, offer them, and their download.
 
-import hashlib
+A download continues where it stopped, is checked against a checksum, and unpacked within one folder.
+"""
+
 import http.client
 import shutil
 import tarfile
@@ -10,11 +12,12 @@ import urllib.request
 import zipfile
 import zlib
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
 from a2tg_jax.host.progress_bars import progress_over
+from a2tg_jax.host.regular_files import sha256_of
 
 CHUNK_BYTES = 1 << 20
 TIMEOUT_SECONDS = 60
@@ -26,6 +29,7 @@ LEFT_OUT = "__MACOSX"
 """Folder of a system's own files in archives, which is not unpacked."""
 FULL = 416
 """HTTP status of a request for bytes beyond the end."""
+GRESEARCH = "https://storage.googleapis.com/gresearch/refraw360"
 
 
 class Archive(NamedTuple):
@@ -33,10 +37,37 @@ class Archive(NamedTuple):
 
     url: str
     folder: str
-    """Folder below that of all scenes in which it is unpacked."""
+    """Folder, below the folder of all scenes, in which it is unpacked."""
     num_bytes: int | None = None
-    """Size, as far as it is known beforehand."""
+    """Size, if it is known before the server is reached."""
     sha256: str | None = None
+    content: str = ""
+    """Content in a few words."""
+
+
+BENCHMARK_SETS = {
+    "mipnerf360": Archive(
+        f"{GRESEARCH}/360_v2.zip", "360_v2", 12_500_000_000,
+        content="Mip-NeRF 360: bicycle, bonsai, counter, garden, kitchen, room, stump",
+    ),
+    "mipnerf360-extra": Archive(
+        f"{GRESEARCH}/360_extra_scenes.zip", "360_v2", content="Mip-NeRF 360: flowers, treehill"
+    ),
+    "tandt-db": Archive(
+        "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip", ".", 690_000_000,
+        content="3DGS's Tanks and Temples (train, truck) and Deep Blending (drjohnson, playroom)",
+    ),
+    "nerf-synthetic": Archive(
+        "https://github.com/yxlao/nerfmirror/releases/download/20220618/nerf_synthetic.zip", ".",
+        sha256="f01fd1b4ab045b0d453917346f26f898657bb5bec4834b95fdad1f361826e45e",
+        content="NeRF's eight synthetic objects: chair, drums, ficus, hotdog, lego, materials, mic, ship",
+    ),
+    "dtu": Archive(
+        "https://huggingface.co/datasets/dylanebert/2DGS/resolve/main/dtu.tar.gz", "dtu",
+        content="15 scans of DTU, prepared for 2DGS, without the measured points",
+    ),
+}  # fmt: skip
+"""Data sets of `a2tg download` by name: what they hold, and where their authors, or mirrors, offer them."""
 
 
 def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
@@ -44,7 +75,7 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
 
     Args:
       archive: what to fetch.
-      scenes: folder for all scenes; archives lie in `archives` below it until they are unpacked.
+      scenes: folder for all scenes; archives are in `archives` below it until they are unpacked.
       progress: show progress bars.
 
     Returns:
@@ -57,19 +88,19 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
     """
     file = scenes / "archives" / archive.url.partition("?")[0].rpartition("/")[2]
     done, begun = (file.with_name(f"{file.name}.{state}") for state in ("unpacked", "unpacking"))
-    if done.is_file() or file.with_suffix(".unpacked").is_file():  # The second is what earlier versions wrote.
+    if done.is_file():
         return False
     file.parent.mkdir(parents=True, exist_ok=True)
     if not file.is_file():
         _download(archive, file, progress)
-    if archive.sha256 is not None and _sha256(file) != archive.sha256:
+    if archive.sha256 is not None and sha256_of(file) != archive.sha256:
         file.unlink()
         raise ValueError(f"{archive.url}: its SHA-256 is not {archive.sha256}; the file was deleted, call again")
     try:
-        unpack(file, scenes / archive.folder, begun, progress=progress)
+        _unpack(file, scenes / archive.folder, begun, progress)
     except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error) as error:
         file.unlink()
-        raise ValueError(f"{file} is damaged, and was deleted: call again to fetch it anew ({error})") from error
+        raise ValueError(f"{file} is damaged, and was deleted: call again to fetch it ({error})") from error
     done.touch()
     begun.unlink()
     file.unlink()
@@ -77,7 +108,7 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
 
 
 def _download(archive: Archive, file: Path, progress: bool) -> None:
-    """Download a file, from where an earlier attempt stopped, and go on when the connection breaks."""
+    """Download a file, from where an earlier attempt stopped, and continue when the connection breaks."""
     partial = file.with_name(f"{file.name}.partial")
     if archive.num_bytes is not None:
         _check_room(file.parent, 2 * archive.num_bytes - _size(partial), archive.url)
@@ -105,7 +136,7 @@ def _download(archive: Archive, file: Path, progress: bool) -> None:
 
 
 def _receive(url: str, partial: Path, progress: bool) -> int | None:
-    """Receive what is missing of a file. Return its size if the server tells."""
+    """Receive what is missing of a file. Return its size if the server says it."""
     have, version = _size(partial), _version_of(partial)
     request = urllib.request.Request(url)
     if have:
@@ -118,7 +149,11 @@ def _receive(url: str, partial: Path, progress: bool) -> int | None:
             length = response.headers.get("Content-Length")
             total = None if length is None else int(length) + (have if is_rest else 0)
             _check_room(partial.parent, int(length or 0), url)
-            _keep_version(version, response.headers.get("ETag"))
+            etag = response.headers.get("ETag") or "W/"
+            if etag.startswith("W/") or not etag.isascii():  # Parts may be joined by strong ETags only.
+                version.unlink(missing_ok=True)
+            else:
+                version.write_text(etag, encoding="ascii")
             bar = tqdm(
                 desc=partial.name.removesuffix(".partial"), initial=have if is_rest else 0, total=total, unit="B",
                 unit_scale=True, disable=not progress,
@@ -137,69 +172,44 @@ def _receive(url: str, partial: Path, progress: bool) -> int | None:
 
 
 def _version_of(partial: Path) -> Path:
-    """Return the file that keeps the server's name of the version of which a part has come."""
+    """Return the file that keeps the server's name (ETag) of the version of which a part has come."""
     return partial.with_name(f"{partial.name}.etag")
 
 
-def _keep_version(path: Path, etag: str | None) -> None:
-    """Keep a strong ETag, the only kind that parts may be joined by."""
-    if etag and not etag.startswith("W/") and etag.isascii():
-        path.write_text(etag, encoding="ascii")
-    else:
-        path.unlink(missing_ok=True)
-
-
-def unpack(file: Path, folder: Path, begun: Path, *, progress: bool = True) -> None:
-    """Unpack a zip or tar archive.
+def _unpack(file: Path, folder: Path, begun: Path, progress: bool) -> None:
+    """Unpack a zip or tar archive, none of whose members may lead outside the folder, as links and devices may.
 
     Args:
       file: the archive.
       folder: where its members are written.
       begun: a file that is made before the first of them; if it is there, files of other sizes are replaced.
       progress: show a progress bar.
-
-    Raises:
-      OSError: if the disk has no room for its members, or there is another file of the name of one.
-      ValueError: if a member leads outside the folder, as links and devices may.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if tarfile.is_tarfile(file):
-        with tarfile.open(file) as opened:
-            members = [member for member in opened.getmembers() if _is_wanted(member.name)]
-            odd = next((member.name for member in members if not (member.isfile() or member.isdir())), None)
-            if odd is not None:
-                raise ValueError(f"{file}: the member {odd!r} is a link or a device, which may lead outside {folder}")
-            sizes = [member.size if member.isfile() else None for member in members]
-            _check_members(file, folder, [member.name for member in members], sizes, begun)
-            if hasattr(tarfile, "data_filter"):  # Pythons before 3.11.4 know no filters.
+    members: list[tuple[Any, str, int | None]]
+    with tarfile.open(file) if tarfile.is_tarfile(file) else zipfile.ZipFile(file) as opened:
+        if isinstance(opened, tarfile.TarFile):
+            if hasattr(tarfile, "data_filter"):  # Pythons before 3.11.4 have no filters.
                 opened.extraction_filter = tarfile.data_filter
-            for member in progress_over(members, "unpacking", "file", is_shown=progress):
-                opened.extract(member, folder)
-        return
-    with zipfile.ZipFile(file) as opened_zip:
-        infos = [info for info in opened_zip.infolist() if _is_wanted(info.filename)]
-        sizes = [None if info.is_dir() else info.file_size for info in infos]
-        _check_members(file, folder, [info.filename for info in infos], sizes, begun)
-        for info in progress_over(infos, "unpacking", "file", is_shown=progress):
-            opened_zip.extract(info, folder)
-
-
-def _is_wanted(name: str) -> bool:
-    return LEFT_OUT not in Path(name).parts
-
-
-def _check_members(file: Path, folder: Path, names: list[str], sizes: list[int | None], begun: Path) -> None:
-    """Check names and sizes (None for folders) of the members of an archive, then make the file `begun`."""
-    for name, num_bytes in zip(names, sizes, strict=True):
-        target = folder / name
-        if not target.resolve().is_relative_to(folder.resolve()):
-            raise ValueError(f"{file}: the member {name!r} would be written outside {folder}")
-        if num_bytes is not None and not begun.is_file() and target.exists() and _size(target) != num_bytes:
-            raise FileExistsError(
-                f"{target}: exists already and is not what {file.name} has there; move it away, or choose another --out"
-            )
-    _check_room(folder, sum(num_bytes or 0 for num_bytes in sizes), str(file))
-    begun.touch()
+            members = [(each, each.name, None if each.isdir() else each.size) for each in opened.getmembers()]
+        else:
+            members = [(each, each.filename, None if each.is_dir() else each.file_size) for each in opened.infolist()]
+        members = [member for member in members if LEFT_OUT not in Path(member[1]).parts]
+        for member, name, num_bytes in members:
+            if isinstance(member, tarfile.TarInfo) and not (member.isfile() or member.isdir()):
+                raise ValueError(f"{file}: the member {name!r} is a link or a device, which may lead outside {folder}")
+            target = folder / name
+            if not target.resolve().is_relative_to(folder.resolve()):
+                raise ValueError(f"{file}: the member {name!r} would be written outside {folder}")
+            if num_bytes is not None and not begun.is_file() and target.exists() and _size(target) != num_bytes:
+                raise FileExistsError(
+                    f"{target}: exists already and is not what {file.name} has there; move it away, or choose another "
+                    "--out"
+                )
+        _check_room(folder, sum(num_bytes or 0 for _, _, num_bytes in members), str(file))
+        begun.touch()
+        for member, _, _ in progress_over(members, "unpacking", "file", is_shown=progress):
+            opened.extract(member, folder)
 
 
 def _check_room(folder: Path, num_bytes: int, what: str) -> None:
@@ -214,8 +224,3 @@ def _check_room(folder: Path, num_bytes: int, what: str) -> None:
 
 def _size(path: Path) -> int:
     return path.stat().st_size if path.is_file() else 0
-
-
-def _sha256(file: Path) -> str:
-    with open(file, "rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()

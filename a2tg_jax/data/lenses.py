@@ -3,16 +3,15 @@
 import dataclasses
 import functools
 import threading
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from a2tg_jax.core.cameras import check_intrinsics
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.images import downscaled_size, resize_pixels, scaled_intrinsics
 from a2tg_jax.data.observations import pinhole_pixels
 
 PINHOLE_TOLERANCE = 1e-3
@@ -39,10 +38,12 @@ _LOCK = threading.Lock()
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lens:
-    """A calibrated camera of any COLMAP model. Pixel centres lie at +0.5, as COLMAP has them."""
+    """A calibrated camera of any COLMAP model. Pixel centres are at +0.5, as COLMAP has them."""
 
     camera: Any
     """pycolmap.Camera, at the size it was calibrated for."""
+    is_kept: bool = False
+    """Whether photographs are kept as they are, with `rays` as places in the image plane of their K."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -53,6 +54,7 @@ class Lens:
     def is_pinhole(self) -> bool:
         """Whether the camera projects like its calibration matrix (models with zero distortion do)."""
         width, height = self.size
+        # Models with distortion are pinholes if all of its parameters are 0, whatever their kind.
         grid = np.stack(np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5)), -1).reshape(-1, 2)
         rays = np.asarray(self.camera.cam_from_img(grid))
         projected = _homogeneous(rays) @ self.camera.calibration_matrix()[:2].T
@@ -60,11 +62,7 @@ class Lens:
 
     @cached_property
     def pinhole(self) -> tuple[np.ndarray, tuple[int, int]]:
-        """K [3, 3] and (width, height) of the undistorted image: same focal lengths, the largest area without blanks.
-
-        Raises:
-          ValueError: if the model has no pinhole equivalent (panoramas), or its distortion folds the image.
-        """
+        """K [3, 3] and (width, height) of the undistorted image: same focal lengths, largest area without blanks."""
         try:
             if self.is_pinhole:
                 return self.camera.calibration_matrix(), self.size
@@ -80,7 +78,7 @@ class Lens:
         return K, size
 
     def _is_seen_in_order(self, K: np.ndarray, width: int, height: int) -> bool:
-        """Return whether the middle half of a pinhole image lies nearly in the photograph and is not mirrored.
+        """Return whether the middle half of a pinhole image is nearly in the photograph and is not mirrored.
 
         Corners may fold, because calibrations are arbitrary where they saw no feature.
         """
@@ -92,27 +90,28 @@ class Lens:
         return bool(is_inside and is_ordered)
 
     def view_pixels(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pixels of a photograph's view, a pinhole's, at the photograph's resolution divided by `downscale`.
+        """Return the pixels [h', w', C] of a photograph's view, and their K [3, 3].
 
-        Args:
-          pixels: [h, w, C] uint8, of the calibrated size or that size scaled.
-          downscale: k >= 1; the image is undistorted first, which keeps it sharp.
-
-        Returns:
-          (pixels [h', w', C] uint8, K [3, 3] for them).
+        The photograph, [h, w, C] uint8, is of the calibrated size or that size scaled. It is undistorted, unless it is
+        kept, before it is divided by `downscale`, which keeps it sharp.
         """
-        (K, size), stored = self.pinhole, (pixels.shape[1], pixels.shape[0])
-        if not self.is_pinhole:
-            whole = self._undistorted_size(stored)
-            pixels = self._warp(pixels, scaled_intrinsics(K, size, whole), whole)
-        new_size, K = self.view_of(stored, downscale)
+        new_size, K = self.view_of((pixels.shape[1], pixels.shape[0]), downscale)
+        if not (self.is_kept or self.is_pinhole):
+            planes = pixels.astype(np.float32)
+            if planes.shape[2] == 4:  # Colours are multiplied by alpha, so that transparent neighbours do not bleed.
+                planes[..., :3] *= planes[..., 3:] / 255
+            planes = self._sampled(planes)
+            if planes.shape[2] == 4:
+                planes[..., :3] *= 255 / np.maximum(planes[..., 3:], 1)
+            pixels = np.clip(np.rint(planes), 0, 255).astype(np.uint8)
         return resize_pixels(pixels, *new_size), K
 
     def view_of(self, stored: tuple[int, int], downscale: int) -> tuple[tuple[int, int], np.ndarray]:
         """Return (width, height) and K [3, 3] of the view of a photograph of a size, as `view_pixels` makes it."""
-        K, size = self.pinhole
-        new_size = downscaled_size(*self._undistorted_size(stored), downscale)
-        return new_size, scaled_intrinsics(K, size, new_size)
+        K, size = (self._matrix(), self.size) if self.is_kept else self.pinhole
+        width, height = stored if self.is_kept else self._undistorted_size(stored)
+        new_size = max(1, round(width / downscale)), max(1, round(height / downscale))
+        return new_size, _scaled_intrinsics(K, size, new_size)
 
     def _undistorted_size(self, stored: tuple[int, int]) -> tuple[int, int]:
         """Return (width, height) of a photograph of a size after it is undistorted, before it is downscaled."""
@@ -121,82 +120,25 @@ class Lens:
         scales, size = np.divide(stored, self.size), self.pinhole[1]
         return round(size[0] * scales[0]), round(size[1] * scales[1])
 
-    def viewing(self, downscale: int) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the function from the pixels of a photograph to those of its view."""
-        return lambda pixels: self.view_pixels(pixels, downscale)[0]
-
-    def rays(self, width: int, height: int) -> np.ndarray | None:
-        """Return the rays of pictures of a size, as `Camera.rays` has them; None of a pinhole."""
-        return None
+    def view_plane(self, plane: np.ndarray) -> np.ndarray:
+        """Return numbers [h, w] float32 of a photograph's pixels as its view has them, not downscaled."""
+        return plane if self.is_kept or self.is_pinhole else self._sampled(plane[..., None])[..., 0]
 
     def projected(self, points: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         """Return x and y [P, 2] in pixels of points [P, 3] before the camera, in a view of a K and (width, height)."""
-        return pinhole_pixels(points, K)
-
-    def view_plane(self, plane: np.ndarray) -> np.ndarray:
-        """Return numbers [h, w] float32 of each pixel of a photograph as its view, a pinhole's, sees them, at their
-        size."""
-        if self.is_pinhole:
-            return plane
-        K, size = self.pinhole
-        scales = np.divide(plane.shape[::-1], self.size)
-        new_size = round(size[0] * scales[0]), round(size[1] * scales[1])
-        return self._sampled(plane[..., None], scaled_intrinsics(K, size, new_size), new_size)[..., 0]
-
-    def _warp(self, pixels: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Return a pinhole image with intrinsics K of the given size, sampled bilinearly from the photograph."""
-        return _straight(self._sampled(_premultiplied(pixels), K, size))
-
-    def _sampled(self, planes: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Return float32 planes [h, w, C] of a pinhole image, sampled bilinearly from those of a photograph."""
-        width, height = size
-        warped = np.empty((height, width, planes.shape[2]), np.float32)
-        for top in range(0, height, ROWS_AT_ONCE):
-            rows = warped[top : top + ROWS_AT_ONCE]
-            coordinates = self._seen_at(K, width, range(top, top + len(rows)), planes.shape[1::-1])
-            for channel in range(planes.shape[2]):
-                rows[..., channel] = map_coordinates(planes[..., channel], coordinates, order=1, mode="nearest")
-        return warped
-
-    def _seen_at(self, K: np.ndarray, width: int, rows: range, image_size: tuple[int, int]) -> np.ndarray:
-        """Return array coordinates (row, column) [2, rows, width] in a photograph for some rows of a pinhole image
-        K."""
-        x, y = np.meshgrid(np.arange(width) + 0.5, np.asarray(rows) + 0.5)
-        rays = _homogeneous(np.stack([x, y], -1).reshape(-1, 2)) @ np.linalg.inv(K).T
-        places = np.asarray(self.camera.img_from_cam(rays)) * np.divide(image_size, self.size) - 0.5
-        return places[:, ::-1].T.reshape(2, len(rows), width)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class KeptLens(Lens):
-    """A calibrated camera whose photographs are kept as they are."""
-
-    def view_pixels(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Return a photograph divided by `downscale`, and its K [3, 3]; `rays` are places in the image plane of K."""
-        new_size, K = self.view_of((pixels.shape[1], pixels.shape[0]), downscale)
-        return resize_pixels(pixels, *new_size), K
-
-    def view_of(self, stored: tuple[int, int], downscale: int) -> tuple[tuple[int, int], np.ndarray]:
-        """Return (width, height) and K [3, 3] of a photograph of a size, divided by `downscale`."""
-        new_size = downscaled_size(*stored, downscale)
-        return new_size, scaled_intrinsics(self._matrix(), self.size, new_size)
-
-    def projected(self, points: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Return x and y [P, 2] in pixels of points [P, 3] before the camera, in a picture of a (width, height)."""
+        if not self.is_kept:
+            return pinhole_pixels(points, K)
         xy: np.ndarray = np.asarray(self.camera.img_from_cam(points)) * np.divide(size, self.size)
         return xy
 
-    def view_plane(self, plane: np.ndarray) -> np.ndarray:
-        """Return numbers [h, w] of each pixel of a photograph as they are."""
-        return plane
-
     def rays(self, width: int, height: int) -> np.ndarray | None:
-        """Return the rays [height, width, 2] of pictures of a size, NaN where the lens has none; None of a pinhole.
+        """Return the rays [height, width, 2] of views of a size, as `Camera.rays` has them; NaN where there is none.
 
-        Raises:
-          ValueError: if the model has no pinhole equivalent (panoramas), or next to no pixel has a ray.
+        None of a pinhole, or if photographs are undistorted. Raise ValueError if next to no pixel has a ray.
         """
-        K = scaled_intrinsics(self._matrix(), self.size, (width, height))
+        if not self.is_kept:
+            return None
+        K = _scaled_intrinsics(self._matrix(), self.size, (width, height))
         if self.is_pinhole:
             return None
         camera = self.camera
@@ -209,6 +151,23 @@ class KeptLens(Lens):
         except (ValueError, RuntimeError):
             raise ValueError(f"{self.camera.model.name} has no image plane{CUT}") from None
         return matrix
+
+    def _sampled(self, planes: np.ndarray) -> np.ndarray:
+        """Return float32 planes of the undistorted image, sampled bilinearly from planes [h, w, C] of a photograph."""
+        stored = planes.shape[1::-1]
+        width, height = self._undistorted_size(stored)
+        to_rays = np.linalg.inv(_scaled_intrinsics(*self.pinhole, (width, height))).T
+        warped = np.empty((height, width, planes.shape[2]), np.float32)
+        for top in range(0, height, ROWS_AT_ONCE):
+            rows = warped[top : top + ROWS_AT_ONCE]
+            x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(top, top + len(rows)) + 0.5)
+            rays = _homogeneous(np.stack([x, y], -1).reshape(-1, 2)) @ to_rays
+            # From x and y of COLMAP, whose first pixel has its centre at 0.5, to row and column of the array.
+            places = np.asarray(self.camera.img_from_cam(rays)) * np.divide(stored, self.size) - 0.5
+            coordinates = places[:, ::-1].T.reshape(2, len(rows), width)
+            for channel in range(planes.shape[2]):
+                rows[..., channel] = map_coordinates(planes[..., channel], coordinates, order=1, mode="nearest")
+        return warped
 
 
 @functools.lru_cache(maxsize=256)
@@ -241,11 +200,9 @@ def forget_rays() -> None:
 
 
 def checked_lens(camera: Any, what: str, use: LensUse = "undistort") -> Lens:
-    """Return the lens of a pycolmap.Camera after checking its numbers.
+    """Return the lens of a pycolmap.Camera, named `what` in errors.
 
-    Raises:
-      ValueError: naming it `what`, if a number is NaN, infinite, or beyond the bounds of `check_intrinsics` and
-        `LARGEST_DISTORTION`.
+    Raise ValueError if a number is not finite or beyond the bounds of `check_intrinsics` and `LARGEST_DISTORTION`.
     """
     params = np.asarray(camera.params, np.float64)
     if not np.isfinite(params).all():
@@ -255,7 +212,7 @@ def checked_lens(camera: Any, what: str, use: LensUse = "undistort") -> Lens:
         raise ValueError(f"{what}: its distortion must lie within ±{LARGEST_DISTORTION:g}; got {distortion.tolist()}")
     if len(camera.focal_length_idxs()):  # Panoramas have none.
         check_intrinsics(camera.calibration_matrix(), camera.width, camera.height, what)
-    return KeptLens(camera) if use == "keep" else Lens(camera)
+    return Lens(camera, is_kept=use == "keep")
 
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:
@@ -263,17 +220,17 @@ def _homogeneous(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
-def _premultiplied(pixels: np.ndarray) -> np.ndarray:
-    """Return float32 pixels with colour multiplied by alpha, so that transparent neighbours do not bleed."""
-    planes = pixels.astype(np.float32)
-    if planes.shape[2] == 4:
-        planes[..., :3] *= planes[..., 3:] / 255
-    return planes
+def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Return the image at a smaller size, each new pixel a weighted mean around its area (weighted with alpha too).
+
+    Pillow's box filter uses whole pixels only, which shifts details at fractional ratios.
+    """
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.HAMMING))
 
 
-def _straight(planes: np.ndarray) -> np.ndarray:
-    """Return uint8 pixels with straight alpha, the inverse of `_premultiplied`."""
-    if planes.shape[2] == 4:
-        planes[..., :3] *= 255 / np.maximum(planes[..., 3:], 1)
-    pixels: np.ndarray = np.clip(np.rint(planes), 0, 255).astype(np.uint8)
-    return pixels
+def _scaled_intrinsics(K: np.ndarray, old: tuple[int, int], new: tuple[int, int]) -> np.ndarray:
+    """Return K [3, 3] for an image of the size `new` instead of `old`, both (width, height); pixel edges stay edges."""
+    scaled: np.ndarray = np.diag([new[0] / old[0], new[1] / old[1], 1.0]) @ K
+    return scaled

@@ -1,39 +1,30 @@
 """Loading of scenes in any known format."""
 
+import dataclasses
 import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from a2tg_jax.core.checks import check_literal
+from a2tg_jax.data.assembly import check_test_every
 from a2tg_jax.data.colmap import find_models, load_colmap
-from a2tg_jax.data.division import Division, among_processes, sharing_errors
-from a2tg_jax.data.frames import Frames, load_frames
+from a2tg_jax.data.division import Division, among_processes, divided, sharing_errors
 from a2tg_jax.data.lenses import LensUse, forget_rays
-from a2tg_jax.data.mask_files import AlphaMeaning, alpha_as_mask
-from a2tg_jax.data.metashape import metashape_file, metashape_frames
-from a2tg_jax.data.photo_folder import check_no_video, holds_photos
-from a2tg_jax.data.polycam import polycam_folders, polycam_frames
-from a2tg_jax.data.realityscan import realityscan_files, realityscan_frames
-from a2tg_jax.data.record3d import record3d_file, record3d_frames
-from a2tg_jax.data.scene import Scene, warn_of_lenses
-from a2tg_jax.data.splits import check_test_every
-from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, load_blender, load_transforms
-from a2tg_jax.data.unread_captures import told_of_capture
+from a2tg_jax.data.masks import AlphaMeaning, Mask, check_left
+from a2tg_jax.data.phone_captures import polycam, record3d
+from a2tg_jax.data.photo_folder import check_no_video, holds_photos, told_of_capture
+from a2tg_jax.data.photo_reading import Options
+from a2tg_jax.data.photo_store import Shelf
+from a2tg_jax.data.photogrammetry import metashape, realityscan
+from a2tg_jax.data.scene import Scene, View, warn_of_lenses
+from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, Frames, load_blender, load_frames, load_transforms
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.remote_files import RemotePath, check_reachable, is_remote, located
 from a2tg_jax.host.text import as_argument
 
-NO_SCENE_FILE = (
-    "is neither a transforms.json nor an XML file of Metashape's cameras (File > Export > Export Cameras); "
-    "give one of these, or the scene's folder"
-)
-
-NO_REMOTE_SCENE = (
-    "has none of the scenes that are read from a URL: sparse/0, transforms.json or transforms_train.json; copy others "
-    "to a folder, or mount the bucket (mountpoint-s3, gcsfuse, rclone mount)"
-)
+OTHER_PROGRAMS: tuple[Callable[[Path], Callable[[], Frames] | None], ...] = (polycam, record3d, metashape, realityscan)
+"""Functions that recognise a folder of another program, in order of preference, and return what reads its frames."""
 
 
 def load_scene(
@@ -53,7 +44,7 @@ def load_scene(
     nerfstudio's `colmap/sparse/0`, Polycam's raw data, Record3D's frames with their metadata, Metashape's cameras
     (.xml), RealityScan's XMP files. Of several COLMAP models, the one with the most images is read.
     Photographs of distorted cameras are undistorted to pinholes unless `lens` keeps them. Images in the folder without
-    a pose are ignored. Masks, black at excluded pixels, lie in `masks` beside `images`, or at `mask_path`.
+    a pose are ignored. Masks, black at excluded pixels, are in `masks` beside `images`, or at `mask_path`.
 
     Args:
       path: the scene folder, a transforms.json, or an XML file of Metashape's cameras; or a URL, such as s3://bucket/x,
@@ -87,12 +78,17 @@ def load_scene(
             division.check_same([f"{name}={value}" for name, value in options.items()], "options of the scene")
         check_literal("alpha", alpha, AlphaMeaning)
         check_literal("lens", lens, LensUse)
+        if downscale < 1 or downscale != int(downscale):
+            raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
+        check_test_every(test_every)
+        if room is not None and room < 0:
+            raise ValueError(f"room must be at least 0 bytes; got {room}")
         try:
-            scene = _load(located(path), downscale, test_every, room, lens, division)
+            scene = _load(located(path), Options(int(downscale), test_every, lens, Shelf(room), division))
         finally:
             forget_rays()
         warn_of_lenses(scene)
-        return alpha_as_mask(scene, str(path), division) if alpha == "mask" else scene
+        return _alpha_as_mask(scene, str(path), division) if alpha == "mask" else scene
 
 
 def is_scene(folder: Path) -> bool:
@@ -100,36 +96,39 @@ def is_scene(folder: Path) -> bool:
     return _loader(folder) is not None or _frames(folder) is not None
 
 
-def _load(
-    path: Path, downscale: int, test_every: int, room: int | None, lens: LensUse, division: Division | None
-) -> Scene:
-    """Load the scene as it lies on disk."""
-    if downscale < 1 or downscale != int(downscale):
-        raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
-    check_test_every(test_every)
+def _load(path: Path, options: Options) -> Scene:
+    """Load the scene as it is on disk or in a store."""
     is_here = not is_remote(path)
     if is_here and not path.exists():
         built_in = "; the built-in scene is synthetic_scene()" if str(path) == "synthetic" else ""
         raise FileNotFoundError(f"{path}: no such scene folder{built_in}")
-    if room is not None and room < 0:
-        raise ValueError(f"room must be at least 0 bytes; got {room}")
-    options: dict[str, Any] = {
-        "downscale": int(downscale), "test_every": test_every, "room": room, "lens": lens, "division": division,
-    }  # fmt: skip
-    if not is_here:
-        return _load_remote(path, options)
-    check_no_video(path)
-    if is_regular(path):
-        return _load_file(path, options)
+    is_json = path.suffix.lower() == ".json"
+    if is_here:
+        check_no_video(path)
+        is_json = is_json and is_regular(path) and told_of_capture(path) is None
+    else:
+        check_reachable(path.parent if path.suffix.lower() in (".json", ".xml") else path)
+    if is_json:
+        return load_transforms(path, options)
     if (load := _loader(path)) is not None:
-        return load(**options)
-    make = _frames(path)
-    if make is not None:
-        return load_frames(make(), **options)
+        return load(options)
+    if not is_here:
+        raise FileNotFoundError(
+            f"{path}: has none of the scenes that are read from a URL: sparse/0, transforms.json or "
+            "transforms_train.json; copy others to a folder, or mount the bucket (mountpoint-s3, gcsfuse, rclone mount)"
+        )
+    if (make := _frames(path)) is not None:
+        return load_frames(make(), options)
     told = told_of_capture(path)
+    if is_regular(path):
+        nothing = (
+            "is neither a transforms.json nor an XML file of Metashape's cameras (File > Export > Export Cameras); "
+            "give one of these, or the scene's folder"
+        )
+        raise FileNotFoundError(f"{path}: {told or nothing}")
     if told is not None:
-        anew = f"; or find cameras anew: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
-        raise FileNotFoundError(f"{path}: {told}{anew}")
+        again = f"; or find cameras anew: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
+        raise FileNotFoundError(f"{path}: {told}{again}")
     scene = next((parent for parent in path.resolve().parents[:2] if _loader(parent) is not None), None)
     if scene is not None:
         raise FileNotFoundError(f"{path}: is a folder in the scene {scene}; give that folder instead")
@@ -139,8 +138,8 @@ def _load(
     )
 
 
-def _loader(path: Path) -> Callable[..., Scene] | None:
-    """Return what loads a folder with a COLMAP model or a transforms file, or None."""
+def _loader(path: Path) -> Callable[[Options], Scene] | None:
+    """Return the function that loads a folder with a COLMAP model or a transforms file, or None."""
     if find_models(path):
         return functools.partial(load_colmap, path)
     if is_regular(path / NERFSTUDIO_FILE):
@@ -151,35 +150,32 @@ def _loader(path: Path) -> Callable[..., Scene] | None:
     return functools.partial(load_colmap, below) if find_models(below) else None
 
 
-def _load_remote(path: Path, options: dict[str, Any]) -> Scene:
-    """Load a scene from object storage."""
-    suffix = path.suffix.lower()
-    check_reachable(path.parent if suffix in (".json", ".xml") else path)
-    if suffix == ".json":
-        return load_transforms(path, **options)
-    if (load := _loader(path)) is not None:
-        return load(**options)
-    raise FileNotFoundError(f"{path}: {NO_REMOTE_SCENE}")
-
-
-def _load_file(path: Path, options: dict[str, Any]) -> Scene:
-    """Load the scene that one file names."""
-    told = told_of_capture(path)
-    if path.suffix.lower() == ".json" and told is None:
-        return load_transforms(path, **options)
-    if metashape_file(path) is not None:
-        return load_frames(metashape_frames(path), **options)
-    raise FileNotFoundError(f"{path}: {told or NO_SCENE_FILE}")
-
-
 def _frames(path: Path) -> Callable[[], Frames] | None:
-    """Return what reads the frames of another program in a folder, or None."""
-    if (folders := polycam_folders(path)) is not None:
-        return functools.partial(polycam_frames, *folders)
-    if (metadata := record3d_file(path)) is not None:
-        return functools.partial(record3d_frames, metadata)
-    if (cameras := metashape_file(path)) is not None:
-        return functools.partial(metashape_frames, cameras)
-    if files := realityscan_files(path):
-        return functools.partial(realityscan_frames, path, files)
-    return None
+    """Return the function that reads the frames of another program in a folder or a file, or None."""
+    return next(filter(None, (recognise(path) for recognise in OTHER_PROGRAMS)), None)
+
+
+def _alpha_as_mask(scene: Scene, source: str, division: Division | None) -> Scene:
+    """Return the scene with the alpha of its photographs as masks, of which only opaque pixels count."""
+    views = [*scene.train, *scene.test]
+
+    def mask_of(number: int) -> Mask | None:
+        view = views[number]
+        if not view.has_alpha:
+            return view.mask
+        is_opaque = view.picture.read()[..., 3] == 255
+        mask = Mask.of(is_opaque if view.mask is None else is_opaque & view.mask.read())
+        check_left(mask, view.name, source)
+        return mask
+
+    masks = divided(division, [view.name for view in views], mask_of, "views")
+    masked = [_opaque(view, mask) for view, mask in zip(views, masks, strict=True)]
+    return dataclasses.replace(scene, train=tuple(masked[: len(scene.train)]), test=tuple(masked[len(scene.train) :]))
+
+
+def _opaque(view: View, mask: Mask | None) -> View:
+    """Return a view without its alpha, and with a mask."""
+    picture, (height, width) = view.picture, view.picture.size
+    if view.has_alpha:
+        picture = dataclasses.replace(picture, shape=(height, width, 3), read=lambda: view.picture.read()[..., :3])
+    return dataclasses.replace(view, picture=picture, mask=mask)

@@ -25,14 +25,14 @@ class ObservedPoints(NamedTuple):
         return int(self.pixels.nbytes + self.depths.nbytes)
 
     def scaled(self, factor: float) -> "ObservedPoints":
-        """Return the points in a world that is `factor` times as large, without those that are then too near or far."""
+        """Return the points in a world that is `factor` times as large, if they are not too near or far then."""
         depths = (self.depths * np.float64(factor)).astype(np.float32)
         is_usable = _are_usable(depths)
         return ObservedPoints(self.pixels[is_usable], depths[is_usable])
 
 
 def observed_points(xy: np.ndarray, depths: np.ndarray, size: tuple[int, int]) -> ObservedPoints:
-    """Return the points that lie within a picture and before its camera.
+    """Return the points within a picture and before its camera.
 
     Args:
       xy: [S, 2] x and y in pixels, 0.5 at the centre of the first; NaN where there is none.
@@ -48,13 +48,13 @@ def observed_points(xy: np.ndarray, depths: np.ndarray, size: tuple[int, int]) -
     is_within = ((xy >= 0) & (xy < size[::-1])).all(axis=1) & _are_usable(depths)  # False for NaN.
     column, row = xy[is_within].astype(np.int32).T
     pixels, near = row * np.int32(size[1]) + column, depths[is_within].astype(np.float32)
-    order = np.lexsort((near, pixels))
+    order = np.lexsort((near, pixels))  # By pixel, the nearest first, of which `unique` gives the place.
     found, first = np.unique(pixels[order], return_index=True)
     return ObservedPoints(found, near[order][first])
 
 
 def before_camera(points: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
-    """Return those of the points [P, 3] of a world that lie before a camera, in its frame."""
+    """Return the points of [P, 3] in a world that are before a camera, in its frame."""
     own: np.ndarray = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     return own[own[:, 2] > 0]
 

@@ -30,17 +30,11 @@ class Direction(NamedTuple):
 def directions() -> tuple[Direction, ...]:
     """Return the views that a panorama is cut into, the one towards its middle first."""
     headings = [360.0 * number / AROUND for number in range(AROUND)]
-    angles = [(f"heading{heading:03.0f}", heading, 0.0) for heading in headings] + [
-        ("up", 0.0, 90.0),
-        ("down", 0.0, -90.0),
-    ]
-    return tuple(Direction(name, _rotation(heading, pitch)) for name, heading, pitch in angles)
-
-
-def _rotation(heading: float, pitch: float) -> np.ndarray:
-    """Return [3, 3] to a view that is turned right by the heading and then up by the pitch, in degrees."""
-    turned: np.ndarray = Rotation.from_euler("YX", [heading, pitch], degrees=True).as_matrix().T
-    return turned
+    angles = [(f"heading{heading:03.0f}", heading, 0.0) for heading in headings]
+    angles += [("up", 0.0, 90.0), ("down", 0.0, -90.0)]
+    # A view is turned right by its heading and then up by its pitch.
+    turns = [Rotation.from_euler("YX", [heading, pitch], degrees=True) for _, heading, pitch in angles]
+    return tuple(Direction(name, turn.as_matrix().T) for (name, _, _), turn in zip(angles, turns, strict=True))
 
 
 def view_size(width: int) -> tuple[int, float]:
@@ -51,31 +45,25 @@ def view_size(width: int) -> tuple[int, float]:
 
 def cut_view(panorama: np.ndarray, direction: Direction) -> np.ndarray:
     """Return the square view [side, side, C] uint8 of a panorama [H, W, C] in a direction, sampled bilinearly."""
-    side, focal = view_size(panorama.shape[1])
-    # Columns go on over the seam.
-    wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
-    view = np.empty((side, side, panorama.shape[2]), np.uint8)
+    height, width, channels = panorama.shape
+    side, focal = view_size(width)
+    wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)  # Columns continue over the seam.
+    view = np.empty((side, side, channels), np.uint8)
     for top in range(0, side, ROWS_AT_ONCE):
         rows = view[top : top + ROWS_AT_ONCE]
-        places = _seen_at(direction, focal, side, range(top, top + len(rows)), panorama.shape[:2])
-        for channel in range(view.shape[2]):
-            seen = map_coordinates(wrapped[..., channel], places, np.float32, order=1, mode="nearest")
-            rows[..., channel] = np.rint(seen)
+        x, y = np.meshgrid(np.arange(side) + 0.5 - side / 2, np.arange(top, top + len(rows)) + 0.5 - side / 2)
+        rays = np.stack([x, y, np.full_like(x, focal)], -1) @ direction.rotation
+        longitude = np.arctan2(rays[..., 0], rays[..., 2])
+        latitude = np.arctan2(-rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
+        row, column = (0.5 - latitude / np.pi) * height, (0.5 + longitude / (2 * np.pi)) * width
+        places = np.stack([row - 0.5, column - 0.5 + 1])  # One more for the wrapped column on the left.
+        for channel in range(channels):
+            rows[..., channel] = np.rint(map_coordinates(wrapped[..., channel], places, np.float32, 1, mode="nearest"))
     return view
 
 
-def _seen_at(direction: Direction, focal: float, side: int, rows: range, size: tuple[int, ...]) -> np.ndarray:
-    """Return array coordinates (row, column) [2, rows, side] in a wrapped panorama for some rows of a view."""
-    x, y = np.meshgrid(np.arange(side) + 0.5 - side / 2, np.asarray(rows) + 0.5 - side / 2)
-    rays = np.stack([x, y, np.full_like(x, focal)], -1) @ direction.rotation
-    longitude = np.arctan2(rays[..., 0], rays[..., 2])
-    latitude = np.arctan2(-rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
-    height, width = size
-    return np.stack([(0.5 - latitude / np.pi) * height - 0.5, (0.5 + longitude / (2 * np.pi)) * width - 0.5 + 1])
-
-
 def is_panorama(pixels: np.ndarray) -> bool:
-    """Return whether a picture [H, W, C] is twice as wide as high, and its left edge goes on at its right edge."""
+    """Return whether a picture [H, W, C] is twice as wide as high, and its right edge continues at its left edge."""
     if pixels.shape[1] != 2 * pixels.shape[0]:
         return False
     columns = pixels[:, [-1, 0, 1, 2, 3]].astype(np.float32)

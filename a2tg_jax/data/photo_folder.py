@@ -1,15 +1,23 @@
-"""Plain photographs in a folder: which are read, which are skipped, and what to do about those."""
+"""Folders of plain photographs: which files are photographs, and what to do about the others.
+
+Masks, depth maps, copies and pictures that this program wrote are left out: taken for photographs they would give a
+test view a twin among the training views, or a pose of their own. Captures in formats that are not read are recognised.
+"""
 
 import itertools
+import math
+import re
 import warnings
-from collections import Counter
-from collections.abc import Iterator
-from pathlib import Path
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path, PurePosixPath
 
-from a2tg_jax.data.images import PHOTO_SUFFIXES
-from a2tg_jax.data.other_pictures import other_pictures
-from a2tg_jax.data.unread_captures import told_of_capture
-from a2tg_jax.host.text import as_argument, counted
+import numpy as np
+
+from a2tg_jax.data.decoding import upright_thumbnail
+from a2tg_jax.data.image_files import PHOTO_SUFFIXES, map_in_threads
+from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.host.text import as_argument, counted, first_names
 
 FOREIGN_SUFFIXES = (
     ".jxl", ".jp2", ".j2k", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".gif",
@@ -20,10 +28,45 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 LEAST_PHOTOS = 3
 MOST_TOLD = 5
 """Largest number of suffixes that a message counts."""
+CAMERA_PICTURE = "cameras.png"
+"""Picture of the cameras that `a2tg sfm` puts beside `sparse`."""
+LISTS = (".a2tg-run", ".a2tg-frames")
+"""Lists of what runs and renders wrote into a folder, a name a line, after its checksum if it has one."""
+MOST_LIST_BYTES = 1 << 26
+NOT_PHOTOGRAPHS = re.compile(
+    r"(?<![a-z])(mask(?!ed)[a-z]*|(mattes?|segmentations?|depths?|depthmaps?|normals|confidences?)(?![a-z]))",
+    re.IGNORECASE,
+)
+"""Words in names of folders, and in names of files around the name of a photograph."""
+THUMBNAIL = 32
+SMALLER_TOLERANCE, EQUAL_TOLERANCE = 2.0, 0.5
+"""Largest mean difference in grey levels of thumbnails between a photograph and its copy, smaller or of its size.
+
+Copies at 1/4 differ by up to 1.2, and neighbouring frames of six captures by at least 2.4.
+"""
+FOUND_BY: tuple[tuple[str, str], ...] = (
+    ("*.psx", "is a project of Metashape: File > Export > Export Cameras as Agisoft XML, beside a folder images"),
+    ("*.rcproj", "is a project of RealityCapture: export the registration as COLMAP, or as XMP beside the photographs"),
+    ("*.rsproj", "is a project of RealityScan: export the registration as COLMAP, or as XMP beside the photographs"),
+    ("*.r3d", "is a recording of Record3D: rename it to .zip, unpack it, and give the folder with metadata and rgbd"),
+    ("*.insv", "is a recording of Insta360: export an equirectangular MP4 with Insta360 Studio, then a2tg sfm"),
+    ("*.360", "is a recording of GoPro MAX: export an equirectangular MP4 with GoPro Player, then a2tg sfm"),
+    ("*.usdz", "is a finished model, without photographs: export the raw data of the capture"),
+    ("*.zip", "is packed: unpack it, and give the folder in it"),
+    ("poses_bounds.npy", "has LLFF's poses only, which are not read: a2tg sfm finds them again from its images"),
+    ("bundle.out", "has Bundler's cameras, which are not read: export COLMAP's format"),
+    ("*.nvm", "has VisualSFM's cameras, which are not read: export COLMAP's format"),
+    ("reconstruction.json", "has OpenSfM's cameras: opensfm export_colmap writes what is read"),
+    ("opensfm/reconstruction.json", "has OpenSfM's cameras: opensfm export_colmap opensfm writes what is read"),
+    ("*.sfm", "has Meshroom's cameras: its node ExportColmap writes what is read"),
+    ("*.mvs", "is a scene of OpenMVS, which is not read: export COLMAP's format"),
+    ("pose/*.txt", "has a pose for each image (ScanNet), which are not read: write transforms.json"),
+    ("database.db", "has COLMAP's database without a model: colmap mapper writes sparse/0"),
+)
+"""Pattern of files below the capture's folder, and what to do. The first that fits is reported."""
 
 
 def is_video(path: Path) -> bool:
-    """Return whether a path is a file named as videos are."""
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
@@ -36,7 +79,7 @@ def holds_photos(folder: Path) -> bool:
 def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
     """Return paths of the photographs below a folder, relative to it, sorted.
 
-    Warnings count pictures that are no photographs (`other_pictures`), and files of other formats.
+    Warnings count pictures that are no photographs (`_other_pictures`), and files of other formats.
 
     Raises:
       FileNotFoundError: if there is no such folder.
@@ -48,7 +91,7 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
         raise FileNotFoundError(f"{folder}: no such folder of photographs")
     files = sorted(file.relative_to(folder) for file in _files_below(folder))
     pictures = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
-    left_out, told_others = other_pictures(folder, pictures)
+    left_out, told_others = _other_pictures(folder, pictures)
     photos = [name for name in pictures if name not in left_out]
     unread = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
     if len(photos) < least:
@@ -69,7 +112,7 @@ def _files_below(folder: Path) -> Iterator[Path]:
 
 
 def check_no_video(path: Path) -> None:
-    """Raise ValueError if the path is that of a video, telling how it becomes a scene."""
+    """Raise ValueError if the path is a video; the message says how it becomes a scene."""
     if is_video(path):
         raise ValueError(f"{path}: is a video; to make a scene of it, run `a2tg sfm {as_argument(path)} SCENE` first")
 
@@ -87,3 +130,97 @@ def _skipped(folder: Path, files: list[Path]) -> str:
     if video is not None:
         told += f". A video is given by itself: a2tg sfm {as_argument(folder / video)} SCENE"
     return told
+
+
+def told_of_capture(path: Path) -> str | None:
+    """Return what a file or folder is and what to do with it, or None if nothing is known of it."""
+    if not path.is_dir():
+        return next((told for pattern, told in FOUND_BY if "/" not in pattern and path.match(pattern)), None)
+    found = ((min(path.glob(pattern), default=None), told) for pattern, told in FOUND_BY)
+    return next((f"{first.relative_to(path).as_posix()} {told}" for first, told in found if first is not None), None)
+
+
+def _other_pictures(folder: Path, names: Sequence[str]) -> tuple[set[str], str]:
+    """Return the pictures among sorted names below a folder that are no photographs, and a line that counts them."""
+    kinds = {
+        "written by a2tg": _written(folder, names),
+        "in hidden folders": {name for name in names if any(part[0] in ".@" for part in name.split("/")[:-1])},
+        "masks or depth maps": _masks(names),
+    }
+    others = set().union(*kinds.values())
+    kinds["copies of others"] = _copies(folder, [name for name in names if name not in others])
+    told = [f"{kind}: {len(found)} ({first_names(_patterns(found))})" for kind, found in kinds.items() if found]
+    line = f"Not taken for photographs: {'; '.join(told)}. To use some, give a folder of these only"
+    return others | kinds["copies of others"], line
+
+
+def _written(folder: Path, names: Sequence[str]) -> set[str]:
+    """Return the pictures that `a2tg` wrote."""
+    cameras = (name for name in names if PurePosixPath(name).name == CAMERA_PICTURE)
+    found = {name for name in cameras if (folder / name).with_name("sparse").is_dir()}
+    for file in folder.rglob(".a2tg-*"):
+        if file.name in LISTS and is_regular(file):
+            place = PurePosixPath(file.parent.relative_to(folder).as_posix())
+            lines = read_regular(file, MOST_LIST_BYTES).decode(errors="replace").splitlines()
+            found |= {str(place / line.rpartition("  ")[2]) for line in lines}.intersection(names)
+    return found
+
+
+def _masks(names: Sequence[str]) -> set[str]:
+    """Return the pictures in folders of masks and the like, and the ones named so next to a photograph."""
+    pictures = set(names)
+    known = pictures | {str(PurePosixPath(name).with_suffix("")) for name in names}
+    found = set()
+    for path in map(PurePosixPath, names):
+        word = NOT_PHOTOGRAPHS.search(path.stem)
+        parts = () if word is None else (path.stem[: word.start()], path.stem[word.end() :])
+        rest = [part.strip("_-. ") for part in parts]
+        if (
+            any(map(NOT_PHOTOGRAPHS.search, path.parts[:-1]))
+            or any(name and str(path.with_name(name)) in known for name in rest)  # 0_mask.png beside 0.jpg
+            or (path.suffix.lower() == ".png" and str(path.with_suffix("")) in pictures)  # 0.jpg.png beside 0.jpg
+        ):
+            found.add(str(path))
+    return found
+
+
+def _copies(folder: Path, names: Sequence[str]) -> set[str]:
+    """Return the pictures that show the same as a larger or earlier one of the same name, in this or another folder."""
+    same_name = defaultdict(list)
+    for name in names:
+        path = PurePosixPath(name)
+        while path.suffix.lower() in PHOTO_SUFFIXES:  # 0.heic.jpg is a copy of 0.heic.
+            path = path.with_suffix("")
+        # Copies may be in a folder of their own at any level: two names are alike with one folder left out of either.
+        for key in {path.parts, *(path.parts[:at] + path.parts[at + 1 :] for at in range(len(path.parts) - 1))}:
+            same_name[key].append(name)
+    groups = [group for group in same_name.values() if len(group) > 1]
+    wanted = sorted(set().union(*groups))
+    thumbnails = map_in_threads(lambda name: upright_thumbnail(folder / name, THUMBNAIL), wanted)
+    pictures = dict(zip(wanted, thumbnails, strict=True))
+    found: set[str] = set()
+    for group in groups:
+        kept: list[tuple[tuple[int, int], np.ndarray]] = []
+        for name in sorted(group, key=lambda name: (-math.prod(pictures[name][0]), name)):
+            if any(_is_copy(*pictures[name], *larger) for larger in kept):
+                found.add(name)
+            else:
+                kept.append(pictures[name])
+    return found
+
+
+def _is_copy(size: tuple[int, int], grey: np.ndarray, larger_size: tuple[int, int], larger_grey: np.ndarray) -> bool:
+    """Return whether two pictures have the same aspect, up to a pixel of rounding, and show the same."""
+    (width, height), (larger_width, larger_height) = size, larger_size
+    if abs(width * larger_height - height * larger_width) > larger_width + larger_height:
+        return False
+    tolerance = EQUAL_TOLERANCE if size == larger_size else SMALLER_TOLERANCE
+    return bool(np.abs(grey - larger_grey).mean() <= tolerance)
+
+
+def _patterns(names: Iterable[str]) -> list[str]:
+    """Return a pattern for the pictures of each folder and suffix; a single one by its name."""
+    groups = defaultdict(list)
+    for path in map(PurePosixPath, sorted(names)):
+        groups[path.with_name(f"*{path.suffix}")].append(path)
+    return [str(group[0] if len(group) == 1 else pattern) for pattern, group in groups.items()]

@@ -1,5 +1,6 @@
 """Storage of photographs: in memory while there is room, otherwise read on demand from a disk or a store."""
 
+import contextlib
 import dataclasses
 import os
 import shutil
@@ -29,7 +30,7 @@ SHARE_OF_DISK = 0.5
 
 
 def how_to_convert(values: object, name: str) -> str:
-    """Return how to make uint8 of colours in [0, 1], [0, 255] or 16 bits, which their values tell apart; else ""."""
+    """Return how to make uint8 of colours in [0, 1], [0, 255] or 16 bits, judged by their values; else ""."""
     values = np.asarray(values)
     is_float, is_integer = (np.issubdtype(values.dtype, kind) for kind in (np.floating, np.integer))
     largest = np.nanmax(values, initial=0)
@@ -77,17 +78,14 @@ class Picture:
         return self
 
     def __reduce__(self) -> Any:
-        """Pickle the pixels; of a photograph that is read from its file as it is, only the place."""
+        """Pickle the pixels; of a photograph that is read unchanged from its file, only the place."""
         if isinstance(self.read, _FileRead) and self.read.view is None:
             return Picture, tuple(getattr(self, field.name) for field in dataclasses.fields(self))
         return Picture.of, (self.read(),)
 
     def __repr__(self) -> str:
-        return f"Picture({np.dtype(self.dtype)}{[*self.shape]}, {self._place})"
-
-    @property
-    def _place(self) -> str:
-        return "in memory" if self.is_held else "in object storage" if self.is_remote else "on disk"
+        place = "in memory" if self.is_held else "in object storage" if self.is_remote else "on disk"
+        return f"Picture({np.dtype(self.dtype)}{[*self.shape]}, {place})"
 
     @property
     def size(self) -> tuple[int, int]:
@@ -120,17 +118,15 @@ class Shelf:
         self._disk: int | None = None
 
     def keep(self, pixels: np.ndarray, source: Path | None = None, view: Processing | None = None) -> Picture:
-        """Return a picture of these pixels.
+        """Return a picture of these pixels, uint8 of any shape.
 
         Args:
-          pixels: of any shape, uint8.
+          pixels: the pixels.
           source: image file that they come from; None: no file has them.
-          view: function that made them of those in the file; None: they are exactly these.
-
-        Raises:
-          OSError: with a remedy, if there is no room on disk.
+          view: function that made them of the pixels in the file; None: they are exactly these.
         """
         with self._lock:
+            # Smaller pictures may still fit after a larger one did not.
             self._room -= pixels.nbytes
             if self._room >= 0:
                 return Picture.of(pixels)
@@ -146,19 +142,14 @@ class Shelf:
         return fitting
 
     def read_later(self, shape: tuple[int, ...], source: Path, view: Processing | None) -> Picture:
-        """Return the picture in an image file that is not read before it is needed, and not kept in memory then.
-
-        Args:
-          shape: of its pixels.
-          source, view: as for `keep`.
-        """
+        """Return the picture in an image file that is not read before it is needed, and not kept in memory then."""
+        # The first reading leaves a checksum or a copy on disk, to which all later ones are held.
         lock, kept = threading.Lock(), list[Picture]()
 
         def read() -> np.ndarray:
             with lock:
                 if not kept:
-                    stored = read_pixels(source)
-                    pixels = np.ascontiguousarray(stored if view is None else view(stored))
+                    pixels = _read_file(source, view)
                     if pixels.shape != shape:
                         raise ValueError(
                             f"{source}: has pixels {list(pixels.shape)}, but {list(shape)} where another process has "
@@ -172,23 +163,9 @@ class Shelf:
 
     def _left(self, pixels: np.ndarray, source: Path | None, view: Processing | None) -> Picture:
         """Return a picture of pixels without room in memory. Arguments as for `keep`."""
-        if source is not None and (view is None or self._is_made_again(source, pixels.nbytes)):
-            return _decoded_again(source, pixels, view)
-        return self._put(pixels)
-
-    def _is_made_again(self, source: Path, num_bytes: int) -> bool:
-        """Return whether undistorted or resized pixels are dropped: those of a remote file, if its share of the disk
-        is taken."""
-        if not is_remote(source):
-            return False
-        with self._lock:
-            if self._disk is None:
-                self._disk = int(SHARE_OF_DISK * _free_disk())
-            self._disk -= num_bytes
-            return self._disk < 0
-
-    def _put(self, pixels: np.ndarray) -> Picture:
-        """Write pixels to the unnamed file."""
+        if source is not None and (view is None or (is_remote(source) and not self._takes_disk(pixels.nbytes))):
+            checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
+            return Picture(pixels.shape, _FileRead(source, view, checksum), is_remote=is_remote(source))
         folder, shape = cache_folder(), pixels.shape
         try:
             with self._lock:
@@ -214,34 +191,37 @@ class Shelf:
 
         return Picture(shape, read)
 
+    def _takes_disk(self, num_bytes: int) -> bool:
+        """Take so many bytes of the share of the disk for pictures of remote files, and return whether it had them.
+        It has none if no file can be made there."""
+        with self._lock:
+            if self._disk is None:
+                folder = cache_folder()
+                self._disk = 0
+                with contextlib.suppress(OSError):
+                    folder.mkdir(parents=True, exist_ok=True)
+                    if os.access(folder, os.W_OK):
+                        self._disk = int(SHARE_OF_DISK * shutil.disk_usage(folder).free)
+            self._disk -= num_bytes
+            return self._disk >= 0
 
-def _free_disk() -> int:
-    """Return the free bytes for pictures; 0 if no file can be made there."""
-    folder = cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        return shutil.disk_usage(folder).free if os.access(folder, os.W_OK) else 0
-    except OSError:
-        return 0
 
-
-def _decoded_again(source: Path, pixels: np.ndarray, view: Processing | None) -> Picture:
-    """Return the picture in an image file, which must not change, or what a function makes of it."""
-    checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
-    return Picture(pixels.shape, _FileRead(source, view, checksum), is_remote=is_remote(source))
+def _read_file(source: Path, view: Processing | None) -> np.ndarray:
+    """Return the pixels in an image file, or what `view` makes of them."""
+    stored = read_pixels(source)
+    return np.ascontiguousarray(stored if view is None else view(stored))
 
 
 @dataclasses.dataclass(frozen=True)
 class _FileRead:
-    """Function that reads the pixels in an image file, or what `view` makes of them."""
+    """Function that reads the pixels of an image file, which must not change."""
 
     source: Path
     view: Processing | None
     checksum: int
 
     def __call__(self) -> np.ndarray:
-        stored = read_pixels(self.source)
-        pixels = np.ascontiguousarray(stored if self.view is None else self.view(stored))
+        pixels = _read_file(self.source, self.view)
         if zlib.crc32(pixels.data) != self.checksum:
             raise ValueError(f"{self.source}: has changed since the scene was loaded; restore it or start again")
         return pixels

@@ -1,20 +1,29 @@
-"""Parts that readers of photogrammetry programs share: XML, numbers in texts, images by name, and worlds of maps."""
+"""Cameras of photogrammetry programs, read as frames of `transforms.json`.
 
+Metashape writes one XML file (File > Export > Export Cameras). Its lenses are those of the manual's appendix on camera
+models: a projection onto the plane z = 1 (frame), or onto radii θ (equidistant fisheye) or 2·sin(θ/2) (equisolid
+fisheye) for a ray at the angle θ, then Brown's distortion. RealityScan (RealityCapture) writes an XMP file beside each
+photograph.
+"""
+
+import functools
 import re
 import warnings
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from a2tg_jax.data.assembly import PointCloud
-from a2tg_jax.data.frames import Frames
-from a2tg_jax.data.images import PHOTO_SUFFIXES, inside, named_image
+from a2tg_jax.data.assembly import PointCloud, rigid_viewmat
+from a2tg_jax.data.decoding import picture_size
+from a2tg_jax.data.image_files import PHOTO_SUFFIXES, inside, named_image, warn_of_unposed
 from a2tg_jax.data.ply_points import read_ply_points
+from a2tg_jax.data.transforms import Frames, check_images
 from a2tg_jax.host.json_text import MOST_BYTES
-from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.host.regular_files import is_regular, open_regular, read_regular
 from a2tg_jax.host.text import shortened
 
 Element = ElementTree.Element
@@ -25,39 +34,266 @@ FARTHEST_POINTS = 100.0
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Change of a camera's frame between OpenCV and OpenGL."""
 UNDISTORTED = "export undistorted images in COLMAP's format instead"
+SWITCHED_OFF = ("0", "false")
+"""Values of a camera's attribute enabled that leave it out."""
+HIGHER_TERMS = {"frame": ("k4", "p3", "p4"), "equidistant": ("p3", "p4"), "equisolid": ("p1", "p2", "p3", "p4")}
+"""Coefficients of distortion that COLMAP's models do not have, by projection."""
+PROJECTIONS = {
+    "frame": "frame", "fisheye": "equidistant", "equidistant_fisheye": "equidistant", "equisolid_fisheye": "equisolid",
+}  # fmt: skip
+"""Projections that are read, by the type of a sensor."""
+LARGEST_MISFIT = 0.05
+"""Largest difference in pixels between an equisolid fisheye and the polynomial that stands for it."""
+NUM_ANGLES = 200
+"""Number of angles at which they are compared."""
+HEAD_BYTES = 1 << 16
+"""Number of bytes of an XML file in which a chunk's sensors are looked for."""
+XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
+FILM_WIDTH = 36.0
+"""Width in mm of the film that FocalLength35mm refers to, for the longer side of an image."""
 
 
-def with_near_points(frames: Frames) -> Frames:
-    """Return frames with poses as lists. Points far from the cameras are left out, with a warning."""
-    poses = np.stack([frame["transform_matrix"] for frame in frames.frames])
-    middle = np.median(poses[:, :3, 3], axis=0)
-    spread = np.linalg.norm(poses[:, :3, 3] - middle, axis=1).max()
-    if frames.cloud is not None and not _are_near(frames.cloud.points, middle, FARTHEST_POINTS * spread):
-        warnings.warn(
-            f"{frames.file}: the points beside it lie far from its cameras, in another coordinate system: not used",
-            stacklevel=2,
+def metashape(path: Path) -> Callable[[], Frames] | None:
+    """Return the function that reads Metashape's cameras, an XML file or one in a folder; None if there is none."""
+    for file in [path] if is_regular(path) else sorted(path.glob("*.xml")):
+        if file.suffix.lower() == ".xml":
+            with open_regular(file) as opened:
+                is_found = b"<sensors" in opened.read(HEAD_BYTES)
+            if is_found:
+                return functools.partial(_metashape_frames, file)
+    return None
+
+
+def _metashape_frames(file: Path) -> Frames:
+    """Return the frames of Metashape's cameras. A PLY file beside them, if it is the only one, holds their points.
+
+    Component and chunk have a transform to the world, which poses go through; its scale leaves the cameras rigid.
+    """
+    frames, lacking = [], []
+    below = _images_below(file.parent / "images")
+    for label, sensor, pose in _posed_cameras(file):
+        image = _image_of(file.parent, label, below)
+        if image is None:
+            lacking.append(label)
+            continue
+        lens = _metashape_lens(sensor, f"{file}: {label}")
+        frames.append({**lens, "file_path": image, "transform_matrix": pose @ OPENGL})
+    nothing = f"{file}: none of its cameras has a pose and an image beside it; put the photographs into images/"
+    check_images(file, frames, lacking, nothing)
+    return _with_points(file, frames)
+
+
+def _posed_cameras(file: Path) -> list[tuple[str, Element, np.ndarray]]:
+    """Return label, sensor and pose [4, 4] in the world of each camera that has a pose and is switched on.
+
+    A camera without a pose of its own in a rig has the pose of its master and the offset of its sensor. Warnings count
+    those, and cameras that are not used.
+    """
+    found: list[tuple[str, Element, np.ndarray]] = []
+    unused, in_rigs = [], []
+    for chunk in _read_xml(file).iter("chunk"):
+        sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
+        worlds = {part.get("id"): _world(part, file) for part in chunk.iter("component")}
+        of_chunk = _world(chunk, file)
+        cameras = {camera.get("id"): camera for camera in chunk.iter("camera")}
+        for camera in chunk.iter("camera"):
+            label, sensor, posed = camera.get("label") or "", sensors.get(camera.get("sensor_id")), camera
+            offset: np.ndarray | None = np.eye(4)
+            if sensor is not None and camera.find("transform") is None and camera.get("master_id") in cameras:
+                posed = cameras[camera.get("master_id")]
+                offset = _offset(sensor, sensors.get(posed.get("sensor_id")), file)
+            pose = posed.find("transform")
+            if sensor is None or pose is None or offset is None or camera.get("enabled") in SWITCHED_OFF:
+                unused.append(label)
+                continue
+            if posed is not camera:
+                in_rigs.append(label)
+            world = worlds.get(posed.get("component_id"))
+            own = _numbers_in(pose.text, 16, file).reshape(4, 4) @ offset
+            world = of_chunk if world is None else world
+            if world is not None:  # The rotation keeps the scale 1.
+                own = world @ own
+                own[:3, :3] /= np.cbrt(abs(np.linalg.det(world[:3, :3]))) or 1.0
+            found.append((label, sensor, own))
+    by_offset = "have no own pose, such as {}: placed by their sensors' offsets from the master, in units of its pose"
+    for labels, told in ((in_rigs, by_offset), (unused, "have no pose or are switched off, such as {}: not used")):
+        if labels:
+            count = f"{file}: {len(labels)} of {len(found) + len(unused)} cameras"
+            warnings.warn(f"{count} {told.format(shortened(labels[0]))}", stacklevel=3)
+    return found
+
+
+def _offset(sensor: Element, master: Element | None, file: Path) -> np.ndarray | None:
+    """Return the rigid motion [4, 4] from a sensor of a rig to the sensor of its master camera; None if the file has
+    neither's place in the rig. A sensor without a place is the origin of the rig."""
+    from_sensor, from_master = (None if part is None else _in_rig(part, file) for part in (sensor, master))
+    if from_sensor is None and (from_master is None or sensor.get("master_id") is not None):
+        return None
+    offset: np.ndarray = np.linalg.inv(np.eye(4) if from_master is None else from_master)
+    return offset if from_sensor is None else offset @ from_sensor
+
+
+def _in_rig(sensor: Element, file: Path) -> np.ndarray | None:
+    """Return the rigid motion [4, 4] from a sensor's frame to its rig's; None without one."""
+    if sensor.find("rotation") is None and sensor.find("translation") is None:
+        return None
+    return rigid_viewmat(_motion(sensor, file), f"{file}: sensor {sensor.get('id')}")
+
+
+def _world(part: Element, file: Path) -> np.ndarray | None:
+    """Return the similarity [4, 4] from a component or a chunk to the world, or None."""
+    transform = part.find("transform")
+    if transform is None or transform.find("rotation") is None:
+        return None
+    world, scale = _motion(transform, file), transform.findtext("scale")
+    world[:3, :3] *= 1.0 if scale is None else _numbers_in(scale, 1, file)[0]
+    return world
+
+
+def _motion(part: Element, file: Path) -> np.ndarray:
+    """Return [4, 4] of the rotation and the translation in an element, if they are there."""
+    motion = np.eye(4)
+    if part.find("rotation") is not None:
+        motion[:3, :3] = _numbers_in(part.findtext("rotation"), 9, file).reshape(3, 3)
+    if part.find("translation") is not None:
+        motion[:3, 3] = _numbers_in(part.findtext("translation"), 3, file)
+    return motion
+
+
+def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
+    """Return the adjusted intrinsics of a sensor as `transforms.json` has them. P1 and P2 are OpenCV's p2 and p1."""
+    kind = sensor.get("type", "frame")
+    projection = PROJECTIONS.get(kind)
+    if projection is None:
+        advice = "cut panoramas into views with a2tg sfm" if kind == "spherical" else UNDISTORTED
+        raise ValueError(f"{what}: is of a sensor of type {shortened(kind)}, which is not read; {advice}")
+    with_focal = [part for part in sensor.iter("calibration") if part.find("f") is not None]
+    calibration = min(with_focal, key=lambda part: part.get("class") != "adjusted", default=None)
+    if calibration is None:
+        raise ValueError(f"{what}: is of a sensor without a calibration; {UNDISTORTED}")
+    size = calibration.find("resolution")
+    size = sensor.find("resolution") if size is None else size
+    if size is None:
+        raise ValueError(f"{what}: its sensor has no resolution; export the cameras again")
+    width, height = (float(_numbers_in(size.get(side), 1, what)[0]) for side in ("width", "height"))
+
+    def read(name: str) -> float:
+        return float(_numbers_in(calibration.findtext(name, "0"), 1, what)[0])
+
+    higher = HIGHER_TERMS[projection]
+    if any(map(read, higher)) or abs(read("b2")) * height / max(read("f"), 1.0) > LARGEST_SKEW:
+        told = ", ".join(higher)
+        raise ValueError(f"{what}: its {projection} lens has {told} or b2, which are not known here; {UNDISTORTED}")
+    lens: dict[str, Any] = {
+        "w": int(width), "h": int(height), "fl_x": read("f") + read("b1"), "fl_y": read("f"),
+        "cx": width / 2 + read("cx"), "cy": height / 2 + read("cy"),
+        "k1": read("k1"), "k2": read("k2"), "k3": read("k3"), "p1": read("p2"), "p2": read("p1"),
+    }  # fmt: skip
+    if projection == "frame":
+        return lens
+    lens |= {"camera_model": "THIN_PRISM_FISHEYE", "k4": read("k4")}
+    return lens | (_equidistant_terms(lens, what) if projection == "equisolid" else {})
+
+
+def _equidistant_terms(lens: dict[str, Any], what: str) -> dict[str, float]:
+    """Return k1 to k4 of the equidistant fisheye nearest to an equisolid one with its own k1 to k4, up to
+    `LARGEST_MISFIT`."""
+    farthest = np.hypot(max(lens["cx"], lens["w"] - lens["cx"]), max(lens["cy"], lens["h"] - lens["cy"]))
+    widest = min(2 * np.arcsin(min(farthest / max(lens["fl_y"], 1.0) / 2, 1.0)), np.pi / 2)
+    angles = np.linspace(0, widest, NUM_ANGLES + 1)[1:]
+    radii = 2 * np.sin(angles / 2)
+    distorted = radii * (1 + sum(lens[f"k{power}"] * radii ** (2 * power) for power in range(1, 5)))
+    powers = angles[:, None] ** (2 * np.arange(1, 5))
+    terms, *_ = np.linalg.lstsq(angles[:, None] * powers, distorted - angles, rcond=None)
+    misfit = lens["fl_y"] * np.abs(angles * (1 + powers @ terms) - distorted).max()
+    if not misfit <= LARGEST_MISFIT:  # Also for NaN.
+        raise ValueError(f"{what}: its equisolid lens is {misfit:.2g} pixels off COLMAP's fisheyes; {UNDISTORTED}")
+    return {f"k{power}": float(term) for power, term in enumerate(terms, 1)}
+
+
+def realityscan(path: Path) -> Callable[[], Frames] | None:
+    """Return the function that reads RealityScan's XMP files in a folder, or anywhere below its folder images; None if
+    there are none."""
+    for found in (path.glob("*.xmp"), (path / "images").rglob("*.xmp")):
+        files = [file for file in sorted(found) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
+        if files:
+            return functools.partial(_realityscan_frames, path, files)
+    return None
+
+
+def _realityscan_frames(path: Path, files: list[Path]) -> Frames:
+    """Return the frames of XMP files, each beside its image. The only PLY file in the folder holds the points."""
+    frames, lacking = [], []
+    for file in files:
+        image = named_image(file.parent, file.stem)
+        if image is None:
+            lacking.append(file.name)
+            continue
+        values: dict[str, str] = {}  # RealityScan's, which are attributes or elements.
+        for element in _read_xml(file).iter():
+            values |= {key.removeprefix(XCR): text for key, text in element.attrib.items() if key.startswith(XCR)}
+            if element.tag.startswith(XCR):
+                values[element.tag.removeprefix(XCR)] = element.text or ""
+        pose = np.eye(4)
+        pose[:3, :3] = _numbers_in(values.get("Rotation"), 9, file).reshape(3, 3).T
+        pose[:3, 3] = _numbers_in(values.get("Position"), 3, file)
+        lens = _xcr_lens(values, *picture_size(image), file)
+        frames.append({**lens, "file_path": image.relative_to(path).as_posix(), "transform_matrix": pose @ OPENGL})
+    nothing = f"{path}: no photograph lies beside an XMP file of its name; put them together"
+    check_images(path / "*.xmp", frames, lacking, nothing)
+    folder = path / "images" if files[0].is_relative_to(path / "images") else path
+    posed = [(path / frame["file_path"]).relative_to(folder).as_posix() for frame in frames]
+    warn_of_unposed(folder, posed, is_deep=folder != path)
+    return _with_points(path / "*.xmp", frames)
+
+
+def _xcr_lens(values: dict[str, str], width: int, height: int, file: Path) -> dict[str, Any]:
+    """Return the intrinsics of an XMP file; lengths in it are in units of the longer side."""
+
+    def read(name: str, default: str) -> float:
+        return float(_numbers_in(values.get(name, default), 1, file)[0])
+
+    k1, k2, k3, k4, t1, t2 = _numbers_in(values.get("DistortionCoeficients", "0 0 0 0 0 0"), 6, file)
+    model, longer = values.get("DistortionModel", "perspective"), max(width, height)
+    has_brown = model.startswith("brown") or not any((k1, k2, k3))
+    if k4 or t1 or t2 or not has_brown or abs(read("Skew", "0")) * longer > LARGEST_SKEW:
+        raise ValueError(
+            f"{file}: has the distortion model {shortened(model)} with skew, k4, t1 or t2, which are not known here; "
+            f"align with Brown3, or {UNDISTORTED}"
         )
-        frames = frames._replace(cloud=None)
-    listed = [{**frame, "transform_matrix": pose.tolist()} for frame, pose in zip(frames.frames, poses, strict=True)]
-    return frames._replace(frames=listed)
+    focal = read("FocalLength35mm", "0") / FILM_WIDTH * longer
+    cx, cy = width / 2 + longer * read("PrincipalPointU", "0"), height / 2 + longer * read("PrincipalPointV", "0")
+    size = {"w": width, "h": height, "cx": cx, "cy": cy}
+    return {**size, "fl_x": focal, "fl_y": focal * read("AspectRatio", "1"), "k1": k1, "k2": k2, "k3": k3}
 
 
-def points_beside(file: Path) -> PointCloud | None:
-    """Return the points of the only PLY file in the folder of a file; None, with a warning, of several."""
-    points = sorted(file.parent.glob("*.ply"))
-    if len(points) > 1:
-        names = ", ".join(point.name for point in points)
-        warnings.warn(f"{file}: {len(points)} PLY files are beside it, {shortened(names)}: none used", stacklevel=3)
-    return read_ply_points(points[0]) if len(points) == 1 else None
+def _with_points(file: Path, frames: list[dict[str, Any]]) -> Frames:
+    """Return frames with poses as lists, and the points of the only PLY file beside `file`.
+
+    Several PLY files, or points far from the cameras, are not used, with a warning.
+    """
+    poses = np.stack([frame["transform_matrix"] for frame in frames])
+    middle = np.median(poses[:, :3, 3], axis=0)
+    farthest = FARTHEST_POINTS * np.linalg.norm(poses[:, :3, 3] - middle, axis=1).max()
+    cloud: PointCloud | None = None
+    files = sorted(file.parent.glob("*.ply"))
+    if len(files) > 1:
+        names = ", ".join(each.name for each in files)
+        warnings.warn(f"{file}: {len(files)} PLY files are beside it, {shortened(names)}: none used", stacklevel=3)
+    elif files:
+        cloud = read_ply_points(files[0])
+        finite = cloud.points[np.isfinite(cloud.points).all(axis=-1)]
+        if len(finite) and farthest and not np.linalg.norm(np.median(finite, axis=0) - middle) <= farthest:
+            warnings.warn(
+                f"{file}: the points beside it lie far from its cameras, in another coordinate system: not used",
+                stacklevel=3,
+            )
+            cloud = None
+    listed = [{**frame, "transform_matrix": pose.tolist()} for frame, pose in zip(frames, poses, strict=True)]
+    return Frames(file, listed, cloud)
 
 
-def _are_near(points: np.ndarray, middle: np.ndarray, farthest: float) -> bool:
-    """Return whether the median of points [P, 3] is near a place, or cannot be told."""
-    finite = points[np.isfinite(points).all(axis=-1)]
-    return not len(finite) or not farthest or bool(np.linalg.norm(np.median(finite, axis=0) - middle) <= farthest)
-
-
-def images_below(folder: Path) -> dict[str, Path]:
+def _images_below(folder: Path) -> dict[str, Path]:
     """Return the images in all folders below a folder, by name and by name without suffix, as far as that is unique."""
     found: dict[str, set[Path]] = defaultdict(set)
     for file in folder.rglob("*"):
@@ -67,7 +303,7 @@ def images_below(folder: Path) -> dict[str, Path]:
     return {name: next(iter(files)) for name, files in found.items() if len(files) == 1}
 
 
-def image_of(folder: Path, label: str, below: Mapping[str, Path]) -> str | None:
+def _image_of(folder: Path, label: str, below: Mapping[str, Path]) -> str | None:
     """Return the path, from the folder, of the image of a camera's label: a path of any machine, or a name.
 
     It is looked for in `images`, in the folder itself, and then among the images `below`.
@@ -78,7 +314,7 @@ def image_of(folder: Path, label: str, below: Mapping[str, Path]) -> str | None:
     return None if found is None else found.relative_to(folder).as_posix()
 
 
-def read_xml(file: Path) -> Element:
+def _read_xml(file: Path) -> Element:
     """Return the root of an XML file. Declarations of entities, which can grow without end, are refused."""
     data = read_regular(file, MOST_BYTES)
     try:
@@ -89,7 +325,7 @@ def read_xml(file: Path) -> Element:
         raise ValueError(f"{file}: cannot be read as XML ({shortened(str(error))}); export it again") from None
 
 
-def numbers_in(text: str | None, count: int, what: object) -> np.ndarray:
+def _numbers_in(text: str | None, count: int, what: object) -> np.ndarray:
     """Return the numbers in a text, or raise ValueError unless there are so many and all are finite."""
     try:
         numbers = np.array([float(word) for word in (text or "").split()])

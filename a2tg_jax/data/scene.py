@@ -32,7 +32,7 @@ GENERIC_NAMES = {
     "0", "capture", "colmap", "data", "dataset", "dense", "images", "input", "output", "photos", "scene", "sfm",
     "sparse", "undistorted",
 }  # fmt: skip
-"""Names of folders, in lower case, that do not tell one scene from another."""
+"""Names of folders, in lower case, that do not distinguish scenes."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -111,8 +111,11 @@ class Scene:
     """scene_scale: 1.1 × the largest distance of a camera, train or test, from their mean."""
 
     def __repr__(self) -> str:
-        views = [counted(len(self.train), "training view"), counted(len(self.test), "test view")]
-        return f"Scene({self.name!r}, {', '.join(views)}, {self._sizes()}, {counted(len(self.points), 'point')})"
+        sizes = {view.picture.size for view in (*self.train, *self.test)}
+        height, width = max(sizes, key=math.prod, default=(0, 0))
+        size = f"{width}×{height}" if len(sizes) < 2 else f"{len(sizes)} sizes to {width}×{height}"
+        views = f"{counted(len(self.train), 'training view')}, {counted(len(self.test), 'test view')}"
+        return f"Scene({self.name!r}, {views}, {size}, {counted(len(self.points), 'point')})"
 
     def _repr_html_(self) -> str:
         """Return the line above thumbnails of a few training views, evenly spaced, for notebooks."""
@@ -121,16 +124,9 @@ class Scene:
         images = (html_image(png(view.picture.read(), THUMBNAIL), view.name) for view in views)
         return f"<div>{html.escape(repr(self))}</div><div>{' '.join(images)}</div>"
 
-    def _sizes(self) -> str:
-        """Return the size of the images, or the number of sizes and the largest."""
-        sizes = {view.picture.size for view in (*self.train, *self.test)}
-        height, width = max(sizes, key=math.prod, default=(0, 0))
-        return f"{width}×{height}" if len(sizes) < 2 else f"{len(sizes)} sizes to {width}×{height}"
-
 
 def check_scene(scene: Scene) -> None:
-    """Raise ValueError, naming the field, unless points, transform and scale are valid, and the training views have
-    different names."""
+    """Raise ValueError, naming the field, unless its numbers are valid and its training views have different names."""
     names = [view.name for view in scene.train]
     twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
     if twice is not None:
@@ -175,7 +171,7 @@ def _lenses(views: Sequence[View]) -> dict[int, Array]:
 
 
 def ray_bytes(views: Sequence[View]) -> int:
-    """Return the bytes of the rays of the views' lenses; those of one lens count once."""
+    """Return the bytes of the rays of the views' lenses; views of one lens count once."""
     return sum(int(rays.nbytes) for rays in _lenses(views).values())
 
 
@@ -241,7 +237,7 @@ def view_image(view: View, background: Sequence[float] | np.ndarray | None = Non
 
 
 def scene_name(folder: Path | str) -> str:
-    """Return the end of a folder's path or URL, from the last name that tells more than "scene" or "colmap" does."""
+    """Return the end of a folder's path or URL, from the last name that says more than "scene" or "colmap" does."""
     is_url = isinstance(folder, str) or is_remote(folder)
     parts = ("", *str(folder).split("/")[2:]) if is_url else Path(folder).resolve().parts
     told = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]

@@ -2,34 +2,42 @@
 
 import os
 import shutil
+import sys
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
 
 from a2tg_jax.core.checks import check_literal
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.panoramas import directions
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
-from a2tg_jax.data.progress import clock
-from a2tg_jax.data.sfm_database import (
-    CameraModel,
-    Matching,
-    extract_features,
-    featureless,
-    known_cameras,
-    match_features,
-    num_matched_pairs,
-)
 from a2tg_jax.data.staging import Panorama, Staged, stage
 from a2tg_jax.data.video import DEFAULT_FRAMES
-from a2tg_jax.host.progress_bars import counting
+from a2tg_jax.host.machine import num_threads
+from a2tg_jax.host.progress_bars import counting, has_terminal
 from a2tg_jax.host.text import counted, first_names
 
+Matching = Literal["auto", "exhaustive", "sequential"]
+"""Pairs of photographs to match: all of them (exhaustive), neighbours by name (sequential), or by their number."""
+CameraModel = Literal[
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE", "OPENCV_FISHEYE",
+]  # fmt: skip
+"""COLMAP's names of camera models that can be estimated from photographs."""
 MAX_EXHAUSTIVE = 200
 """Number of photographs beyond which "auto" matches only neighbours in name order."""
 MIN_REGISTERED = 3
+PHOTOS_PER_CORE = 2
+"""Photographs of which features are extracted together, so that the progress bar moves."""
+TICK = 0.5
+"""Seconds between two readings of the clock of a phase without countable progress."""
 ADVICE = "take more, sharp and closer together: they should overlap by two thirds and show texture, unlike blank walls"
 
 NO_DEPTH = "photographs match, but show no depth: walk between them; "
@@ -71,8 +79,8 @@ def run_sfm(
     Args:
       photos: folder of photographs of one scene, whose subfolders are searched, or a video, or several of these.
       out: new folder for `images` and `sparse/0`.
-      seed: of COLMAP's random choices, at least 0.
-      camera_model: COLMAP's name of the camera model to estimate; those of FISHEYE are for action cameras.
+      seed: random seed of COLMAP, at least 0.
+      camera_model: COLMAP's name of the camera model to estimate; the FISHEYE models are for action cameras.
       matching: pairs of photographs to match; "auto" takes all pairs of up to 200, and neighbours by name of more.
       frames: largest number of frames to take from each video. The sharpest are taken, evenly along the camera's way.
       panorama: pictures to cut into perspective views: "auto" takes those twice as wide as high whose edges join,
@@ -97,7 +105,11 @@ def run_sfm(
         raise ValueError(f"frames must be at least {LEAST_PHOTOS}; got {frames}")
     sources = [Path(photos)] if isinstance(photos, str | os.PathLike) else [Path(source) for source in photos]
     out = Path(out)
-    _check_new(out)
+    for existing in (out / "images", out / "sparse"):
+        if existing.exists():
+            raise FileExistsError(f"{existing}: exists already; choose another output folder or remove it")
+    if out.is_file():
+        raise FileExistsError(f"{out} is a file; choose a folder for the scene")
     with _new_folder(out), tempfile.TemporaryDirectory(dir=out, prefix="sfm-") as folder, _quiet():
         work = Path(folder)
         staged = stage(sources, work, frames=frames, panorama=panorama, progress=progress, tell=on_note)
@@ -107,27 +119,82 @@ def run_sfm(
         if matching == "auto":
             matching = "exhaustive" if len(names) <= MAX_EXHAUSTIVE else "sequential"
         database = work / "database.db"
-        extract_features(staged, names, database, seed, camera_model, progress)
-        match_features(database, len(names), seed, matching, progress)
-        models = _map(staged, work, seed, progress)
-        _check_models(models, names, told, matching, num_matched_pairs(database), featureless(database))
+        pycolmap().set_random_seed(seed)
+        list_photos(database, staged, camera_model)
+        _extract_features(database, staged.folder, names, progress)
+        _match_features(database, len(names), seed, matching, progress)
+        models = _map(database, staged, work, seed, progress)
+        with closing(pycolmap().Database.open(database)) as opened:
+            images, num_matched = opened.read_all_images(), int(opened.num_verified_image_pairs())
+            blank = sorted(image.name for image in images if not opened.num_keypoints_for_image(image.image_id))
+        _check_models(models, names, told, matching, num_matched, blank)
         model = models[0]
-        with clock("undistorting", progress):
-            _write_scene(model, staged.folder, work, out)
+        with _clock("undistorting", progress):
+            chosen, undistorted = work / "chosen", work / "undistorted"
+            chosen.mkdir()
+            model.write(chosen)
+            pycolmap().undistort_images(undistorted, chosen, staged.folder)
+            (out / "sparse").mkdir()
+            shutil.move(undistorted / "sparse", out / "sparse" / "0")
+            shutil.move(undistorted / "images", out / "images")
     error = model.compute_mean_reprojection_error()
-    return SfmSummary(len(names), model.num_reg_images(), model.num_points3D(), error, _longest_side(model))
+    longest_side = max(int(side) for camera in model.cameras.values() for side in (camera.width, camera.height))
+    return SfmSummary(len(names), model.num_reg_images(), model.num_points3D(), error, longest_side)
 
 
-def _check_new(out: Path) -> None:
-    """Raise FileExistsError if there is a scene or a file already."""
-    for existing in (out / "images", out / "sparse"):
-        if existing.exists():
-            raise FileExistsError(f"{existing}: exists already; choose another output folder or remove it")
-    if out.is_file():
-        raise FileExistsError(f"{out} is a file; choose a folder for the scene")
+def list_photos(database: Path, staged: Staged, camera_model: str) -> None:
+    """Write photographs with their cameras and rigs into COLMAP's database.
+
+    Listing the images first numbers them by name; otherwise the threads of the extraction do, by chance.
+    """
+    colmap = pycolmap()
+    database.touch()
+    for group in staged.all_groups:
+        reader = colmap.ImageReaderOptions(camera_model=camera_model)
+        if group.focal is not None:
+            reader.camera_model = "PINHOLE"
+            reader.camera_params = f"{group.focal},{group.focal},{group.size[0] / 2},{group.size[1] / 2}"
+        names = list(group.names)
+        colmap.import_images(
+            database, staged.folder, options=reader, image_names=names, camera_mode=colmap.CameraMode.SINGLE
+        )
+    for rig in staged.rigs:  # Views of one panorama have one place and known directions.
+        cameras = [
+            colmap.RigConfigCamera(
+                ref_sensor=index == 0,
+                image_prefix=f"{rig.folder}/{direction.name}/",
+                cam_from_rig=colmap.Rigid3d(colmap.Rotation3d(direction.rotation), np.zeros(3)) if index else None,
+            )
+            for index, direction in enumerate(directions())
+        ]
+        with closing(colmap.Database.open(database)) as opened:
+            colmap.apply_rig_config([colmap.RigConfig(cameras=cameras)], opened)
 
 
-def _map(staged: Staged, work: Path, seed: int, progress: bool) -> list[Any]:
+def _extract_features(database: Path, folder: Path, names: list[str], progress: bool) -> None:
+    """Extract features of the photographs into the database, a few photographs at a time."""
+    colmap = pycolmap()
+    together = PHOTOS_PER_CORE * num_threads()
+    with counting("features", len(names), "photo", is_shown=progress) as bar:
+        for start in range(0, len(names), together):
+            some = names[start : start + together]
+            colmap.extract_features(database, folder, some, device=colmap.Device.cpu)
+            bar.update(len(some))
+
+
+def _match_features(database: Path, num_photos: int, seed: int, matching: Matching, progress: bool) -> None:
+    """Match features of pairs of photographs into the database."""
+    colmap = pycolmap()
+    verification = colmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    is_exhaustive = matching == "exhaustive"
+    match = colmap.match_exhaustive if is_exhaustive else colmap.match_sequential
+    pairs = f"{num_photos * (num_photos - 1) // 2:,} pairs" if is_exhaustive else "neighbours by name"
+    with _clock(f"matching {pairs}", progress):
+        match(database, verification_options=verification, device=colmap.Device.cpu)
+
+
+def _map(database: Path, staged: Staged, work: Path, seed: int, progress: bool) -> list[Any]:
     """Return the reconstructions of the matched photographs, the largest first."""
     colmap = pycolmap()
     options = colmap.IncrementalPipelineOptions(
@@ -135,12 +202,14 @@ def _map(staged: Staged, work: Path, seed: int, progress: bool) -> list[Any]:
     )
     options.mapper.random_seed = options.triangulation.random_seed = seed
     options.mapper.num_threads = 1
-    if staged.rigs:
+    if staged.rigs:  # The calibration of a panorama's views is exact.
         options.ba_refine_sensor_from_rig = False
-        options.constant_cameras = known_cameras(work / "database.db", staged)
+        firsts = [group.names[0] for rig in staged.rigs for group in rig.groups]
+        with closing(colmap.Database.open(database)) as opened:
+            options.constant_cameras = {opened.read_image_with_name(name).camera_id for name in firsts}
     with counting("mapping", staged.num_places, "photo", is_shown=progress) as bar:
         models = colmap.incremental_mapping(
-            work / "database.db",
+            database,
             staged.folder,
             work,
             options=options,
@@ -153,14 +222,14 @@ def _map(staged: Staged, work: Path, seed: int, progress: bool) -> list[Any]:
 def _check_models(
     models: Sequence[Any], names: Sequence[str], told: str, matching: Matching, num_matched: int, blank: Sequence[str]
 ) -> None:
-    """Raise ValueError without a usable model, and warn of the photographs that the largest leaves out.
+    """Raise ValueError without a usable model, and warn of the photographs that the largest one leaves out.
 
     Args:
       models: the reconstructions, the largest first.
       names: of all photographs.
       told: name of the sources in messages.
       matching: how pairs were chosen.
-      num_matched: number of pairs that match.
+      num_matched: number of pairs with verified matches.
       blank: names of the photographs without features.
     """
     placed = {models[0].image(number).name for number in models[0].reg_image_ids()} if models else set()
@@ -190,24 +259,9 @@ def _check_models(
     warnings.warn("; ".join([f"{missing} ({first_names(left_out)})", *reasons]), stacklevel=3)
 
 
-def _longest_side(model: Any) -> int:
-    return max(int(side) for camera in model.cameras.values() for side in (camera.width, camera.height))
-
-
-def _write_scene(model: Any, photos: Path, work: Path, out: Path) -> None:
-    """Undistort the photographs of the model, and move images and sparse model to their places."""
-    chosen, undistorted = work / "chosen", work / "undistorted"
-    chosen.mkdir()
-    model.write(chosen)
-    pycolmap().undistort_images(undistorted, chosen, photos)
-    (out / "sparse").mkdir()
-    shutil.move(undistorted / "sparse", out / "sparse" / "0")
-    shutil.move(undistorted / "images", out / "images")
-
-
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[None]:
-    """Make a folder. If the block fails, remove what was made, as far as it is empty."""
+    """Make a folder. If the block fails, remove the folders that were made, if they are empty."""
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -221,10 +275,32 @@ def _new_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep COLMAP's log to what ends the process for a while; errors are told by exceptions."""
+    """Keep COLMAP's log to what ends the process for a while; its errors become exceptions."""
     logging = pycolmap().logging
     level, logging.minloglevel = logging.minloglevel, logging.FATAL.value
     try:
         yield
     finally:
         logging.minloglevel = level
+
+
+@contextmanager
+def _clock(phase: str, progress: bool) -> Iterator[None]:
+    """Show the time since the start of a phase whose progress cannot be counted."""
+    if progress and not has_terminal():
+        print(f"{phase} …", file=sys.stderr, flush=True)
+        progress = False
+    ended = threading.Event()
+    with tqdm(desc=phase, bar_format="{desc}: {elapsed}", disable=not progress) as bar:
+
+        def tick() -> None:
+            while not ended.wait(TICK):
+                bar.refresh()
+
+        ticking = threading.Thread(target=tick, daemon=True)
+        ticking.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            ticking.join()

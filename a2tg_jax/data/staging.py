@@ -15,8 +15,8 @@ from typing import Literal, NamedTuple
 from PIL import Image
 
 from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
-from a2tg_jax.data.images import map_in_threads
-from a2tg_jax.data.panoramas import Direction, cut_view, directions, is_panorama, view_size
+from a2tg_jax.data.image_files import map_in_threads
+from a2tg_jax.data.panoramas import cut_view, directions, is_panorama, view_size
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS, find_photos, is_video
 from a2tg_jax.data.video import extract_frames
 from a2tg_jax.host.text import counted
@@ -29,7 +29,7 @@ COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 """Suffixes of the images that COLMAP can write; it reads by content."""
 LOSSLESS_FORMATS = ("PNG", "TIFF", "BMP")
 QUALITY = 95
-"""JPEG quality of photographs that are written anew."""
+"""JPEG quality of photographs that are written again."""
 
 
 class CameraGroup(NamedTuple):
@@ -47,9 +47,8 @@ class Rig(NamedTuple):
 
     folder: str
     """Folder below the staging folder, with one folder per direction."""
-    directions: tuple[Direction, ...]
     groups: tuple[CameraGroup, ...]
-    """One group for each direction; names below its folder are the panoramas'."""
+    """One group for each of `directions()`; names below its folder are the panoramas'."""
 
 
 class Staged(NamedTuple):
@@ -57,13 +56,18 @@ class Staged(NamedTuple):
 
     folder: Path
     groups: tuple[CameraGroup, ...]
+    """Groups of photographs that are no views of panoramas."""
     rigs: tuple[Rig, ...]
+
+    @property
+    def all_groups(self) -> list[CameraGroup]:
+        """Groups of all photographs."""
+        return [*self.groups, *(group for rig in self.rigs for group in rig.groups)]
 
     @property
     def names(self) -> list[str]:
         """Names of all photographs, sorted."""
-        groups = [*self.groups, *(group for rig in self.rigs for group in rig.groups)]
-        return sorted(name for group in groups for name in group.names)
+        return sorted(name for group in self.all_groups for name in group.names)
 
     @property
     def num_places(self) -> int:
@@ -83,13 +87,7 @@ class _Photo(NamedTuple):
 
 
 def stage(
-    sources: Sequence[Path],
-    work: Path,
-    *,
-    frames: int,
-    panorama: Panorama,
-    progress: bool,
-    tell: Callable[[str], None],
+    sources: Sequence[Path], work: Path, *, frames: int, panorama: Panorama, progress: bool, tell: Callable[[str], None]
 ) -> Staged:
     """Gather photographs of folders and videos in the folder `work/photos`.
 
@@ -100,9 +98,6 @@ def stage(
       panorama: which pictures are cut into views.
       progress: show progress bars.
       tell: takes lines about what was found.
-
-    Raises:
-      FileNotFoundError, ValueError: as `find_photos`, `extract_frames` and `read_pixels`.
     """
     folder = work / "photos"
     files: list[tuple[int, Path, str]] = []
@@ -119,30 +114,25 @@ def stage(
             tell(f"{source}: {written} of {counted(num_frames, 'frame')} taken")
         files += [(number, place / name, prefix + name) for name in find_photos(place, least)]
     for _, file, name in files:
-        _check_name(file, name)
-    photos = map_in_threads(lambda file: _look(*file, panorama), files)
-    flat = [photo for photo in photos if not photo.is_panorama]
-    groups = _stage_flat(flat, folder)
+        try:
+            name.encode()
+        except UnicodeEncodeError:  # Bytes that are no UTF-8 are surrogates in Python's names of files.
+            told = os.fsencode(file).decode(errors="backslashreplace")
+            raise ValueError(f"{told}: its name is not UTF-8, as COLMAP wants it; rename the photograph") from None
+
+    def look(source: int, file: Path, name: str) -> _Photo:
+        facts = picture_facts(file)
+        is_double = facts.size[0] == 2 * facts.size[1]
+        is_cut = is_double and panorama != "no" and (panorama == "yes" or is_panorama(read_pixels(file)))
+        return _Photo(source, file, name, facts, is_cut)
+
+    photos = map_in_threads(look, *zip(*files, strict=True))
+    groups = _stage_flat([photo for photo in photos if not photo.is_panorama], folder)
     tops = {name.partition("/")[0] for group in groups for name in group.names}
     rigs = _stage_panoramas([photo for photo in photos if photo.is_panorama], folder, tops, tell)
     num_turned = sum(photo.facts.is_turned for photo in photos)
     if num_turned:
         tell(f"{counted(num_turned, 'photograph')} turned as EXIF says")
-    _warn_of_alpha(photos, sources)
-    return Staged(folder, groups, rigs)
-
-
-def _check_name(file: Path, name: str) -> None:
-    """Raise ValueError unless COLMAP can keep a photograph's name."""
-    try:
-        name.encode()
-    except UnicodeEncodeError:  # Bytes that are no UTF-8 are surrogates in Python's names of files.
-        told = os.fsencode(file).decode(errors="backslashreplace")
-        raise ValueError(f"{told}: its name is not UTF-8, as COLMAP wants it; rename the photograph") from None
-
-
-def _warn_of_alpha(photos: Sequence[_Photo], sources: Sequence[Path]) -> None:
-    """Warn of photographs whose alpha channels the scene will not have."""
     num_transparent = sum(photo.facts.is_transparent for photo in photos)
     if num_transparent:
         message = (
@@ -150,11 +140,12 @@ def _warn_of_alpha(photos: Sequence[_Photo], sources: Sequence[Path]) -> None:
             "but COLMAP writes the scene's images without alpha; to leave pixels out, put masks of these images into "
             "the scene's folder masks"
         )
-        warnings.warn(message, stacklevel=4)
+        warnings.warn(message, stacklevel=3)
+    return Staged(folder, groups, rigs)
 
 
 def _prefixes(sources: Sequence[Path]) -> list[str]:
-    """Return what names of each source begin with: nothing for a single source, else its own name, made unique."""
+    """Return the beginning of the names of each source: nothing for a single one, else its own name, made unique."""
     if len(sources) == 1:
         return [""]
     stems = [source.stem if is_video(source) else source.name for source in map(Path.resolve, sources)]
@@ -166,6 +157,7 @@ def _made_unique(names: Sequence[str], others: Iterable[str] = ()) -> list[str]:
 
     Names that differ in case only are the same, because they are on some disks.
     """
+    # A file cannot have the name of a folder in which others are.
     taken = {str(folder).casefold() for name in names for folder in PurePosixPath(name).parents}
     taken |= {other.casefold() for other in others}
     unique = []
@@ -177,34 +169,26 @@ def _made_unique(names: Sequence[str], others: Iterable[str] = ()) -> list[str]:
     return unique
 
 
-def _look(source: int, file: Path, name: str, panorama: Panorama) -> _Photo:
-    """Return what is known of one photograph."""
-    facts = picture_facts(file)
-    is_double = facts.size[0] == 2 * facts.size[1]
-    is_cut = is_double and panorama != "no" and (panorama == "yes" or is_panorama(read_pixels(file)))
-    return _Photo(source, file, name, facts, is_cut)
-
-
 def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
-    """Link or write anew photographs that are no panoramas, and group them by source, size and lens."""
-    names = _made_unique([_wanted_name(photo) for photo in photos])
-    map_in_threads(lambda pair: _place(pair[0], folder / pair[1]), list(zip(photos, names, strict=True)))
+    """Link or write again photographs that are no panoramas, and group them by source, size and lens."""
+
+    def wanted_name(photo: _Photo) -> str:
+        """Return a photograph's name in the folder: with another suffix if its own does not suit the file there."""
+        suits = (".jpg", ".jpeg", ".png") if photo.facts.is_turned else COLMAP_SUFFIXES
+        if photo.facts.format in COLMAP_FORMATS and Path(photo.name).suffix.lower() in suits:
+            return photo.name
+        return photo.name + (".png" if photo.facts.format in LOSSLESS_FORMATS else ".jpg")
+
+    names = _made_unique([wanted_name(photo) for photo in photos])
+    map_in_threads(_place, photos, [folder / name for name in names])
     grouped: dict[tuple[int, tuple[int, int], tuple[str, ...]], list[str]] = defaultdict(list)
     for photo, name in zip(photos, names, strict=True):
         grouped[photo.source, photo.facts.size, photo.facts.lens].append(name)
     return tuple(CameraGroup(tuple(sorted(members)), key[1]) for key, members in grouped.items())
 
 
-def _wanted_name(photo: _Photo) -> str:
-    """Return a photograph's name in the folder: with another suffix if its own does not suit what is put there."""
-    suits = (".jpg", ".jpeg", ".png") if photo.facts.is_turned else COLMAP_SUFFIXES
-    if photo.facts.format in COLMAP_FORMATS and Path(photo.name).suffix.lower() in suits:
-        return photo.name
-    return photo.name + (".png" if photo.facts.format in LOSSLESS_FORMATS else ".jpg")
-
-
 def _place(photo: _Photo, target: Path) -> None:
-    """Link a photograph to a new place, or write it anew if it is turned or COLMAP cannot read it."""
+    """Link a photograph to a new place, or write it again if it is turned or COLMAP cannot read it."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if photo.facts.format in COLMAP_FORMATS and not photo.facts.is_turned:
         _link(photo.file, target)
@@ -232,13 +216,17 @@ def _stage_panoramas(
     for photo in photos:
         by_size[photo.facts.size].append(photo)
     rigs = []
-    folders = _made_unique([f"panorama{number or ''}" for number in range(len(by_size))], tops)
-    for name, (size, members) in zip(folders, by_size.items(), strict=True):
-        views = _made_unique([_view_name(photo) for photo in members])
-        pairs = list(zip(members, views, strict=True))
-        map_in_threads(lambda pair, name=name: _cut(pair[0], folder / name, pair[1]), pairs)  # type: ignore[misc]
-        rigs.append(_rig(name, size, sorted(views)))
-        side, _ = view_size(size[0])
+    tops = _made_unique([f"panorama{number or ''}" for number in range(len(by_size))], tops)
+    for top, (size, members) in zip(tops, by_size.items(), strict=True):
+        is_jpeg = [Path(photo.name).suffix.lower() in (".jpg", ".jpeg") for photo in members]
+        views = _made_unique(
+            [photo.name if own else f"{photo.name}.jpg" for photo, own in zip(members, is_jpeg, strict=True)]
+        )
+        map_in_threads(_cut, [photo.file for photo in members], itertools.repeat(folder / top), views)
+        side, focal = view_size(size[0])
+        ordered = sorted(views)
+        names = [tuple(f"{top}/{direction.name}/{view}" for view in ordered) for direction in directions()]
+        rigs.append(Rig(top, tuple(CameraGroup(own, (side, side), focal) for own in names)))
         tell(
             f"{counted(len(members), 'panorama')} of {size[0]}x{size[1]}, each cut into {len(directions())} views of "
             f"{side}x{side}; --panorama no leaves them whole"
@@ -246,23 +234,10 @@ def _stage_panoramas(
     return tuple(rigs)
 
 
-def _cut(photo: _Photo, folder: Path, view: str) -> None:
+def _cut(file: Path, folder: Path, view: str) -> None:
     """Write the views of one panorama."""
-    pixels = read_pixels(photo.file)[..., :3]
+    pixels = read_pixels(file)[..., :3]
     for direction in directions():
         target = folder / direction.name / view
         target.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(cut_view(pixels, direction)).save(target, quality=QUALITY)
-
-
-def _view_name(photo: _Photo) -> str:
-    return f"{photo.name}.jpg" if Path(photo.name).suffix.lower() not in (".jpg", ".jpeg") else photo.name
-
-
-def _rig(name: str, size: tuple[int, int], views: Sequence[str]) -> Rig:
-    side, focal = view_size(size[0])
-    groups = tuple(
-        CameraGroup(tuple(f"{name}/{direction.name}/{view}" for view in views), (side, side), focal)
-        for direction in directions()
-    )
-    return Rig(name, directions(), groups)

@@ -11,13 +11,21 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import patterns
-from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene
-from a2tg_jax.data.lighting import light
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, check_test_every, every_kth
 from a2tg_jax.data.observations import before_camera, observed_points, pinhole_pixels
 from a2tg_jax.data.photo_store import Picture
+from a2tg_jax.data.ray_tracing import (
+    Ball,
+    Block,
+    Disc,
+    ParametricSurface,
+    Surface,
+    Tube,
+    light,
+    nearest_hits,
+    trace_rays,
+)
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.data.splits import check_test_every, every_kth
-from a2tg_jax.data.surfaces import Ball, Block, Disc, ParametricSurface, Surface, Tube, nearest_hits, trace_rays
 
 TARGET = np.array([0.0, 0.1, 0.45])
 """Point that all cameras look at."""
@@ -27,7 +35,7 @@ DISTANCE = 2.4
 FIELD_OF_VIEW = np.deg2rad(58.0)
 """Field of view across the longer side of the image."""
 SAME_SURFACE = 1e-3
-"""Largest relative difference of depth between a point and the surface that it lies on."""
+"""Largest relative difference of depth between a point and its surface."""
 SAMPLE_OFFSETS = np.array([[-0.375, -0.125, 0.125, 0.375], [0.125, -0.375, 0.375, -0.125]])
 """Places [2, S] of a pixel's rays around its centre: a turned square, all different along x and along y."""
 
@@ -48,7 +56,7 @@ def synthetic_scene(
       seed: of patterns, light and points; the arrangement is always the same.
       num_views: at least 2.
       width, height: size of the images in pixels, before `downscale`.
-      num_points: points sampled evenly over the images, in place of a sparse reconstruction; at least 2.
+      num_points: points sampled evenly over the images, instead of a sparse reconstruction; at least 2.
       downscale: k >= 1; images have 1/k of the size.
       test_every: every k-th view is a test view; 0 keeps none.
 
@@ -70,7 +78,7 @@ def synthetic_scene(
     K = intrinsics(*size, FIELD_OF_VIEW)
     viewmats = [viewmat_to_target(center) for center in camera_path(num_views)]
     shots = [
-        Shot(f"view_{index:03d}.png", viewmat, K, render(surfaces, viewmat, K, *size))
+        Shot(f"view_{index:03d}.png", viewmat, K, Picture.of(render(surfaces, viewmat, K, *size)))
         for index, viewmat in enumerate(viewmats)
     ]
     cloud = sample_points(surfaces, shots, num_points, rng)
@@ -137,8 +145,8 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
     shares = np.bincount(rng.integers(len(shots), size=count), minlength=len(shots))
     points, colors = [], []
     for shot, share in zip(shots, shares, strict=True):
-        pixels = Picture.of(shot.pixels).read()
-        height, width = pixels.shape[:2]
+        pixels = shot.picture.read()
+        height, width = shot.picture.size
         column, row = rng.integers(width, size=share), rng.integers(height, size=share)
         directions = _directions(shot.viewmat, shot.K, column + 0.5, row + 0.5)
         points.append(trace_rays(surfaces, _center(shot.viewmat), directions)[1].T)
@@ -148,30 +156,24 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
 
 
 def observing(shot: Shot, points: np.ndarray, shapes: Sequence[ParametricSurface]) -> Shot:
-    """Return a shot that observed those of the points [P, 3] that no shape hides from it."""
+    """Return a shot that observed the points of [P, 3] that no shape hides from it."""
     own = before_camera(points, shot.viewmat)
     xy, depths = pinhole_pixels(own, shot.K), own[:, 2]
     hits, _ = nearest_hits(shapes, _center(shot.viewmat), _directions(shot.viewmat, shot.K, *xy.T))
     is_seen = depths <= (1 + SAME_SURFACE) * hits
-    height, width = Picture.of(shot.pixels).size
-    return dataclasses.replace(shot, points=observed_points(xy[is_seen], depths[is_seen], (height, width)))
+    return dataclasses.replace(shot, points=observed_points(xy[is_seen], depths[is_seen], shot.picture.size))
 
 
 def exact_points(scene: Scene) -> np.ndarray:
-    """Return the points [P, 3] on the exact surfaces that the pixels of the training views see, in the original world.
-
-    Args:
-      scene: a scene that `synthetic_scene` made.
+    """Return the points [P, 3] on the exact surfaces that the training views of a synthetic scene see, in the original
+    world.
     """
     return np.concatenate([(center + t * rays).T[np.isfinite(t)] for center, rays, t in _exact_hits(scene)])
 
 
 def exact_depths(scene: Scene) -> list[np.ndarray]:
-    """Return the depth [H, W] float32 of the exact surfaces at the pixel centres of each training view, along the
-    camera's z axis in the normalised world.
-
-    Args:
-      scene: a scene that `synthetic_scene` made.
+    """Return the depths [H, W] float32 of the exact surfaces that each training view of a synthetic scene sees, along
+    the camera's z axis in the normalised world.
     """
     hits = zip(scene.train, _exact_hits(scene), strict=True)
     return [(scene.transform.scale * t).astype(np.float32).reshape(view.picture.size) for view, (_, _, t) in hits]

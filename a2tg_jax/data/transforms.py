@@ -1,34 +1,34 @@
 """Scenes with a transforms.json, of nerfstudio or instant-ngp, or of Blender with one file per split.
 
+Readers of other programs make `Frames` of the same form.
+
 Poses are camera-to-world in OpenGL's camera frame (x right, y up, z backward). nerfstudio's `applied_transform` is the
 change of COLMAP's world before the file was written. Poses and points of `ply_file_path` have both gone through it, so
 both are in the file's own world, which is the original world here.
 """
 
-import logging
+import dataclasses
+import functools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from a2tg_jax.core.cameras import LONGEST_SIDE
-from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, rigid_viewmat
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_viewmat
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_size
-from a2tg_jax.data.depth_files import find_depths
-from a2tg_jax.data.division import Division
-from a2tg_jax.data.images import inside, locate_image, map_in_threads, num_readers
+from a2tg_jax.data.depths import find_depths
+from a2tg_jax.data.division import divided
+from a2tg_jax.data.image_files import SmallerCopies, find_copies, inside, locate_image, map_in_threads
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
-from a2tg_jax.data.mask_files import check_masks, find_mask, mask_to_read
-from a2tg_jax.data.photo_reading import PhotoFiles, Reading, read_photos
-from a2tg_jax.data.photo_store import Shelf
+from a2tg_jax.data.masks import Mask, find_mask, mask_to_read
+from a2tg_jax.data.photo_reading import Options, Photo, check_masks, read_photos
 from a2tg_jax.data.ply_points import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
-from a2tg_jax.data.smaller_copies import SmallerCopies, find_copies
-from a2tg_jax.data.splits import every_kth
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.remote_files import is_remote
@@ -38,83 +38,92 @@ NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
 POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
 """Names of the points of nerfstudio and of 3DGS beside a transforms file, in order of preference."""
-OPENCV_KEYS = ("k1", "k2", "p1", "p2")
-FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
-PRISM_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "ply_file_path")
 SPLIT_KEYS = ("train_filenames", "test_filenames", "val_filenames")
+PRISM_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")
+DISTORTION_KEYS = {"OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"), "THIN_PRISM_FISHEYE": PRISM_KEYS}
+"""Parameters of fisheyes, in COLMAP's order."""
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
-logger = logging.getLogger(__name__)
+
+class Frames(NamedTuple):
+    """Frames as `transforms.json` has them, made of files of another program."""
+
+    file: Path
+    """File that messages name; paths of images start from its folder."""
+    frames: list[dict[str, Any]]
+    cloud: PointCloud | None = None
+    counted: Callable[[np.ndarray], np.ndarray] | None = None
+    """Function from pixels [H, W, C] to a mask [H, W] of the pixels that count."""
 
 
-def load_transforms(
-    file: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort",
-    division: Division | None = None,
-) -> Scene:  # fmt: skip
+def load_transforms(file: Path, options: Options) -> Scene:
     """Read a nerfstudio or instant-ngp scene.
 
     The lists train_filenames, test_filenames and val_filenames decide the split if the file has them (val is the test
     split without a test list); otherwise test_every does. A warning counts frames that the lists leave out.
-
-    Args:
-      file: path of transforms.json.
-      downscale, test_every, room, lens: as in `load_scene`.
-      division: processes that call this together; None: one.
-
-    Raises:
-      FileNotFoundError: if an image or the point file is missing.
-      ValueError: if the JSON, a frame, an image or a pose is invalid, a list names what is no frame, or the views make
-        no scene (`assemble_scene`).
     """
     meta = _read_json(file)
-    (shots,) = read_shots([(file, meta)], downscale, Shelf(room), lens, division)
-    listed = {key: _names(meta[key]) for key in SPLIT_KEYS if key in meta}
-    train, test = _listed_split(file, shots, listed) if listed else every_kth(shots, test_every)
+    (shots,) = _read_shots([(file, meta)], options)
+    listed = {key: set(meta[key]) for key in SPLIT_KEYS if key in meta}
+    train, test = _listed_split(file, shots, listed) if listed else every_kth(shots, options.test_every)
     cloud = _points_beside(file, meta)
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
 
 
-def load_blender(
-    folder: Path, *, downscale: int, test_every: int, room: int | None = None, lens: LensUse = "undistort",
-    division: Division | None = None,
-) -> Scene:  # fmt: skip
+def load_blender(folder: Path, options: Options) -> Scene:
     """Read a Blender scene in the format of NeRF: transforms_train.json, transforms_test.json, images with alpha.
 
     Most such scenes have no points, and start from random ones in a cube around what all cameras look at. Without a
     test file, every test_every-th training view is a test view.
-
-    Args:
-      folder: the scene folder.
-      downscale, test_every, room, lens: as in `load_scene`.
-      division: processes that call this together; None: one.
-
-    Raises:
-      FileNotFoundError, ValueError: as `load_transforms`.
     """
     train_file, test_file = (folder / name for name in BLENDER_FILES)
     files = [train_file, test_file] if is_regular(test_file) else [train_file]
     metas = [_read_json(file) for file in files]
-    groups = read_shots(list(zip(files, metas, strict=True)), downscale, Shelf(room), lens, division)
-    train, test = groups if len(groups) == 2 else every_kth(groups[0], test_every)
+    groups = _read_shots(list(zip(files, metas, strict=True)), options)
+    train, test = groups if len(groups) == 2 else every_kth(groups[0], options.test_every)
     cloud = _points_beside(train_file, *metas)
-    logger.info("%s: a Blender scene, starting from %s points", folder, "random" if cloud is None else "its")
     return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder), is_object=True)
+
+
+def load_frames(made: Frames, options: Options) -> Scene:
+    """Make a scene of frames of another program."""
+    meta = {"frames": made.frames}
+    _check_meta(made.file, meta)
+    (shots,) = _read_shots([(made.file, meta)], options)
+    shots = sorted(shots, key=lambda shot: shot.name)
+
+    def mask_of(number: int) -> Mask | None:
+        """Return the mask of a photograph, or of its own pixels if it has none."""
+        shot = shots[number]
+        counts = made.counted(shot.picture.read()) if made.counted and shot.mask is None else None
+        return shot.mask if counts is None or counts.all() else Mask.of(counts)
+
+    if made.counted is not None:
+        masks = divided(options.division, [shot.name for shot in shots], mask_of, "views")
+        shots = [dataclasses.replace(shot, mask=mask) for shot, mask in zip(shots, masks, strict=True)]
+    name = scene_name(made.file.resolve().parent)
+    return assemble_scene(name, *every_kth(shots, options.test_every), made.cloud, source=str(made.file))
+
+
+def check_images(file: Path, frames: Sequence[object], lacking: Sequence[str], nothing: str) -> None:
+    """Raise ValueError with a text if there are no frames, and warn of cameras without an image, given by name."""
+    if not frames:
+        raise ValueError(nothing)
+    if lacking:
+        message = f"{file}: {len(lacking)} of {len(frames) + len(lacking)} cameras have no image beside them, such as "
+        warnings.warn(f"{message}{shortened(lacking[0])}: not used", stacklevel=3)
 
 
 def _points_beside(file: Path, *metas: dict[str, Any]) -> PointCloud | None:
     """Return the points that transforms files of a folder name, or else those in one of `POINT_FILES`, or None."""
     named = [meta["ply_file_path"] for meta in metas if meta.get("ply_file_path")]
     usual = [name for name in POINT_FILES if not named and is_regular(file.parent / name)]
-    return next((read_ply_points(_beside(file, name)) for name in (*named, *usual)), None)
+    return next((read_ply_points(file.parent / name) for name in (*named, *usual)), None)
 
 
 def _listed_split(file: Path, shots: Sequence[Shot], listed: dict[str, set[str]]) -> tuple[list[Shot], list[Shot]]:
-    """Return (train, test) of lists by their keys. Warn of frames that they leave out.
-
-    Raises:
-      ValueError: if a list names what is no frame.
-    """
+    """Return (train, test) of lists by their keys. Warn of frames that they leave out."""
     names = {shot.name for shot in shots}
     for key, own in listed.items():
         if unknown := sorted(own - names):
@@ -132,138 +141,102 @@ def _listed_split(file: Path, shots: Sequence[Shot], listed: dict[str, set[str]]
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    """Return the JSON object in a file. It has a non-empty list `frames` of objects, and file names that are texts."""
     data = read_regular(file, MOST_BYTES)
     try:
-        meta = parse_json(data, allow_nan=True)  # Numbers are looked at where they are used.
+        meta: dict[str, Any] = parse_json(data, allow_nan=True)  # Numbers are looked at where they are used.
     except ValueError as error:
         raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
-    check_meta(file, meta)
-    checked: dict[str, Any] = meta
-    return checked
+    _check_meta(file, meta)
+    return meta
 
 
-def check_meta(file: Path, meta: object) -> None:
-    """Raise ValueError unless there is a non-empty list `frames` of objects, and file names are texts."""
+def _check_meta(file: Path, meta: object) -> None:
+    """Raise ValueError unless there is a non-empty list `frames` of objects, and file names are texts.
+
+    File names become relative to the scene folder.
+    """
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
         raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is expected")
-    for number, frame in enumerate(meta["frames"]):
-        if not isinstance(frame, dict):
-            raise ValueError(f"{file}: frame {number} must be an object; got {shortened(frame)}")
-        _check_texts(file, frame)
-    _check_texts(file, meta)
+    for number, values in enumerate([*meta["frames"], meta]):
+        if not isinstance(values, dict):
+            raise ValueError(f"{file}: frame {number} must be an object; got {shortened(values)}")
+        for key in FILE_KEYS:
+            name = values.get(key)
+            if ((key == "file_path" and key in values) or name) and not (isinstance(name, str) and name):
+                raise ValueError(f"{file}: {key} must be the name of a file; got {shortened(name)}")
+            if name:
+                values[key] = inside(file.parent, name)
+        for key in SPLIT_KEYS:
+            names = values.get(key, [])
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                raise ValueError(f"{file}: {key} must be a list of names; got {shortened(names)}")
+            if names:
+                values[key] = [inside(file.parent, name) for name in names]
 
 
-def _check_texts(file: Path, values: dict[str, Any]) -> None:
-    """Make file names relative to the scene folder. Raise ValueError unless they are texts, or lists of texts."""
-    for key in FILE_KEYS:
-        name = values.get(key)
-        if ((key == "file_path" and key in values) or name) and not (isinstance(name, str) and name):
-            raise ValueError(f"{file}: {key} must be the name of a file; got {shortened(name)}")
-        if name:
-            values[key] = inside(file.parent, name)
-    for key in SPLIT_KEYS:
-        names = values.get(key, [])
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise ValueError(f"{file}: {key} must be a list of names; got {shortened(names)}")
-        if names:
-            values[key] = [inside(file.parent, name) for name in names]
-
-
-def read_shots(
-    files: Sequence[tuple[Path, dict[str, Any]]], downscale: int, shelf: Shelf, use: LensUse,
-    division: Division | None = None,
-) -> list[list[Shot]]:  # fmt: skip
+def _read_shots(files: Sequence[tuple[Path, dict[str, Any]]], options: Options) -> list[list[Shot]]:
     """Return the frames of each transforms file of a scene, downscaled, in the file's order.
 
-    Args:
-      files: with their contents, which `check_meta` has checked.
-      downscale, shelf, use, division: as `load_transforms` has them.
+    The files come with their contents, which `_check_meta` has checked.
     """
     frames = [(file, {**meta, **frame}) for file, meta in files for frame in meta["frames"]]
-    place = files[0][0]
-    copies = find_copies(_named_files(frames, downscale), downscale, place.parent)
-    photos = map_in_threads(lambda item: _photo(*item, copies, use), frames, num_readers(place))
-    found = iter(read_photos(photos, shelf, division, place))
-    groups = []
-    for file, meta in files:
-        group = [_shot(file, {**meta, **frame}, next(found)) for frame in meta["frames"]]
-        check_masks(group, str(file))
-        groups.append(group)
-    return groups
-
-
-def _named_files(frames: Sequence[tuple[Path, dict[str, Any]]], downscale: int) -> list[tuple[Path, str]]:
-    """Return folder and name of the photographs and masks of all frames."""
-    files: list[tuple[Path, str] | None] = []
+    masks: list[tuple[Path, str] | None] = []
+    named: list[tuple[Path, str]] = []
     for file, frame in frames:
         if "file_path" not in frame or "transform_matrix" not in frame:
             raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
-        image = _beside(file, frame["file_path"])
-        files += [(image.parent, image.name), _find_mask(file, frame, image, downscale)]
-    return [each for each in files if each is not None]
+        image, mask = file.parent / frame["file_path"], None
+        if frame.get("mask_path"):
+            path = file.parent / frame["mask_path"]
+            mask = path.parent, path.name
+        elif (name := _below_images(file, image)) is not None:
+            mask = find_mask(file.parent / "images", name, options.downscale)
+        masks.append(mask)
+        named += [(image.parent, image.name), *([] if mask is None else [mask])]
+    place = files[0][0]
+    copies = find_copies(named, options.downscale, place.parent)
+    read = functools.partial(_photo, copies, options.lens)
+    photos = map_in_threads(read, *zip(*frames, strict=True), masks, place=place)
+    shots = iter(read_photos(photos, options, place))
+    groups = [[next(shots) for _ in meta["frames"]] for _, meta in files]
+    for (file, _), group in zip(files, groups, strict=True):
+        check_masks(group, str(file))
+    return groups
 
 
-def _photo(file: Path, frame: dict[str, Any], copies: SmallerCopies, use: LensUse) -> PhotoFiles:
+def _below_images(file: Path, image: Path) -> str | None:
+    """Return the path of an image below the folder `images`, next to which masks and depth maps are; None elsewhere."""
+    images = file.parent / "images"
+    return str(image.relative_to(images)) if image.is_relative_to(images) else None
+
+
+def _photo(
+    copies: SmallerCopies, use: LensUse, file: Path, frame: dict[str, Any], mask: tuple[Path, str] | None
+) -> Photo:
     """Return the files of one frame; `frame` also holds the file's global values, which the frame's own override."""
-    path, downscale = _beside(file, frame["file_path"]), copies.downscale
-    name = Path(frame["file_path"]).as_posix()
+    name, downscale = frame["file_path"], copies.downscale
+    path, told = file.parent / name, f"{file}: {name}"
     folder, still_to_downscale = copies.of(path.parent)
-    image_file = locate_image(folder, path.name)
+    depths, below = None, _below_images(file, path)
+    if frame.get("depth_file_path"):
+        depths = file.parent / frame["depth_file_path"]
+    elif below is not None:
+        depths = find_depths(file.parent / "images", below)
 
     def lens_of(stored: tuple[int, int]) -> Lens:
-        has_size = frame.get("w") and frame.get("h")
-        is_reduced = still_to_downscale < downscale
-        full = _full_size(path, stored, downscale) if is_reduced and not has_size else stored
-        return _lens(frame, full, f"{file}: {name}", use)
+        """Return the camera of the full image, of which the file may be a smaller copy."""
+        full = stored
+        if still_to_downscale < downscale and not (frame.get("w") and frame.get("h")):
+            full = downscale * stored[0], downscale * stored[1]
+            if not is_remote(path):  # Of stores, the size would be another request for each photograph.
+                with suppress(FileNotFoundError):  # The full image may be missing.
+                    full = picture_size(locate_image(path.parent, path.name))
+        return _lens(frame, full, told, use)
 
-    return PhotoFiles(
-        name, image_file, still_to_downscale, lens_of,
-        error_message=lambda error: f"{file}: {name}: its camera model {error}",
-        mask=mask_to_read(_find_mask(file, frame, path, downscale), copies, is_named=bool(frame.get("mask_path"))),
-        depths=_find_depths(file, frame, path),
+    return Photo(
+        name, _viewmat(frame["transform_matrix"], told), locate_image(folder, path.name), still_to_downscale, lens_of,
+        told, mask_to_read(mask, copies, is_named=bool(frame.get("mask_path"))), depths,
     )  # fmt: skip
-
-
-def _full_size(path: Path, stored: tuple[int, int], downscale: int) -> tuple[int, int]:
-    """Return the (width, height) of the full image of a reduced one, to which the intrinsics belong.
-
-    It is that of the full image's file, or `downscale` times the size `stored` of the reduced one if that file is
-    missing or in object storage.
-    """
-    if not is_remote(path):
-        with suppress(FileNotFoundError):
-            return picture_size(locate_image(path.parent, path.name))
-    return downscale * stored[0], downscale * stored[1]
-
-
-def _shot(file: Path, frame: dict[str, Any], read: Reading) -> Shot:
-    """Return one frame whose photograph is read."""
-    name = Path(frame["file_path"]).as_posix()
-    viewmat = _viewmat(frame["transform_matrix"], f"{file}: {name}")
-    return Shot(name, viewmat, read.K, read.picture, read.facts.mask, read.rays, read.depth)
-
-
-def _beside(file: Path, name: str) -> Path:
-    """Return the path of a file that a scene names from the folder of its own file."""
-    return file.parent / Path(name).as_posix()
-
-
-def _find_depths(file: Path, frame: dict[str, Any], image: Path) -> Path | None:
-    """Return the depth map that a frame names, or else that of its image in the folder `depths` beside `images`."""
-    if frame.get("depth_file_path"):
-        return _beside(file, frame["depth_file_path"])
-    images = file.parent / "images"
-    return find_depths(images, str(image.relative_to(images))) if image.is_relative_to(images) else None
-
-
-def _find_mask(file: Path, frame: dict[str, Any], image: Path, downscale: int) -> tuple[Path, str] | None:
-    """Return folder and name of the mask that a frame names, or of the one for its image in `masks` beside `images`."""
-    if frame.get("mask_path"):
-        path = _beside(file, frame["mask_path"])
-        return path.parent, path.name
-    images = file.parent / "images"
-    return find_mask(images, str(image.relative_to(images)), downscale) if image.is_relative_to(images) else None
 
 
 def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
@@ -322,18 +295,11 @@ def _distortion(frame: dict[str, Any], what: str) -> tuple[str, list[float]]:
     """Return COLMAP's camera model and its distortion parameters; nerfstudio's have the same names and meaning."""
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
     values = {key: _number(frame, key, 0.0, what) for key in PRISM_KEYS}
-    if model == "OPENCV_FISHEYE":
-        return model, [values[key] for key in FISHEYE_KEYS]
-    if model == "THIN_PRISM_FISHEYE":
-        return model, [values[key] for key in PRISM_KEYS]
+    if model in ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"):
+        return model, [values[key] for key in DISTORTION_KEYS[model]]
     if model not in PERSPECTIVE_MODELS:
         wanted = "a perspective one, OPENCV_FISHEYE or THIN_PRISM_FISHEYE"
         raise ValueError(f"{what}: has the camera_model {shortened(model)}; {wanted} is expected")
     if values["k4"] != 0:
         raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are known there")
-    return "FULL_OPENCV", [*(values[key] for key in OPENCV_KEYS), values["k3"], 0.0, 0.0, 0.0]
-
-
-def _names(file_names: list[str]) -> set[str]:
-    """Return the file names of a split, written like the shots' names."""
-    return {Path(name).as_posix() for name in file_names}
+    return "FULL_OPENCV", [*(values[key] for key in PRISM_KEYS[:5]), 0.0, 0.0, 0.0]

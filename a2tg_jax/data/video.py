@@ -1,12 +1,11 @@
 """Photographs from a video: frames that are sharp and apart from each other, turned as the video is shown.
 
-A first pass scores small greyscale frames, a second one writes those that were chosen.
+A first pass scores small greyscale frames, a second one writes the chosen ones.
 """
 
 import importlib
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -38,14 +37,12 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
 
     Returns:
       (number written, number of frames of the video).
-
-    Raises:
-      ValueError: if PyAV is missing, the file is no video, or its frames are too large.
     """
     sharpness, places = [], []
     seen, path = None, 0.0
     for frame in _frames(video, "scoring frames", progress):
-        sharpness.append(_sharpness(_grey(frame, SHARPNESS_WIDTH)))
+        # Sharpness is the variance of the Laplacian.
+        sharpness.append(float(laplace(_grey(frame, SHARPNESS_WIDTH).astype(np.float32)).var()))
         small = _grey(frame, MOTION_WIDTH)
         moved = LEAST_MOTION if seen is None else motion(seen, small)
         if moved >= LEAST_MOTION:
@@ -57,24 +54,24 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
     folder.mkdir(parents=True)
     for number, frame in enumerate(_frames(video, "writing frames", progress)):
         if number in chosen:
-            _write(frame, folder / f"{number:06d}.jpg")
+            pixels = _as_shown(frame.to_ndarray(format="rgb24"), _display_matrix(frame))
+            Image.fromarray(np.ascontiguousarray(pixels)).save(folder / f"{number:06d}.jpg", quality=QUALITY)
     return len(chosen), len(places)
 
 
 def choose_frames(sharpness: np.ndarray, places: np.ndarray, count: int) -> np.ndarray:
-    """Return the numbers of the frames to keep: the sharpest of each of `count` intervals of equal length.
+    """Return the sorted numbers of the frames to keep: the sharpest of each of `count` intervals of equal length.
+
+    An interval that the camera jumped over has none.
 
     Args:
       sharpness: [T] score of each frame.
       places: [T] length of the camera's way until each frame; it does not grow while the camera is still.
       count: number of intervals, at least 1.
-
-    Returns:
-      Sorted numbers [at most count]; an interval that the camera jumped over has none.
     """
     way = places - places[0]
     interval = np.minimum((way * (count / max(way[-1], 1e-12))).astype(int), count - 1)
-    order = np.lexsort((-sharpness, interval))
+    order = np.lexsort((-sharpness, interval))  # By interval, the sharpest first.
     is_first = np.diff(interval[order], prepend=-1) > 0
     return np.sort(order[is_first])
 
@@ -90,14 +87,12 @@ def motion(before: np.ndarray, after: np.ndarray) -> float:
     return float(np.abs(after - before).mean() / max(slope, 1.0) / before.shape[1])
 
 
-def _sharpness(grey: np.ndarray) -> float:
-    """Return the variance of the Laplacian."""
-    return float(laplace(grey.astype(np.float32)).var())
-
-
 def _frames(video: Path, phase: str, progress: bool) -> Iterator[Any]:
     """Yield the decoded frames of the first video stream."""
-    av = _av()
+    try:
+        av = importlib.import_module("av")
+    except ImportError:
+        raise ValueError("a video needs PyAV, which is not installed: pip install 'a2tg-jax[video]'") from None
     try:
         with av.open(str(video), options=ONLY_VIDEOS) as container:
             if not container.streams.video:
@@ -122,12 +117,6 @@ def _grey(frame: Any, width: int) -> np.ndarray:
     return grey
 
 
-def _write(frame: Any, path: Path) -> None:
-    """Write a frame as players show it."""
-    pixels = _as_shown(frame.to_ndarray(format="rgb24"), _display_matrix(frame))
-    Image.fromarray(np.ascontiguousarray(pixels)).save(path, quality=QUALITY)
-
-
 def _display_matrix(frame: Any) -> np.ndarray:
     """Return [2, 2] that maps stored (x, y) to shown (x, y), y down, up to a positive factor."""
     try:
@@ -146,10 +135,3 @@ def _as_shown(pixels: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     if abs(matrix[0, 1]) + abs(matrix[1, 0]) > abs(matrix[0, 0]) + abs(matrix[1, 1]):
         pixels, matrix = pixels.swapaxes(0, 1), matrix[:, ::-1]
     return pixels[:: -1 if matrix[1, 1] < 0 else 1, :: -1 if matrix[0, 0] < 0 else 1]
-
-
-def _av() -> ModuleType:
-    try:
-        return importlib.import_module("av")
-    except ImportError:
-        raise ValueError("a video needs PyAV, which is not installed: pip install 'a2tg-jax[video]'") from None

@@ -9,8 +9,8 @@ import numpy as np
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.similarity import Similarity, camera_centers
+from a2tg_jax.data.assembly import scene_scale
 from a2tg_jax.data.scene import Scene, View
-from a2tg_jax.data.world import scene_scale
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.systems.baselines import Gaussians2d

@@ -1,7 +1,7 @@
-"""Files in object storage and wherever else fsspec reaches. Their paths are those of universal_pathlib.
+"""Files in object storage and wherever else fsspec reaches, at paths of universal_pathlib.
 
-Such a path has pathlib's methods and is annotated as `Path`. Each question to a store takes a while, so every folder is
-listed once, and files are fetched whole. What fails is tried again.
+Such a path has pathlib's methods and is annotated as `Path`. Each request to a store takes a while, so every folder is
+listed once, and files are fetched whole. A request that fails is tried again.
 """
 
 import errno
@@ -27,13 +27,13 @@ PIECE = 1 << 26
 LIBRARIES = ("s3fs", "gcsfs", "adlfs", "paramiko", "aiohttp")
 """Libraries of stores whose packages have their modules' names."""
 FINAL = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, NotImplementedError)
-"""Errors that another attempt does not mend."""
+"""Errors for which another attempt makes no sense."""
 
 Result = TypeVar("Result")
 
 
 class Unreachable(OSError):
-    """Error of a store that does not answer, or does not give what it is asked for."""
+    """Error of a store that does not answer, or does not give what is requested."""
 
 
 class RemotePath(Protocol):
@@ -54,7 +54,7 @@ class Entry(NamedTuple):
     kind: str
     """ "file", "directory", "link", or another word of fsspec's."""
     size: int | None
-    """Number of bytes; None if the store does not tell it."""
+    """Number of bytes; None if the store does not say it."""
 
 
 Listing = dict[str, Entry]
@@ -72,7 +72,7 @@ def located(path: str | os.PathLike[str] | RemotePath) -> Path:
     """Return the path that a text means: of universal_pathlib for a URL, but of this machine for file://.
 
     Raises:
-      ValueError: if it is no path, a library is missing, fsspec does not know the protocol, or the URL has a secret.
+      ValueError: if it is no path, a library is missing, fsspec has no such protocol, or the URL has a secret.
     """
     if isinstance(path, str | os.PathLike):
         text = os.fspath(path)
@@ -102,11 +102,7 @@ def _of_store(url: str) -> Path:
 
 
 def check_reachable(folder: Path) -> None:
-    """List a folder anew, in one attempt, so that a mistake in a URL or in credentials is told at once.
-
-    Raises:
-      OSError: naming the folder, if it is missing or empty, or the store does not list it.
-    """
+    """List a folder again, in one attempt, so that a mistake in a URL or in credentials is reported at once."""
     with _lock:
         _listings.clear()
     cast(Any, folder).fs.invalidate_cache()
@@ -121,7 +117,7 @@ def is_remote_file(path: Path) -> bool:
 
 
 def is_remote_folder(path: Path) -> bool:
-    """Return whether anything is listed in a folder. Object storage knows no empty ones."""
+    """Return whether anything is listed in a folder. Object storage has no empty ones."""
     return bool(_listed(path))
 
 
@@ -131,11 +127,7 @@ def remote_names(folder: Path) -> list[str]:
 
 
 def remote_size(path: Path) -> int | None:
-    """Return the number of bytes of a file; None if its store does not tell it.
-
-    Raises:
-      FileNotFoundError: if it is not listed in its folder.
-    """
+    """Return the number of bytes of a file that is listed in its folder; None if its store does not say it."""
     entry = _entry(path)
     if entry is None or entry.kind != "file":
         raise _missing(path)
@@ -169,15 +161,11 @@ def fetched(path: Path, size: int | None, most_bytes: int) -> BufferedReader:
 
 def _is_filled(file: IO[bytes], path: Path, size: int) -> bool:
     """Write a file of a listed size in pieces, and return whether it has no more bytes. The last piece asks for one."""
+    store: Any = path
     for start in range(0, size, PIECE):
         end = start + PIECE if start + PIECE < size else size + 1
-        file.write(_tried(path, functools.partial(_piece, path, start, end)))
+        file.write(_tried(path, functools.partial(store.fs.cat_file, store.path, start=start, end=end)))
     return file.tell() <= size
-
-
-def _piece(path: Any, start: int, end: int) -> bytes:
-    data: bytes = path.fs.cat_file(path.path, start=start, end=end)
-    return data
 
 
 def _stream(path: Any, file: IO[bytes], most_bytes: int) -> None:
@@ -189,41 +177,36 @@ def _stream(path: Any, file: IO[bytes], most_bytes: int) -> None:
             file.write(data)
 
 
-def _entry(path: Path) -> Entry | None:
+def _entry(path: Any) -> Entry | None:
     """Return what is listed of a path, or what a link leads to; None if there is nothing."""
     listing = _listed(path.parent)
     entry = listing.get(path.name)
     if entry is not None and entry.kind == "link":
-        entry = listing[path.name] = _target(path)
+        try:
+            found = _tried(path, functools.partial(path.fs.info, path.path))
+            entry = Entry(found["type"], found.get("size"))
+        except FileNotFoundError:
+            entry = Entry("nothing", None)
+        listing[path.name] = entry
     return entry
 
 
-def _target(path: Any) -> Entry:
-    try:
-        found = _tried(path, functools.partial(path.fs.info, path.path))
-    except FileNotFoundError:
-        return Entry("nothing", None)
-    return Entry(found["type"], found.get("size"))
-
-
-def _listed(folder: Path, pauses: tuple[float, ...] | None = None) -> Listing:
+def _listed(folder: Any, pauses: tuple[float, ...] | None = None) -> Listing:
     """Return the files and folders in a folder, by name, from its first listing; nothing if there is no such folder.
 
     Other threads that want the same folder wait for this listing.
     """
-    place = cast(Any, folder)
     with _lock:
-        listing = _listings.get(_key(place))
+        listing = _listings.get(_key(folder))
         if is_first := listing is None:
-            listing = _listings[_key(place)] = Future()
+            listing = _listings[_key(folder)] = Future()
     assert listing is not None
     if is_first:
         try:
-            is_told = _may_exist(place)
-            listing.set_result(_tried(folder, functools.partial(_list, place), pauses) if is_told else {})
+            listing.set_result(_tried(folder, functools.partial(_list, folder), pauses) if _may_exist(folder) else {})
         except BaseException as error:
             with _lock:
-                _listings.pop(_key(place), None)
+                _listings.pop(_key(folder), None)
             listing.set_exception(error)
     return listing.result()
 
@@ -233,7 +216,7 @@ def _key(folder: Any) -> tuple[Any, str]:
 
 
 def _may_exist(folder: Any) -> bool:
-    """Return False if a folder lies below a listed one, and is in no listing itself. Some stores refuse to list it."""
+    """Return False if a folder is below a listed one, and is in no listing itself. Some stores refuse to list it."""
     if ".." in folder.parts:
         return True
     with _lock:
@@ -242,15 +225,15 @@ def _may_exist(folder: Any) -> bool:
 
 
 def _list(folder: Any) -> Listing:
-    own = folder.path.strip("/")
     try:
-        found = [(entry["name"].rstrip("/"), entry) for entry in folder.fs.ls(folder.path, detail=True)]
+        entries = folder.fs.ls(folder.path, detail=True)
     except (FileNotFoundError, NotADirectoryError):
         return {}
+    own = folder.path.strip("/")  # Some stores list the folder itself.
     return {
-        name.rpartition("/")[2]: Entry(entry["type"], entry.get("size"))
-        for name, entry in found
-        if name.strip("/") != own
+        entry["name"].rstrip("/").rpartition("/")[2]: Entry(entry["type"], entry.get("size"))
+        for entry in entries
+        if entry["name"].strip("/") != own
     }
 
 

@@ -26,11 +26,11 @@ from typing import Any, Literal
 import tomli_w
 
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
+from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.division import among_processes, sharing_errors
 from a2tg_jax.data.lenses import LensUse
-from a2tg_jax.data.mask_files import AlphaMeaning
+from a2tg_jax.data.masks import AlphaMeaning
 from a2tg_jax.data.scene import scene_name
-from a2tg_jax.data.splits import with_validation_views
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular

@@ -14,9 +14,9 @@ from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.pytree import combine, partition
+from a2tg_jax.data.assembly import Sight, unseeing
 from a2tg_jax.data.observations import check_observed_points
 from a2tg_jax.data.scene import Scene, View
-from a2tg_jax.data.start_points import Sight, unseeing
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.training.batches import Extras

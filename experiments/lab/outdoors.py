@@ -4,10 +4,8 @@ import numpy as np
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.cameras import intrinsics, looking
-from a2tg_jax.data.assembly import Shot, assemble_scene
-from a2tg_jax.data.lighting import light
-from a2tg_jax.data.splits import every_kth
-from a2tg_jax.data.surfaces import Surface, trace_rays
+from a2tg_jax.data.assembly import Shot, assemble_scene, every_kth
+from a2tg_jax.data.ray_tracing import Surface, light, trace_rays
 from a2tg_jax.data.synthetic import DISTANCE, DOWN, FIELD_OF_VIEW, SAMPLE_OFFSETS, TARGET, sample_points, still_life
 
 NUM_VIEWS, NUM_POINTS, TEST_EVERY = 28, 4_000, 8
@@ -22,7 +20,7 @@ def outdoors(width: int, height: int) -> a2tg.Scene:
     surfaces = light(still_life(rng), rng)[1:]
     K = intrinsics(width, height, FIELD_OF_VIEW)
     shots = [
-        Shot(f"view_{index:03d}.png", viewmat, K, photograph(surfaces, viewmat, K, width, height))
+        Shot(f"view_{index:03d}.png", viewmat, K, a2tg.Picture.of(photograph(surfaces, viewmat, K, width, height)))
         for index, viewmat in enumerate(low_path(NUM_VIEWS))
     ]
     cloud = sample_points(surfaces, shots, NUM_POINTS, rng)

@@ -1,32 +1,32 @@
-"""Surfaces of the synthetic scene: shapes that rays can hit, with an image on them.
+"""Surfaces of the synthetic scene: shapes that rays can hit, with an image on them, and the light on them.
 
 Vectors are float32 with their components first, [3, P], which makes numpy several times faster. Rays are origin +
 t·direction, directions not necessarily unit; t is infinite if a ray misses. (u, v) in [0, 1] run along the columns and
-rows of a surface's image.
+rows of a surface's image. Light is multiplied once into the images, so that every view sees the same.
+
+Each shape has three methods. `hit` returns t [P] of the nearest hit beyond NEAR, of rays whose origins are [3, P] or
+one for all, [3, 1]. `locate` returns (u, v), each [P], of points [3, P] on the shape. `place`, its inverse, returns
+points and unit normals [3, P] at (u, v).
 """
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
+from scipy.ndimage import zoom
 
 NEAR = 1e-3
 """Smallest t of a hit; nearer ones are the point itself."""
+LAMP = np.array([[-1.7], [-1.9], [3.1]], np.float32)
+"""Centre of a spherical lamp."""
+LAMP_RADIUS = 0.35
+NUM_LAMP_RAYS, NUM_SKY_RAYS = 8, 16
+SKY_REACH = 0.8
+"""Largest distance at which a surface darkens a point."""
+SKY_LIGHT, LAMP_LIGHT = 0.48, 0.68
+TEXELS_PER_SAMPLE = 8
+"""Factor by which the grid of light is coarser than a surface's image."""
 Vector = tuple[float, float, float]
-
-
-class ParametricSurface(Protocol):
-    """A parametrised surface."""
-
-    def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """t [P] of the nearest hit beyond NEAR; origins are [3, P] or one for all rays, [3, 1]."""
-
-    def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (u, v), each [P], of points [3, P] on the surface."""
-
-    def place(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (points, unit normals) [3, P] at (u, v), each [P]; the inverse of `locate`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,6 +127,7 @@ class Block:
         return np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]], np.float32) / np.float32(self.half_side)
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        # A ray is in the cube where it is between the planes of all three axes at once.
         entry, leaving = np.float32(NEAR), np.float32(np.inf)
         start, step = self.axes @ (origins - column(self.center)), self.axes @ directions
         for position, speed in zip(start, step, strict=True):
@@ -151,6 +152,9 @@ class Block:
         to_world = self.axes.T * np.float32(self.half_side)
         points = to_world @ (normals + along * rights + down * downs) * self.half_side
         return points + column(self.center), to_world @ normals
+
+
+ParametricSurface = Disc | Tube | Ball | Block
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -178,15 +182,9 @@ def nearest_hits(
 def trace_rays(
     surfaces: Sequence[Surface], origin: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the colours and positions of the hits of rays from one point.
+    """Return the colours [P, 3] uint8 and positions [3, P] float32 of the hits of rays [3, P] from one point [3, 1].
 
-    Args:
-      surfaces: the scene.
-      origin: [3, 1] float32.
-      directions: [3, P] float32.
-
-    Returns:
-      (colors [P, 3] uint8, black where nothing is hit; points [3, P] float32, not finite there).
+    Where nothing is hit, colours are black and positions not finite.
     """
     t, index = nearest_hits([surface.shape for surface in surfaces], origin, directions)
     points = origin + t * directions
@@ -194,17 +192,12 @@ def trace_rays(
     index[~np.isfinite(t)] = -1
     for number, surface in enumerate(surfaces):
         hits = np.flatnonzero(index == number)
-        colors[hits] = nearest_texels(surface.image, *surface.shape.locate(points[:, hits]))
+        rows, columns = surface.image.shape[:2]
+        u, v = surface.shape.locate(points[:, hits])
+        row = np.clip((v * rows).astype(np.int32), 0, rows - 1)
+        texel = row * columns + np.clip((u * columns).astype(np.int32), 0, columns - 1)
+        colors[hits] = np.take(surface.image.reshape(-1, 3), texel, axis=0)
     return colors, points
-
-
-def nearest_texels(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return the texels [P, 3] nearest to (u, v)."""
-    rows, columns = image.shape[:2]
-    row = np.clip((v * rows).astype(np.int32), 0, rows - 1)
-    column = np.clip((u * columns).astype(np.int32), 0, columns - 1)
-    texels: np.ndarray = np.take(image.reshape(-1, 3), row * columns + column, axis=0)
-    return texels
 
 
 def column(vector: Vector) -> np.ndarray:
@@ -225,3 +218,49 @@ def quadratic_roots(a: np.ndarray, half_b: np.ndarray, c: np.ndarray) -> tuple[n
     root = np.sqrt(np.where(discriminant > 0, discriminant, np.float32(np.nan)))
     inverse = 1 / np.maximum(a, np.float32(1e-12))
     return (-half_b - root) * inverse, (-half_b + root) * inverse
+
+
+def light(colored: list[tuple[ParametricSurface, np.ndarray]], rng: np.random.Generator) -> list[Surface]:
+    """Return surfaces with images of the given colours, lit by a lamp with soft shadows and by the sky.
+
+    Colours are [rows, columns, 3] float32 in [0, 1]; the generator turns the patterns of rays.
+    """
+    shapes = [shape for shape, _ in colored]
+    return [Surface(shape, _shaded(shape, colors, shapes, rng)) for shape, colors in colored]
+
+
+def _shaded(
+    shape: ParametricSurface, colors: np.ndarray, shapes: list[ParametricSurface], rng: np.random.Generator
+) -> np.ndarray:
+    """Return the image [rows, columns, 3] uint8 of one shape: its colours times its light, clipped at 1."""
+    rows, columns = (max(2, -(-size // TEXELS_PER_SAMPLE)) for size in colors.shape[:2])
+    u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+    points, normals = (x.astype(np.float32) for x in shape.place(u.ravel(), v.ravel()))
+    points = points + np.float32(1e-3) * normals
+    # Of the sky, the share of the cosine-weighted hemisphere with nothing nearer than SKY_REACH.
+    sky = np.zeros(points.shape[1], np.float32)
+    for offset in _unit_vectors(rng, NUM_SKY_RAYS):
+        directions = normals + np.float32(0.999) * offset[:, None]
+        directions /= np.linalg.norm(directions, axis=0)
+        sky += nearest_hits(shapes, points, directions)[0] > SKY_REACH
+    # Of the lamp, the cosine of its direction times its visible share.
+    lamp = np.zeros(points.shape[1], np.float32)
+    for offset in _unit_vectors(rng, NUM_LAMP_RAYS):
+        towards = LAMP + np.float32(LAMP_RADIUS) * offset[:, None] - points
+        cosine = (towards * normals).sum(axis=0) / np.linalg.norm(towards, axis=0)
+        is_free = nearest_hits(shapes, points, towards)[0] > 1
+        lamp += np.maximum(cosine, 0) * is_free
+    coarse = SKY_LIGHT * (sky / NUM_SKY_RAYS)
+    coarse = coarse + LAMP_LIGHT * (lamp / NUM_LAMP_RAYS)
+    factors = colors.shape[0] / rows, colors.shape[1] / columns
+    fine = zoom(coarse.reshape(rows, columns), factors, order=1, grid_mode=True, mode="nearest")
+    pixels: np.ndarray = np.rint(255 * np.clip(colors * fine[..., None], 0, 1)).astype(np.uint8)
+    return pixels
+
+
+def _unit_vectors(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Return [count, 3] float32 unit vectors spread evenly over the sphere (a Fibonacci lattice, turned at random)."""
+    index = np.arange(count) + 0.5
+    z, angle = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index + rng.uniform(0, 2 * np.pi)
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1).astype(np.float32)

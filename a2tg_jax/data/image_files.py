@@ -1,0 +1,196 @@
+"""Photographs and masks on disk: files by name, smaller copies of them, and threads that read them."""
+
+import os
+import unicodedata
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path, PurePath, PureWindowsPath
+from typing import Any, NamedTuple, TypeVar
+
+from a2tg_jax.data.decoding import picture_size
+from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
+from a2tg_jax.host.remote_files import is_remote
+from a2tg_jax.host.text import counted, shortened
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
+"""Suffixes of photographs; capital letters do as well."""
+LONGEST_NAME = 1000
+"""Largest number of letters in an image's path below its folder."""
+MOST_READERS = 8
+"""Largest number of threads that read photographs."""
+ROUNDING = 1.0
+"""Largest difference in pixels between a side of a smaller copy and the photograph's side divided by the downscale."""
+
+Result = TypeVar("Result")
+
+
+def locate_image(folder: Path, name: str) -> Path:
+    """Return the file of an image, whose name is a path below a folder, perhaps without suffix.
+
+    Raises:
+      FileNotFoundError: naming the image, if it is not there.
+      ValueError: if the name leads out of the folder.
+    """
+    name = inside(folder, name)
+    for candidate in (folder / name, folder / f"{name}.png", *_with_suffixes(folder, name)):
+        if is_regular(candidate):
+            return candidate
+    if (found := on_disk(folder, name)) is not None:
+        return found
+    raise FileNotFoundError(
+        f"{folder / name}: no such image, but the scene has a camera for it; "
+        f"put the image there, or remove its frame from the file that names it"
+    )
+
+
+def find_image(folder: Path, name: str) -> Path | None:
+    """Return the file that `locate_image` returns, or None if it is not there."""
+    with suppress(FileNotFoundError):
+        return locate_image(folder, name)
+    return None
+
+
+def named_image(folder: Path, name: str) -> Path | None:
+    """Return the image of a name, with or without its suffix, or None."""
+    own = [folder / name] if Path(name).suffix.lower() in PHOTO_SUFFIXES else []
+    found = next((file for file in (*own, *_with_suffixes(folder, name)) if name and is_regular(file)), None)
+    return found or (on_disk(folder, name) if own else None)
+
+
+def _with_suffixes(folder: Path, name: str) -> Iterator[Path]:
+    return (folder / f"{name}{each}" for suffix in PHOTO_SUFFIXES for each in (suffix, suffix.upper()))
+
+
+def inside(folder: Path, name: str) -> str:
+    """Return the path below a folder of a file that the scene names, with "/" between its parts.
+
+    A backslash separates parts as "/" does, unless a file has that very name. An absolute path in the folder becomes a
+    relative one.
+
+    Raises:
+      ValueError: naming both, if it leads out of the folder, by ".." or as an absolute path, or is no name. Links may
+        lead anywhere.
+    """
+    if len(name) > LONGEST_NAME:
+        raise ValueError(f"{folder}: {shortened(name)} is too long a name ({len(name)} letters); shorten it")
+    # On Linux and macOS a backslash may also be a letter of a name.
+    is_file = "\0" not in name and "\\" in name and is_regular(folder / name)
+    path = Path(name if is_file else name.replace("\\", "/"))
+    if path.is_absolute() and not is_remote(folder):
+        roots = os.path.abspath(folder), os.path.realpath(folder)  # The scene may have been written through a link.
+        path = next((path.relative_to(root) for root in roots if path.is_relative_to(root)), path)
+    if PureWindowsPath(str(path)).root or path.drive or os.pardir in path.parts or "\0" in name:
+        raise ValueError(
+            f"{folder}: {shortened(name)} leads out of the scene's folder, and nothing outside is read; "
+            "move it there, or put a link there to where it is, and name that"
+        )
+    return path.as_posix()
+
+
+def on_disk(folder: Path, *names: str) -> Path | None:
+    """Return the first file of some paths below a folder that exists; None without one.
+
+    If none exists, return the first that differs from a file in capitals alone, unless it does from several.
+    """
+    files = [folder / name for name in names if is_regular(folder / name)]
+    for name in () if files else names:
+        found = [folder]
+        for part in Path(name).parts:
+            # All that fit so far, because folders may differ in capitals, too.
+            found = [each / own for each in found for own in names_in(each) if _letters(own) == _letters(part)]
+        files += [found[0]] if len(found) == 1 and is_regular(found[0]) else []
+    return files[0] if files else None
+
+
+def _letters(name: str) -> str:
+    """Return a name without capitals. macOS writes accents as letters of their own, which are joined."""
+    return unicodedata.normalize("NFC", name.casefold())
+
+
+def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) -> None:
+    """Warn of photographs in a folder of this machine (`is_deep`: and in folders of it) that are not among some names.
+
+    The names are paths below it, whose suffixes and capitals may differ.
+    """
+    if is_remote(folder) or not folder.is_dir():
+        return
+    own = {_letters(PurePath(name).with_suffix("").as_posix()) for name in names}
+    files = (file.relative_to(folder) for file in (folder.rglob("*") if is_deep else folder.iterdir()))
+    photos = (file for file in files if file.suffix.lower() in PHOTO_SUFFIXES)
+    others = sorted(file.as_posix() for file in photos if _letters(file.with_suffix("").as_posix()) not in own)
+    if others:
+        told = f"{counted(len(others), 'photograph')} without a pose, such as {shortened(others[0])}"
+        warnings.warn(f"{folder}: {told}: not used", stacklevel=3)
+
+
+class SmallerCopies(NamedTuple):
+    """Where a scene has smaller copies of its files: images_2 beside images, for a downscale of 2."""
+
+    downscale: int
+    folders: Mapping[Path, Path]
+    """Folder of the copies, by folder of the full files."""
+
+    def of(self, folder: Path) -> tuple[Path, int]:
+        """Return the folder to read a folder's files from, and the remaining factor of downscaling."""
+        return (self.folders[folder], 1) if folder in self.folders else (folder, self.downscale)
+
+
+def find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) -> SmallerCopies:
+    """Find the folders NAME_k beside folders NAME of a scene that hold its files at 1/k of their size.
+
+    Such a folder may also be another clip of the scene. It counts if the scene names no file in it, and it has a copy
+    of each file of NAME, 1/k as large. A folder that fails is not used, with a warning. Files whose full size is
+    missing, cannot be read or is in object storage are not compared.
+
+    Args:
+      files: folder, and path below it, of every photograph and mask that the scene names.
+      downscale: k >= 1.
+      root: the scene's folder, which has no copies: its siblings are other scenes.
+    """
+
+    def difference(name: str) -> str:
+        """Return how the copy of a file differs from one of 1/downscale of its size; "" if it does not."""
+        full, copy = (find_image(place, name) for place in (folder, smaller))
+        if full is None:
+            return ""
+        if copy is None:
+            return f"{name}, which is missing"
+        if is_remote(full):
+            return ""
+        with suppress(ValueError):  # A photograph may be too large to be read in full.
+            size, copied = picture_size(full), picture_size(copy)
+            if any(abs(side - whole / downscale) > ROUNDING for side, whole in zip(copied, size, strict=True)):
+                return f"{name}, which is {copied[0]}x{copied[1]} for {size[0]}x{size[1]}"
+        return ""
+
+    found: dict[Path, Path] = {}
+    named = {(folder / name).parent for folder, name in files} if downscale > 1 else set()
+    for folder in dict.fromkeys(folder for folder, _ in files if downscale > 1 and folder != root):
+        smaller = folder.with_name(f"{folder.name}_{downscale}")
+        if not is_folder(smaller) or any(place.is_relative_to(smaller) for place in named):
+            continue
+        names = [name for own, name in files if own == folder]
+        if told := [each for each in map_in_threads(difference, names, place=folder) if each]:
+            warnings.warn(
+                f"{smaller}: does not hold the files of {folder} at 1/{downscale} of their size, for {len(told)} of "
+                f"{len(names)}, such as {told[0]}: not used",
+                stacklevel=4,
+            )
+        else:
+            found[folder] = smaller
+    return SmallerCopies(downscale, found)
+
+
+def map_in_threads(
+    function: Callable[..., Result], *iterables: Iterable[Any], place: Path | None = None
+) -> list[Result]:
+    """Return list(map(function, *iterables)), run in several threads.
+
+    Decoding and resizing of pictures release Python's lock. Threads that wait for a store, if the place is in one, take
+    no core.
+    """
+    is_waiting = place is not None and is_remote(place)
+    with ThreadPoolExecutor(max_workers=MOST_READERS if is_waiting else min(MOST_READERS, os.cpu_count() or 1)) as pool:
+        return list(pool.map(function, *iterables))
