@@ -196,10 +196,10 @@ def test_convert_bakes(tmp_path, capsys):
     arguments = ["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.ply"), "--bake", "--bake-iterations", "0"]
     assert main(arguments) == 0
     told = capsys.readouterr().out
-    assert "baked: 3 splats into" in told and "beside the model in 1 training view" in told and "textures" not in told
+    assert "baked: 3 splats into" in told and "against the model in 1 training view" in told and "textures" not in told
     assert load_splats(tmp_path / "b.ply").num > 3
     assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.ply"), "--bake"]) == 2
-    assert "knows its cameras" in capsys.readouterr().err
+    assert "needs a model with cameras" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("name", "reason"), [("b.sog", "pip install"), ("b.pt", "can be read, but not written")])

@@ -23,7 +23,7 @@ def check_output(path: Path) -> None:
     stderr.
 
     Raises:
-      ValueError: naming what stands in the way.
+      ValueError: naming what is in the way.
     """
     place = Path(os.path.abspath(path))
     missing = [folder for folder in (place, *place.parents) if not folder.exists()]

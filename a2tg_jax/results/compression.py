@@ -65,8 +65,8 @@ def compress(
     """
     name = source.name.lower()
     if not source.is_dir() and name.endswith(tuple(FORMATS)) and not name.endswith(".npz"):
-        told = ", which is compressed already" if name.endswith(SUFFIX) else ""
-        raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(source))}{told}")
+        done = ", which is compressed already" if name.endswith(SUFFIX) else ""
+        raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(source))}{done}")
     if not 0 <= max_loss < math.inf:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
     if tune_iterations < 0:
@@ -118,11 +118,10 @@ def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: 
     rows = [["kept as", "bytes", *(f"dB lost, {measure}" for measure in measures)]]
     rows += [[name, f"{trial.num_bytes:,}", *(f"{loss:.3f}" for loss in trial.losses)] for name, trial in named]
     groups = {trial.group for trial in trials}
-    kept = [
-        (name, ", ".join(f"{group} {getattr(trial.choices, group)}" for group in GROUPS if group in groups))
-        for name, trial in named[len(trials) :]
-    ]
-    bits = [f"{name}: {told}" for name, told in kept]
+    bits = []
+    for name, trial in named[len(trials) :]:
+        kept = ", ".join(f"{group} {getattr(trial.choices, group)}" for group in GROUPS if group in groups)
+        bits.append(f"{name}: {kept}")
     if found.diverged:
         bits.insert(-1, f"tuning ended early, what was found before is kept: {found.diverged}")
     return [*aligned(list(zip(*rows, strict=True))), *bits]
@@ -140,9 +139,9 @@ def _smaller(model: Model, untuned: Trial | None, found: TunedFiles, max_loss: f
     if untuned is not None:
         return untuned, encode_model(model, untuned.choices)
     least = min((trial.losses[0] for trial in found.tried), default=None)
-    told = "" if least is None else f"; the best tuned file loses {least:.3f} dB"
+    best = "" if least is None else f"; the best tuned file loses {least:.3f} dB"
     ended = f"; tuning ended early: {found.diverged}" if found.diverged else ""
-    raise TooMuchLostError(f"max_loss must be larger: no file, tuned or not, is within it; got {max_loss}{told}{ended}")
+    raise TooMuchLostError(f"max_loss must be larger: no file, tuned or not, is within it; got {max_loss}{best}{ended}")
 
 
 def _tuned(scene: Scene, system: System, iterations: int, model: Model, choices: CompactChoices, number: int) -> Tuned:

@@ -101,7 +101,7 @@ def convert(
 def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str]:
     """Return a plain model, and what was done in words."""
     if model.origin is None or not model.origin.cameras:
-        raise ValueError(f"--bake needs a model that knows its cameras; {source} has none")
+        raise ValueError(f"--bake needs a model with cameras; {source} has none")
     shown = model.appearance
     if shown.is_portable and shown.texture is None and shown.exponents is None:
         return model, "baked: nothing, for the model is plain"
@@ -109,13 +109,13 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
     plain = bake(model, training, growth=options.growth, iterations=options.iterations, progress=True)
     views = held_out or training
     views = views[:: -(-len(views) // MOST_VIEWS)]
-    beside = likeness(pictures(plain, views), pictures(model, views))
+    likeness_db = likeness(pictures(plain, views), pictures(model, views))
     degree, ratio = plain.gaussians.sh_degree, plain.num_bytes / model.num_bytes
     numbers = f"{counted(model.num, 'splat')} into {plain.num:,} plain ones of SH degree {degree}"
     judged = counted(len(views), f"{'held-out' if held_out else 'training'} view")
     return (
         plain,
-        f"baked: {numbers}, {ratio:.2f} times the numbers' bytes, {beside:.1f} dB beside the model in {judged}",
+        f"baked: {numbers}, {ratio:.2f} times the numbers' bytes, {likeness_db:.1f} dB against the model in {judged}",
     )
 
 

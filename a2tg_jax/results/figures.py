@@ -100,7 +100,7 @@ def write_figures(
     for shown in level_maps(model):
         save_picture(path := own(shown.file), level_picture(model, shown.levels, camera, settings))
         legend = list(zip(map(to_hex, level_colors(len(shown.names))), shown.names, strict=True))
-        caption = f"The first view, every Gaussian by {shown.told}; {NOT_HIT}."
+        caption = f"The first view, every Gaussian by {shown.varying}; {NOT_HIT}."
         found["maps"].append(ReportFigure(path, caption, legend=legend))
     output = Renderer(model, settings=settings)(camera)
     picture, stops = depth_picture(output)
@@ -246,7 +246,8 @@ class LevelMap(NamedTuple):
     """Level of each Gaussian in a property that varies, such as its degree."""
 
     file: str
-    told: str
+    varying: str
+    """The property in words."""
     levels: np.ndarray
     """[N] integers, each of which has a colour."""
     names: Sequence[str]

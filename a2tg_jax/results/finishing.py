@@ -54,20 +54,20 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     record, planned = finished_stage(source)
     path, run = source.model(planned.name), RunFolder(out)
     origin = {"source": str(source.path.resolve()), "model": planned.name, "sha256": sha256_of(path)}
-    told = {**origin, **dataclasses.asdict(options)}
-    _is_written(run, told)
+    content = {**origin, **dataclasses.asdict(options)}
+    _is_written(run, content)
     model, scene = load_model(path), record.scene.load()
     _check(model, planned, options)
     finished_stages(source, record.plan)
     with claimed(run):
-        is_written = _is_written(run, told)  # Another process may have been here meanwhile.
+        is_written = _is_written(run, content)  # Another process may have been here meanwhile.
         changed = [("finished", load_model(run.model(planned.name)))] if is_written else _changed(model, scene, options)
         models, steps = {"before": model}, {"before": _measured(model, scene, planned)}
         for name, after in changed:
             models[name], steps[name] = after, _measured(after, scene, planned)
         if not is_written:
             run.clear()
-            write_json(run.own(run.finish), told)
+            write_json(run.own(run.finish), content)
             for name in record.plan.names:
                 for find in (RunFolder.model, RunFolder.history):
                     if find(source, name).is_file() and find(source, name) != path:
@@ -86,12 +86,12 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     return "\n".join([*aligned(columns), *spoiled])
 
 
-def _is_written(run: RunFolder, told: Mapping[str, Any]) -> bool:
+def _is_written(run: RunFolder, content: Mapping[str, Any]) -> bool:
     """Return whether a process was killed in a folder after it had done the same, as finish.json says, and written the
     model. Unless the same was begun there, the folder must be free."""
     is_begun = not run.report.is_file() and run.finish.name in run.written() and is_regular(run.finish)
     with contextlib.suppress(ValueError):
-        if is_begun and read_json(run.finish) == told:
+        if is_begun and read_json(run.finish) == content:
             return run.record.is_file()
     check_free(run.path, in_use="is not empty; choose another --out")
     return False

@@ -7,7 +7,7 @@
       models/NAME.npz            what each finished stage left behind, with cameras, world and background
       corrections/NAME.json      exposure and pose of each training view, if they were learned
       history/NAME.csv           loss, PSNR, Gaussians, MB over the iterations
-      tensorboard/events.*       the same for TensorBoard, if it was asked for
+      tensorboard/events.*       the same for TensorBoard, with --tensorboard
       metrics.json, per_view.json
       test/NAME.png              photograph, renders and error side by side
       figures/                   curves, texture resolutions, some textures, depth, normals, a flight
@@ -18,7 +18,7 @@
       diverged/NAME-*.npz        the state before a step whose numbers were not finite, a checkpoint
       .a2tg-old/                 the run that this one replaces, until this one has its report
 
-NAME is that of a stage, such as `a2tg-gaussians` or `a2tg-textures`: the system's, and the stage's in it (`plan`).
+NAME is a stage's name in the run, such as `a2tg-gaussians` or `a2tg-textures` (`plan`).
 """
 
 import contextlib
@@ -199,8 +199,8 @@ def open_run(path: Path) -> RunFolder:
 
 
 def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
-    """Return the command line that continues the training of a run on these devices; None: on those of its newest
-    checkpoint."""
+    """Return the command line that continues the training of a run on these devices; None: as its newest
+    checkpoint was made."""
     if devices is None:
         devices = ALONE
         found = sorted((run.path / "checkpoints").glob("*.npz"), key=lambda path: path.stat().st_mtime_ns)
@@ -284,7 +284,7 @@ def old_run(run: RunFolder) -> RunFolder | None:
 def set_aside(run: RunFolder) -> None:
     """Move what runs wrote into a folder, as its marker lists it, to RUN/.a2tg-old.
 
-    If a run lies there already, because the one that was to replace it never ended, that one is kept and this one
+    If there is a run already, because the one that was to replace it never ended, that one is kept and this one is
     deleted.
     """
     if old_run(run) is None:

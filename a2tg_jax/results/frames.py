@@ -139,9 +139,9 @@ def render_frames(
 
 
 def check_rate(frames_per_second: float) -> None:
-    """Raise ValueError unless a video can have so many frames a second."""
+    """Raise ValueError unless a video can have this frame rate."""
     if not 1 <= frames_per_second <= 1000:
-        raise ValueError(f"the number of frames per second must lie in 1..1000; got {frames_per_second}")
+        raise ValueError(f"the number of frames per second must be in 1..1000; got {frames_per_second}")
 
 
 def video_name() -> str:
@@ -184,7 +184,7 @@ def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tup
         yield from _numbered(path_through(saved, num_frames))
         return
     if model.origin is None:
-        raise ValueError("the model has no cameras to render; it does not know where it was trained")
+        raise ValueError("the model has no cameras to render")
     views = sorted(zip(model.origin.names, model.origin.is_test, model.origin.cameras, strict=True), key=lambda v: v[0])
     if route != "test":
         path = smooth_path if route == "smooth" else turntable

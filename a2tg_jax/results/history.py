@@ -18,7 +18,7 @@ from a2tg_jax.training import History
 from a2tg_jax.training.checkpoint import TERM
 
 NAMES = tuple(History.empty().to_dict())
-"""Columns of each file; those of loss terms follow, such as loss_l1."""
+"""Columns of each file; loss terms follow, such as loss_l1."""
 INTEGERS = ("stage", "iteration", "num_gaussians")
 LARGEST = 1e15
 MOST_BYTES = 1 << 26

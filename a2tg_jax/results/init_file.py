@@ -1,4 +1,4 @@
-"""Splats from a file in place of the first stage of a run."""
+"""Splats from a file instead of the first stage of a run."""
 
 import dataclasses
 import warnings

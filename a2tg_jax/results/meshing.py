@@ -45,11 +45,11 @@ class MeshOptions:
     """Options of a mesh; lengths are in units of the original world."""
 
     resolution: int | None = None
-    """Voxels along the radius; None is that of `extract_mesh`."""
+    """Voxels along the radius; None: as in `extract_mesh`."""
     voxel: float | None = None
-    """Side of a voxel, in place of the resolution."""
+    """Side of a voxel, instead of the resolution."""
     radius: float | None = None
-    """Radius of the space; None is that of `extract_mesh`."""
+    """Radius of the space; None: as in `extract_mesh`."""
     unbounded: bool = False
     """Whether the space goes on beyond the radius."""
     clusters: int = MOST_CLUSTERS

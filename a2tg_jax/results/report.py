@@ -107,7 +107,7 @@ class RunResult:
 
     @property
     def gains(self) -> dict[str, float]:
-        """PSNR of the main model over that of each model it is compared with, in dB."""
+        """Gain in PSNR over each model that the main model is compared with, in dB."""
         psnr = self.models[self.main].shown.psnr
         return {name: psnr - self.models[name].shown.psnr for name in self.compared}
 

@@ -186,7 +186,7 @@ def _write_sheets(run: RunFolder, result: RunResult, models: Mapping[str, Model]
     """Write a sheet of photograph, renders and error for each view, and return some for the report. Memory holds the
     pictures of one view at a time."""
     views, names = scene.test or scene.train, [*(result.compared or result.before), result.main]
-    # The cameras are those of `evaluate`, so that nothing is compiled again.
+    # With the cameras of `evaluate`, nothing is compiled again.
     cameras = [view.camera for view in (*scene.test, *scene.train)]
     renderers = [
         Renderer(models[name], cameras=cameras, settings=settings_of(result.plan[name].system), has_geometry=False)

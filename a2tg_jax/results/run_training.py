@@ -95,7 +95,7 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     Raises:
       ValueError, OSError: if the run cannot be trained, naming the option, weights, folder, scene, disk or memory; if
         another process is at that folder; or as `train_run`.
-      Stopped: if the process is asked to end; its `advice` says how to continue.
+      Stopped: if a signal ends the training; its `advice` says how to continue.
     """
     record.check()
     check_weights(options.lpips_weights)
@@ -161,12 +161,12 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
         number = getattr(stop, "number", signals.CTRL_C)
         raise signals.Stopped(number, advice()) from None
     except Exception as error:
-        told = error_text(error, LESS_MEMORY)
-        if told is None:
+        text = error_text(error, LESS_MEMORY)
+        if text is None:
             raise
         if others is not None:
             others.told(error)
-        raise ValueError(f"{told}; {advice()}") from error
+        raise ValueError(f"{text}; {advice()}") from error
 
 
 def measure(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path | None = None) -> RunResult:
@@ -273,14 +273,14 @@ def _number_of_next_order(run: RunFolder, planned: PlannedStage, error: Diverged
     before, checkpoints = error.checkpoint, run.checkpoints(planned.name)
     path = run.own(run.diverged(planned.name, before.iteration))
     save_checkpoint(path, before)
-    told, count = f"{error}, in {path}", before.num_restored + 1
+    text, count = f"{error}, in {path}", before.num_restored + 1
     if on_nan == "stop":
-        raise ValueError(f"{told}; --on-nan restore continues with the views in another order") from error
+        raise ValueError(f"{text}; --on-nan restore continues with the views in another order") from error
     if count > MOST_RESTORED:
-        raise ValueError(f"{told}; the stage was restored {MOST_RESTORED} times already") from error
+        raise ValueError(f"{text}; the stage was restored {MOST_RESTORED} times already") from error
     back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"
     warnings.warn(
-        f"{told}; the stage restarts from {back} with the views in another order ({count} of {MOST_RESTORED} times)",
+        f"{text}; the stage restarts from {back} with the views in another order ({count} of {MOST_RESTORED} times)",
         stacklevel=4,
     )
     return count

@@ -79,7 +79,7 @@ def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> N
 
     Raises:
       ValueError: as `fit_stage` does.
-      Stopped: if one of the processes is asked to end.
+      Stopped: if a signal ends one of the processes.
     """
     check_alike(record, scene, session)
     plan = record.plan
