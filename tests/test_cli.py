@@ -29,7 +29,7 @@ from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.results import exporting, finishing, frames, run_training
+from a2tg_jax.results import finishing, frames, run_training, viewing
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.frames import LIST, FrameFolder
 from a2tg_jax.results.history import read_history
@@ -532,7 +532,7 @@ def test_export_and_what_view_would_serve(tiny_run, tmp_path, monkeypatch, capsy
     listed = json.loads((tmp_path / "site" / "photographs.json").read_text())
     assert listed and len(list((tmp_path / "site" / "photographs").glob("*.jpg"))) == len(listed)
     (tmp_path / "site" / "photographs" / "mine.jpg").touch()
-    monkeypatch.setattr(exporting, "losses_of", lambda source: {})
+    monkeypatch.setattr(viewing, "losses_of", lambda source: {})
     assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--overwrite"]) == 0
     assert [path.name for path in (tmp_path / "site" / "photographs").iterdir()] == ["mine.jpg"]
     routes = routes_of(open_source(run.path, "a2tg-gaussians"))

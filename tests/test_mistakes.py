@@ -114,7 +114,7 @@ MISTAKES = {
     "info": "RUN is missing: run folder",
     "info photo.png": "is not a run folder",
     "render done --frames -3": "number of frames must be at least 1",
-    "render done --fps 0": "frames per second must lie in 1..1000",
+    "render done --fps 0": "frames per second must be in 1..1000",
     "render done --path test --frames 9": "have no effect on --path test",
     "render done --path test --fps 9": "have no effect on --path test",
     "mesh done --texture-size 512": "--texture-size has no effect without a texture: add --texture renders or",

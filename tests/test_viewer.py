@@ -29,12 +29,12 @@ from a2tg_jax.io.compact import save_compact
 from a2tg_jax.io.model_file import save_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import decode_web_scene
-from a2tg_jax.results import exporting
-from a2tg_jax.results.exporting import export_web, loss_text, losses_of
+from a2tg_jax.results import viewing
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
-from a2tg_jax.results.viewing import ServedPhotographs, routes_of
+from a2tg_jax.results.report import loss_text
+from a2tg_jax.results.viewing import ServedPhotographs, export_web, losses_of, routes_of
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serve, served
@@ -341,7 +341,7 @@ def test_a_failed_export_leaves_the_photographs_of_the_old_page(tmp_path, monkey
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
-        patch.setattr(exporting, "replacing", full)
+        patch.setattr(viewing, "replacing", full)
         export_web(source, tmp_path, overwrite=True)
     assert old.is_file()
     export_web(source, tmp_path, overwrite=True)

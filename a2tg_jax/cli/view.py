@@ -12,9 +12,9 @@ from a2tg_jax.cli.arguments import LastModel
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.results.checks import check_apart, check_new, check_not_source, check_output
-from a2tg_jax.results.exporting import check_page, check_ply, export_ply, export_web
+from a2tg_jax.results.conversion import check_ply, export_ply
 from a2tg_jax.results.model_source import open_source
-from a2tg_jax.results.viewing import routes_of, shown_live
+from a2tg_jax.results.viewing import check_page, export_web, routes_of, shown_live
 from a2tg_jax.training.loop import Watch
 from a2tg_jax.web.server import LOOPBACK, serve
 

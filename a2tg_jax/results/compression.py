@@ -26,10 +26,9 @@ from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.results.checks import check_export, check_output
-from a2tg_jax.results.exporting import loss_text
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import open_source
-from a2tg_jax.results.report import aligned
+from a2tg_jax.results.report import aligned, loss_text
 from a2tg_jax.results.run_evaluation import refined_views
 from a2tg_jax.training import System
 

@@ -1,4 +1,4 @@
-"""Conversion of models between formats of files."""
+"""Conversion of models between formats of files, and export of their Gaussians as PLY."""
 
 import dataclasses
 import math
@@ -23,7 +23,7 @@ from a2tg_jax.io.formats import (
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
 from a2tg_jax.results.checks import check_new, check_output
-from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.model_source import Source, open_source
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,3 +124,22 @@ def cameras_apart(origin: Origin) -> tuple[list[Camera], list[Camera]]:
     training = [camera for camera, is_test in zip(origin.cameras, origin.is_test, strict=True) if not is_test]
     held_out = [camera for camera, is_test in zip(origin.cameras, origin.is_test, strict=True) if is_test]
     return (training, held_out) if training else (held_out, [])
+
+
+def check_ply(out: Path) -> None:
+    """Raise ValueError if `out` is a folder or has another suffix than ply."""
+    if out.is_dir() or out.suffix.lower() != ".ply":
+        raise ValueError(f"--ply must be the path of a file that ends in .ply; got {out}")
+
+
+def export_ply(source: Source, out: Path, *, float64: bool = False) -> str:
+    """Write the Gaussians of a model as programs for 3DGS read them, and return a summary, with what PLY does not keep.
+
+    `float64` is as in `save_ply`.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    save_ply(out, source.model, float64=float64)
+    lines = [f"file: {out}: {source.model.num:,} Gaussians"]
+    if lost := lost_by(source.model, ".ply"):  # --bake is an option of another command.
+        lines.append(f"not kept by this format: {', '.join(lost).replace('--bake', 'a2tg convert --bake')}")
+    return "\n".join(lines)

@@ -255,6 +255,11 @@ def megabytes(num_bytes: int) -> str:
     return f"{num_bytes / 1e6:.2f}"
 
 
+def loss_text(loss: float) -> str:
+    """Return a loss of PSNR in dB as "0.067 dB of PSNR lost", and a negative one as gained."""
+    return f"{abs(loss):.3f} dB of PSNR {'gained' if loss < 0 else 'lost'}"
+
+
 def minutes(seconds: float) -> str:
     """Return a duration as "1 h 2 min", "3 min 4 s" or "5 s"."""
     whole = round(seconds)
