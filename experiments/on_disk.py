@@ -15,7 +15,7 @@ from lab.measured import Figures, measured_once
 
 import a2tg_jax as a2tg
 from a2tg_jax.finish.compaction import LADDER, Trial, loss_on_views, measure_choices, smallest_within
-from a2tg_jax.io.coders import CODERS
+from a2tg_jax.io.columns import CODERS
 from a2tg_jax.io.compact import GROUPS, bytes_by_part, decode_model, encode_model
 from a2tg_jax.results.figures import save_figure
 

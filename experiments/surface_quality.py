@@ -21,7 +21,7 @@ from lab.tables import markdown
 from scipy.io import loadmat
 
 import a2tg_jax as a2tg
-from a2tg_jax.data.ply_points import read_ply_points
+from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.synthetic import exact_points
 from a2tg_jax.mesh.distance import thinned
 

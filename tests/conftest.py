@@ -8,7 +8,9 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("XLA_FLAGS", TEST_FLAGS)  # Command lines that tests start inherit them.
 
 import gc
+import importlib
 import pathlib
+import sys
 
 import jax
 import pytest
@@ -21,6 +23,7 @@ gc.freeze()
 gc.set_threshold(100_000, 50, 50)
 
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
+READERS = pathlib.Path(__file__).resolve().parents[1] / "docs" / "reference"
 
 
 def pytest_addoption(parser):
@@ -91,3 +94,16 @@ def kernels_of_the_compositor(request):
     """The kernels that a test's parameter `compositor` asks for."""
     if getattr(request.node, "callspec", None) and request.node.callspec.params.get("compositor") == "cuda":
         request.getfixturevalue("gpu_kernels")
+
+
+@pytest.fixture(scope="module")
+def reference():
+    """The reference reader and renderer; none of their modules is left behind."""
+    names = {path.stem for path in READERS.glob("*.py")}
+    sys.path.insert(0, str(READERS))
+    try:
+        yield importlib.import_module("read_model").read_model, importlib.import_module("draw").draw
+    finally:
+        sys.path.remove(str(READERS))
+        for name in names:
+            sys.modules.pop(name, None)

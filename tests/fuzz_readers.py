@@ -105,7 +105,7 @@ def _scene(folder: Path, file: Path) -> None:
 
 
 def _points(folder: Path, file: Path) -> None:
-    from a2tg_jax.data.ply_points import read_ply_points
+    from a2tg_jax.data.ply import read_ply_points
 
     cloud = read_ply_points(file)
     assert cloud.points.shape == cloud.colors.shape and cloud.points.shape[1:] == (3,)

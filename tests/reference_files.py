@@ -20,7 +20,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io.web_scene import decode_web_scene, encode_web_scene
+from a2tg_jax.io.web_scene import encode_web_scene, rounded_model
 from a2tg_jax.model import Model
 from a2tg_jax.texture import textures_from_arrays
 
@@ -67,9 +67,9 @@ def shaped_model() -> Model:
 
 
 def load(path: Path) -> Model:
-    """Read a file with this library."""
+    """Read a file with this library, which only writes scenes for browsers."""
     if path.suffix == ".a2tgw":
-        return decode_web_scene(path.read_bytes()).model
+        return rounded_model(shaped_model() if path.name in SHAPED else reference_model())
     return {".npz": load_model, ".a2tgz": load_compact, ".glb": load_gltf}[path.suffix](path)
 
 

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from run_folders import create_run
+from web_header import web_header
 
 from a2tg_jax.cli import doctor, main as cli
 from a2tg_jax.cli.train import train_defaults
@@ -28,7 +29,6 @@ from a2tg_jax.host import startup
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply
-from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.results import finishing, frames, run_training, viewing
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.frames import LIST, FrameFolder
@@ -536,7 +536,7 @@ def test_export_and_what_view_would_serve(tiny_run, tmp_path, monkeypatch, capsy
     assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--overwrite"]) == 0
     assert [path.name for path in (tmp_path / "site" / "photographs").iterdir()] == ["mine.jpg"]
     routes = routes_of(open_source(run.path, "a2tg-gaussians"))
-    assert decode_web_scene(routes["/scene.a2tgw"].read()).header["num_texels"] is None
+    assert web_header(routes["/scene.a2tgw"].read())["num_texels"] is None
     assert json.loads(routes["/photographs.json"].read()) == listed
 
 

@@ -30,10 +30,30 @@ from a2tg_jax.appearance.files import arrays_of
 from a2tg_jax.appearance.parts import bands_of_dense, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
 from a2tg_jax.core.origin import Origin
-from a2tg_jax.io import coders, compact, quantise
+from a2tg_jax.io import compact
+from a2tg_jax.io.columns import (
+    CODERS,
+    AxisSteps,
+    ColumnReader,
+    ColumnWriter,
+    Ends,
+    decode,
+    dequantised,
+    encode,
+    from_byte_planes,
+    from_morton,
+    from_planes,
+    green_apart,
+    morton,
+    quantised,
+    to_byte_planes,
+    to_planes,
+    with_green,
+    with_w,
+)
 from a2tg_jax.io.compact import GROUPS, HEAD, CompactChoices, decode_model, encode_model, load_compact, save_compact
+from a2tg_jax.io.model_rows import nearest_half_turn
 from a2tg_jax.io.ply import load_ply, save_ply
-from a2tg_jax.io.streams import ColumnReader, ColumnWriter
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderSettings
 from a2tg_jax.texture import textures_from_arrays
@@ -162,7 +182,7 @@ def test_what_comes_back_looks_the_same(name, choices):
     assert difference.mean() < (1e-4 if choices is EXACT else 0.003)
 
 
-@pytest.mark.parametrize("coder", ["smallest", *coders.CODERS])
+@pytest.mark.parametrize("coder", ["smallest", *CODERS])
 def test_coders_do_not_change_what_comes_back(coder):
     model = banded(0, textured(True))
     data = encode_model(model, CompactChoices(coder=coder))
@@ -197,7 +217,7 @@ def test_rotations_are_within_the_diagonal_of_a_step(bits):
     model = plain()
     found = decode_model(encode_model(model, EXACT.keeping({"quats": bits})))
     order = order_of(model, found)
-    quats, axis = quantise.nearest_half_turn(np.asarray(model.gaussians.quats)[order])
+    quats, axis = nearest_half_turn(np.asarray(model.gaussians.quats)[order])
     wanted, step = quats[:, 1:], np.ptp(quats[:, 1:]) / (2**bits - 2)
     # w follows from the others, which change it by three times as much at most: it is no smaller than they are.
     assert np.abs(np.asarray(found.gaussians.quats)[:, 1:] - wanted).max() <= 2 * step + 1e-6
@@ -212,7 +232,7 @@ def test_means_are_within_a_step_that_grows_with_the_distance(bits):
     order = writer.means("means", means, bits)
     found = ColumnReader(writer.body, writer.layout, 10**6).means("means", 400, bits)
     for axis, values in zip(means[:, order], found, strict=True):
-        contraction = quantise.Contraction.of(axis)
+        contraction = AxisSteps.of(axis, bits)
         step = np.ptp(contraction.contracted(axis)) / (2**bits - 2)
         # The derivative of sinh, at the end of half a step.
         slope = np.cosh(np.abs(contraction.contracted(axis)) + step / 2)
@@ -383,7 +403,7 @@ def test_every_changed_byte_is_noticed(tmp_path):
         refused(tmp_path, bytes(spoiled))
 
 
-@pytest.mark.parametrize("coder", coders.CODERS)
+@pytest.mark.parametrize("coder", CODERS)
 def test_changed_bytes_under_a_right_checksum_do_no_harm(coder):
     """A model of other numbers, or a ValueError; nothing else."""
     data = encode_model(banded(0, textured(True)), CompactChoices(coder=coder))
@@ -452,7 +472,7 @@ def sizes_of(*size):
         (header_with(lengths=[1, 2]), "damaged"),
         (header_with(coders={}), "damaged"),
         (header_with(coders__quats="pickle"), "the part quats is of the coder pickle, which is not known"),
-        (header_with(coders__quats=["lzma"]), "damaged"),
+        (header_with(coders__quats=["lzma"]), "not known"),
         (header_with(coders__means="none"), "the part means"),
         (header_with(ends__means=[0.0]), "the ends of means must be 12 numbers"),
         (header_with(ends__means=[1e30] * 12), "means|the part"),
@@ -510,14 +530,14 @@ def test_headers_that_are_no_headers_are_refused(tmp_path):
     )
 
 
-@pytest.mark.parametrize("coder", coders.CODERS)
+@pytest.mark.parametrize("coder", CODERS)
 def test_bombs_are_refused_before_they_unpack(coder):
     """Millions of zeros where 1000 bytes should be."""
-    bomb = coders.encode(coder, np.zeros((3, 10**6 if coder == "webp" else 10**7), np.uint8))
+    bomb = encode(coder, np.zeros((3, 10**6 if coder == "webp" else 10**7), np.uint8))
     tracemalloc.start()
     try:
-        with pytest.raises(coders.CodedError, match=coder if coder != "none" else "1000 were announced"):
-            coders.decode(coder, bomb, 1, 1000)
+        with pytest.raises(ValueError, match=coder if coder != "none" else "1000 were announced"):
+            decode(coder, bomb, 1, 1000)
         assert tracemalloc.get_traced_memory()[1] < 2e6
     finally:
         tracemalloc.stop()
@@ -527,7 +547,7 @@ def test_a_file_of_many_rows_and_few_bytes_is_refused(tmp_path):
     """Zeros code well: a small file of 20 million splats is what a bomb looks like."""
     header, _ = compact._unframed(encode_model(plain(1), CompactChoices(coder="zstd")))
     num = 10**7
-    means = coders.encode("zstd", np.zeros((6, num), np.uint8))
+    means = encode("zstd", np.zeros((6, num), np.uint8))
     header |= {"num": num, "lengths": {"means": len(means)}, "coders": {"means": "zstd"}}
     refused(tmp_path, sealed(header, means), "too small")
 
@@ -539,22 +559,20 @@ def test_a_file_of_many_rows_and_few_bytes_is_refused(tmp_path):
 def test_laws_of_quantisation(bits):
     rng = np.random.default_rng(bits)
     codes = rng.integers(0, 1 << bits, (3, 100))
-    np.testing.assert_array_equal(quantise.from_planes(quantise.to_planes(codes, bits), 3), codes)
-    np.testing.assert_array_equal(quantise.with_green(quantise.green_apart(codes, bits), bits), codes)
-    np.testing.assert_array_equal(quantise.from_morton(quantise.morton(codes, bits), bits), codes)
-    ends = quantise.Ends(-2.0, 3.0)
-    np.testing.assert_array_equal(quantise.quantised(quantise.dequantised(codes, ends, bits), ends, bits), codes)
-    turned, _ = quantise.nearest_half_turn(rng.normal(size=(100, 4)))
-    np.testing.assert_allclose(quantise.with_w(turned[:, 1:].T), turned, atol=1e-12)
+    np.testing.assert_array_equal(from_planes(to_planes(codes, bits), 3), codes)
+    np.testing.assert_array_equal(with_green(green_apart(codes, bits), bits), codes)
+    np.testing.assert_array_equal(from_morton(morton(codes, bits), bits), codes)
+    ends = Ends(-2.0, 3.0)
+    np.testing.assert_array_equal(quantised(dequantised(codes, ends, bits), ends, bits), codes)
+    turned, _ = nearest_half_turn(rng.normal(size=(100, 4)))
+    np.testing.assert_allclose(with_w(turned[:, 1:].T), turned, atol=1e-12)
     assert np.all(turned[:, 0] >= np.abs(turned).max(axis=1) - 1e-12)
 
 
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "i4"])
 def test_bytes_of_numbers_come_back(dtype):
     values = np.random.default_rng(0).normal(size=(3, 20)).astype(dtype)
-    np.testing.assert_array_equal(
-        quantise.from_byte_planes(quantise.to_byte_planes(values), 3, np.dtype(dtype)), values
-    )
+    np.testing.assert_array_equal(from_byte_planes(to_byte_planes(values), 3, np.dtype(dtype)), values)
 
 
 def test_a_reader_reads_all_or_nothing():

@@ -33,7 +33,7 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
-from a2tg_jax.io.gaussforge_files import SUFFIXES
+from a2tg_jax.io.gaussforge_files import KINDS
 from a2tg_jax.io.model_file import number_in_file
 from a2tg_jax.results import init_file, run_training
 from a2tg_jax.results.folder import RunFolder
@@ -42,7 +42,7 @@ from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.results.run_training import RunOptions, begin_run
 
-OTHERS = [".ply", ".ksplat", *SUFFIXES]
+OTHERS = [".ply", ".ksplat", *(f".{kind}" for kind in KINDS)]
 TEXTURES = "textures (--bake turns them into plain splats)"
 CUT = "colours of 1 Gaussian beyond the format's range (cut)"
 RNG = np.random.default_rng(0)
@@ -160,7 +160,7 @@ def test_cut_colours_and_scales_are_counted(tmp_path, suffix, num):
     assert (told in lost) == (suffix == ".spz") == bool(np.abs(found.log_scales - g.log_scales).max() > 0.4)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", [f".{kind}" for kind in KINDS])
 def test_a_file_without_gaussians_is_refused(tmp_path, suffix):
     with pytest.raises(ValueError, match="has no Gaussians"):
         save_splats(tmp_path / f"a{suffix}", Model(some_gaussians(3)[:0]))

@@ -19,11 +19,10 @@ from a2tg_jax.appearance import Exponents, MovableKernels, TextureOptions, alloc
 from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io import gltf, gltf_textures
-from a2tg_jax.io.exchange import joined_parts, matrix_of, upright
-from a2tg_jax.io.gltf import load_gltf, save_gltf
-from a2tg_jax.io.gltf_reader import Document
-from a2tg_jax.io.gltf_textures import EXTENSION
+from a2tg_jax.io import gltf
+from a2tg_jax.io.gltf import EXTENSION, load_gltf, save_gltf
+from a2tg_jax.io.gltf_container import Document
+from a2tg_jax.io.other_programs import joined_parts, matrix_of, upright
 from a2tg_jax.model import Model
 
 SPLATS = "KHR_gaussian_splatting"
@@ -298,7 +297,7 @@ def test_the_extension_counts_more_than_the_extras(tmp_path, saved, changes, is_
 
 @pytest.mark.parametrize("wrong", [np.full(50, np.nan), np.full(50, 4.0), np.zeros(49)])
 def test_shapes_out_of_range_or_of_another_length_are_refused(tmp_path, monkeypatch, wrong):
-    monkeypatch.setattr(gltf_textures, "log_exponents_of", lambda shapes: wrong)
+    monkeypatch.setattr(gltf, "log_exponents_of", lambda shapes: wrong)
     save_gltf(tmp_path / "m.glb", shaped(plain(1)))
     refused(tmp_path / "m.glb", "shapes must be finite|kernels must be within|shapes must be 50 numbers; got 49")
 
@@ -459,9 +458,9 @@ def test_no_more_numbers_than_the_file_can_hold(tmp_path, saved, monkeypatch):
     document, num_read = Document(path), 0
     with pytest.raises(ValueError, match="means would take 600 bytes, which the file is too small for"):
         while num_read < 100 * path.stat().st_size:
-            num_read += document.numbers(0, ("VEC3",), "means").nbytes
+            num_read += document.numbers(0, "VEC3", "means").nbytes
     assert num_read > 2**20
-    monkeypatch.setattr(gltf, "MOST_PRIMITIVES", 2)
+    monkeypatch.setattr(gltf, "MOST_PARTS", 2)
     described["meshes"][0]["primitives"] *= 3
     write_parts(path, described, saved[1])
     refused(path, "holds more than 2 sets of splats")
@@ -498,7 +497,7 @@ def test_the_schema_knows_what_is_written(saved):
     """All properties, those of the library's options with its choices and defaults."""
     schema = json.loads((Path(__file__).parents[1] / "docs/reference/A2TG_splat_textures.schema.json").read_text())
     hints = typing.get_type_hints(TextureOptions)
-    for name, field in gltf_textures.OPTIONS.items():
+    for name, field in gltf.OPTIONS.items():
         described = schema["properties"][name]
         assert described["default"] == getattr(TextureOptions(), field)
         assert name == "maxAlpha" or tuple(described["enum"]) == typing.get_args(hints[field])

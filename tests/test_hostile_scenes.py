@@ -24,7 +24,7 @@ from test_data_transforms import (
 from a2tg_jax.data import load_scene
 from a2tg_jax.data.colmap_files import KINDS, read_binary, read_text
 from a2tg_jax.data.lenses import checked_lens
-from a2tg_jax.data.ply_points import read_ply_points
+from a2tg_jax.data.ply import read_ply_points
 
 
 def refused(path, match, error=ValueError):

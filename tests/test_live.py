@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 from test_compact import plain, textured
+from web_header import web_header
 
 from a2tg_jax import A2tg, fit, synthetic_scene
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Billboards, allocate_appearance
-from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.model import Model
 from a2tg_jax.results.run_training import unseen
@@ -73,8 +73,8 @@ def test_snapshots_and_figures():
     assert live.routes["/scene.a2tgw"].read() is None and status(live)["version"] == 0
     assert live(run, never) == 0
     encoded(live)
-    scene = decode_web_scene(live.routes["/scene.a2tgw"].read())
-    assert scene.header["title"] == "scene" and scene.model.num == run.state.model.num
+    scene = web_header(live.routes["/scene.a2tgw"].read())
+    assert scene["title"] == "scene" and scene["num"] == run.state.model.num
     found = status(live)
     assert (found["version"], found["stage"], found["iteration"], found["psnr"]) == (1, "textures", 20, 17.0)
     assert found["bytes"] == 1.25e6 and not found["is_paused"]

@@ -16,8 +16,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.data.ply_points import read_ply_points
-from a2tg_jax.io.gaussforge_files import SUFFIXES
+from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.results.init_file import write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource
 
@@ -91,7 +90,7 @@ def positions_in(data: bytes, suffix: str, num: int) -> np.ndarray:
         rows = np.frombuffer(data[5120:], np.uint8).reshape(num, -1)
         return np.ascontiguousarray(rows[:, :12]).view("<f4")
     gaussforge = pytest.importorskip("gaussforge")
-    read = gaussforge.GaussForge().read(data, SUFFIXES[suffix])["data"]
+    read = gaussforge.GaussForge().read(data, suffix.removeprefix("."))["data"]
     return np.frombuffer(read["positions"], "<f4").reshape(-1, 3)
 
 

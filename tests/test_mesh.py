@@ -12,7 +12,7 @@ import surface_quality
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_points
-from a2tg_jax.io.exchange import upright_from
+from a2tg_jax.io.other_programs import upright_from
 from a2tg_jax.mesh import distance
 from a2tg_jax.mesh.blocks import BlockGrid, unique_blocks
 from a2tg_jax.mesh.depth_maps import RenderedDepth

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from a2tg_jax.core.gaussians import SH_C0
-from a2tg_jax.io.ply import load_ply
-from a2tg_jax.io.ply_packed import read_packed
+from a2tg_jax.data.ply import PlyFile
+from a2tg_jax.io.ply import load_ply, unpacked_vertices
 
 NUM = 300
 """More than a chunk, and no whole number of them."""
@@ -89,7 +89,7 @@ def packed_rotations(quats: np.ndarray) -> np.ndarray:
 
 def read(path) -> np.ndarray:
     with open(path, "rb") as file:
-        return read_packed(file, path)
+        return unpacked_vertices(PlyFile(file, path))
 
 
 def columns(vertices: np.ndarray, pattern: str, num: int) -> np.ndarray:
@@ -149,7 +149,7 @@ def test_opacities_of_nothing_and_all_are_finite(tmp_path):
         ({"float min_x": "float other_x"}, "has no attribute min_x"),
         ({"uint packed_scale": "float packed_scale"}, "must be uint"),
         ({"uchar f_rest_3": "ushort f_rest_3"}, "sh must be uchar"),
-        ({"uint packed_color": "list uchar int packed_color"}, "cannot read the property"),
+        ({"uint packed_color": "list uchar int packed_color"}, "cannot read the vertex property"),
         ({"binary_little_endian": "binary_big_endian"}, "binary_little_endian is expected"),
         ({"binary_little_endian": "middle"}, "is a PLY in middle"),
     ],

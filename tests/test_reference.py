@@ -1,7 +1,6 @@
 """The published formats: readers without this library find in the kept files what it finds, and checksums hold."""
 
 import dataclasses
-import importlib
 import json
 import subprocess
 import sys
@@ -17,19 +16,6 @@ from a2tg_jax.io.web_scene import encode_web_scene
 
 DATA = Path(__file__).parent / "data"
 READER = Path(__file__).parents[1] / "docs" / "reference" / "read_model.py"
-
-
-@pytest.fixture(scope="module")
-def reference():
-    """The reference reader and renderer; none of their modules is left behind."""
-    names = {path.stem for path in READER.parent.glob("*.py")}
-    sys.path.insert(0, str(READER.parent))
-    try:
-        yield importlib.import_module("read_model").read_model, importlib.import_module("draw").draw
-    finally:
-        sys.path.remove(str(READER.parent))
-        for name in names:
-            sys.modules.pop(name, None)
 
 
 def test_checksums_hold():

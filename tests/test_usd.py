@@ -10,7 +10,7 @@ from test_compact import MODELS, plain, textured
 from test_gltf import assert_shows_the_same
 
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io.exchange import joined_parts, upright
+from a2tg_jax.io.other_programs import joined_parts, upright
 from a2tg_jax.io.usd import load_usd, save_usd
 from a2tg_jax.model import Model
 

@@ -19,6 +19,7 @@ from PIL import Image
 from run_folders import create_run
 from small_values import some_gaussians
 from test_compact import textured
+from web_header import web_header
 
 from a2tg_jax.appearance import parts
 from a2tg_jax.cli.main import main
@@ -28,7 +29,6 @@ from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.compact import save_compact
 from a2tg_jax.io.model_file import save_model
 from a2tg_jax.io.ply import save_ply
-from a2tg_jax.io.web_scene import decode_web_scene
 from a2tg_jax.results import viewing
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import Source, open_source
@@ -269,7 +269,7 @@ def test_models_compact_scenes_and_point_clouds_are_opened(tmp_path):
     for name, num in (("a.npz", model.num), ("b.a2tgz", model.num), ("c.ply", some_gaussians().num)):
         source = open_source(tmp_path / name)
         assert source.model.num == num and source.title == name[0] and not source.note
-        assert decode_web_scene(source.encoded).header["title"] == name[0]
+        assert web_header(source.encoded)["title"] == name[0]
 
 
 def test_3d_gaussians_are_said_to_be_shown_flat(tmp_path):
@@ -284,7 +284,7 @@ def test_3d_gaussians_are_said_to_be_shown_flat(tmp_path):
     with pytest.warns(UserWarning, match="thinnest axis is dropped"):
         source = open_source(path)
     assert "3D Gaussians" in source.note and str(path) not in source.note
-    assert decode_web_scene(source.encoded).header["note"] == source.note
+    assert web_header(source.encoded)["note"] == source.note
 
 
 @pytest.mark.parametrize("name", ["nowhere.npz", "nowhere.a2tgz", "nowhere.ply", "nowhere"])
@@ -315,7 +315,7 @@ def test_a_folder_and_a_single_file(tmp_path):
     assert page.read_text(encoding="utf-8") == viewer_html()
     scene = (tmp_path / "site" / "scene.a2tgw").read_bytes()
     assert f"whose scene takes {in_bytes(len(scene))}, " in text and "dB of PSNR lost, were it a model of 30 dB" in text
-    assert decode_web_scene(scene).model.num == source.model.num
+    assert web_header(scene)["num"] == source.model.num
     total = sum(file.stat().st_size for file in page.parent.iterdir())
     assert text.endswith(f"{page}: {in_bytes(total)} with 2 files beside it")
     assert (tmp_path / "site" / "photographs.json").read_bytes() == b"[]"

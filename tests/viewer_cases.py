@@ -19,7 +19,7 @@ from a2tg_jax.appearance.parts import bands_of_dense
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
-from a2tg_jax.io.web_scene import decode_web_scene
+from a2tg_jax.io.web_scene import rounded_model
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderOutput
 from a2tg_jax.renderer import Renderer
@@ -58,14 +58,14 @@ def shaped_model() -> Model:
 
 def write_small(folder: Path) -> None:
     """A scene's file, and what is in it."""
-    data = Source(small_model(), "small", "a note").encoded
-    (folder / "small.a2tgw").write_bytes(data)
-    (folder / "small.json").write_text(json.dumps(small_numbers(data)) + "\n")
+    source = Source(small_model(), "small", "a note")
+    (folder / "small.a2tgw").write_bytes(source.encoded)
+    (folder / "small.json").write_text(json.dumps(small_numbers(source.model)) + "\n")
 
 
-def small_numbers(data: bytes) -> dict[str, list]:
+def small_numbers(model: Model) -> dict[str, list]:
     """What a reader must find in the file, rounded, by row."""
-    model = decode_web_scene(data).model
+    model = rounded_model(model)
     found = {
         "means": model.gaussians.means,
         "log_scales": model.gaussians.log_scales,
@@ -91,7 +91,7 @@ def write_case(
     folder.mkdir(parents=True)
     (folder / "scene.a2tgw").write_bytes(source.encoded)
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
-    models = {"the model": source.model, "the file": decode_web_scene(source.encoded).model}
+    models = {"the model": source.model, "the file": rounded_model(source.model)}
     views = []
     for name in of:
         for mode in modes:

@@ -25,7 +25,7 @@ from a2tg_jax.data.lenses import checked_lens
 from a2tg_jax.data.masks import FOLDER, find_mask, mask_to_read
 from a2tg_jax.data.observations import before_camera, observed_points
 from a2tg_jax.data.photo_reading import Options, Photo, check_masks, read_photos
-from a2tg_jax.data.ply_points import read_ply_points
+from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
 from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
 from a2tg_jax.host.text import counted

@@ -20,7 +20,7 @@ import numpy as np
 from a2tg_jax.data.assembly import PointCloud, rigid_viewmat
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, inside, named_image, warn_of_unposed
-from a2tg_jax.data.ply_points import read_ply_points
+from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.transforms import Frames, check_images
 from a2tg_jax.host.json_text import MOST_BYTES
 from a2tg_jax.host.regular_files import is_regular, open_regular, read_regular

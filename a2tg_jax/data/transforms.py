@@ -27,7 +27,7 @@ from a2tg_jax.data.image_files import SmallerCopies, find_copies, inside, locate
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.masks import Mask, find_mask, mask_to_read
 from a2tg_jax.data.photo_reading import Options, Photo, check_masks, read_photos
-from a2tg_jax.data.ply_points import read_ply_points
+from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.regular_files import is_regular, read_regular

@@ -27,7 +27,7 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.finish.distilling import distill, likeness, pictures
 from a2tg_jax.finish.shrinking import texel_weights_of
 from a2tg_jax.finish.texel_choice import Tables, fewest_texels
-from a2tg_jax.io.ply import plain_gaussians
+from a2tg_jax.io.other_programs import plain_gaussians
 from a2tg_jax.model import Model
 
 MOST_GROWTH = 2.0

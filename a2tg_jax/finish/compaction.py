@@ -17,8 +17,8 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Color
 from a2tg_jax.data import View, view_image
 from a2tg_jax.data.scene import check_are_views
+from a2tg_jax.io.columns import Precision
 from a2tg_jax.io.compact import CompactChoices, decode_model, encode_model
-from a2tg_jax.io.quantise import Precision
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer

@@ -22,7 +22,8 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import Change, Now, StepEvent
-from a2tg_jax.io.compact import LEAST_OPACITY, CompactChoices, Grids
+from a2tg_jax.io.columns import LEAST_OPACITY
+from a2tg_jax.io.compact import CompactChoices, Grids
 from a2tg_jax.model import Model
 
 LAST_ROUNDED = 0.95
@@ -53,7 +54,7 @@ class Steps(NamedTuple):
 
 
 class ContractedSteps(NamedTuple):
-    """Even steps of asinh((x − centre) / spread), for an axis of the means (`io.quantise.Contraction`)."""
+    """Even steps of asinh((x − centre) / spread), for an axis of the means (`io.columns.AxisSteps`)."""
 
     centre: Any
     spread: Any
@@ -159,7 +160,7 @@ def _xyz(quats: Array) -> Array:
 
 
 def _with_w(xyz: Array) -> Array:
-    """Return unit quaternions [N, 4] from their last three numbers (`io.quantise.with_w`)."""
+    """Return unit quaternions [N, 4] from their last three numbers (`io.columns.with_w`)."""
     w = jnp.sqrt(jnp.maximum(1 - jnp.sum(xyz**2, axis=1, keepdims=True), 0))
     return normalize(jnp.concatenate([w, xyz], axis=1))
 

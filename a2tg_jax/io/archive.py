@@ -5,7 +5,7 @@ The entry "header" holds the JSON text as bytes; its "format" and "version" say 
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ def write_archive(
       path: the file, by custom *.npz.
       header: JSON-able values; "format" and "version" are added.
       arrays: named arrays of plain dtypes; the name "header" is taken.
-      format: what kind of archive this is; `read_archive` wants the same.
+      format: what kind of archive this is; `read_archive` expects the same.
     """
     text = json.dumps({**header, "format": format, "version": VERSION}, allow_nan=False)
     entries = {HEADER: np.frombuffer(text.encode(), np.uint8), **{name: np.asarray(a) for name, a in arrays.items()}}
@@ -39,61 +39,41 @@ def write_archive(
         np.savez(file, **entries)  # type: ignore[arg-type]
 
 
-def read_archive(path: str | os.PathLike[str], *, format: str = FORMAT) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the header and the arrays that `write_archive` was given.
+def read_archive(
+    path: str | os.PathLike[str], *, format: str = FORMAT, names: Collection[str] | None = None
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return the header and the arrays that `write_archive` was given, all or those of some names.
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is not such an archive, is damaged, or is of another version.
+      ValueError: if it is not such an archive, is damaged, lacks one of the names, or is of another version.
     """
-    header = read_archive_header(path, format=format)
-    return header, _read_entries(Path(path), format, lambda name: name != HEADER)
-
-
-def read_archive_array(path: str | os.PathLike[str], name: str, *, format: str = FORMAT) -> np.ndarray:
-    """Return one array, without reading the others. Raises as `read_archive` does."""
-    read_archive_header(path, format=format)
-    entries = _read_entries(Path(path), format, lambda found: found == name)
-    if name not in entries:
-        raise _damaged(Path(path), format, f"it has no {name}")
-    return entries[name]
-
-
-def read_archive_header(path: str | os.PathLike[str], *, format: str = FORMAT) -> dict[str, Any]:
-    """Return the header alone, without reading the arrays. Raises as `read_archive` does."""
     path = Path(path)
-    entries = _read_entries(path, format, lambda name: name == HEADER)
-    if HEADER not in entries:
-        raise _damaged(path, format, "it has no header")
-    try:
-        header = parse_json(entries[HEADER].tobytes())
-    except ValueError as error:
-        raise _damaged(path, format, f"its header: {error}") from error
-    if not isinstance(header, dict):
-        raise _damaged(path, format, "its header is no JSON object")
-    found, version = header.get("format"), header.get("version")
-    if found != format:
-        raise ValueError(f"{path}: is an {shortened(found)}, not an {format}")
-    if version != VERSION:
-        raise ValueError(
-            f"{path}: is an {format} of version {shortened(version)}; this program reads version {VERSION}, "
-            "so use the version of a2tg-jax that wrote it"
-        )
-    return header
-
-
-def _read_entries(path: Path, format: str, is_wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
-    """Return the wanted arrays of an .npz; whatever is wrong with the file becomes one ValueError."""
     if is_folder(path):
         found = sorted(path.glob("models/*.npz"))
         raise ValueError(f"{path}: is a folder; name a file{f', such as {found[0]}' if found else ''}")
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such {format}")
     try:
-        return read_npz(path, is_wanted)
+        arrays = read_npz(path, lambda name: name == HEADER or names is None or name in names)
+        if missing := [name for name in (HEADER, *(names or ())) if name not in arrays]:
+            raise ValueError(f"it has no {missing[0]}")
+        header = parse_json(arrays.pop(HEADER).tobytes())
+        if not isinstance(header, dict):
+            raise ValueError("its header is no JSON object")
     except ValueError as error:
-        raise _damaged(path, format, str(error).removeprefix(f"{path}: ")) from error
+        reason = str(error).removeprefix(f"{path}: ")
+        raise ValueError(f"{path}: is not an {format}, or is damaged ({reason}); copy or write it again") from error
+    if header.get("format") != format:
+        raise ValueError(f"{path}: is an {shortened(header.get('format'))}, not an {format}")
+    if header.get("version") != VERSION:
+        raise ValueError(
+            f"{path}: is an {format} of version {shortened(header.get('version'))}; this program reads version "
+            f"{VERSION}, so use the version of a2tg-jax that wrote it"
+        )
+    return header, arrays
 
 
-def _damaged(path: Path, format: str, reason: str) -> ValueError:
-    return ValueError(f"{path}: is not an {format}, or is damaged ({reason}); copy or write it again")
+def read_archive_header(path: str | os.PathLike[str], *, format: str = FORMAT) -> dict[str, Any]:
+    """Return the header, without reading the arrays. Raises as `read_archive` does."""
+    return read_archive(path, format=format, names=())[0]

@@ -5,7 +5,8 @@ length; the model shows the same up to rounding.
 
 Files for browsers (`io.web_scene`, *.a2tgw) are another format. This one is smaller: it sorts rows by place, codes each
 group of numbers as a whole with LZMA, zstd or WebP, and restores the model with its appearance, origin and float64
-cameras. It must be read to its end before anything can be drawn, and browsers have no decoder for LZMA.
+cameras. It must be read to its end before anything can be drawn, and browsers have no decoder for LZMA. Both share the
+steps and planes of `io.columns` and the tables of `io.model_rows`.
 """
 
 import dataclasses
@@ -22,12 +23,23 @@ import numpy as np
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import check_gaussians
-from a2tg_jax.core.origin import Origin
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.coders import Choice, decode, encode
+from a2tg_jax.io.columns import (
+    Choice,
+    ColumnReader,
+    ColumnWriter,
+    Precision,
+    check_precision,
+    decode,
+    encode,
+    logits_of,
+    opacities_of,
+    room_of,
+    with_w,
+)
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.io.model_file import (
     LONGEST_REASON,
@@ -36,14 +48,11 @@ from a2tg_jax.io.model_file import (
     background_of,
     origin_arrays,
     origin_of,
-    origin_to_dict,
+    origin_shapes,
 )
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, ordered, rows_of_model
-from a2tg_jax.io.quantise import Precision, check_precision, with_w
-from a2tg_jax.io.streams import ColumnReader, ColumnWriter, Layout
-from a2tg_jax.io.suffixes import check_saved, check_suffix
-from a2tg_jax.io.validate import check_model
-from a2tg_jax.model import Model
+from a2tg_jax.io.validate import check_model, check_suffix
+from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.texture import MAX_SIDE
 
 MAGIC = b"a2tgz\r\n\x1a"
@@ -52,10 +61,6 @@ VERSION, SHAPED_VERSION = 1, 2
 HEAD = struct.Struct("<8sHIII")
 """Magic, version, bytes of the header as coded and as text, checksum of all that follows."""
 MOST_BYTES = 1 << 32
-LARGEST_RATIO = 64
-FREE_ROOM = 1 << 20
-"""Bytes a file may unpack to beyond `LARGEST_RATIO` times its own size."""
-LEAST_OPACITY = 1e-7
 ORIGIN_DTYPES = {
     "viewmats": "f8", "Ks": "f8", "sizes": "i4", "is_test": "u1", "scale": "f8", "rotation": "f8", "translation": "f8",
 }  # fmt: skip
@@ -110,8 +115,6 @@ Grids = Mapping[str, tuple[float, ...]]
 """First and last step of each group kept in bits, by the name of its part of the file; for each axis of the means,
 centre and spread come first."""
 GROUPS = tuple(field.name for field in dataclasses.fields(CompactChoices) if field.name != "coder")
-
-
 DEFAULT_CHOICES = CompactChoices()
 
 
@@ -135,7 +138,8 @@ def save_compact(
       ValueError: if the model shows anything else, has a number that is not finite or too large, or a
         choice cannot be.
     """
-    check_saved(path, model, "save_compact")
+    check_suffix(path, "save_compact")
+    check_is_model(model)
     data = encode_model(model, choices, grids)
     with replacing(path) as temporary:
         temporary.write_bytes(data)
@@ -168,7 +172,7 @@ def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES, grids:
     check_encodable(model.appearance)
     data, num_unpacked = _encoded(model.live, choices, grids)
     check_model(model)
-    if num_unpacked > _room(data):  # So alike are its numbers that the file would be taken for a bomb.
+    if num_unpacked > room_of(len(data)):  # So alike are its numbers that the file would be taken for a bomb.
         data, _ = _encoded(model.live, dataclasses.replace(choices, coder="none"), grids)
     return data
 
@@ -211,8 +215,8 @@ def _encoded(model: Model, choices: CompactChoices, grids: Grids | None) -> tupl
     rows = ordered(rows, writer.means("means", rows.means.T, choices.means), turns=grids is None)
     writer.numbers("log_scales", rows.log_scales.T, choices.log_scales)
     writer.numbers("quats", rows.quats[:, 1:].T, choices.quats)
-    is_bits = isinstance(choices.opacities, int)
-    writer.numbers("opacities", _opacities(rows.logit_opacities, is_bits)[None], choices.opacities)
+    opacities = opacities_of(rows.logit_opacities) if isinstance(choices.opacities, int) else rows.logit_opacities
+    writer.numbers("opacities", opacities[None], choices.opacities)
     degrees = np.unique(rows.degrees)
     writer.indices("degrees", np.searchsorted(degrees, rows.degrees), len(degrees))
     for degree, band in enumerate(rows.bands):
@@ -238,12 +242,11 @@ def _encoded(model: Model, choices: CompactChoices, grids: Grids | None) -> tupl
         writer.numbers("shapes", (log_exponents_of(rows.shapes) if is_bits else rows.shapes)[None], choices.shapes)
     header["background"] = list(model.background)
     if model.origin is not None:
-        header["origin"] = origin_to_dict(model.origin)
+        header["origin"] = {"names": list(model.origin.names)}
         for name, array in origin_arrays(model.origin).items():
             writer.exact(f"origin_{name}", np.asarray(array, ORIGIN_DTYPES[name]))
-    header |= dataclasses.asdict(writer.layout)
     version = VERSION if rows.shapes is None else SHAPED_VERSION
-    return _framed(header, writer.body, version), writer.num_unpacked
+    return _framed(header | writer.layout, writer.body, version), writer.num_unpacked
 
 
 def _framed(header: Mapping[str, Any], body: bytes, version: int = VERSION) -> bytes:
@@ -253,21 +256,22 @@ def _framed(header: Mapping[str, Any], body: bytes, version: int = VERSION) -> b
     return HEAD.pack(MAGIC, version, len(coded), len(text), zlib.crc32(rest)) + rest
 
 
-def _opacities(logits: np.ndarray, is_bits: bool) -> np.ndarray:
-    return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80))) if is_bits else logits
-
-
 # From bytes to a model
 
 
 def _decoded(data: bytes) -> Model:
     header, body = _unframed(data)
     choices = config_from_dict(CompactChoices, header["choices"], "choices").check()
-    appearance = appearance_from_dict(header["appearance"], ())
+    appearance = appearance_from_dict(header["appearance"])
     check_encodable(appearance)
-    reader = ColumnReader(body, Layout(header["lengths"], header["coders"], header["ends"]), _room(data))
+    reader = ColumnReader(body, header, room_of(len(data)))
     rows = _rows_of(reader, header, choices, appearance)
-    origin = _origin_of(reader, header["origin"]) if "origin" in header else None
+    origin = None
+    if "origin" in header:
+        shapes = origin_shapes(len(header["origin"]["names"]))
+        arrays = {name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()}
+        arrays |= {"sizes": arrays["sizes"].astype(np.int64), "is_test": arrays["is_test"].astype(bool)}
+        origin = origin_of(header["origin"], arrays)
     reader.end()
     return model_of(rows, header["base_degree"], appearance, origin, background_of(header))
 
@@ -283,17 +287,12 @@ def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
     rest = data[HEAD.size :]
     if zlib.crc32(rest) != checksum:
         raise ValueError("is damaged or cut off")
-    if num_coded > len(rest) or num_text > _room(data):
+    if num_coded > len(rest) or num_text > room_of(len(data)):
         raise ValueError(f"announces a header of {num_coded} bytes, {num_text} unpacked")
     header = parse_json(decode("zstd", rest[:num_coded], 1, num_text).tobytes())
     if not isinstance(header, dict):
         raise ValueError("has no header")
     return header, rest[num_coded:]
-
-
-def _room(data: bytes) -> int:
-    """Return how many bytes a file may unpack to."""
-    return FREE_ROOM + LARGEST_RATIO * len(data)
 
 
 def _rows_of(reader: ColumnReader, header: Mapping[str, Any], choices: CompactChoices, appearance: Appearance) -> Rows:
@@ -322,18 +321,8 @@ def _rows_of(reader: ColumnReader, header: Mapping[str, Any], choices: CompactCh
     if appearance.exponents is not None:
         shapes = reader.numbers("shapes", 1, num, choices.shapes)[0]
         shapes = shapes_of(shapes) if isinstance(choices.shapes, int) else shapes
-    logits = _logits(opacities) if isinstance(choices.opacities, int) else opacities
+    logits = logits_of(opacities) if isinstance(choices.opacities, int) else opacities
     return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)
-
-
-def _origin_of(reader: ColumnReader, data: Mapping[str, Any]) -> Origin:
-    """Return the origin that the file holds."""
-    num = len(data["names"])
-    shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
-    shapes |= {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
-    arrays = {name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()}
-    arrays |= {"sizes": arrays["sizes"].astype(np.int64), "is_test": arrays["is_test"].astype(bool)}
-    return origin_of(data, arrays)
 
 
 def _textures_of(reader: ColumnReader, table: Any, num: int, choices: CompactChoices) -> tuple[np.ndarray, np.ndarray]:
@@ -346,8 +335,3 @@ def _textures_of(reader: ColumnReader, table: Any, num: int, choices: CompactCho
     count = int(sizes.prod(axis=1).sum())
     colors = reader.numbers("texel_colors", 3, count, choices.texels, is_color=True)
     return sizes, np.concatenate([colors, reader.numbers("texel_alphas", 1, count, choices.texels)]).T
-
-
-def _logits(opacities: np.ndarray) -> np.ndarray:
-    inside = np.clip(opacities.astype(np.float64), LEAST_OPACITY, 1 - LEAST_OPACITY)
-    return np.log(inside) - np.log1p(-inside)

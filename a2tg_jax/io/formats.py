@@ -1,22 +1,22 @@
 """Formats of files of splats: by suffix how each is read and written, and what it keeps."""
 
 import dataclasses
-import importlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gaussforge_files import import_gaussforge, load_by_gaussforge, save_by_gaussforge
-from a2tg_jax.io.gltf_reader import buffer_files
+from a2tg_jax.io.gltf import load_gltf, save_gltf
+from a2tg_jax.io.gltf_container import buffer_files
 from a2tg_jax.io.ksplat import load_ksplat, save_ksplat
 from a2tg_jax.io.model_file import load_model, save_model
-from a2tg_jax.io.number_ranges import RANGES, cut_numbers
-from a2tg_jax.io.ply import load_ply_model, save_ply, world_gaussians
+from a2tg_jax.io.other_programs import cut_numbers
+from a2tg_jax.io.ply import load_ply_model, save_ply
 from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians
+from a2tg_jax.io.usd import import_usd, load_usd, save_usd
 from a2tg_jax.model import Model
 
 LEARNED = {
@@ -25,21 +25,18 @@ LEARNED = {
     "pose": "learned motions of cameras",
 }
 """Corrections of photographs in words, by name."""
-BAKES = "(--bake turns them into plain splats)"
-"""Remedy for what plain splats do not keep."""
-Reader = Callable[[Path], Model | Gaussians]
 Writer = Callable[[Path, Model], None]
 
 
 @dataclasses.dataclass(frozen=True)
 class FileFormat:
-    """Format of files, and what it keeps of a model beside its Gaussians."""
+    """Format of files, and what it keeps of a model besides its Gaussians."""
 
     name: str
-    load: Reader | None
+    load: Callable[[Path], Model | Gaussians]
     save: Writer | None
     keeps_appearance: bool = False
-    """Whether textures, and whatever else splats show, are kept."""
+    """Whether textures, and everything else that splats show, are kept."""
     keeps_origin: bool = False
     """Whether cameras, background and the normalised world are kept; other formats hold the original world."""
     keeps_corrections: bool = False
@@ -54,15 +51,6 @@ class FileFormat:
     """Import of the optional library that writing needs; raises ValueError, with what to install, without it."""
 
 
-def _later(module: str, function: str) -> Callable[..., Any]:
-    """Return a function that imports a function of a module of this room when it is called."""
-
-    def call(*arguments: object) -> Any:
-        return getattr(importlib.import_module(f"a2tg_jax.io.{module}"), function)(*arguments)
-
-    return call
-
-
 def _by_gaussforge(name: str, degree: int = 3) -> FileFormat:
     return FileFormat(
         name,
@@ -74,44 +62,23 @@ def _by_gaussforge(name: str, degree: int = 3) -> FileFormat:
     )
 
 
-_GLTF = FileFormat(
-    "glTF",
-    _later("gltf", "load_gltf"),
-    _later("gltf", "save_gltf"),
-    keeps_appearance=True,
-    keeps_origin=True,
-    is_exact=False,
-    has_extension=True,
-)
+_GLTF = FileFormat("glTF", load_gltf, save_gltf, True, True, is_exact=False, has_extension=True)
 _USD = FileFormat(
-    "OpenUSD",
-    _later("usd", "load_usd"),
-    _later("usd", "save_usd"),
-    keeps_origin=True,
-    is_exact=False,
-    import_library=lambda path: _later("usd", "import_usd")(),
+    "OpenUSD", load_usd, save_usd, keeps_origin=True, is_exact=False, import_library=lambda path: import_usd()
 )
 _CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, None)
 FORMATS = {
     ".npz": FileFormat("model", load_model, save_model, True, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
-    ".compressed.ply": FileFormat(
-        "compressed PLY", load_ply_model, save_by_gaussforge, is_exact=False, import_library=import_gaussforge
-    ),
+    ".compressed.ply": dataclasses.replace(_by_gaussforge("compressed PLY"), load=load_ply_model),
     ".ply": FileFormat("PLY", load_ply_model, save_ply),
     ".spz": _by_gaussforge("SPZ"),
     ".sog": _by_gaussforge("SOG"),
     ".splat": _by_gaussforge(".splat", degree=0),
     ".ksplat": FileFormat(".ksplat", load_ksplat, save_ksplat, highest_degree=2, is_exact=False),
-    ".glb": _GLTF,
-    ".gltf": _GLTF,
-    ".usda": _USD,
-    ".usdc": _USD,
-    ".usdz": _USD,
-    ".usd": _USD,
-    ".pt": _CHECKPOINT,
-    ".pth": _CHECKPOINT,
-    ".ckpt": _CHECKPOINT,
+    **dict.fromkeys((".glb", ".gltf"), _GLTF),
+    **dict.fromkeys((".usda", ".usdc", ".usdz", ".usd"), _USD),
+    **dict.fromkeys((".pt", ".pth", ".ckpt"), _CHECKPOINT),
 }
 """Formats by suffix. Of two that fit a name the first counts."""
 
@@ -152,10 +119,7 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
       FileNotFoundError: if there is no such file.
       ValueError: if the suffix is unknown, an optional library is missing, or the file is damaged.
     """
-    found = format_of(path)
-    if found.load is None:
-        raise ValueError(f"{shortened(os.fspath(path))}: {found.name} files can be written, but not read")
-    loaded = found.load(Path(path))
+    loaded = format_of(path).load(Path(path))
     return Model(loaded) if isinstance(loaded, Gaussians) else loaded
 
 
@@ -183,24 +147,11 @@ def file_bytes(path: Path) -> int:
     return sum(file.stat().st_size for file in files_of(path))
 
 
-def beside_gaussians(model: Model) -> str:
-    """Return in words what a model shows beside plain splats, of what baking turns into these; "" if nothing."""
-    has_textures, has_shapes = model.textures is not None, model.appearance.exponents is not None
-    return " and ".join(["textures"] * has_textures + ["shapes of kernels"] * has_shapes)
-
-
 def _bakeable(model: Model) -> str:
-    """Return `beside_gaussians` with its remedy; "" if nothing."""
-    beside = beside_gaussians(model)
-    return f"{beside} {BAKES}" if beside else ""
-
-
-def _lost_appearance(model: Model) -> list[str]:
-    """Return in words what plain splats do not keep of what a model shows."""
-    lost = [_bakeable(model)]
-    if not model.appearance.is_portable and model.textures is None:
-        lost.append(f"what {type(model.appearance).__name__} shows besides Gaussians")
-    return [found for found in lost if found]
+    """Return in words what a model shows besides plain splats that baking turns into these; "" if nothing."""
+    has_textures, has_shapes = model.textures is not None, model.appearance.exponents is not None
+    found = " and ".join(["textures"] * has_textures + ["shapes of kernels"] * has_shapes)
+    return f"{found} (--bake turns them into plain splats)" if found else ""
 
 
 def unseen_elsewhere(model: Model, path: str | os.PathLike[str]) -> str:
@@ -210,18 +161,18 @@ def unseen_elsewhere(model: Model, path: str | os.PathLike[str]) -> str:
 
 def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     """Return in words what a file of some suffix does not keep of a model."""
-    into, lost = format_of(path), list[str]()
+    into, shown, origin, lost = format_of(path), model.appearance, model.origin, list[str]()
     if not into.keeps_appearance:
-        lost += _lost_appearance(model)
-    degree = model.gaussians.sh_degree if model.appearance.bands is None else 3
-    if degree > into.highest_degree:
+        lost += [found for found in [_bakeable(model)] if found]
+        if not shown.is_portable and model.textures is None:
+            lost.append(f"what {type(shown).__name__} shows besides Gaussians")
+    if (model.gaussians.sh_degree if shown.bands is None else 3) > into.highest_degree:
         lost.append(f"spherical harmonics above degree {into.highest_degree}")
-    if into.name in RANGES:
-        lost += cut_numbers(into.name, world_gaussians(model).gaussians)
-    if model.origin is not None and model.origin.names and not into.keeps_origin:
+    lost += cut_numbers(into.name, model)
+    if origin is not None and origin.names and not into.keeps_origin:
         lost.append("cameras and background")
-    if model.origin is not None and not into.keeps_corrections:
-        lost += [LEARNED.get(name, f"learned {name}") for name in sorted(model.origin.corrections)]
+    if origin is not None and not into.keeps_corrections:
+        lost += [LEARNED.get(name, f"learned {name}") for name in sorted(origin.corrections)]
     if not into.is_exact:
         lost.append("last digits")
     return lost

@@ -8,6 +8,7 @@ gaussforge 0.6 writes the spherical harmonics of compressed PLY in another order
 order that SuperSplat reads. Its .ksplat files are empty for GaussianSplats3D; `ksplat.py` writes and reads those.
 """
 
+import contextlib
 import dataclasses
 import importlib
 import io
@@ -21,24 +22,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.data.ply_header import OFFSET
+from a2tg_jax.data.ply import OFFSET
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.exchange import reading
-from a2tg_jax.io.flattening import third_log_scales
-from a2tg_jax.io.number_ranges import check_positions, origin_at, warn_of_offset
-from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, offset_comment, world_gaussians
-from a2tg_jax.io.quantise import morton
+from a2tg_jax.io.columns import morton
+from a2tg_jax.io.other_programs import (
+    check_positions,
+    origin_at,
+    reading,
+    third_log_scales,
+    warn_of_offset,
+    world_gaussians,
+)
+from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, offset_comment
 from a2tg_jax.model import Model
 
-SUFFIXES = {
-    ".compressed.ply": "compressed.ply",
-    ".spz": "spz",
-    ".sog": "sog",
-    ".splat": "splat",
-}
-"""gaussforge's names of formats, by suffix."""
+KINDS = ("compressed.ply", "spz", "sog", "splat")
+"""gaussforge's names of formats, which are the suffixes."""
 LEAST_LOG_SCALE = -20.0
 CURVE_BITS = 16
 SOG_HEADER, SOG_FLAT = "meta.json", "2dgs"
@@ -55,19 +56,27 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
       ValueError: if gaussforge is not installed or cannot write them, there are none, or the format cannot hold their
         positions.
     """
-    kind = gaussforge_format(path)
+    kind = _kind_of(path)
     gaussians, offset, _ = world_gaussians(model, kind=kind)
     if not gaussians.num:
         raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
     check_positions(kind, gaussians, str(path))
-    gaussians = _along_curve(gaussians)
+    # In the order of a Z curve through the means.
+    means = np.asarray(gaussians.means, np.float64)
+    low, high = means.min(axis=0), means.max(axis=0)
+    codes = ((means - low) / np.maximum(high - low, 1e-30) * (2**CURVE_BITS - 1)).astype(np.int64)
+    gaussians = gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]
     third = third_log_scales(np.asarray(gaussians.log_scales)).min(axis=0, keepdims=True, initial=0.0)
-    source = _by_coefficient(gaussians) if kind == "compressed.ply" else gaussians
-    ply = encode_ply(source, np.repeat(third.clip(LEAST_LOG_SCALE), gaussians.num, axis=0))
+    if kind == "compressed.ply":
+        # gaussforge takes the order channel by channel of SH above degree 0 for the order coefficient by coefficient.
+        sh = np.asarray(gaussians.sh)
+        rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, sh.shape[1] - 1, 3)
+        gaussians = dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], rest], axis=1)))
+    ply = encode_ply(gaussians, np.repeat(third.clip(LEAST_LOG_SCALE), gaussians.num, axis=0))
     data = _marked(_converted(ply, "ply", kind, Path(path)), kind, offset)
     with replacing(path) as temporary:
         temporary.write_bytes(data)
-    warn_of_offset(kind, offset, str(path))
+    warn_of_offset(kind, offset, path)
 
 
 def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
@@ -79,12 +88,20 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
       FileNotFoundError: if there is no such file.
       ValueError: if gaussforge is not installed or cannot read the file, or a number is not finite.
     """
-    kind, path = gaussforge_format(path), Path(path)
+    kind, path = _kind_of(path), Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such file")
     with open_regular(path) as file:
         data = file.read()
-    header = _sog_header(data) if kind == "sog" else {}
+    header: dict[str, Any] = {}
+    if kind == "sog":
+        with (
+            contextlib.suppress(zipfile.BadZipFile, KeyError, ValueError, OSError, NotImplementedError, RuntimeError),
+            zipfile.ZipFile(io.BytesIO(data)) as archive,
+            archive.open(SOG_HEADER) as entry,
+        ):
+            found = json.loads(entry.read(MOST_HEADER_BYTES))
+            header = found if isinstance(found, dict) else {}
     converted = _converted(data, kind, "ply", path)
     gaussians = decode_ply(io.BytesIO(converted), path, is_flat=header.get("model") == SOG_FLAT).gaussians
     origin = reading(path, lambda: origin_at(np.array(header.get(OFFSET, (0, 0, 0)), np.float64).reshape(3)))
@@ -103,30 +120,9 @@ def import_gaussforge(path: Path) -> Any:
         raise ValueError(f"{path}: needs gaussforge: pip install 'a2tg-jax[formats]'") from error
 
 
-def gaussforge_format(path: str | os.PathLike[str]) -> str:
-    """Return gaussforge's name of the format of a file. Raises ValueError if it writes none of this suffix."""
-    name = Path(path).name.lower()
-    for suffix, kind in SUFFIXES.items():
-        if name.endswith(suffix):
-            return kind
-    raise ValueError(f"{shortened(os.fspath(path))}: must end in one of {', '.join(SUFFIXES)}")
-
-
-def _along_curve(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians in the order of a Z curve through their means."""
-    means = np.asarray(gaussians.means, np.float64)
-    low, high = (end(axis=0, initial=0.0) for end in (means.min, means.max))
-    codes = ((means - low) / np.maximum(high - low, 1e-30) * (2**CURVE_BITS - 1)).astype(np.int64)
-    return gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]
-
-
-def _by_coefficient(gaussians: Gaussians) -> Gaussians:
-    """Return Gaussians of which gaussforge writes the SH above degree 0 channel by channel, which it takes for the
-    order coefficient by coefficient."""
-    sh = np.asarray(gaussians.sh)
-    num, num_bases, _ = sh.shape
-    rest = sh[:, 1:].transpose(0, 2, 1).reshape(num, num_bases - 1, 3)
-    return dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], rest], axis=1)))
+def _kind_of(path: str | os.PathLike[str]) -> str:
+    """Return gaussforge's name of the format of a file."""
+    return next(kind for kind in KINDS if Path(path).name.lower().endswith(f".{kind}"))
 
 
 def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
@@ -155,13 +151,3 @@ def _marked(data: bytes, kind: str, offset: np.ndarray) -> bytes:
                 content = json.dumps(header, separators=(",", ":")).encode()
             new.writestr(zipfile.ZipInfo(entry.filename), content)
     return marked.getvalue()
-
-
-def _sog_header(data: bytes) -> dict[str, Any]:
-    """Return the header of a SOG file; empty if it is none."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open(SOG_HEADER) as file:
-            header = json.loads(file.read(MOST_HEADER_BYTES))
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError, NotImplementedError, RuntimeError):
-        return {}
-    return header if isinstance(header, dict) else {}

@@ -1,25 +1,35 @@
 """glTF files of splats: KHR_gaussian_splatting, as *.glb, or *.gltf with a *.bin beside it.
 
 Splats are points of a mesh: means, rotations, scales, opacities and spherical harmonics are its attributes. They stay
-in the model's world; the matrix of their node leads to glTF's, which has +y up. Textures and degrees of splats are in
-the extension A2TG_splat_textures, which other programs leave aside. docs/formats.md describes both.
+in the model's world; the matrix of their node leads to glTF's, which has +y up. Textures, degrees and kernels of splats
+are in the extension A2TG_splat_textures; programs that do not know it show the plain splats. docs/formats.md describes
+both.
 """
 
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from a2tg_jax.appearance import Appearance
-from a2tg_jax.core.gaussians import SH_C0, check_gaussians
+from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
+from a2tg_jax.appearance.parts import EXTENT, MAX_DEGREE, log_exponents_of, shapes_of
+from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.exchange import (
+from a2tg_jax.io.columns import LARGEST_FLOAT, Ends, dequantised, ends_of, quantised
+from a2tg_jax.io.config_json import config_from_dict
+from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes
+from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict, background_of
+from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
+from a2tg_jax.io.other_programs import (
+    HIGHEST_DEGREE,
+    MOST_PARTS,
     Ellipsoids,
+    degree_to_read,
     gaussians_of,
     joined_parts,
     linear_colors,
@@ -30,24 +40,15 @@ from a2tg_jax.io.exchange import (
     similarity_of,
     splats_of,
     upright,
-    whole_splats,
 )
-from a2tg_jax.io.gltf_nodes import mesh_nodes
-from a2tg_jax.io.gltf_reader import Document
-from a2tg_jax.io.gltf_textures import EXTENSION, SplatTextures, TexelKind, add_textures, kept_appearance, shown_of
-from a2tg_jax.io.gltf_writer import Builder
-from a2tg_jax.io.model_file import appearance_to_dict, background_of
-from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
-from a2tg_jax.io.sh_degrees import HIGHEST_DEGREE, degree_to_read
-from a2tg_jax.io.suffixes import check_saved, check_suffix
-from a2tg_jax.io.validate import check_model
+from a2tg_jax.io.validate import check_model, check_suffix, live_model
 from a2tg_jax.model import Model
+from a2tg_jax.texture import MAX_SIDE
 
-SPLATS = "KHR_gaussian_splatting"
+SPLATS, EXTENSION = "KHR_gaussian_splatting", "A2TG_splat_textures"
 READ = {SPLATS, EXTENSION, "KHR_mesh_quantization"}
 """Extensions that a file may require."""
 MEANS, ROTATION, SCALE, OPACITY = "POSITION", f"{SPLATS}:ROTATION", f"{SPLATS}:SCALE", f"{SPLATS}:OPACITY"
-COLOR = "COLOR_0"
 DESCRIBED = {
     "kernel": "ellipse",
     "colorSpace": "srgb_rec709_display",
@@ -56,14 +57,19 @@ DESCRIBED = {
 }
 OWN = "a2tg"
 """Name of what the extras of splats keep of their model."""
-POINTS = 0
-MOST_PRIMITIVES = 256
-"""Largest number of sets of splats in one file."""
+TexelKind = Literal["float32", "uint8"]
+OPTIONS = {"uv": "uv", "outside": "outside", "rgb": "rgb", "alpha": "alpha", "maxAlpha": "max_alpha"}
+"""Names of the options that say how textures are shown, and their fields."""
+RANGES = {"rgb": slice(0, 3), "alpha": slice(3, 4)}
+"""Columns of texels that share ends."""
 
 
 def coefficient(degree: int, order: int) -> str:
     """Return the name of the attribute of a spherical harmonic."""
     return f"{SPLATS}:SH_DEGREE_{degree}_COEF_{order}"
+
+
+# Writing
 
 
 def save_gltf(
@@ -83,69 +89,77 @@ def save_gltf(
       ValueError: if the model has no Gaussians, shows what the extension cannot hold, or has a number that is not
         finite or too large.
     """
-    check_saved(path, model, "save_gltf")
-    check_gaussians(model.gaussians, "model.gaussians")
     if texels not in get_args(TexelKind):
         raise ValueError(f"texels must be {' or '.join(get_args(TexelKind))}; got {shortened(repr(texels))}")
-    model = model.live
-    check_model(model)
+    model = live_model(path, model, "save_gltf")
     if not model.num:
         raise ValueError("model has no Gaussians; a glTF file has at least one")
     if textures:
         check_encodable(model.appearance, "a glTF file", "a *.ply, or textures=False here, holds their plain splats")
-    builder = Builder()
-    primitive = _primitive(builder, model, texels if textures else None)
-    used = [SPLATS, *primitive["extensions"][SPLATS].get("extensions", {})]
-    node = {"name": "splats", "mesh": 0, "matrix": matrix_of(upright(model.origin, "y")).T.ravel().tolist()}
-    described = {
-        "asset": {"version": "2.0", "generator": "a2tg-jax"},
-        "extensionsUsed": used,
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
-    }
-    builder.save(Path(path), described)
-
-
-def _primitive(builder: Builder, model: Model, texels: TexelKind | None) -> dict[str, Any]:
-    """Return the points of the mesh; `texels` None leaves textures, degrees and shapes out."""
-    splats = splats_of(model, keeps_shapes=texels is not None)
+    builder, splats = Builder(), splats_of(model, keeps_shapes=textures)
     attributes = {
         MEANS: builder.add(splats.means, has_bounds=True),
         ROTATION: builder.add(splats.quats[:, [1, 2, 3, 0]]),
         SCALE: builder.add(splats.scales),
         OPACITY: builder.add(splats.opacities),
-        COLOR: builder.add(_point_colors(splats), normalized=True),
     }
+    # Linear RGB and opacity as bytes, for programs that show points.
+    shown = linear_colors(np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0))
+    points = np.rint(255 * np.concatenate([shown, splats.opacities[:, None]], axis=1)).astype(np.uint8)
+    attributes["COLOR_0"] = builder.add(points, normalized=True)
     for degree in range(NUM_BASES.index(splats.sh.shape[1]) + 1):
         for order in range(2 * degree + 1):
             index = NUM_BASES[degree] - 2 * degree - 1 + order
             attributes[coefficient(degree, order)] = builder.add(splats.sh[:, index])
     described: dict[str, Any] = dict(DESCRIBED)
-    if texels is not None:
-        rows = rows_of_model(model)
-        shown = add_textures(builder, rows, model.appearance, model.gaussians.sh_degree, texels)
-        described |= {"extensions": {EXTENSION: shown}} if shown else {}
-    primitive = {"attributes": attributes, "mode": POINTS, "extensions": {SPLATS: described}}
-    return primitive | _extras(model, has_appearance=texels is not None)
-
-
-def _point_colors(splats: Ellipsoids) -> np.ndarray:
-    """Return linear RGB and opacity [N, 4] as bytes, for programs that show points."""
-    shown = np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0)
-    colors = np.concatenate([linear_colors(shown), splats.opacities[:, None]], axis=1)
-    rounded: np.ndarray = np.rint(255 * colors).astype(np.uint8)
-    return rounded
-
-
-def _extras(model: Model, *, has_appearance: bool) -> dict[str, Any]:
-    """Return what only this program reads."""
-    kept: dict[str, Any] = {"appearance": appearance_to_dict(model.appearance)} if has_appearance else {}
+    kept: dict[str, Any] = {}
+    if textures:
+        if extended := _extension_of(builder, model, texels):
+            described["extensions"] = {EXTENSION: extended}
+        kept["appearance"] = appearance_to_dict(model.appearance)
     kept["background"] = list(model.background)
     if model.origin is not None:
         kept["origin"] = origin_to_json(model.origin)
-    return {"extras": {OWN: kept}} if kept else {}
+    node = {"name": "splats", "mesh": 0, "matrix": matrix_of(upright(model.origin, "y")).T.ravel().tolist()}
+    primitive = {"attributes": attributes, "mode": 0, "extensions": {SPLATS: described}, "extras": {OWN: kept}}
+    whole = {
+        "asset": {"version": "2.0", "generator": "a2tg-jax"},
+        "extensionsUsed": [SPLATS, *described.get("extensions", {})],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [primitive]}],
+    }
+    builder.save(Path(path), whole)
+
+
+def _extension_of(builder: Builder, model: Model, kind: TexelKind) -> dict[str, Any]:
+    """Add what splats show to a file, and return the object of the extension; an empty one if it is nothing."""
+    described: dict[str, Any] = {}
+    rows, appearance = rows_of_model(model), model.appearance
+    if appearance.texture_options is not None and rows.sizes is not None and rows.texels is not None:
+        options = {name: getattr(appearance.texture_options, field) for name, field in OPTIONS.items()}
+        described |= {"extent": EXTENT} | options
+        described["sizes"] = builder.add(rows.sizes.astype(np.uint8), is_attribute=False)
+        if len(rows.texels) and kind == "float32":
+            described["texels"] = builder.add(rows.texels.astype(np.float32), is_attribute=False)
+        elif len(rows.texels):
+            ends = {name: ends_of(rows.texels[:, columns], 8) for name, columns in RANGES.items()}
+            codes = [quantised(rows.texels[:, columns], ends[name], 8) for name, columns in RANGES.items()]
+            as_bytes = np.concatenate(codes, axis=1).astype(np.uint8)
+            described["texels"] = builder.add(as_bytes, normalized=True, is_attribute=False)
+            described["texelRanges"] = {name: list(found) for name, found in ends.items()}
+    if appearance.bands is not None:
+        described["baseDegree"] = model.gaussians.sh_degree
+        described["degrees"] = builder.add(rows.degrees.astype(np.uint8), is_attribute=False)
+    if rows.shapes is not None:
+        described["shapes"] = builder.add(log_exponents_of(rows.shapes).astype(np.float32), is_attribute=False)
+    if described:
+        described["maxAlpha"] = appearance.alpha_limit
+    return described
+
+
+# Reading
 
 
 def load_gltf(path: str | os.PathLike[str]) -> Model:
@@ -160,61 +174,52 @@ def load_gltf(path: str | os.PathLike[str]) -> Model:
       ValueError: if it is not glTF 2.0, is damaged, holds no splats, or needs an extension that is not known here.
     """
     check_suffix(path, "load_gltf")
-    return reading(path, lambda: _loaded(path))
 
+    def loaded() -> Model:
+        document, parts = Document(path), list[tuple[Model, Similarity]]()
+        if unknown := [name for name in document.json.get("extensionsRequired", []) if name not in READ]:
+            raise ValueError(f"needs the extension {shortened(unknown[0])}, which this program does not read")
+        for node, matrix in mesh_nodes(document):
+            for primitive in document.entry("meshes", node["mesh"])["primitives"]:
+                if SPLATS in primitive.get("extensions", {}):
+                    parts.append((_model_of(document, primitive), similarity_of(matrix, "the transform of its node")))
+                if len(parts) > MOST_PARTS:
+                    raise ValueError(f"holds more than {MOST_PARTS} sets of splats")
+        if not parts:
+            raise ValueError(f"holds no splats ({SPLATS})")
+        return joined_parts(parts, "y")
 
-def _loaded(path: str | os.PathLike[str]) -> Model:
-    document = Document(path)
-    required = document.json.get("extensionsRequired", [])
-    if unknown := [name for name in required if name not in READ]:
-        raise ValueError(f"needs the extension {shortened(unknown[0])}, which this program does not read")
-    parts: list[tuple[Model, Similarity]] = []
-    for primitive, matrix in _primitives(document):
-        parts.append((_model_of(document, primitive), similarity_of(matrix, "the transform of its node")))
-        if len(parts) > MOST_PRIMITIVES:
-            raise ValueError(f"holds more than {MOST_PRIMITIVES} sets of splats")
-    if not parts:
-        raise ValueError(f"holds no splats ({SPLATS})")
-    return joined_parts(parts, "y")
-
-
-def _primitives(document: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Yield the splats of the scene, and the matrix from each to the world."""
-    for node, matrix in mesh_nodes(document):
-        for primitive in document.entry("meshes", node["mesh"])["primitives"]:
-            if SPLATS in primitive.get("extensions", {}):
-                yield primitive, matrix
+    return reading(path, loaded)
 
 
 def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
     """Return the model of some splats, in the world of their node."""
-    splats = _splats(document, primitive)
+    splats = _splats(document, primitive["attributes"])
     described = primitive["extensions"][SPLATS]
-    _warn_of_others(document.path, described)
+    for name in ("kernel", "colorSpace"):
+        if (found := described.get(name)) != DESCRIBED[name]:
+            message = f"its splats have the {name} {shortened(found)}; they are read as {DESCRIBED[name]}"
+            warnings.warn(f"{document.path}: {message}", stacklevel=5)
     extras = primitive.get("extras", {})
     kept = extras.get(OWN, {}) if isinstance(extras, dict) else {}
     origin = origin_from_json(kept["origin"]) if "origin" in kept else None
-    degree = NUM_BASES.index(splats.sh.shape[1])
     extended = described.get("extensions", {}).get(EXTENSION)
-    if extended is None:
-        gaussians = gaussians_of(whole_splats(splats, document.path), document.path, is_flat=False)
-        appearance = kept_appearance(kept, Appearance(), is_told=False)
-        model = Model(gaussians, appearance, background=background_of(kept), origin=origin)
-        check_model(model)
-        return model
-    shown = shown_of(document, extended, len(splats.means), degree)
-    rows = _rows(splats, shown, document.path)
-    appearance = kept_appearance(kept, shown.appearance, is_told=True)
-    return model_of(rows, shown.base_degree, appearance, origin, background_of(kept))
+    if extended is not None:
+        shown, rows, base_degree = _shown(document, extended, splats)
+        appearance = _kept_appearance(kept, shown, is_described=True)
+        return model_of(rows, base_degree, appearance, origin, background_of(kept))
+    gaussians = gaussians_of(splats, document.path, is_flat=False)
+    appearance = _kept_appearance(kept, Appearance(), is_described=False)
+    model = Model(gaussians, appearance, background=background_of(kept), origin=origin)
+    check_model(model)
+    return model
 
 
-def _splats(document: Document, primitive: Mapping[str, Any]) -> Ellipsoids:
-    attributes = primitive["attributes"]
-
+def _splats(document: Document, attributes: Mapping[str, Any]) -> Ellipsoids:
     def numbers(name: str, kind: str) -> np.ndarray:
         if name not in attributes:
             raise ValueError(f"its splats lack {name}")
-        return document.numbers(attributes[name], (kind,), name)
+        return document.numbers(attributes[name], kind, name)
 
     means, quats = numbers(MEANS, "VEC3"), numbers(ROTATION, "VEC4")[:, [3, 0, 1, 2]]
     scales, opacities = numbers(SCALE, "VEC3"), numbers(OPACITY, "SCALAR")[:, 0]
@@ -228,27 +233,89 @@ def _splats(document: Document, primitive: Mapping[str, Any]) -> Ellipsoids:
     return Ellipsoids(means, quats, scales, opacities, np.stack(columns[4:], axis=1))
 
 
-def _rows(splats: Ellipsoids, shown: SplatTextures, path: Path) -> Rows:
-    """Return the tables of splats that show textures or have degrees."""
-    gaussians = gaussians_of(splats, path, is_flat=shown.sizes is not None or shown.shapes is not None)
+def _shown(document: Document, described: Mapping[str, Any], splats: Ellipsoids) -> tuple[Appearance, Rows, int]:
+    """Return the template, the tables and the degree of all splats, from the object of the extension.
+
+    Raises:
+      ValueError: if a field is missing, out of range, or does not fit the others.
+    """
     num, highest = splats.sh.shape[:2]
-    dense = np.zeros((num, NUM_BASES[-1] if shown.degrees is not None else highest, 3), np.float32)
-    dense[:, :highest] = splats.sh
-    degrees = np.full(num, shown.base_degree) if shown.degrees is None else shown.degrees
-    bands = [
-        dense[degrees >= degree, count - 2 * degree - 1 : count]
-        for degree, count in enumerate(NUM_BASES)
-        if count <= dense.shape[1]
-    ]
-    return Rows(
+    base_degree = sh_degree = NUM_BASES.index(highest)
+    has_textures, has_degrees, has_shapes = (name in described for name in ("sizes", "degrees", "shapes"))
+    names = {field: described[name] for name, field in OPTIONS.items() if name in described}
+    options = config_from_dict(TextureOptions, names, EXTENSION)
+    if not 0 < options.max_alpha < 1:
+        raise ValueError(f"{EXTENSION}.maxAlpha must lie in (0, 1); got {options.max_alpha!r}")
+    appearance = appearance_for(options, has_textures=has_textures, has_degrees=has_degrees, has_shapes=has_shapes)
+
+    def integers(name: str, kind: str, most: int) -> np.ndarray:
+        values = document.numbers(described[name], kind, f"{EXTENSION}.{name}")
+        if len(values) != num or not ((values >= 0) & (values <= most) & (values % 1 == 0)).all():
+            raise ValueError(f"{EXTENSION}.{name} must be {num} times whole numbers in 0..{most}")
+        return values.astype(np.int64)
+
+    sizes, texels, shapes, degrees = None, None, None, np.full(num, sh_degree)
+    if has_textures:
+        sizes = integers("sizes", "VEC2", MAX_SIDE)
+        texels = _texels(document, described, int(sizes.prod(axis=1).sum()))
+    if has_degrees:
+        degrees, base_degree = integers("degrees", "SCALAR", MAX_DEGREE)[:, 0], described["baseDegree"]
+        least, most = int(degrees.min(initial=sh_degree)), int(degrees.max(initial=0))
+        if type(base_degree) is not int or not 0 <= base_degree <= least or most > sh_degree:
+            raise ValueError(
+                f"{EXTENSION}.degrees must lie from baseDegree to the {sh_degree} of the splats; got {least}..{most} "
+                f"and {shortened(base_degree)}"
+            )
+    if has_shapes:
+        log_exponents = document.numbers(described["shapes"], "SCALAR", f"{EXTENSION}.shapes")[:, 0]
+        if len(log_exponents) != num:
+            raise ValueError(f"{EXTENSION}.shapes must be {num} numbers; got {len(log_exponents)}")
+        shapes = shapes_of(log_exponents)
+    gaussians = gaussians_of(splats, document.path, is_flat=has_textures or has_shapes, keeps_all=True)
+    sh = splats.sh if not has_degrees else np.pad(splats.sh, ((0, 0), (0, NUM_BASES[-1] - highest), (0, 0)))
+    counts = [count for count in NUM_BASES if count <= sh.shape[1]]
+    bands = [sh[degrees >= degree, count - 2 * degree - 1 : count] for degree, count in enumerate(counts)]
+    rows = Rows(
         np.asarray(gaussians.means), np.asarray(gaussians.quats), np.asarray(gaussians.log_scales),
-        np.asarray(gaussians.logit_opacities), degrees, tuple(bands), shown.sizes, shown.texels, shown.shapes,
+        np.asarray(gaussians.logit_opacities), degrees, tuple(bands), sizes, texels, shapes,
     )  # fmt: skip
+    return appearance, rows, base_degree
 
 
-def _warn_of_others(path: Path, described: Mapping[str, Any]) -> None:
-    """Warn of splats that are read as what they are not."""
-    for name in ("kernel", "colorSpace"):
-        if (found := described.get(name)) != DESCRIBED[name]:
-            message = f"{path}: its splats have the {name} {shortened(found)}; they are read as {DESCRIBED[name]}"
-            warnings.warn(message, stacklevel=6)
+def _texels(document: Document, described: Mapping[str, Any], count: int) -> np.ndarray:
+    """Return the texels [T, 4] of textures of so many."""
+    if described.get("extent", EXTENT) != EXTENT:
+        raise ValueError(f"{EXTENSION}.extent must be {EXTENT}; got {shortened(described['extent'])}")
+    texels = np.zeros((0, 4), np.float32)
+    if "texels" in described:
+        texels = document.numbers(described["texels"], "VEC4", f"{EXTENSION}.texels")
+    if len(texels) != count:
+        raise ValueError(f"{EXTENSION}.sizes are of {count} texels, but there are {len(texels)}")
+    for name, columns in RANGES.items() if "texelRanges" in described else ():
+        low, high = described["texelRanges"][name]
+        if not all(type(end) in (int, float) and abs(end) <= LARGEST_FLOAT for end in (low, high)):
+            raise ValueError(f"{EXTENSION}.texelRanges.{name} must be two numbers")
+        texels[:, columns] = dequantised(texels[:, columns] * 255.0, Ends(low, high), 8)
+    return texels
+
+
+def _kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_described: bool) -> Appearance:
+    """Return the appearance that a model had, with options of its training, if it shows the same.
+
+    Args:
+      kept: what the extras keep.
+      shown: what the file says without these.
+      is_described: whether the file has the extension.
+    """
+    if "appearance" not in kept:
+        return shown
+    appearance = appearance_from_dict(kept["appearance"])
+    own, told = appearance.texture_options, shown.texture_options
+    is_same = appearance.is_portable and (own is None) == (told is None)
+    for part in ("bands", "exponents"):
+        is_same &= (getattr(appearance, part) is None) == (getattr(shown, part) is None)
+    if is_same and is_described:
+        is_same = appearance.alpha_limit == shown.alpha_limit and all(
+            getattr(own, field, None) == getattr(told, field, None) for field in ("uv", "outside", "rgb", "alpha")
+        )
+    return appearance if is_same else shown

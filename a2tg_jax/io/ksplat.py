@@ -19,9 +19,14 @@ from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
-from a2tg_jax.io.exchange import Ellipsoids, gaussians_of, splats_of, whole_splats
-from a2tg_jax.io.number_ranges import warn_of_offset
-from a2tg_jax.io.ply import world_gaussians
+from a2tg_jax.io.other_programs import (
+    Ellipsoids,
+    gaussians_of,
+    reading,
+    splats_of,
+    warn_of_offset,
+    world_gaussians,
+)
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
@@ -64,7 +69,7 @@ def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
     section = SECTION.pack(num, num, 0, 0, 0.0, 0, 0, rows.nbytes, 0, 0, degree).ljust(SECTION_BYTES, b"\0")
     with replacing(path) as temporary:
         temporary.write_bytes(header + section + rows.tobytes())
-    warn_of_offset("ksplat", offset, os.fspath(path))
+    warn_of_offset("ksplat", offset, path)
 
 
 def load_ksplat(path: str | os.PathLike[str]) -> Gaussians:
@@ -79,15 +84,15 @@ def load_ksplat(path: str | os.PathLike[str]) -> Gaussians:
         raise FileNotFoundError(f"{path}: no such file")
     with open_regular(path) as file:
         data = file.read()
-    try:
+
+    def loaded() -> Gaussians:
         with np.errstate(over="ignore", invalid="ignore"):  # What is not finite is left out.
             splats = _read(data)
-        splats = whole_splats(splats, path)
         gaussians = gaussians_of(splats, path, is_flat=False)
         check_model(Model(gaussians))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return gaussians
+        return gaussians
+
+    return reading(path, loaded)
 
 
 def _read(data: bytes) -> Ellipsoids:

@@ -1,7 +1,7 @@
 """Models on disk: Gaussians, what they show and where they were trained, in one archive, without padding.
 
 The header names the class of the appearance and holds its options. Reading a file imports nothing: a class that is not
-this package's must be handed over, or its module be imported already.
+this package's must be passed, or its module be imported already.
 """
 
 import dataclasses
@@ -24,10 +24,9 @@ from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.archive import read_archive, read_archive_array, write_archive
+from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
-from a2tg_jax.io.suffixes import check_saved, check_suffix
-from a2tg_jax.io.validate import check_model
+from a2tg_jax.io.validate import check_model, check_suffix, live_model
 from a2tg_jax.model import Model
 
 FORMAT = "a2tg-jax model"
@@ -50,17 +49,14 @@ def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, 
       ValueError: if the suffix is another format's, if `load_model` would refuse the model, as it does numbers that
         are not finite, or if the options of the appearance cannot be written as JSON.
     """
-    check_saved(path, model, "save_model")
-    check_gaussians(model.gaussians, "model.gaussians")
-    model = model.live
-    check_model(model)
+    model = live_model(path, model, "save_model")
     arrays = {name: np.asarray(getattr(model.gaussians, name)) for name in FIELDS}
     shown = arrays_of(model.appearance, model.gaussians.sh_degree)
     arrays |= {APPEARANCE + name: np.asarray(array) for name, array in shown.items()}
     described = {**(header or {}), "appearance": appearance_to_dict(model.appearance)}
     described["background"] = list(model.background)
     if model.origin is not None:
-        described["origin"] = origin_to_dict(model.origin)
+        described["origin"] = {"names": list(model.origin.names)}
         arrays |= {ORIGIN + name: array for name, array in origin_arrays(model.origin).items()}
         arrays |= {ORIGIN + CORRECTIONS + name: rows for name, rows in model.origin.corrections.items()}
     write_archive(path, described, arrays, format=FORMAT)
@@ -82,7 +78,21 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
     check_suffix(path, "load_model")
     header, arrays = read_archive(path, format=FORMAT)
     try:
-        return _model_of(header, arrays, appearances)
+        gaussians = Gaussians(**{name: arrays[name] for name in FIELDS})  # type: ignore[arg-type]
+        check_gaussians(gaussians)
+        gaussians = jax.tree.map(jnp.asarray, gaussians)
+        shown = {name.removeprefix(APPEARANCE): array for name, array in arrays.items() if name.startswith(APPEARANCE)}
+        if "appearance" in header:
+            appearance = appearance_from_dict(header["appearance"], appearances)
+        else:  # Version 0.1
+            shown = {name: arrays[name] for name in ("sizes", "texels") if name in arrays}
+            appearance = appearance_for(TextureOptions(), has_textures=bool(shown))
+        shown_by = with_arrays(appearance, shown, gaussians.sh_degree)
+        of_origin = {name.removeprefix(ORIGIN): array for name, array in arrays.items() if name.startswith(ORIGIN)}
+        origin = origin_of(header["origin"], of_origin) if "origin" in header else None
+        model = Model(gaussians, shown_by, background=background_of(header), origin=origin)
+        check_model(model)
+        return model
     except KeyError as error:
         raise ValueError(f"{os.fspath(path)}: the model lacks {error}; it is damaged or of another version") from error
     except (TypeError, IndexError, AttributeError, OverflowError) as error:
@@ -99,29 +109,9 @@ def number_in_file(path: str | os.PathLike[str]) -> int:
       FileNotFoundError: if there is no such file.
       ValueError: if it is not a model, is damaged, or is of another version.
     """
-    means = read_archive_array(path, "means", format=FORMAT)
+    means = read_archive(path, format=FORMAT, names=("means",))[1]["means"]
     check_shape(f"{os.fspath(path)}: means", means, ("N", 3))
     return len(means)
-
-
-def _model_of(
-    header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], appearances: Sequence[type[Appearance]]
-) -> Model:
-    gaussians = Gaussians(**{name: arrays[name] for name in FIELDS})  # type: ignore[arg-type]
-    check_gaussians(gaussians)
-    gaussians = jax.tree.map(jnp.asarray, gaussians)
-    shown = {name.removeprefix(APPEARANCE): array for name, array in arrays.items() if name.startswith(APPEARANCE)}
-    if "appearance" in header:
-        appearance = appearance_from_dict(header["appearance"], appearances)
-    else:
-        shown = {name: arrays[name] for name in ("sizes", "texels") if name in arrays}
-        appearance = appearance_for(TextureOptions(), has_textures=bool(shown))
-    shown_by = with_arrays(appearance, shown, gaussians.sh_degree)
-    of_origin = {name.removeprefix(ORIGIN): array for name, array in arrays.items() if name.startswith(ORIGIN)}
-    origin = origin_of(header["origin"], of_origin) if "origin" in header else None
-    model = Model(gaussians, shown_by, background=background_of(header), origin=origin)
-    check_model(model)
-    return model
 
 
 # Appearances
@@ -151,18 +141,29 @@ def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
     return described
 
 
-def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]]) -> Appearance:
-    """Return the template that `appearance_to_dict` described, or version 0.2. ValueError: its class is not known
-    here."""
-    name, options = data["name"], data["options"]
-    if data["module"].partition(".")[0] == built_in.__name__.partition(".")[0] and "parts" not in data:
+def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]] = ()) -> Appearance:
+    """Return the template that `appearance_to_dict` described, or version 0.2. ValueError: its class is unknown."""
+    name, module, options = data["name"], data["module"], data["options"]
+    is_own = module.partition(".")[0] == __name__.partition(".")[0]
+    if is_own and "parts" not in data:
         if name in OLD_PARTS:
             return dataclasses.replace(appearance_from_dict(data["held"]["inner"], appearances), **OLD_PARTS[name])
         if name == "Textured":
             return Appearance(texture=config_from_dict(Texture, options, "options of Textured", given={"texels": None}))
         if name == "Plain":
             return appearance_for(config_from_dict(TextureOptions, options, "options of Plain"), has_textures=False)
-    return _appearance_of(_known_class(data["module"], name, appearances), data)
+    # The class was passed, or is this package's, or of a module that is already imported.
+    found: Any = next((kind for kind in appearances if kind.__qualname__ == name), None)
+    if found is None and is_own:
+        found = getattr(built_in, name, None)
+    if found is None:
+        found = getattr(sys.modules.get(module), name, None)
+    if not (isinstance(found, type) and issubclass(found, Appearance)):
+        raise ValueError(
+            f"shows the appearance {name} of the module {module}, which is not known here: import that module first, "
+            f"or pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
+        )
+    return _appearance_of(found, data)
 
 
 def _options_of(node: Any) -> dict[str, Any]:
@@ -181,23 +182,6 @@ def _appearance_of(kind: type[Appearance], data: Mapping[str, Any]) -> Appearanc
     return read_appearance
 
 
-def _known_class(module: str, name: str, appearances: Sequence[type[Appearance]]) -> type[Appearance]:
-    """Return the class that a file names: one that was handed over, this package's, or one of a module already
-    imported."""
-    given = [kind for kind in appearances if kind.__qualname__ == name]
-    found: Any = given[0] if given else None
-    if found is None and module.partition(".")[0] == __name__.partition(".")[0]:
-        found = getattr(built_in, name, None)
-    if found is None:
-        found = getattr(sys.modules.get(module), name, None)
-    if isinstance(found, type) and issubclass(found, Appearance):
-        return found
-    raise ValueError(
-        f"shows the appearance {name} of the module {module}, which is not known here: import that module first, or "
-        f"pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
-    )
-
-
 # Origins
 
 
@@ -205,11 +189,6 @@ def background_of(header: Mapping[str, Any]) -> Color:
     """Return the background of a model in a file; version 0.2 kept it in the origin."""
     red, green, blue = header.get("background") or header.get("origin", {}).get("background", BLACK)
     return float(red), float(green), float(blue)
-
-
-def origin_to_dict(origin: Origin) -> dict[str, Any]:
-    """Return the fields of an origin that are not arrays."""
-    return {"names": list(origin.names)}
 
 
 def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
@@ -226,27 +205,23 @@ def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
     }
 
 
+def origin_shapes(num: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays of an origin of some cameras."""
+    shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
+    return shapes | {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
+
+
 def origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Origin:
-    """Return the origin that `origin_to_dict` and `origin_arrays` were given. ValueError: a shape or a number is
-    wrong."""
+    """Return the origin of `origin_arrays`, with data["names"]. ValueError: a shape or a number is wrong."""
     names = data["names"]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"origin/names must be texts; got {shortened(names)}")
-    num = len(names)
-    shapes: dict[str, tuple[int, ...]] = {"viewmats": (num, 4, 4), "Ks": (num, 3, 3), "sizes": (num, 2)}
-    shapes |= {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
+    shapes = origin_shapes(len(names))
     for name, shape in shapes.items():
         check_shape(ORIGIN + name, arrays[name], shape)
     viewmats, Ks, sizes, is_test, scale, rotation, translation = (arrays[name] for name in shapes)
     if not np.issubdtype(sizes.dtype, np.integer) or is_test.dtype != bool:
         raise ValueError(f"origin/sizes must be integers, origin/is_test bool; got {sizes.dtype}, {is_test.dtype}")
-    learned = [name for name in arrays if name.startswith(CORRECTIONS)]
-    return Origin(
-        viewmats=viewmats,
-        Ks=Ks,
-        sizes=sizes,
-        names=tuple(names),
-        is_test=is_test,
-        transform=Similarity(float(scale), rotation, translation),
-        corrections={name.removeprefix(CORRECTIONS): arrays[name] for name in learned},
-    )
+    learned = {name.removeprefix(CORRECTIONS): rows for name, rows in arrays.items() if name.startswith(CORRECTIONS)}
+    world = Similarity(float(scale), rotation, translation)
+    return Origin(viewmats, Ks, sizes, tuple(names), is_test, world, learned)

@@ -15,10 +15,19 @@ from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.io.quantise import nearest_half_turn, with_positive_w
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
+HALF_TURNS = np.array(
+    [
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+        [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
+        [[0, 0, -1, 0], [0, 0, 0, -1], [1, 0, 0, 0], [0, 1, 0, 0]],
+        [[0, 0, 0, -1], [0, 0, 1, 0], [0, -1, 0, 0], [1, 0, 0, 0]],
+    ],
+    np.float64,
+)
+"""Row k: the matrix of q → q·(1, i, j, k) on wxyz, a half-turn about no axis, the first, the second, the third."""
 U_MIRRORED, V_MIRRORED = (2, 3), (1, 3)
 """Axes of half-turns that mirror a texture's columns, and its rows."""
 
@@ -121,6 +130,28 @@ def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarra
     column = np.where(np.repeat(np.isin(axis, U_MIRRORED), areas), widths - 1 - column, column)
     places: np.ndarray = np.repeat(starts, areas) + row * widths + column
     return places
+
+
+def nearest_half_turn(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit quaternions [n, 4] after a half-turn about an own axis, so that w is largest and not negative.
+
+    A flat Gaussian is the same after half a turn about any of its axes; what is shown on it is mirrored along.
+
+    Returns:
+      The quaternions, float64, and [n] the axis about which each was turned: 0 is none, 1 to 3 are u, v and the normal.
+    """
+    quats = np.asarray(quats, np.float64)
+    axis = np.argmax(np.abs(quats), axis=1)
+    return with_positive_w(np.einsum("nij,nj->ni", HALF_TURNS[axis], quats)), axis
+
+
+def with_positive_w(quats: np.ndarray) -> np.ndarray:
+    """Return the same rotations as unit quaternions [n, 4], float64, of which no w is negative."""
+    quats = np.asarray(quats, np.float64)
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1.0), [1.0, 0.0, 0.0, 0.0])
+    positive: np.ndarray = unit * np.where(unit[:, :1] < 0, -1.0, 1.0)
+    return positive
 
 
 def model_of(

@@ -5,35 +5,45 @@ opacities as logits, scales as logarithms, quaternions wxyz. f_rest lists the co
 channel: all of red, then green, then blue. scale_2 belongs to the axis along the normal; files of 2DGS lack it. The
 comment "SplatRenderMode: 2dgs" says that splats are flat. What splats show besides has no place in this format:
 textures, movable kernels and billboards, and with them the colours and opacities that they carry, are lost;
-`save_model` keeps all.
+`save_model` keeps all. Positions that float32 would round too far, as those of maps, are relative to an offset:
+"comment offset X Y Z".
 
-Positions that float32 would round too far, as those of maps, are relative to an offset: "comment offset X Y Z".
+SuperSplat packs a Gaussian into sixteen bytes, within the bounds of its chunk of 256. Elements: `chunk` (float: bounds
+of positions, log-scales and, in newer files, colours), `vertex` (four uint: position and scale in 11, 10 and 11 bits;
+rotation as the index of its largest number and the three others in 10 bits; colour and opacity in 8), and perhaps `sh`
+(uchar: spherical harmonics above degree 0).
 """
 
-import dataclasses
 import os
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.lib.recfunctions import append_fields
 
-from a2tg_jax.appearance.parts import nearest_gaussians
-from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gaussians, logit, rotation_matrices
+from a2tg_jax.core.gaussians import SH_C0, Gaussians, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.similarity import Similarity, transform_gaussians
-from a2tg_jax.data.ply_header import OFFSET, header_lines, offset_of, read_vertex_header
+from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.data.ply import OFFSET, PlyFile
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
-from a2tg_jax.io.flattening import flattened, third_log_scales, whole_rows
-from a2tg_jax.io.number_ranges import offset_for, offset_words, origin_at, place_in_words, warn_of_offset
-from a2tg_jax.io.ply_packed import is_packed, read_packed
-from a2tg_jax.io.sh_degrees import degree_to_read
-from a2tg_jax.io.suffixes import check_suffix
-from a2tg_jax.io.validate import check_model
+from a2tg_jax.io.other_programs import (
+    LEAST_OPACITY,
+    degree_to_read,
+    flattened,
+    offset_for,
+    offset_words,
+    origin_at,
+    reading,
+    third_log_scales,
+    warn_of_offset,
+    whole_rows,
+    world_gaussians,
+)
+from a2tg_jax.io.validate import check_model, check_suffix
 from a2tg_jax.model import Model
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -45,8 +55,6 @@ COLORS = ("red", "green", "blue")
 NUM_REST = (0, 9, 24, 45, 72)
 """Number of attributes f_rest_* by degree of the spherical harmonics; some programs write degree 4."""
 THIRD_SCALE = "scale_2"
-LEAST_OPACITY = 1e-6
-ENCODING = "binary_little_endian"
 FLAT_MARK = "SplatRenderMode: 2dgs"
 """Comment in the header by which programs tell flat splats from ellipsoids."""
 
@@ -86,53 +94,7 @@ def save_ply(
     means, offset = (found.means, np.zeros(3)) if float64 else (None, found.offset)
     with replacing(path) as temporary:
         temporary.write_bytes(encode_ply(found.gaussians, third, offset, means))
-    warn_of_offset("ply", offset, os.fspath(path))
-
-
-def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False) -> Gaussians:
-    """Return the Gaussians of a model without what they show, in the model's world.
-
-    Args:
-      gaussians: as in `save_ply`.
-      keeps_shapes: the file keeps the shapes of kernels besides. If not, each kernel becomes the nearest Gaussian.
-    """
-    if isinstance(gaussians, Model):
-        gaussians = _as_plain(gaussians.live, keeps_shapes)
-    check_gaussians(gaussians)
-    return gaussians
-
-
-class WorldGaussians(NamedTuple):
-    """Plain Gaussians in the original world, as files hold them."""
-
-    gaussians: Gaussians
-    """Their means are relative to the offset."""
-    offset: np.ndarray
-    """[3] float64 whole numbers, zeros where the format holds the positions as they are."""
-    means: np.ndarray
-    """[N, 3] float64 positions, without the offset."""
-
-
-def world_gaussians(
-    gaussians: Gaussians | Model, transform: Similarity | None = None, kind: str = "ply"
-) -> WorldGaussians:
-    """Return the Gaussians of a model without what they show, in the original world.
-
-    Args:
-      gaussians, transform: as in `save_ply`.
-      kind: gaussforge's name of the format.
-    """
-    plain = plain_gaussians(gaussians)
-    if transform is None and isinstance(gaussians, Model) and gaussians.origin is not None:
-        transform = gaussians.origin.transform
-    to_world = Similarity(1.0, np.eye(3), np.zeros(3)) if transform is None else transform.inverse()
-    means = to_world.apply(np.asarray(plain.means, np.float64))
-    offset = offset_for(kind, means, np.asarray(plain.log_scales, np.float64) + np.log(to_world.scale))
-    if offset.any():
-        # The offset goes before means are rounded to float32.
-        to_world = dataclasses.replace(to_world, translation=to_world.translation - offset)
-    moved = plain if transform is None and not offset.any() else transform_gaussians(plain, to_world)
-    return WorldGaussians(moved, offset, means)
+    warn_of_offset("ply", offset, path)
 
 
 def encode_ply(
@@ -149,7 +111,7 @@ def encode_ply(
     Raises:
       ValueError: if `load_ply` would refuse the Gaussians, as it does numbers that are not finite.
     """
-    _check(gaussians)
+    check_model(Model(gaussians))
     sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, 3 * (sh.shape[1] - 1))
     names = [name for name in ATTRIBUTES if name not in SH_REST[rest.shape[1] :]]
@@ -167,7 +129,7 @@ def encode_ply(
     kind, positions = ("float", np.asarray(gaussians.means, "<f4")) if means is None else ("double", means)
     properties = "".join(f"property {kind if name in MEANS else 'float'} {name}\n" for name in names)
     comments = f"comment {FLAT_MARK}\n{'' if offset is None else offset_comment(offset)}"
-    header = f"ply\nformat {ENCODING} 1.0\n{comments}element vertex {gaussians.num}\n{properties}end_header\n"
+    header = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {gaussians.num}\n{properties}end_header\n"
     parts = (positions.astype(positions.dtype.newbyteorder("<")), np.concatenate(columns, 1).astype("<f4"))
     rows = np.concatenate([np.ascontiguousarray(part).view(np.uint8) for part in parts], axis=1)
     return header.encode("ascii") + rows.tobytes()
@@ -176,18 +138,6 @@ def encode_ply(
 def offset_comment(offset: np.ndarray) -> str:
     """Return the line of a header that says what positions are relative to; "" for zeros."""
     return f"comment {OFFSET} {' '.join(offset_words(offset))}\n" if offset.any() else ""
-
-
-def _as_plain(model: Model, keeps_shapes: bool) -> Gaussians:
-    """Return the Gaussians of a model, opaque by themselves, with all spherical harmonics that they have."""
-    gaussians = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh))
-    shapes = model.appearance.shapes
-    if shapes is not None and not keeps_shapes:
-        gaussians = nearest_gaussians(gaussians, np.asarray(shapes))
-    if model.appearance.has_own_opacities:
-        return gaussians
-    opacities = jnp.clip(model.appearance.opacities(model.gaussians), LEAST_OPACITY, LARGEST_OPACITY)
-    return dataclasses.replace(gaussians, logit_opacities=logit(opacities))
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
@@ -213,8 +163,8 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     check_suffix(path, "load_ply")
     model = load_ply_model(path)
     if model.origin is not None:
-        offset = place_in_words(-model.origin.transform.translation)
-        warnings.warn(f"{path}: positions are relative to {offset}; load_splats keeps this offset", stacklevel=2)
+        offset = ", ".join(offset_words(-model.origin.transform.translation))
+        warnings.warn(f"{path}: positions are relative to ({offset}); load_splats keeps this offset", stacklevel=2)
     return model.gaussians
 
 
@@ -235,11 +185,17 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
       path: the name for messages.
       is_flat: whether the splats are known to be flat; if not, the header may say so.
     """
-    vertices = read_packed(file, path) if is_packed(file, path) else _read_vertices(file, path)
-    has_third = THIRD_SCALE in (vertices.dtype.names or ()) and not (is_flat or _is_marked(file, path))
+    ply = PlyFile(file, path)
+    vertices = unpacked_vertices(ply) if [*ply.counts][:1] == ["chunk"] else _vertices(ply)
+    is_flat |= any(" ".join(words).lower() == FLAT_MARK.lower() for words in ply.comments)
+    has_third = THIRD_SCALE in (vertices.dtype.names or ()) and not is_flat
     log_scales = _columns(vertices, (*SCALES, THIRD_SCALE) if has_third else SCALES)
     means, quats = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1), _columns(vertices, QUATS)
-    logits, sh = _logits_of(vertices), _sh_of(vertices, path)
+    # Some programs write infinite logits for opacities 0 and 1.
+    logits = vertices["opacity"]
+    most = np.where(logits > 0, -np.log(LEAST_OPACITY), np.log(LEAST_OPACITY))
+    logits = np.where(np.isinf(logits), most, logits).astype(np.float32)
+    sh = _sh_of(vertices, path)
     kept = whole_rows(str(path), log_scales, means, quats, logits, sh)
     means, quats, log_scales = means[kept], quats[kept], log_scales[kept]
     if has_third:
@@ -248,55 +204,30 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
         means = (means - inside).astype(np.float32)
     gaussians = Gaussians(*(jnp.asarray(rows) for rows in (means, quats, log_scales, logits[kept], sh[kept])))
-    try:
-        _check(gaussians)
-        return Model(gaussians, origin=origin_at(inside + offset_of(file, path)))
-    except ValueError as error:
-        raise ValueError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+
+    def checked() -> Model:
+        check_model(Model(gaussians))
+        return Model(gaussians, origin=origin_at(inside + ply.offset))
+
+    return reading(path, checked)
 
 
-def _is_marked(file: BinaryIO, path: Path) -> bool:
-    """Return whether the header of a PLY says that the splats are flat."""
-    file.seek(0)
-    lines = [" ".join(words[1:]).lower() for words in header_lines(file, path) if words[:1] == ["comment"]]
-    return FLAT_MARK.lower() in lines
-
-
-def _check(gaussians: Gaussians) -> None:
-    """Raise ValueError unless Gaussians can be rendered; of numbers that are not finite it tells field and rows."""
-    for field in dataclasses.fields(gaussians):
-        rows = np.asarray(getattr(gaussians, field.name))
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=tuple(range(1, rows.ndim))))
-        if len(bad):
-            raise ValueError(
-                f"gaussians.{field.name} must be finite; {len(bad):,} of {gaussians.num:,} rows have NaN or infinite "
-                f"numbers, the first is row {bad[0]:,} (from 0)"
-            )
-    check_model(Model(gaussians))
-
-
-def _read_vertices(file: BinaryIO, path: Path) -> np.ndarray:
+def _vertices(ply: PlyFile) -> np.ndarray:
     """Return the vertices, structured, with the attributes that 2DGS gives them."""
-    header = read_vertex_header(file, path)
-    has_colors = set(COLORS) <= set(header.fields) and not set(SH_DEGREE0) & set(header.fields)
-    header.require((*MEANS, *(COLORS if has_colors else SH_DEGREE0), "opacity", *SCALES, *QUATS), "a PLY of Gaussians")
-    vertices = header.read(file)
+    fields = ply.fields.get("vertex", {})
+    has_colors = set(COLORS) <= set(fields) and not set(SH_DEGREE0) & set(fields)
+    wanted = (*MEANS, *(COLORS if has_colors else SH_DEGREE0), "opacity", *SCALES, *QUATS)
+    ply.require_vertices(wanted, "a PLY of Gaussians")
+    vertices = ply.read("vertex")
     if not has_colors:
         return vertices
     colors = np.stack([vertices[name].astype(np.float64) for name in COLORS], axis=1)
-    kind = np.dtype(header.fields[COLORS[0]])
+    kind = np.dtype(fields[COLORS[0]])
     if kind.kind != "f":
         colors /= np.iinfo(kind).max
     elif np.max(colors, initial=0.0, where=np.isfinite(colors)) > 1:
         colors /= 255  # Floats of 0 to 255, as some programs write them.
     return append_fields(vertices, SH_DEGREE0, ((colors - 0.5) / SH_C0).T, usemask=False)
-
-
-def _logits_of(vertices: np.ndarray) -> np.ndarray:
-    """Return the logits [N] of opacities. Infinite ones of opacities 0 and 1, as programs write them, become finite."""
-    given = vertices["opacity"]
-    most = np.where(given > 0, -np.log(LEAST_OPACITY), np.log(LEAST_OPACITY))
-    return np.where(np.isinf(given), most, given).astype(np.float32)
 
 
 def _sh_of(vertices: np.ndarray, path: Path) -> np.ndarray:
@@ -318,3 +249,76 @@ def _columns(vertices: np.ndarray, wanted: Iterable[str]) -> np.ndarray:
     """Return attributes of vertices as columns, float32."""
     with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
         return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)
+
+
+# Files that SuperSplat packed
+
+CHUNK = 256
+AXES, CHANNELS = "xyz", "rgb"
+BOUNDS = tuple(f"{end}_{what}{axis}" for what in ("", "scale_") for end in ("min", "max") for axis in AXES)
+COLOR_BOUNDS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in CHANNELS)
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+SH_RANGE = 8.0
+"""Range of the coefficients that a byte stands for."""
+
+
+def unpacked_vertices(ply: PlyFile) -> np.ndarray:
+    """Return the vertices of a packed PLY, structured, with the attribute names of 3DGS; float32.
+
+    Raises:
+      ValueError: naming the file, if it is cut off, not binary, or its elements do not fit each other.
+    """
+    path, names = ply.path, list(ply.counts)
+    if names not in (["chunk", "vertex"], ["chunk", "vertex", "sh"]):
+        raise ValueError(f"{path}: a packed PLY has the elements chunk, vertex and sh; this one has {names}")
+    if ply.encoding != "binary_little_endian":
+        raise ValueError(f"{path}: is a packed PLY in {ply.encoding}; binary_little_endian is expected")
+    for name, wanted in {"chunk": BOUNDS, "vertex": PACKED, "sh": ()}.items():
+        ply.require(name, wanted, "a PLY as SuperSplat packs it")
+    num, types = ply.counts["vertex"], [ply.fields["vertex"][name] for name in PACKED]
+    if set(types) != {"u4"}:
+        raise ValueError(f"{path}: packed attributes must be uint; got {types}")
+    if ply.counts["chunk"] != -(-num // CHUNK):
+        raise ValueError(f"{path}: has {ply.counts['chunk']} chunks for {num} vertices; {CHUNK} are in each")
+    if "sh" in names and (ply.counts["sh"] != num or set(ply.fields["sh"].values()) - {"u1"}):
+        raise ValueError(f"{path}: sh must be uchar of each of the {num} vertices; got {ply.counts['sh']}")
+    chunks, vertices, *rest = (ply.read(name) for name in names)
+    chunks = np.repeat(chunks, CHUNK)[:num]
+
+    def within(what: str, axes: str, shares: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return columns scaled between their bounds."""
+        ends = [(chunks[f"min_{what}{axis}"], chunks[f"max_{what}{axis}"]) for axis in axes]
+        return [low * (1 - share) + high * share for (low, high), share in zip(ends, shares, strict=True)]
+
+    columns = dict(zip(AXES, within("", AXES, _unpacked(vertices["packed_position"], (11, 10, 11))), strict=True))
+    scales = within("scale_", AXES, _unpacked(vertices["packed_scale"], (11, 10, 11)))
+    columns |= {f"scale_{k}": scale for k, scale in enumerate(scales)}
+    # The highest bits of a rotation hold the index of its largest number, which follows from the others.
+    packed = vertices["packed_rotation"]
+    others = np.stack([(share - 0.5) * np.sqrt(2) for share in _unpacked(packed & np.uint32((1 << 30) - 1), (10,) * 3)])
+    largest, index = np.sqrt(np.maximum(1 - np.sum(others**2, axis=0), 0.0)), (packed >> np.uint32(30)).astype(np.int64)
+    before, after = np.stack([*others, others[2]]), np.stack([others[0], *others])
+    columns |= {f"rot_{k}": np.where(index == k, largest, np.where(index > k, before[k], after[k])) for k in range(4)}
+    *colors, opacity = _unpacked(vertices["packed_color"], (8,) * 4)
+    if set(COLOR_BOUNDS) <= set(ply.fields["chunk"]):
+        colors = within("", CHANNELS, colors)
+    columns |= {f"f_dc_{k}": (color - 0.5) / SH_C0 for k, color in enumerate(colors)}
+    opacity = np.clip(opacity, LEAST_OPACITY, 1 - LEAST_OPACITY)
+    columns["opacity"] = np.log(opacity) - np.log1p(-opacity)
+    for name in ply.fields["sh"] if rest else ():
+        codes = rest[0][name].astype(np.float64)
+        shares = np.where(codes == 0, 0.0, np.where(codes == 255, 1.0, (codes + 0.5) / 256))
+        columns[name] = (shares - 0.5) * SH_RANGE
+    found = np.empty(num, [(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        found[name] = values
+    return found
+
+
+def _unpacked(packed: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
+    """Return numbers in [0, 1] of unsigned integers packed into one, the first highest."""
+    found, shift = [], sum(bits)
+    for num in bits:
+        shift -= num
+        found.append(((packed >> np.uint32(shift)) & np.uint32((1 << num) - 1)) / ((1 << num) - 1))
+    return found

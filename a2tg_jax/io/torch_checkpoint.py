@@ -10,7 +10,6 @@ programs of 3DGS and 2DGS ((parameters, iteration)).
 import collections
 import functools
 import io
-import itertools
 import math
 import os
 import pickle
@@ -26,8 +25,7 @@ import numpy as np
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.flattening import flattened, whole_rows
-from a2tg_jax.io.sh_degrees import degree_to_read
+from a2tg_jax.io.other_programs import degree_to_read, flattened, reading, whole_rows
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
@@ -72,12 +70,7 @@ def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
         except Exception as error:  # A damaged pickle may raise anything.
             reason = shortened(str(error) or type(error).__name__, 200)
             raise ValueError(f"{path}: is no checkpoint of PyTorch 1.6 or newer, or is damaged ({reason})") from error
-    try:
-        gaussians = _gaussians_of(_fields_of(arrays, path), path)
-        check_model(Model(gaussians))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return gaussians
+    return reading(path, lambda: _gaussians_of(arrays, path))
 
 
 class _Refused(Exception):
@@ -92,6 +85,15 @@ class _Storage(NamedTuple):
     num: int
 
 
+class _Tensor(NamedTuple):
+    """A view into a storage."""
+
+    storage: _Storage
+    offset: int
+    size: tuple[int, ...]
+    stride: tuple[int, ...]
+
+
 class _Ignored:
     """A value of no use here, such as a NumPy scalar."""
 
@@ -102,35 +104,26 @@ class _Ignored:
         pass
 
 
-class _Tensor(NamedTuple):
-    """A view into a storage."""
-
-    storage: _Storage
-    offset: int
-    size: tuple[int, ...]
-    stride: tuple[int, ...]
-
-
-def _rebuild_tensor(storage: _Storage, offset: int, size: Any, stride: Any, *rest: Any) -> _Tensor:
+def _tensor(storage: _Storage, offset: int, size: Any, stride: Any, *rest: Any) -> _Tensor:
     return _Tensor(storage, offset, tuple(size), tuple(stride))
 
 
-def _rebuild_parameter(data: Any, *rest: Any) -> Any:
+def _parameter(data: Any, *rest: Any) -> Any:
     return data
 
 
-KNOWN: dict[tuple[str, str], Callable[..., Any]] = {
-    ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
-    ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
-    ("torch.nn.parameter", "Parameter"): _rebuild_parameter,
-    ("collections", "OrderedDict"): collections.OrderedDict,
-    ("numpy.core.multiarray", "scalar"): _Ignored,
-    ("numpy._core.multiarray", "scalar"): _Ignored,
-    ("numpy", "dtype"): _Ignored,
-    ("_codecs", "encode"): _Ignored,
-    ("torch", "device"): _Ignored,
+KNOWN: dict[str, Callable[..., Any]] = {
+    "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch._utils._rebuild_parameter": _parameter,
+    "torch.nn.parameter.Parameter": _parameter,
+    "collections.OrderedDict": collections.OrderedDict,
+    "numpy.core.multiarray.scalar": _Ignored,
+    "numpy._core.multiarray.scalar": _Ignored,
+    "numpy.dtype": _Ignored,
+    "_codecs.encode": _Ignored,
+    "torch.device": _Ignored,
 }
-"""Names that a pickle may hold, and the functions called in their place."""
+"""Names that a pickle may hold, and the functions called instead."""
 
 
 class _Unpickler(pickle.Unpickler):
@@ -141,12 +134,12 @@ class _Unpickler(pickle.Unpickler):
             return STORAGES[name]
         if module in ("torch", "torch.storage") and name.endswith("Storage"):
             raise _Refused(f"has numbers of the type {shortened(name)}, which this program does not read; save floats")
-        if (module, name) not in KNOWN:
+        if (full := f"{module}.{name}") not in KNOWN:
             raise _Refused(
-                f"pickles {shortened(f'{module}.{name}')}, which could run any code; save a dictionary of tensors "
-                "alone, or export a PLY"
+                f"pickles {shortened(full)}, which could run any code; save a dictionary of tensors alone, or export a "
+                "PLY"
             )
-        return functools.partial(KNOWN[module, name])  # What a pickle sets on it, it sets on no other.
+        return functools.partial(KNOWN[full])  # What a pickle sets on it, it sets on no other.
 
     def persistent_load(self, pid: Any) -> _Storage:
         kind, dtype, key, _, num = pid
@@ -162,27 +155,23 @@ def _unpickled(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
     if pickled is None or len(names) > MOST_ENTRIES:
         raise _Refused("is not a checkpoint of PyTorch: it has no data.pkl")
     folder = pickled.removesuffix("data.pkl")
-    if folder + "byteorder" in names and _start(archive, folder + "byteorder", len(BYTE_ORDER) + 1) != BYTE_ORDER:
+
+    def start(name: str, num_bytes: int) -> bytes:
+        """Return the first bytes of an entry, without unpacking more."""
+        with archive.open(name) as entry:
+            return entry.read(num_bytes)
+
+    if folder + "byteorder" in names and start(folder + "byteorder", len(BYTE_ORDER) + 1) != BYTE_ORDER:
         raise _Refused("is a checkpoint of a big-endian machine")
-    data = _start(archive, pickled, MOST_PICKLE_BYTES + 1)
+    data = start(pickled, MOST_PICKLE_BYTES + 1)
     if len(data) > MOST_PICKLE_BYTES:
         raise _Refused(f"has a pickle of more than {MOST_PICKLE_BYTES:,} bytes")
-    _check_memo(data)
-    value = _Unpickler(io.BytesIO(data)).load()
-    return {name: _array(tensor, archive, folder) for name, tensor in _tensors_of(value).items()}
-
-
-def _start(archive: zipfile.ZipFile, name: str, num_bytes: int) -> bytes:
-    """Return the first bytes of an entry, without unpacking more."""
-    with archive.open(name) as entry:
-        return entry.read(num_bytes)
-
-
-def _check_memo(data: bytes) -> None:
-    """Refuse a pickle that asks for a memo longer than itself, for which the unpickler would make room."""
+    # The unpickler makes room for a memo of any index that a pickle names.
     for opcode, argument, _ in pickletools.genops(data):
         if opcode.name.endswith("PUT") and isinstance(argument, int) and argument > len(data):
             raise _Refused("has a damaged pickle: its memo is longer than the pickle")
+    value = _Unpickler(io.BytesIO(data)).load()
+    return {name: _array(tensor, archive, folder) for name, tensor in _tensors_of(value).items()}
 
 
 def _tensors_of(value: Any) -> dict[str, _Tensor]:
@@ -191,10 +180,12 @@ def _tensors_of(value: Any) -> dict[str, _Tensor]:
         parts = value[0]
         found = {name: parts[place] for name, place in TUPLE_2DGS.items()} if len(parts) >= TUPLE_LENGTH - 1 else {}
     else:
-        nodes = list(itertools.islice(_nodes(value), MOST_NODES + 1))
-        if len(nodes) > MOST_NODES:
-            raise _Refused(f"has dictionaries of more than {MOST_NODES:,} values")
-        own = {name: node for name, node in nodes if isinstance(node, _Tensor)}
+        own = dict[str, _Tensor]()
+        for index, (name, node) in enumerate(_nodes(value)):
+            if index >= MOST_NODES:
+                raise _Refused(f"has dictionaries of more than {MOST_NODES:,} values")
+            if isinstance(node, _Tensor):
+                own[name] = node
         wanted = GSPLAT if any(name.endswith("sh0") for name in own) else NERFSTUDIO
         found = {name: own[key] for name, key in zip(GSPLAT, wanted, strict=True) if key in own}
     tensors = {name: tensor for name, tensor in found.items() if isinstance(tensor, _Tensor)}
@@ -232,32 +223,22 @@ def _array(tensor: _Tensor, archive: zipfile.ZipFile, folder: str) -> np.ndarray
     return np.array(np.lib.stride_tricks.as_strided(flat[tensor.offset :], size, strides), np.float32)
 
 
-def _fields_of(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
-    """Return means, quats, scales, opacities and SH to degree 3 [N, K, 3]. Raises ValueError if the shapes disagree."""
-    num = len(arrays["means"])
-    first = arrays["sh0"].reshape(num, 1, 3)
-    rest = arrays.get("shN")
-    rest = np.zeros((num, 0, 3), np.float32) if rest is None else rest.reshape(num, -1, 3)
-    shapes = {"means": (num, 3), "quats": (num, 4), "scales": (num, arrays["scales"].shape[-1]), "opacities": (num,)}
-    fields = {name: arrays[name].reshape(shape) for name, shape in shapes.items()}
-    sh = np.concatenate([first, rest], axis=1)
-    if sh.shape[1] not in COEFFICIENTS or fields["scales"].shape[1] not in (2, 3):
-        found = f"{sh.shape[1]} coefficients and {fields['scales'].shape[1]} scales of each Gaussian"
+def _gaussians_of(arrays: Mapping[str, np.ndarray], path: Path) -> Gaussians:
+    """Return the Gaussians of arrays by gsplat's names. Raises ValueError if the shapes disagree."""
+    means = arrays["means"]
+    num = len(means)
+    bands = [arrays[name].reshape(num, -1, 3) for name in ("sh0", "shN") if name in arrays]
+    sh, log_scales = np.concatenate(bands, axis=1), arrays["scales"]
+    if sh.shape[1] not in COEFFICIENTS or bands[0].shape[1] != 1 or log_scales.shape[1:] not in ((2,), (3,)):
+        found = f"{sh.shape[1]} coefficients and {log_scales.shape[-1]} scales of each Gaussian"
         raise ValueError(f"has {found}; SH of degree 0 to 4 have 1, 4, 9, 16 or 25, and Gaussians 2 or 3 scales")
-    degree = degree_to_read(COEFFICIENTS.index(sh.shape[1]), str(path))
-    return {**fields, "sh": sh[:, : COEFFICIENTS[degree]]}
-
-
-def _gaussians_of(fields: Mapping[str, np.ndarray], path: Path) -> Gaussians:
-    kept = whole_rows(str(path), fields["scales"], *(fields[name] for name in ("means", "quats", "opacities", "sh")))
-    fields = {name: values[kept] for name, values in fields.items()}
-    quats, log_scales = fields["quats"], fields["scales"]
+    sh = sh[:, : COEFFICIENTS[degree_to_read(COEFFICIENTS.index(sh.shape[1]), str(path))]]
+    columns = (means.reshape(num, 3), arrays["quats"].reshape(num, 4), arrays["opacities"].reshape(num), sh)
+    kept = whole_rows(str(path), log_scales, *columns)
+    means, quats, logits, sh = (values[kept] for values in columns)
+    log_scales = log_scales[kept]
     if log_scales.shape[1] == 3:
         quats, log_scales = flattened(quats, log_scales, str(path))
-    return Gaussians(
-        means=jnp.asarray(fields["means"]),
-        quats=jnp.asarray(quats),
-        log_scales=jnp.asarray(log_scales),
-        logit_opacities=jnp.asarray(fields["opacities"]),
-        sh=jnp.asarray(fields["sh"]),
-    )
+    gaussians = Gaussians(*(jnp.asarray(values) for values in (means, quats, log_scales, logits, sh)))
+    check_model(Model(gaussians))
+    return gaussians

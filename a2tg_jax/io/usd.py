@@ -9,22 +9,23 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, open_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.exchange import (
+from a2tg_jax.io.model_file import background_of
+from a2tg_jax.io.other_programs import (
+    MOST_PARTS,
     Ellipsoids,
     Up,
+    degree_to_read,
     gaussians_of,
     joined_parts,
     matrix_of,
@@ -34,20 +35,14 @@ from a2tg_jax.io.exchange import (
     similarity_of,
     splats_of,
     upright,
-    whole_splats,
 )
-from a2tg_jax.io.model_file import background_of
-from a2tg_jax.io.sh_degrees import degree_to_read
-from a2tg_jax.io.suffixes import check_saved, check_suffix
-from a2tg_jax.io.validate import check_model
+from a2tg_jax.io.validate import check_model, check_suffix, live_model
 from a2tg_jax.model import Model
 
 ORIGIN = "a2tg:origin"
 """Name of the origin, as JSON, in the custom data of a particle field."""
 ATTRIBUTES = ("Position", "Orientation", "Scale", "Opacity", "SphericalHarmonics")
 SURFLET, ELLIPSOID = "ParticleFieldKernelGaussianSurfletAPI", "ParticleFieldKernelGaussianEllipsoidAPI"
-MOST_FIELDS = 256
-"""Largest number of particle fields in one file."""
 
 
 def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = False) -> None:
@@ -61,11 +56,7 @@ def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = F
     Raises:
       ValueError: if usd-core is missing, or the model has a number that is not finite or too large.
     """
-    check_saved(path, model, "save_usd")
-    check_gaussians(model.gaussians, "model.gaussians")
-    model = model.live
-    check_model(model)
-    stage = _stage_of(model, ellipsoids)
+    stage = _stage_of(live_model(path, model, "save_usd"), ellipsoids)
     path = Path(path)
     with replacing(path) as temporary, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         suffix = path.suffix.lower() if path.suffix.lower() in (".usda", ".usdz") else ".usdc"
@@ -108,37 +99,28 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
         getattr(usd.UsdVol, SURFLET).Apply(prim)
     matrix = matrix_of(upright(model.origin, "z"))
     field.AddTransformOp().Set(usd.Gf.Matrix4d(*matrix.T.ravel().tolist()))
-    _set_numbers(usd, prim, splats)
-    if model.num:
-        reach = 3 * splats.scales.max(axis=1, keepdims=True)
-        corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
-        field.CreateExtentAttr(usd.Vt.Vec3fArray.FromNumpy(corners))
-    if model.origin is not None:
-        prim.SetCustomDataByKey(
-            ORIGIN, json.dumps(origin_to_json(model.origin) | {"background": list(model.background)}, allow_nan=False)
-        )
-    return stage
-
-
-def _set_numbers(usd: Any, prim: Any, splats: Ellipsoids) -> None:
-    """Set the attributes of a particle field; coefficients go particle by particle."""
     volume, arrays = usd.UsdVol, usd.Vt
-    xyzw = np.ascontiguousarray(splats.quats[:, [1, 2, 3, 0]])
     harmonics = volume.ParticleFieldSphericalHarmonicsAttributeAPI(prim)
+    xyzw = splats.quats[:, [1, 2, 3, 0]]
     numbers = (
         (volume.ParticleFieldPositionAttributeAPI(prim).CreatePositionsAttr(), arrays.Vec3fArray, splats.means),
         (volume.ParticleFieldOrientationAttributeAPI(prim).CreateOrientationsAttr(), arrays.QuatfArray, xyzw),
         (volume.ParticleFieldScaleAttributeAPI(prim).CreateScalesAttr(), arrays.Vec3fArray, splats.scales),
         (volume.ParticleFieldOpacityAttributeAPI(prim).CreateOpacitiesAttr(), arrays.FloatArray, splats.opacities),
-        (
-            harmonics.CreateRadianceSphericalHarmonicsCoefficientsAttr(),
-            arrays.Vec3fArray,
-            splats.sh.reshape(-1, 3),
-        ),
+        # Coefficients go particle by particle.
+        (harmonics.CreateRadianceSphericalHarmonicsCoefficientsAttr(), arrays.Vec3fArray, splats.sh.reshape(-1, 3)),
     )
-    for attribute, kind, values in numbers:
-        attribute.Set(kind.FromNumpy(np.ascontiguousarray(values)))
+    for attribute, array, values in numbers:
+        attribute.Set(array.FromNumpy(np.ascontiguousarray(values)))
     harmonics.CreateRadianceSphericalHarmonicsDegreeAttr(NUM_BASES.index(splats.sh.shape[1]))
+    if model.num:
+        reach = 3 * splats.scales.max(axis=1, keepdims=True)
+        corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
+        field.CreateExtentAttr(usd.Vt.Vec3fArray.FromNumpy(corners))
+    if model.origin is not None:
+        kept = origin_to_json(model.origin) | {"background": list(model.background)}
+        prim.SetCustomDataByKey(ORIGIN, json.dumps(kept, allow_nan=False))
+    return stage
 
 
 def load_usd(path: str | os.PathLike[str]) -> Model:
@@ -159,42 +141,34 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
 
     def loaded() -> Model:
         try:
-            return _loaded(usd, path)
+            stage = usd.Usd.Stage.Open(str(path))
+            up: Up = "z" if usd.UsdGeom.GetStageUpAxis(stage) == usd.UsdGeom.Tokens.z else "y"
+            unit = float(usd.UsdGeom.GetStageMetersPerUnit(stage))
+            parts: list[tuple[Model, Similarity]] = []
+            for prim in stage.Traverse():
+                if not prim.IsA(usd.UsdVol.ParticleField):
+                    continue
+                field = usd.UsdVol.ParticleField(prim)
+                matrix = np.array(field.ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())).T
+                matrix[:3] *= unit
+                parts.append((_model_of(usd, prim, path), similarity_of(matrix, "the transform of its splats")))
+                if len(parts) > MOST_PARTS:
+                    raise ValueError(f"holds more than {MOST_PARTS} particle fields")
+            if not parts:
+                raise ValueError("holds no splats (ParticleField)")
+            return joined_parts(parts, up)
         except RuntimeError as error:  # Those of usd-core, of several lines.
             raise ValueError(f"is no USD file, or is damaged ({shortened(str(error))})") from error
 
     return reading(path, loaded)
 
 
-def _loaded(usd: Any, path: Path) -> Model:
-    stage = usd.Usd.Stage.Open(str(path))
-    up: Up = "z" if usd.UsdGeom.GetStageUpAxis(stage) == usd.UsdGeom.Tokens.z else "y"
-    unit = float(usd.UsdGeom.GetStageMetersPerUnit(stage))
-    parts: list[tuple[Model, Similarity]] = []
-    for field in _fields(usd, stage):
-        matrix = np.array(field.ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())).T
-        matrix[:3] *= unit
-        parts.append((_model_of(usd, field, path), similarity_of(matrix, "the transform of its splats")))
-        if len(parts) > MOST_FIELDS:
-            raise ValueError(f"holds more than {MOST_FIELDS} particle fields")
-    if not parts:
-        raise ValueError("holds no splats (ParticleField)")
-    return joined_parts(parts, up)
-
-
-def _fields(usd: Any, stage: Any) -> Iterator[Any]:
-    for prim in stage.Traverse():
-        if prim.IsA(usd.UsdVol.ParticleField):
-            yield usd.UsdVol.ParticleField(prim)
-
-
-def _model_of(usd: Any, field: Any, path: Path) -> Model:
+def _model_of(usd: Any, prim: Any, path: Path) -> Model:
     """Return the model of a particle field, in the field's own world."""
-    prim = field.GetPrim()
     kernels = set(prim.GetAppliedSchemas()) & {SURFLET, ELLIPSOID}
     if len(kernels) != 1:
         raise ValueError(f"its particle field {shortened(str(prim.GetPath()))} must have a kernel of Gaussians")
-    gaussians = gaussians_of(whole_splats(_splats(usd, prim, path), path), path, is_flat=SURFLET in kernels)
+    gaussians = gaussians_of(_splats(usd, prim, path), path, is_flat=SURFLET in kernels)
     kept = prim.GetCustomDataByKey(ORIGIN)
     described = parse_json(kept) if isinstance(kept, str) else None
     origin = None if described is None else origin_from_json(described)

@@ -1,10 +1,12 @@
 """Checks that a file holds a valid model: shapes, dtypes, ranges, finite numbers. On the host, with numpy.
 
-Native loops believe the layout that they are given. Both loaders, of models and of checkpoints, go through here first.
+Native loops trust the layout of their arrays, so the loaders of models and of checkpoints come through here first.
 """
 
 import math
+import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,9 +19,42 @@ from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import check_similarity
 from a2tg_jax.host.text import shortened
-from a2tg_jax.model import Model
+from a2tg_jax.model import Model, check_is_model
 
 LARGEST_LOG_SCALE = math.log(LARGEST_NUMBER)
+FUNCTIONS = {
+    ".npz": "model", ".a2tgz": "compact", ".ply": "ply", ".glb": "gltf", ".gltf": "gltf",
+    ".usdz": "usd", ".usdc": "usd", ".usda": "usd", ".usd": "usd",
+}  # fmt: skip
+"""Names of public functions, without save_ and load_, by the suffix of their files."""
+
+
+def check_suffix(path: str | os.PathLike[str], function: str) -> None:
+    """Raise ValueError if a file has the suffix of another format than the function's, such as "save_ply"."""
+    verb, _, own = function.partition("_")
+    found = FUNCTIONS.get(Path(path).suffix.lower(), own)
+    if found != own:
+        suffix = next(suffix for suffix, name in FUNCTIONS.items() if name == own)
+        does = "writes" if verb == "save" else "reads"
+        raise ValueError(
+            f"{shortened(os.fspath(path))}: {function} {does} *{suffix} files; call {verb}_{found} instead"
+        )
+
+
+def live_model(path: str | os.PathLike[str], model: Model, function: str, *, is_whole: bool = True) -> Model:
+    """Return the model of existing rows that a function writes to a file.
+
+    Raises:
+      ValueError: if the suffix is another format's, or the value is no model that can be loaded again; `is_whole` False
+        leaves the numbers for later.
+    """
+    check_suffix(path, function)
+    check_is_model(model)
+    check_gaussians(model.gaussians, "model.gaussians")
+    model = model.live
+    if is_whole:
+        check_model(model)
+    return model
 
 
 def check_model(model: Model) -> None:
@@ -63,9 +98,14 @@ def check_finite(name: str, tree: object, *, is_signed: bool = True) -> None:
         values = np.asarray(leaf)
         if not np.issubdtype(values.dtype, np.floating):
             continue
-        if not (np.isfinite(values) if is_signed else values >= 0).all():
+        is_good = np.atleast_1d(np.isfinite(values) if is_signed else values >= 0)
+        if not is_good.all():
             wanted, found = ("finite", "NaN or infinite") if is_signed else ("at least 0", "negative or NaN")
-            raise ValueError(f"{name}{jax.tree_util.keystr(path)} must be {wanted}; some are {found}")
+            bad = np.flatnonzero(~is_good.all(axis=tuple(range(1, is_good.ndim))))
+            raise ValueError(
+                f"{name}{jax.tree_util.keystr(path)} must be {wanted}; {len(bad):,} of {len(is_good):,} rows have "
+                f"{found} numbers, the first is row {bad[0]:,} (from 0)"
+            )
 
 
 def check_bounded(name: str, tree: object) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 from PIL import Image
 
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io.exchange import linear_colors, matrix_of, upright_from
 from a2tg_jax.io.gltf import OWN
-from a2tg_jax.io.gltf_writer import Builder
+from a2tg_jax.io.gltf_container import Builder
+from a2tg_jax.io.other_programs import linear_colors, matrix_of, upright_from
 from a2tg_jax.mesh.triangles import Mesh
 
 JPEG_QUALITY = 92

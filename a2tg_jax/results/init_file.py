@@ -17,7 +17,7 @@ from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.formats import format_of, load_splats
 from a2tg_jax.io.model_file import save_model
-from a2tg_jax.io.ply import plain_gaussians
+from a2tg_jax.io.other_programs import plain_gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.history import write_history

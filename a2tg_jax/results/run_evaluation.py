@@ -20,7 +20,7 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import save_ply
-from a2tg_jax.io.web_scene import encode_web_scene, is_viewable
+from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.measure.alignment import align_poses
 from a2tg_jax.measure.evaluation import Evaluation, evaluate
 from a2tg_jax.model import Model
@@ -93,7 +93,7 @@ def evaluate_run(
             write_json(run.own(run.corrections(name)), learned(model.origin))
     main, settings = models[result.main], settings_of(plan[result.main].system)
     save_ply(run.own(run.point_cloud), main)
-    if is_viewable(main.appearance):
+    if main.appearance.is_portable:
         data = encode_web_scene(main, title=f"{scene.name} · {result.main}")
         with replacing(run.own(run.viewer)) as temporary:
             temporary.write_text(viewer_html_with(data), encoding="utf-8")

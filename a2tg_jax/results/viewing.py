@@ -25,7 +25,7 @@ from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_on_views
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import counted, in_bytes
-from a2tg_jax.io.web_scene import decode_web_scene, encode_web_scene
+from a2tg_jax.io.web_scene import encode_web_scene, rounded_model
 from a2tg_jax.model import Model
 from a2tg_jax.results.checks import check_new
 from a2tg_jax.results.folder import read_json, remove_if_empty
@@ -271,7 +271,7 @@ def losses_of(source: Source) -> dict[str, float]:
     if not source.model.num:
         return {}
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
-    again = decode_web_scene(source.encoded).model
+    again = rounded_model(source.model)
     scene = source.load_scene_or_warn()
     if scene is not None:
         views = {"training views": scene.train, "test views": scene.test}

@@ -1,0 +1,166 @@
+"""PLY files of strangers: their header and tables, and points with colours from them."""
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from a2tg_jax.core.gaussians import SH_C0
+from a2tg_jax.data.assembly import PointCloud
+from a2tg_jax.host.regular_files import is_regular, open_regular
+from a2tg_jax.host.text import shortened
+
+OLD_TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
+NEW_TYPES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
+NUMPY_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+PLY_TYPES = dict(zip(OLD_TYPES + NEW_TYPES, NUMPY_TYPES * 2, strict=True))
+BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+LONGEST_LINE, MOST_LINES, MOST_DIGITS = 4096, 10_000, 20
+OFFSET = "offset"
+"""First word of the comment that says what positions are relative to."""
+COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+"""Names of colours, in order of preference."""
+SH_DEGREE0 = ("f_dc_0", "f_dc_1", "f_dc_2")
+FLOAT_RANGES, INTEGER_RANGES = (1, 255, 65535), (255, 65535, 2**32 - 1)
+"""Largest values of colours in files."""
+
+
+class PlyFile:
+    """An open PLY file, whose elements are read one after the other, as far as they are lists of numbers.
+
+    Raises:
+      ValueError: naming the file, if it is no PLY, or its header does not end.
+    """
+
+    def __init__(self, file: BinaryIO, path: Path):
+        self.path, self.encoding, self._file = path, "", file
+        self.comments: list[list[str]] = []
+        self.counts: dict[str, int] = {}
+        self.fields: dict[str, dict[str, str]] = {}
+        """NumPy type of each property, by element and property, in order."""
+        self._unreadable: dict[str, str] = {}
+        if file.readline(LONGEST_LINE).strip() != b"ply":
+            raise ValueError(f"{path}: is not a PLY file")
+        name = ""
+        for _ in range(MOST_LINES):
+            line = file.readline(LONGEST_LINE)
+            words = line.decode("ascii", "replace").split()
+            if words == ["end_header"]:
+                return
+            if not line.endswith(b"\n"):
+                break
+            match words:
+                case ["format", encoding, *_]:
+                    if encoding not in BYTE_ORDERS:
+                        raise ValueError(
+                            f"{path}: is a PLY in {shortened(encoding)}; {', '.join(BYTE_ORDERS)} are known"
+                        )
+                    self.encoding = encoding
+                case ["element", name, number]:
+                    if name in self.counts or not number.isdecimal() or len(number) > MOST_DIGITS:
+                        found = f"{shortened(number)} of {shortened(name)}"
+                        raise ValueError(f"{path}: announces {found}; a number is expected, once for each element")
+                    self.counts[name], self.fields[name] = int(number), {}
+                case ["property", kind, field] if name and kind in PLY_TYPES and field not in self.fields[name]:
+                    self.fields[name][field] = PLY_TYPES[kind]
+                case ["property", *_]:
+                    self._unreadable.setdefault(name, shortened(" ".join(words[1:])))
+                case ["comment", *text]:
+                    self.comments.append(text)
+        raise ValueError(f"{path}: its PLY header does not end")
+
+    def require(self, element: str, names: Iterable[str], wanted: str) -> None:
+        """Raise ValueError unless an element can be read, and has some properties of what is wanted."""
+        if element in self._unreadable:
+            raise ValueError(f"{self.path}: cannot read the {element} property '{self._unreadable[element]}'")
+        if missing := [name for name in names if name not in self.fields[element]]:
+            raise ValueError(f"{self.path}: has no attribute {', '.join(missing)}; {wanted} is expected")
+
+    def require_vertices(self, names: Iterable[str], wanted: str) -> None:
+        """Raise ValueError unless vertices come first, can be read, and have some properties of what is wanted."""
+        if [*self.counts][:1] != ["vertex"] or not self.encoding:
+            found = shortened([*self.counts])
+            raise ValueError(f"{self.path}: vertices must be the first element of the PLY; it has {found}")
+        self.require("vertex", names, wanted)
+
+    def read(self, element: str) -> np.ndarray:
+        """Return the structured rows [count] of the next element, which must be required before; float64 from text.
+
+        Raises:
+          ValueError: if they are cut off, or no numbers.
+        """
+        count, fields, is_text = self.counts[element], self.fields[element], self.encoding == "ascii"
+        dtype = np.dtype([(name, BYTE_ORDERS[self.encoding] + kind) for name, kind in fields.items()])
+        # No room is made for more rows than there can be: a number in text takes a digit and a separator.
+        size, start = 2 * len(fields) - 1 if is_text else dtype.itemsize, self._file.tell()
+        left = self._file.seek(0, os.SEEK_END) - start
+        self._file.seek(start)
+        if count * size > left:
+            raise ValueError(
+                f"{self.path}: is cut off; {count} rows of {size} bytes were announced for {element}, and {left} bytes "
+                "are left; export it again"
+            )
+        if not is_text:
+            return np.frombuffer(self._file.read(count * size), dtype, count)
+        rows = np.empty((count, len(fields)))
+        try:
+            for row in rows:
+                row[:] = [float(word) for word in self._file.readline(LONGEST_LINE).split()[: len(fields)]]
+        except ValueError:
+            raise ValueError(
+                f"{self.path}: a line of it is not a {element} of {len(fields)} numbers; export it again"
+            ) from None
+        return rows.view([(name, np.float64) for name in fields])[:, 0]
+
+    @property
+    def offset(self) -> np.ndarray:
+        """[3] float64 what positions are relative to: zeros without the comment "offset X Y Z"."""
+        for word, *numbers in filter(None, self.comments):
+            if word == OFFSET and len(numbers) == 3:
+                try:
+                    return np.array([float(number) for number in numbers])
+                except ValueError:
+                    continue  # Words of another program.
+        return np.zeros(3)
+
+
+def read_ply_points(path: Path) -> PointCloud:
+    """Return the points of a PLY file whose first element is `vertex` with x, y, z.
+
+    Positions that are relative to an offset, as `save_ply` writes those of maps, are in the original world.
+
+    Colours are whole numbers of 8 bits or, if some are above 255, of 16 or 32; or floats in [0, 1] or, if their mean
+    is above 1, in 0..255 (above 255: 0..65535). Numbers beyond are clipped. Gaussians have the colours of their f_dc.
+    Points without colours are mid-grey.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: naming the file, if it is no such PLY or is truncated.
+    """
+    if not is_regular(path):
+        raise FileNotFoundError(f"{path}: no such point file, but transforms.json names it; correct ply_file_path")
+    with open_regular(path) as file:
+        ply = PlyFile(file, path)
+        ply.require_vertices("xyz", "a PLY file of points")
+        vertices = ply.read("vertex")
+    points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=-1) + ply.offset
+    return PointCloud(points, _colors(vertices, ply.fields["vertex"]))
+
+
+def _colors(vertices: np.ndarray, fields: Mapping[str, str]) -> np.ndarray:
+    """Return uint8 colours [P, 3] of the vertices."""
+    names = next((names for names in (*COLORS, SH_DEGREE0) if set(names).issubset(fields)), None)
+    if names is None or not len(vertices):
+        return np.full((len(vertices), 3), 128, np.uint8)
+    given = np.nan_to_num(np.stack([vertices[name] for name in names], axis=-1).astype(np.float64))
+    if names == SH_DEGREE0:
+        colors = 0.5 + SH_C0 * given
+    elif fields[names[0]].startswith("f"):  # Some floats are a little above 1, or far: the mean decides.
+        mean = np.clip(given, 0, FLOAT_RANGES[-1]).mean()
+        colors = given / next(largest for largest in FLOAT_RANGES if mean <= largest)
+    else:
+        colors = given / next(largest for largest in INTEGER_RANGES if given.max() <= largest)
+    pixels: np.ndarray = np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)
+    return pixels

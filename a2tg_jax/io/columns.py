@@ -1,0 +1,477 @@
+"""Columns of numbers as small integers and coded bytes, and back.
+
+Numbers become even steps between two ends, positions steps along a Z curve, and both become planes of one byte each,
+which lossless coders from established libraries make smaller. `ColumnWriter` and `ColumnReader` go through named
+columns in one order; the reader unpacks no more than it may, whatever the bytes claim.
+
+All arrays are numpy's, on the host; C columns of n numbers are [C, n]. A precision is a number of bits or a float type.
+"""
+
+import io
+import lzma
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import zstandard
+from PIL import Image
+
+Precision = int | Literal["float32", "float16"]
+Choice = Literal["smallest", "lzma", "zstd", "webp", "none"]
+"""Name of a coder, or "smallest" for the one with fewest bytes."""
+CODERS = ("lzma", "zstd", "none", "webp")
+MOST_BITS = 16
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
+LEAST_OPACITY = 1e-7
+LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
+"""Bounds of the bytes that a file may unpack to: a multiple of its own, and further ones."""
+ZSTD_LEVEL = 19
+LZMA_FILTERS = [
+    {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 20}
+]
+"""Filters for LZMA: one adaptive model without contexts, because planes are noise around few values."""
+WEBP_CHANNELS = 3
+LONGEST_WEBP_SIDE = 16_383
+
+
+# Coders of byte planes
+
+
+def room_of(num_bytes: int) -> int:
+    """Return how many bytes a file of so many may unpack to."""
+    return FREE_ROOM + LARGEST_RATIO * num_bytes
+
+
+def encode(coder: str, planes: np.ndarray) -> bytes:
+    """Code planes [C, n] of uint8; no planes give no bytes."""
+    if not planes.size or coder == "none":
+        return planes.tobytes()
+    if coder == "lzma":
+        return lzma.compress(planes.tobytes(), format=lzma.FORMAT_RAW, filters=LZMA_FILTERS)
+    if coder == "zstd":  # In one frame, a plane begins a block of its own, with tables of its own.
+        stream = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compressobj(size=planes.size)
+        pieces = [stream.compress(row.tobytes()) + stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for row in planes]
+        return b"".join([*pieces, stream.flush()])
+    num, height, width = _webp_shape(*planes.shape)
+    if max(num * height, width) > LONGEST_WEBP_SIDE:
+        raise ValueError(f"coder: {planes.size} bytes are more than an image of WebP holds; choose another")
+    pixels = np.zeros((num * WEBP_CHANNELS, height * width), np.uint8)
+    pixels[: len(planes), : planes.shape[1]] = planes
+    image = pixels.reshape(num, WEBP_CHANNELS, height * width).transpose(0, 2, 1).reshape(num * height, width, -1)
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "WEBP", lossless=True, quality=75, method=4, exact=True)
+    return file.getvalue()
+
+
+def decode(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
+    """Return the planes [num_planes, length] of uint8 that `encode` was given.
+
+    Raises:
+      ValueError: if the bytes are damaged, or hold more or less than that.
+    """
+    size = num_planes * length
+    if size == 0:
+        if data:
+            raise ValueError("holds bytes where there should be none")
+        return np.zeros((num_planes, length), np.uint8)
+    try:
+        planes = _decoded(coder, data, num_planes, length)
+    except Exception as error:  # Each library has errors of its own, and Pillow's differ by what is wrong.
+        raise ValueError(f"is not what {coder} wrote ({error})") from error
+    if planes.size != size:
+        raise ValueError(f"holds {planes.size} bytes; {size} were announced")
+    return planes.reshape(num_planes, length)
+
+
+def _decoded(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
+    size = num_planes * length
+    if coder == "none":
+        return np.frombuffer(data, np.uint8)
+    if coder == "lzma":
+        stream = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=LZMA_FILTERS)
+        found = stream.decompress(data, size + 1)
+        if not stream.eof or stream.unused_data:
+            raise ValueError("it does not end where it should")
+        return np.frombuffer(found, np.uint8)
+    if coder == "zstd":
+        announced = zstandard.get_frame_parameters(data).content_size
+        if announced != size:  # The library would allocate what the frame says.
+            raise ValueError(f"its frame is of {announced} bytes")
+        return np.frombuffer(zstandard.ZstdDecompressor().decompress(data, allow_extra_data=False), np.uint8)
+    num, height, width = _webp_shape(num_planes, length)
+    with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+        if image.size != (width, num * height):
+            raise ValueError(f"its image is of {image.size} pixels")
+        pixels = np.asarray(image.convert("RGB"))
+    planes = pixels.reshape(num, height * width, WEBP_CHANNELS).transpose(0, 2, 1).reshape(-1, height * width)
+    return planes[:num_planes, :length]
+
+
+def _webp_shape(num_planes: int, length: int) -> tuple[int, int, int]:
+    """Return the number of stacked images, and the height and width of one: a square for three planes as channels."""
+    width = math.isqrt(max(length - 1, 0)) + 1
+    return -(-num_planes // WEBP_CHANNELS), -(-length // width), width
+
+
+# Numbers as steps
+
+
+class Ends(NamedTuple):
+    """Ends of a range: the first and the last step."""
+
+    low: float
+    high: float
+
+
+def check_precision(name: str, precision: Precision) -> None:
+    """Raise ValueError, naming the choice, unless it is a number of bits or a float type."""
+    is_bits = isinstance(precision, int) and not isinstance(precision, bool) and 1 <= precision <= MOST_BITS
+    if not is_bits and precision not in ("float32", "float16"):
+        raise ValueError(f"{name} must be 1 to {MOST_BITS} bits, float32 or float16; got {precision!r}")
+
+
+def ends_of(values: np.ndarray, bits: int) -> Ends:
+    """Return the smallest and the largest of all numbers; 0 and 0 without numbers.
+
+    Where 0 lies between them, they are moved apart, by a step together, so that a step lies on 0: most of what is added
+    to something else is about 0.
+    """
+    if not values.size:
+        return Ends(0.0, 0.0)
+    low, high = float(values.min()), float(values.max())
+    if low < 0 < high and bits > 1:
+        step = (high - low) / ((1 << bits) - 2)
+        low = -math.ceil(-low / step) * step
+        high = low + step * ((1 << bits) - 1)
+    return Ends(_short(low), _short(high))
+
+
+def _short(value: Any) -> float:
+    """Return the float of fewest digits that is the same float32."""
+    return float(str(np.float32(value)))
+
+
+def quantised(values: np.ndarray, ends: Ends, bits: int) -> np.ndarray:
+    """Return the nearest of 2^bits even steps between the ends, as int64; all 0 if both ends are equal."""
+    low, high = ends
+    if high <= low:
+        return np.zeros(values.shape, np.int64)
+    steps = (1 << bits) - 1
+    shares = (np.asarray(values, np.float64) - low) / (high - low)
+    return np.rint(np.clip(shares, 0.0, 1.0) * steps).astype(np.int64)
+
+
+def dequantised(codes: np.ndarray, ends: Ends, bits: int) -> np.ndarray:
+    """Return the values of steps, float64: off by half a step at most, (high − low) / (2^bits − 1) / 2."""
+    low, high = ends
+    return low + codes * ((high - low) / ((1 << bits) - 1))
+
+
+def green_apart(codes: np.ndarray, bits: int) -> np.ndarray:
+    """Return codes [3, n] of RGB as red − green, green, blue − green, modulo the range of their bytes."""
+    red, green, blue = codes
+    mask = (1 << 8 * num_bytes_of(bits)) - 1
+    return np.stack([(red - green) & mask, green, (blue - green) & mask])
+
+
+def with_green(codes: np.ndarray, bits: int) -> np.ndarray:
+    """Return the inverse of `green_apart`."""
+    red, green, blue = codes
+    mask = (1 << 8 * num_bytes_of(bits)) - 1
+    return np.stack([(red + green) & mask, green, (blue + green) & mask])
+
+
+def opacities_of(logits: np.ndarray) -> np.ndarray:
+    """Return the opacities of logits, float64."""
+    opacities: np.ndarray = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
+    return opacities
+
+
+def logits_of(opacities: np.ndarray) -> np.ndarray:
+    """Return the finite logits of opacities, float64."""
+    inside = np.clip(opacities.astype(np.float64), LEAST_OPACITY, 1 - LEAST_OPACITY)
+    return np.log(inside) - np.log1p(-inside)
+
+
+def with_w(xyz: np.ndarray) -> np.ndarray:
+    """Return unit quaternions [n, 4] from their last three numbers [3, n]; w is not negative."""
+    squares = np.minimum(np.sum(xyz**2, axis=0), 1.0)
+    quats = np.concatenate([np.sqrt(1.0 - squares)[None], xyz]).T
+    units: np.ndarray = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+    return units
+
+
+# Positions
+
+
+class AxisSteps(NamedTuple):
+    """Even steps of asinh((x − centre) / spread): they grow with the distance, so that far positions cost no bits."""
+
+    centre: float
+    spread: float
+    low: float
+    high: float
+
+    @staticmethod
+    def of(x: np.ndarray, bits: int) -> "AxisSteps":
+        """Return the steps of the numbers [n] of one axis; three quarters of them lie within the spread."""
+        centre = _short(np.median(x)) if x.size else 0.0
+        spread = _short(np.quantile(np.abs(x - centre), 0.75)) if x.size else 0.0
+        steps = AxisSteps(centre, spread if spread > 0 else 1.0, 0.0, 0.0)
+        low, high = ends_of(steps.contracted(x), bits)
+        return steps._replace(low=low, high=high)
+
+    def contracted(self, x: np.ndarray) -> np.ndarray:
+        return np.arcsinh((np.asarray(x, np.float64) - self.centre) / self.spread)
+
+    def codes(self, x: np.ndarray, bits: int) -> np.ndarray:
+        """Return the nearest steps, as int64."""
+        return quantised(self.contracted(x), Ends(self.low, self.high), bits)
+
+    def values(self, codes: np.ndarray, bits: int) -> np.ndarray:
+        """Return the numbers of steps, float64."""
+        found: np.ndarray = self.centre + self.spread * np.sinh(dequantised(codes, Ends(self.low, self.high), bits))
+        return found
+
+
+def morton(codes: np.ndarray, bits: int) -> np.ndarray:
+    """Return [n] places along the Z curve of codes [3, n] of so many bits: theirs by turns, x lowest; int64."""
+    key = np.zeros(codes.shape[1], np.int64)
+    for bit in range(bits):
+        for axis in range(3):
+            key |= ((codes[axis] >> bit) & 1) << (3 * bit + axis)
+    return key
+
+
+def from_morton(key: np.ndarray, bits: int) -> np.ndarray:
+    """Return the inverse of `morton`."""
+    codes = np.zeros((3, len(key)), np.int64)
+    for bit in range(bits):
+        for axis in range(3):
+            codes[axis] |= ((key >> (3 * bit + axis)) & 1) << bit
+    return codes
+
+
+# Byte planes
+
+
+def num_bytes_of(bits: int) -> int:
+    """Return the bytes that so many bits take."""
+    return -(-bits // 8)
+
+
+def to_planes(codes: np.ndarray, bits: int) -> np.ndarray:
+    """Return uint8 [C·bytes, n]: the lowest bytes of codes [C, n], column by column, then the next higher."""
+    codes = np.atleast_2d(codes)
+    planes = [(codes >> (8 * index)) & 255 for index in range(num_bytes_of(bits))]
+    return np.concatenate(planes).astype(np.uint8) if planes else np.zeros((0, codes.shape[1]), np.uint8)
+
+
+def from_planes(planes: np.ndarray, num_columns: int) -> np.ndarray:
+    """Return the codes [num_columns, n] that `to_planes` was given, as int64."""
+    codes = np.zeros((num_columns, planes.shape[1]), np.int64)
+    for index in range(len(planes) // num_columns):
+        codes |= planes[index * num_columns : (index + 1) * num_columns].astype(np.int64) << (8 * index)
+    return codes
+
+
+def to_byte_planes(values: np.ndarray) -> np.ndarray:
+    """Return uint8 [C·itemsize, n]: the bytes of numbers [C, n] of any type, lowest first, as in `to_planes`."""
+    values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+    num_columns, length = values.shape
+    by_byte = values.view(np.uint8).reshape(num_columns, length, values.dtype.itemsize)
+    return by_byte.transpose(2, 0, 1).reshape(values.dtype.itemsize * num_columns, length)
+
+
+def from_byte_planes(planes: np.ndarray, num_columns: int, dtype: np.dtype) -> np.ndarray:
+    """Return the numbers [num_columns, n] that `to_byte_planes` was given."""
+    dtype = np.dtype(dtype).newbyteorder("<")
+    by_byte = planes.reshape(dtype.itemsize, num_columns, planes.shape[1]).transpose(1, 2, 0)
+    return np.ascontiguousarray(by_byte).view(dtype)[..., 0]
+
+
+# Named columns in one body
+
+
+class ColumnWriter:
+    """Writer of coded columns, one after the other.
+
+    Args:
+      coder: of all parts.
+      ends: ends of groups kept in bits, as in `layout`; those of other groups follow from their numbers.
+    """
+
+    def __init__(self, coder: Choice, ends: Mapping[str, Sequence[float]] = MappingProxyType({})):
+        self.coder = coder
+        self.layout: dict[str, dict[str, Any]] = {"lengths": {}, "coders": {}, "ends": {}}
+        """Coded bytes and coder of each part, in order; and the first and the last step of each group kept in bits, for
+        each axis of the means after centre and spread."""
+        self.num_unpacked = 0
+        """Bytes before coding."""
+        self._known_ends = ends
+        self._pieces: list[bytes] = []
+
+    @property
+    def body(self) -> bytes:
+        return b"".join(self._pieces)
+
+    def planes(self, name: str, planes: np.ndarray) -> None:
+        """Write uint8 [C, n]."""
+        planes = np.ascontiguousarray(planes)
+        num, height, width = _webp_shape(*planes.shape)
+        fitting = CODERS if max(num * height, width) <= LONGEST_WEBP_SIDE else CODERS[:-1]
+        coded = {coder: encode(coder, planes) for coder in (fitting if self.coder == "smallest" else (self.coder,))}
+        coder, piece = min(coded.items(), key=lambda pair: len(pair[1]))
+        self._pieces.append(piece)
+        self.layout["coders"][name], self.layout["lengths"][name] = coder, len(piece)
+        self.num_unpacked += planes.size
+
+    def exact(self, name: str, values: np.ndarray) -> None:
+        """Write numbers of any shape and type exactly."""
+        self.planes(name, to_byte_planes(values.reshape(1, -1)))
+
+    def indices(self, name: str, indices: np.ndarray, count: int) -> None:
+        """Write [n] integers below `count`; no bytes if there is one."""
+        self.planes(name, to_planes(indices, max(count - 1, 0).bit_length()))
+
+    def numbers(self, name: str, values: np.ndarray, precision: Precision, *, is_color: bool = False) -> None:
+        """Write floats [C, n]. The three columns of colours are red, green, blue.
+
+        Raises:
+          ValueError: if float16 cannot hold them.
+        """
+        if not isinstance(precision, int):
+            self.planes(name, to_byte_planes(_finite(name, np.asarray(values), precision)))
+            return
+        ends = Ends(*self._known_ends[name]) if name in self._known_ends else ends_of(values, precision)
+        self.layout["ends"][name] = list(ends)
+        if ends.low == ends.high:
+            self.planes(name, np.zeros((0, values.shape[1]), np.uint8))
+            self.num_unpacked += values.size
+            return
+        codes = quantised(values, ends, precision)
+        self.planes(name, to_planes(green_apart(codes, precision) if is_color else codes, precision))
+
+    def means(self, name: str, values: np.ndarray, precision: Precision) -> np.ndarray:
+        """Write positions [3, n], and return their order [n] along the Z curve."""
+        bits = precision if isinstance(precision, int) else MOST_BITS
+        known = np.reshape(self._known_ends.get(name, ()), (-1, 4)).tolist()
+        axes = [AxisSteps(*own) for own in known] or [AxisSteps.of(x, bits) for x in values]
+        key = morton(np.stack([axis.codes(x, bits) for axis, x in zip(axes, values, strict=True)]), bits)
+        order = np.argsort(key, kind="stable")
+        if precision != bits:
+            self.numbers(name, values[:, order], precision)
+        else:
+            self.layout["ends"][name] = [number for axis in axes for number in axis]
+            self.planes(name, to_planes(np.diff(key[order], prepend=0), 3 * bits))
+        return order
+
+
+class ColumnReader:
+    """Reads what a `ColumnWriter` wrote, in the same order.
+
+    Args:
+      body: the coded bytes.
+      layout: what was written beside them.
+      room: so many bytes may be unpacked in all.
+
+    Raises:
+      ValueError: if the lengths are not those of the body.
+    """
+
+    def __init__(self, body: bytes, layout: Mapping[str, Any], room: int):
+        lengths = list(layout["lengths"].values())
+        if not all(type(length) is int and length >= 0 for length in lengths) or sum(lengths) != len(body):
+            raise ValueError(f"its parts must have {len(body)} bytes in all; got {lengths}")
+        self._layout, self._room = layout, room
+        self._body, self._at = body, 0
+        self._names = list(layout["lengths"])
+
+    def planes(self, name: str, num_planes: int, length: int) -> np.ndarray:
+        """Read uint8 [num_planes, length].
+
+        Raises:
+          ValueError: if the next part is another, is damaged, or there is no room left.
+        """
+        self._take_room(name, num_planes * length)
+        if not self._names or self._names[0] != name:
+            raise ValueError(f"the part {name} is missing; {self._names[:1]} came")
+        size, coder = self._layout["lengths"][self._names.pop(0)], self._layout["coders"][name]
+        if coder not in CODERS:
+            raise ValueError(f"the part {name} is of the coder {coder}, which is not known here")
+        data = self._body[self._at : self._at + size]
+        self._at += size
+        try:
+            return decode(coder, data, num_planes, length)
+        except ValueError as error:
+            raise ValueError(f"the part {name} {error}") from error
+
+    def _take_room(self, name: str, num_bytes: int) -> None:
+        """Raise ValueError if these are more bytes than a file of this size may unpack to."""
+        if num_bytes > self._room:
+            raise ValueError(f"{name} would take {num_bytes} bytes, which the file is too small for")
+        self._room -= num_bytes
+
+    def end(self) -> None:
+        """Raise ValueError unless all parts were read."""
+        if self._names:
+            raise ValueError(f"the part {self._names[0]} is not known")
+
+    def exact(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+        planes = self.planes(name, np.dtype(dtype).itemsize, math.prod(shape))
+        return from_byte_planes(planes, 1, np.dtype(dtype)).reshape(shape).astype(np.dtype(dtype))
+
+    def indices(self, name: str, length: int, count: int) -> np.ndarray:
+        if count == 0 and length:
+            raise ValueError(f"{name} are of a table that is empty")
+        self._take_room(name, length)
+        num_planes = num_bytes_of(max(count - 1, 0).bit_length())
+        indices: np.ndarray = from_planes(self.planes(name, num_planes, length), 1)[0]
+        if length and indices.max() >= count:
+            raise ValueError(f"{name} must be below {count}; got {indices.max()}")
+        return indices
+
+    def numbers(
+        self, name: str, num_columns: int, length: int, precision: Precision, *, is_color: bool = False
+    ) -> np.ndarray:
+        """Read float32 [num_columns, length]."""
+        if not isinstance(precision, int):
+            dtype = np.dtype(precision)
+            planes = self.planes(name, num_columns * dtype.itemsize, length)
+            return _finite(name, from_byte_planes(planes, num_columns, dtype))
+        ends = Ends(*self._ends(name, 2))
+        if ends.low == ends.high:
+            self._take_room(name, num_columns * length)
+            self.planes(name, 0, length)
+            return np.full((num_columns, length), ends.low, np.float32)
+        codes = from_planes(self.planes(name, num_columns * num_bytes_of(precision), length), num_columns)
+        codes = with_green(codes, precision) if is_color else codes
+        return _finite(name, dequantised(codes, ends, precision))
+
+    def means(self, name: str, length: int, precision: Precision) -> np.ndarray:
+        """Read float32 [3, length]."""
+        if not isinstance(precision, int):
+            return self.numbers(name, 3, length, precision)
+        known = np.reshape(self._ends(name, 12), (3, 4)).tolist()
+        planes = self.planes(name, num_bytes_of(3 * precision), length)
+        with np.errstate(over="ignore"):
+            codes = from_morton(np.cumsum(from_planes(planes, 1)[0]), precision)
+            axes = [AxisSteps(*own).values(axis, precision) for axis, own in zip(codes, known, strict=True)]
+        return _finite(name, np.stack(axes))
+
+    def _ends(self, name: str, count: int) -> list[float]:
+        found = self._layout["ends"][name]
+        is_right = isinstance(found, list) and len(found) == count and all(type(x) in (int, float) for x in found)
+        if not is_right or not all(abs(x) <= LARGEST_FLOAT for x in found):
+            raise ValueError(f"the ends of {name} must be {count} numbers; got {found}")
+        return [float(x) for x in found]
+
+
+def _finite(name: str, values: np.ndarray, dtype: Any = np.float32) -> np.ndarray:
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = values.astype(dtype)
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} must be finite as {np.dtype(dtype)}; some are not")
+    return values

@@ -1,0 +1,336 @@
+"""glTF 2.0 as a container of numbers: a builder of files, and a reader of strangers' files.
+
+A file is one *.glb, or a *.gltf with buffers beside it or embedded. Reading takes no more memory than a file can hold.
+"""
+
+import base64
+import binascii
+import json
+import os
+import struct
+import urllib.parse
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, read_regular
+from a2tg_jax.host.text import shortened
+
+MAGIC, VERSION = b"glTF", 2
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+HEAD, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
+MOST_GLB_BYTES = 2**32 - 1
+ARRAY_BUFFER = 34962
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+"""Types of numbers, by their code."""
+SIDES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+MOST_STRIDE = 252
+LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
+"""Bounds of the bytes of numbers, as float32, in a file: a multiple of its own bytes, and further bytes."""
+LONGEST_NAME = 255
+"""Bytes that the name of a buffer may have."""
+
+
+# Writing
+
+
+class Builder:
+    """Arrays as accessors of one buffer."""
+
+    def __init__(self) -> None:
+        self.accessors: list[dict[str, Any]] = []
+        self._views: list[dict[str, Any]] = []
+        self._pieces: list[bytes] = []
+        self._num_bytes = 0
+
+    def add(
+        self, values: np.ndarray, *, normalized: bool = False, has_bounds: bool = False, is_attribute: bool = True
+    ) -> int:
+        """Add numbers [n] or [n, 2 to 4] of a type of glTF, and return the index of their accessor.
+
+        Args:
+          values: the numbers, at least one row.
+          normalized: integers stand for numbers in [0, 1] or [-1, 1].
+          has_bounds: the accessor says the smallest and the largest of each column.
+          is_attribute: they are an attribute of a mesh.
+        """
+        columns = values.reshape(len(values), -1)
+        code = next(code for code, name in COMPONENTS.items() if np.dtype(name) == values.dtype.newbyteorder("<"))
+        accessor: dict[str, Any] = {"bufferView": len(self._views), "componentType": code, "count": len(values)}
+        accessor["type"] = next(name for name, sides in SIDES.items() if sides == columns.shape[1])
+        if normalized:
+            accessor["normalized"] = True
+        if has_bounds:
+            accessor |= {"min": columns.min(axis=0).tolist(), "max": columns.max(axis=0).tolist()}
+        data = np.ascontiguousarray(columns, np.dtype(COMPONENTS[code])).tobytes()
+        self.add_bytes(data, **({"target": ARRAY_BUFFER} if is_attribute else {}))
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+    def add_bytes(self, data: bytes, **options: Any) -> int:
+        """Add bytes, such as an image, and return the index of their buffer view, which has these options."""
+        self._views.append({"buffer": 0, "byteOffset": self._num_bytes, "byteLength": len(data), **options})
+        self._pieces.append(data + bytes(-len(data) % 4))
+        self._num_bytes += len(self._pieces[-1])
+        return len(self._views) - 1
+
+    def save(self, path: Path, described: Mapping[str, Any]) -> None:
+        """Write the file, *.gltf with a *.bin beside it, any other name as one *.glb.
+
+        Args:
+          path: the file; an older one is replaced once the new one is whole.
+          described: the JSON without accessors and buffers.
+
+        Raises:
+          ValueError: if one file cannot hold so many bytes.
+        """
+        buffer: dict[str, Any] = {"byteLength": self._num_bytes}
+        whole = {**described, "accessors": self.accessors, "bufferViews": self._views, "buffers": [buffer]}
+        if path.suffix.lower() == ".gltf":
+            binary = path.with_suffix(".bin")
+            buffer["uri"] = urllib.parse.quote(binary.name)
+            with replacing(binary) as temporary, open(temporary, "wb") as file:
+                file.writelines(self._pieces)
+            with replacing(path) as temporary:
+                temporary.write_text(json.dumps(whole, allow_nan=False, indent=1), encoding="utf-8")
+            return
+        text = json.dumps(whole, allow_nan=False, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        total = HEAD.size + CHUNK.size + len(text) + CHUNK.size + self._num_bytes
+        if total > MOST_GLB_BYTES:
+            most = f"{MOST_GLB_BYTES:,} bytes, but these are {total:,}"
+            raise ValueError(f"{path}: a *.glb holds up to {most}; write *.gltf")
+        with replacing(path) as temporary, open(temporary, "wb") as file:
+            file.write(HEAD.pack(MAGIC, VERSION, total) + CHUNK.pack(len(text), JSON_CHUNK) + text)
+            file.write(CHUNK.pack(self._num_bytes, BINARY_CHUNK))
+            file.writelines(self._pieces)
+
+
+# Reading
+
+
+class Document:
+    """A file that was read: its JSON, and the numbers of its accessors.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is not glTF 2.0, or is damaged.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]):
+        self.path = Path(path)
+        if not is_regular(self.path):
+            raise FileNotFoundError(f"{self.path}: no such glTF file")
+        data = read_regular(self.path, MOST_ARRAY_BYTES)
+        text, self._binary = _split_glb(data) if data[:4] == MAGIC else (data, None)
+        self.json = parse_json(text)
+        if not isinstance(self.json, dict) or not isinstance(self.json.get("asset"), dict):
+            raise ValueError("is not glTF")
+        if (version := self.json["asset"].get("version")) != "2.0":
+            raise ValueError(f"is glTF of version {shortened(version)}; this program reads 2.0")
+        self._buffers: dict[int, bytes] = {}
+        self._files: dict[Path, bytes] = {}
+        self._room = FREE_ROOM + LARGEST_RATIO * len(data)
+
+    def entry(self, kind: str, index: Any) -> dict[str, Any]:
+        """Return an object of one of the lists of the file, such as "nodes"."""
+        entries = self.json.get(kind, [])
+        if type(index) is not int or not isinstance(entries, list) or not 0 <= index < len(entries):
+            raise ValueError(f"has no {kind}[{shortened(index)}]")
+        if not isinstance(entries[index], dict):
+            raise ValueError(f"its {kind}[{index}] is no object")
+        found: dict[str, Any] = entries[index]
+        return found
+
+    def numbers(self, index: Any, kind: str, what: str) -> np.ndarray:
+        """Return the numbers of an accessor as float32 [n, columns]; integers that are normalised become fractions.
+
+        Args:
+          index: its index.
+          kind: its type, such as "VEC3".
+          what: its name in errors.
+
+        Raises:
+          ValueError: if there is none, it is of another type, or reaches beyond its buffer.
+        """
+        accessor = self.entry("accessors", index)
+        if accessor.get("type") != kind or accessor.get("componentType") not in COMPONENTS:
+            found = f"{accessor.get('type')} of {accessor.get('componentType')}"
+            raise ValueError(f"{what} must be {kind} of numbers; got {shortened(found)}")
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise ValueError(f"{what} is a sparse accessor, which this program does not read")
+        dtype, columns = np.dtype(COMPONENTS[accessor["componentType"]]), SIDES[kind]
+        view, size = self.entry("bufferViews", accessor["bufferView"]), dtype.itemsize * columns
+        data = self._buffer(view.get("buffer"), what)
+        start, length = _count(view, "byteOffset", what, 0), _count(view, "byteLength", what)
+        stride, count = _count(view, "byteStride", what, size), _count(accessor, "count", what)
+        if start + length > len(data):
+            raise ValueError(f"{what} reaches beyond its buffer of {len(data)} bytes")
+        if stride < size or stride > max(size, MOST_STRIDE):
+            raise ValueError(f"{what} has a stride of {stride} bytes for {size}")
+        first = start + _count(accessor, "byteOffset", what, 0)
+        if count and first + stride * (count - 1) + size > start + length:
+            raise ValueError(f"{what} has {count} entries, but its buffer is too short for them")
+        # Several accessors may name the same bytes, each of which takes room of its own.
+        if 4 * count * columns > self._room:
+            raise ValueError(f"{what} would take {4 * count * columns} bytes, which the file is too small for")
+        self._room -= 4 * count * columns
+        rows = np.ndarray((count, columns), dtype, data, first if count else 0, (stride, dtype.itemsize))
+        values = rows.astype(np.float32)
+        if accessor.get("normalized") is True and dtype.kind != "f":
+            values = np.maximum(values / np.float32(np.iinfo(dtype).max), np.float32(-1.0))
+        return values
+
+    def _buffer(self, index: Any, what: str) -> bytes:
+        """Return the bytes of a buffer, which are read once."""
+        described = self.entry("buffers", index)
+        length = _count(described, "byteLength", what)
+        if index not in self._buffers:
+            uri = described.get("uri")
+            if uri is None and (index != 0 or self._binary is None):
+                raise ValueError(f"has no bytes for buffers[{index}]")
+            self._buffers[index] = self._read(uri) if uri is not None else self._binary or b""
+        if (found := len(self._buffers[index])) < length:
+            raise ValueError(f"is cut off: its buffer has {found} bytes where {length} are announced")
+        return self._buffers[index]
+
+    def _read(self, uri: Any) -> bytes:
+        """Return the bytes of a buffer outside the file, which must lie in its folder, or embedded in its JSON."""
+        if not isinstance(uri, str):
+            raise ValueError("the uri of a buffer is no text")
+        if uri.startswith("data:"):
+            head, mark, text = uri.partition("base64,")
+            try:
+                return base64.b64decode(text, validate=True) if mark else urllib.parse.unquote_to_bytes(head[5:])
+            except binascii.Error as error:
+                raise ValueError(f"its embedded buffer is damaged ({error})") from error
+        file = _named_file(self.path, uri)
+        if file not in self._files:
+            self._files[file] = read_regular(file, MOST_ARRAY_BYTES)
+            self._room += LARGEST_RATIO * len(self._files[file])
+        return self._files[file]
+
+
+def buffer_files(path: Path) -> list[Path]:
+    """Return the files beside a *.gltf that its buffers name; none if it cannot be read."""
+    try:
+        buffers = Document(path).json["buffers"]
+        uris = {buffer["uri"]: None for buffer in buffers if not buffer.get("uri", "data:").startswith("data:")}
+        return list({_named_file(path, uri): None for uri in uris})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return []
+
+
+def _named_file(path: Path, uri: str) -> Path:
+    """Return the file of a buffer. Raises ValueError if it is missing or does not lie in the folder of the glTF."""
+    name = urllib.parse.unquote(uri, errors="strict")
+    if len(name.encode("utf-8", "surrogatepass")) > LONGEST_NAME:
+        raise ValueError(f"its buffer has too long a name ({shortened(uri)})")
+    folder = path.parent.resolve()
+    file = (folder / name).resolve() if "://" not in uri else None
+    if file is None or not file.is_relative_to(folder):
+        raise ValueError(f"its buffer {shortened(uri)} does not lie in the folder of the file")
+    if not is_regular(file):
+        raise ValueError(f"its buffer {shortened(uri)} is missing")
+    return file
+
+
+def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
+    """Return the JSON and the binary chunk of a *.glb."""
+    if len(data) < HEAD.size + CHUNK.size:
+        raise ValueError("is cut off")
+    _, version, total = HEAD.unpack_from(data)
+    if version != VERSION:
+        raise ValueError(f"is a GLB of version {version}; this program reads version {VERSION}")
+    if not HEAD.size + CHUNK.size <= total <= len(data):
+        raise ValueError(f"is cut off: it has {len(data)} bytes where {total} are announced")
+    chunks: dict[int, bytes] = {}
+    place = HEAD.size
+    while place + CHUNK.size <= total and len(chunks) < 2:
+        length, kind = CHUNK.unpack_from(data, place)
+        place += CHUNK.size
+        if place + length > total:
+            raise ValueError("is damaged: a chunk is longer than the file")
+        chunks.setdefault(kind, data[place : place + length])
+        place += length
+    if JSON_CHUNK not in chunks:
+        raise ValueError("is damaged: it has no JSON")
+    return chunks[JSON_CHUNK], chunks.get(BINARY_CHUNK)
+
+
+def _count(described: Mapping[str, Any], name: str, what: str, default: int | None = None) -> int:
+    """Return a field that is a whole number, not negative."""
+    value = described.get(name, default)
+    if type(value) is not int or not 0 <= value < 1 << 53:
+        raise ValueError(f"{what}: {name} must be a whole number; got {shortened(value)}")
+    return value
+
+
+# Nodes
+
+
+def mesh_nodes(document: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Yield the nodes of the scene that have a mesh, and the matrix [4, 4] from each to the world.
+
+    Without scenes, all nodes are in the scene.
+
+    Raises:
+      ValueError: if a node is missing, occurs twice, or its transform is no numbers.
+    """
+    if document.json.get("scenes"):
+        roots = _indices(document.entry("scenes", document.json.get("scene", 0)), "nodes")
+    else:
+        nodes = document.json.get("nodes", [])
+        children = {child for node in nodes for child in _indices(node, "children")}
+        roots = [index for index in range(len(nodes)) if index not in children]
+    seen: set[int] = set()
+    waiting = [(index, np.eye(4)) for index in reversed(roots)]
+    while waiting:
+        index, parent = waiting.pop()
+        node = document.entry("nodes", index)
+        if index in seen:
+            raise ValueError(f"its nodes[{index}] occurs twice")
+        seen.add(index)
+        with np.errstate(over="ignore", invalid="ignore"):
+            matrix = parent @ _local_matrix(node)
+        if "mesh" in node:
+            yield node, matrix
+        waiting += [(child, matrix) for child in reversed(_indices(node, "children"))]
+
+
+def _indices(described: Mapping[str, Any], name: str) -> list[Any]:
+    indices = described.get(name, [])
+    if not isinstance(indices, list):
+        raise ValueError(f"{name} must be a list; got {shortened(indices)}")
+    return indices
+
+
+def _local_matrix(node: Mapping[str, Any]) -> np.ndarray:
+    """Return the matrix [4, 4] from a node to its parent, for columns."""
+
+    def vector(name: str, default: list[float]) -> np.ndarray:
+        values = node.get(name, default)
+        is_right = isinstance(values, list) and len(values) == len(default)
+        if not is_right or not all(type(x) in (int, float) and abs(x) < 1e30 for x in values):
+            raise ValueError(f"{name} of a node must be {len(default)} numbers; got {shortened(values)}")
+        return np.asarray(values, np.float64)
+
+    if "matrix" in node:
+        return vector("matrix", [0.0] * 16).reshape(4, 4).T
+    rotation = vector("rotation", [0.0, 0.0, 0.0, 1.0])
+    x, y, z, w = rotation / max(np.linalg.norm(rotation), 1e-30)
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn * vector("scale", [1.0, 1.0, 1.0])
+    matrix[:3, 3] = vector("translation", [0.0, 0.0, 0.0])
+    return matrix

@@ -1,0 +1,492 @@
+"""Models as files of other programs hold them: ellipsoids in a world of its own axes, with numbers of limited range.
+
+A model's own world has +z up, and lengths in which its cameras are 1 away. A file's world has the lengths of the
+original one, and the up axis of its format; the model lies where it does in its own. Positions that a format would
+round too far, such as map coordinates, are relative to an offset.
+"""
+
+import dataclasses
+import math
+import os
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.appearance.parts import nearest_gaussians
+from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gaussians, logit
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.similarity import Similarity, check_similarity, transform_gaussians
+from a2tg_jax.host.text import counted, shortened
+from a2tg_jax.io.model_file import LONGEST_REASON, origin_arrays, origin_of
+from a2tg_jax.io.validate import check_origin
+from a2tg_jax.model import Model, concatenate
+
+Up = Literal["y", "z"]
+UPRIGHT: Mapping[Up, np.ndarray] = {
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "z": np.eye(3),
+}
+"""Rotation from a world of +z up to one of another axis."""
+UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
+LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-6
+HIGHEST_DEGREE = len(NUM_BASES) - 1
+THICKNESS = 1e-3
+"""Ratio of the third scale of a flat Gaussian in a file to its shorter one."""
+AXES_TO_NORMAL = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]], np.float32)
+"""Row k: the rotation (wxyz) of the axes among themselves that makes the k-th the third."""
+SAME_PLACE = 1e-5
+"""Largest difference of the numbers of two similarities that are taken for one."""
+SAME_SCALE = 1e-3
+"""Largest difference of the scales of the axes of a transform, relative to the largest."""
+MOST_PARTS = 256
+"""Largest number of sets of splats in one file."""
+Result = TypeVar("Result")
+
+
+# From a model to a file
+
+
+class Ellipsoids(NamedTuple):
+    """N ellipsoids as a renderer wants them; float32 on the host."""
+
+    means: np.ndarray
+    """[N, 3]."""
+    quats: np.ndarray
+    """Unit quaternions [N, 4], wxyz."""
+    scales: np.ndarray
+    """Standard deviations [N, 3]."""
+    opacities: np.ndarray
+    """[N] in [0, 1]."""
+    sh: np.ndarray
+    """[N, K, 3] coefficients, as in `Gaussians`."""
+
+
+class WorldGaussians(NamedTuple):
+    """Plain Gaussians in the original world, as files hold them."""
+
+    gaussians: Gaussians
+    """Their means are relative to the offset."""
+    offset: np.ndarray
+    """[3] float64 whole numbers, zeros where the format holds the positions as they are."""
+    means: np.ndarray
+    """[N, 3] float64 positions, without the offset."""
+
+
+def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False) -> Gaussians:
+    """Return the Gaussians of a model without what they show, in the model's world.
+
+    They are opaque by themselves, and have all spherical harmonics of the model.
+
+    Args:
+      gaussians: as in `save_ply`.
+      keeps_shapes: the file keeps the shapes of kernels besides. If not, each kernel becomes the nearest Gaussian.
+    """
+    if isinstance(gaussians, Model):
+        model = gaussians.live
+        gaussians, shown = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh)), model.appearance
+        if shown.shapes is not None and not keeps_shapes:
+            gaussians = nearest_gaussians(gaussians, np.asarray(shown.shapes))
+        if not shown.has_own_opacities:
+            opacities = jnp.clip(shown.opacities(model.gaussians), LEAST_OPACITY, LARGEST_OPACITY)
+            gaussians = dataclasses.replace(gaussians, logit_opacities=logit(opacities))
+    check_gaussians(gaussians)
+    return gaussians
+
+
+def world_gaussians(
+    gaussians: Gaussians | Model, transform: Similarity | None = None, kind: str = "ply"
+) -> WorldGaussians:
+    """Return the Gaussians of a model without what they show, in the original world.
+
+    Args:
+      gaussians, transform: as in `save_ply`.
+      kind: gaussforge's name of the format.
+    """
+    plain = plain_gaussians(gaussians)
+    if transform is None and isinstance(gaussians, Model) and gaussians.origin is not None:
+        transform = gaussians.origin.transform
+    to_world = UNMOVED if transform is None else transform.inverse()
+    means = to_world.apply(np.asarray(plain.means, np.float64))
+    offset = offset_for(kind, means, np.asarray(plain.log_scales, np.float64) + np.log(to_world.scale))
+    if offset.any():
+        # The offset goes before means are rounded to float32.
+        to_world = dataclasses.replace(to_world, translation=to_world.translation - offset)
+    moved = plain if transform is None and not offset.any() else transform_gaussians(plain, to_world)
+    return WorldGaussians(moved, offset, means)
+
+
+def splats_of(model: Model, *, keeps_shapes: bool = False) -> Ellipsoids:
+    """Return the splats of a model of which all rows exist, with a third axis of a thousandth of the shorter.
+
+    If splats have degrees of their own, coefficients go up to the highest of these. `keeps_shapes` is as in
+    `plain_gaussians`.
+    """
+    gaussians = plain_gaussians(model, keeps_shapes=keeps_shapes)
+    quats = np.asarray(gaussians.quats, np.float64)
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    units = np.where(norms > 0, quats / np.maximum(norms, LEAST_SCALE), [1.0, 0.0, 0.0, 0.0])
+    logits = np.clip(np.asarray(gaussians.logit_opacities, np.float64), -80, 80)
+    log_scales = np.asarray(gaussians.log_scales, np.float64)
+    scales = np.exp(np.concatenate([log_scales, third_log_scales(log_scales)], axis=1))
+    sh = gaussians.sh[:, : NUM_BASES[model.degrees.max(initial=0)]]
+    numbers = (gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), sh)
+    return Ellipsoids(*(np.asarray(values, np.float32) for values in numbers))
+
+
+def third_log_scales(log_scales: np.ndarray) -> np.ndarray:
+    """Return the logarithms [N, 1] of third scales: of flat Gaussians [N, 2], a thousandth of the shorter one."""
+    third: np.ndarray = log_scales.min(axis=1, keepdims=True) + np.log(THICKNESS)
+    return third
+
+
+def linear_colors(colors: np.ndarray) -> np.ndarray:
+    """Return linear colours of sRGB colours in [0, 1]."""
+    return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+
+
+# From a file to Gaussians
+
+
+def gaussians_of(
+    splats: Ellipsoids, path: str | os.PathLike[str], *, is_flat: bool, keeps_all: bool = False
+) -> Gaussians:
+    """Return the Gaussians of splats.
+
+    Args:
+      splats: the splats.
+      path: their file, for warnings.
+      is_flat: the third axis is the normal; else the thinnest is.
+      keeps_all: also splats with numbers that are not finite; else these are left out with a warning.
+    """
+    if not keeps_all:
+        kept = whole_rows(os.fspath(path), splats.scales, splats.means, splats.quats, splats.opacities, splats.sh)
+        splats = Ellipsoids(*(values[kept] for values in splats))
+    with np.errstate(invalid="ignore"):
+        log_scales = np.log(np.maximum(splats.scales, LEAST_SCALE))
+    quats, log_scales = (
+        (splats.quats, log_scales[:, :2]) if is_flat else flattened(splats.quats, log_scales, os.fspath(path))
+    )
+    opacities = np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, LARGEST_OPACITY)
+    logits = np.log(opacities) - np.log1p(-opacities)
+    numbers = (splats.means, quats, log_scales, logits, splats.sh)
+    return Gaussians(*(jnp.asarray(values, jnp.float32) for values in numbers))
+
+
+def whole_rows(name: str, scales: np.ndarray, *columns: np.ndarray) -> np.ndarray:
+    """Return which rows [N] have finite numbers only. The others are counted in a warning.
+
+    If no row is finite, all are returned, for the checks of a model to refuse.
+
+    Args:
+      name: the file, for the warning.
+      scales: [N, 2] or [N, 3], or their logarithms. The smallest of three may be −inf: `flattened` drops it.
+      columns: other arrays [N, ...].
+    """
+    seen = np.sort(scales, axis=1)[:, -2:]  # NaN is sorted to the end.
+    finite = [np.isfinite(column).all(axis=tuple(range(1, column.ndim))) for column in (seen, *columns)]
+    is_whole: np.ndarray = np.logical_and.reduce(finite)
+    bad = np.flatnonzero(~is_whole)
+    if len(bad) == len(is_whole):
+        return np.ones(len(bad), bool)
+    if len(bad):
+        message = (
+            f"{name}: {counted(len(bad), 'Gaussian')} of {len(is_whole):,} left out, with NaN or infinite numbers; the "
+            f"first is row {bad[0]:,} (from 0)"
+        )
+        warnings.warn(message, stacklevel=4)
+    return is_whole
+
+
+def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return quaternions [N, 4] and log-scales [N, 2] of ellipsoids [N, 3], with the thinnest axis as the normal.
+
+    The axes are moved around in their cycle, so that the rotation stays one; of two equally thin the later goes.
+
+    Args:
+      quats: [N, 4] wxyz.
+      log_scales: [N, 3].
+      name: the file, for the warning that some ellipsoids are not flat.
+    """
+    if len(log_scales):
+        # A file that rounds scales gives all flat Gaussians one third scale, its smallest, and most are far wider.
+        others, third = log_scales[:, :2], log_scales[:, 2]
+        if third.min() == third.max() <= others.min() and third[0] < np.median(others) + np.log(0.1):
+            return quats, others
+    thinnest = 2 - np.argmin(log_scales[:, ::-1], axis=1)
+    kept = np.take_along_axis(log_scales, (thinnest[:, None] + np.array([[1, 2]])) % 3, axis=1)
+    dropped = np.take_along_axis(log_scales, thinnest[:, None], axis=1)[:, 0]
+    num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(2 * THICKNESS))
+    if num_thick:
+        message = f"{name}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
+        warnings.warn(message, stacklevel=4)
+    # The product of quaternions: the turn of the axes first, then the splat's own rotation.
+    (w, x, y, z), (a, b, c, d) = quats.T, AXES_TO_NORMAL[thinnest].T
+    product = (
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    )
+    return np.stack(product, axis=-1), kept
+
+
+def degree_to_read(degree: int, name: str) -> int:
+    """Return the degree to read of the spherical harmonics of a file, at most 3. Warn if the file's is higher."""
+    if degree > HIGHEST_DEGREE:
+        message = f"{name}: has SH of degree {degree}; degree {HIGHEST_DEGREE} is read, and what is above it left out"
+        warnings.warn(message, stacklevel=4)
+    return min(degree, HIGHEST_DEGREE)
+
+
+def reading(path: str | os.PathLike[str], read: Callable[[], Result]) -> Result:
+    """Return what `read` returns. Errors in what a file says become one ValueError that names it."""
+    where = os.fspath(path)
+    try:
+        return read()
+    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{where}: is damaged or of another version ({shortened(repr(error))})") from error
+    except ValueError as error:
+        raise ValueError(f"{where}: {shortened(str(error).removeprefix(f'{where}: '), LONGEST_REASON)}") from error
+
+
+# Worlds
+
+
+def upright(origin: Origin | None, up: Up) -> Similarity:
+    """Return the similarity from a model's world to that of a file with this axis up."""
+    return upright_from(1.0 if origin is None else float(origin.transform.scale), up)
+
+
+def upright_from(scale: float, up: Up) -> Similarity:
+    """Return the same, given the factor of lengths from the original world to the model's."""
+    return Similarity(1.0 / scale, UPRIGHT[up], np.zeros(3))
+
+
+def matrix_of(similarity: Similarity) -> np.ndarray:
+    """Return a similarity as a matrix [4, 4] for columns."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = similarity.scale * similarity.rotation
+    matrix[:3, 3] = similarity.translation
+    return matrix
+
+
+def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
+    """Return the similarity that a matrix [4, 4] for columns is.
+
+    Raises:
+      ValueError: naming it `what`, if it mirrors, shears, or scales axes differently.
+    """
+    scales = np.linalg.norm(matrix[:3, :3], axis=0)
+    largest = float(scales.max())
+    if not np.isfinite(matrix).all() or not 0 < largest < np.inf:
+        raise ValueError(f"{what} must be finite, and must not scale by 0")
+    if np.ptp(scales) > SAME_SCALE * largest or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise ValueError(f"{what} scales its axes differently; apply it to the splats in another program first")
+    rotation = matrix[:3, :3] / largest
+    u, _, v = np.linalg.svd(rotation)
+    check_similarity(Similarity(largest, rotation, matrix[:3, 3]), what)
+    return Similarity(largest, u @ v, matrix[:3, 3])
+
+
+def joined_parts(parts: Sequence[tuple[Model, Similarity]], up: Up) -> Model:
+    """Return the parts of a file as one model in its own world, which has +z up (host).
+
+    A part stays as it is where its file places it as it was written. Else it moves, and its origin along. Positions
+    that float32 would round too far there, as in map coordinates, are relative to an offset, which the origin of a
+    model without one then has.
+
+    Args:
+      parts: at least one model as the file holds it, and the similarity from there to the world of the file.
+      up: the axis that is up there.
+    """
+    origin, offset, models = None, None, list[Model]()
+    for model, world in parts:
+        origin = origin or model.origin
+        move = world.then(upright(origin, up).inverse())
+        if is_same := np.allclose(matrix_of(move), np.eye(4), rtol=0, atol=SAME_PLACE):
+            move = UNMOVED
+        check_similarity(move, "its transform")
+        if offset is None:
+            means, log_scales = np.asarray(model.gaussians.means, np.float64), np.asarray(model.gaussians.log_scales)
+            offset = offset_for("ply", move.apply(means), log_scales + np.log(move.scale))
+        if offset.any():
+            move = dataclasses.replace(move, translation=move.translation - offset)
+        models.append(model if is_same and not offset.any() else model.transform(move))
+    if offset is not None and models[0].origin is None:
+        models[0] = dataclasses.replace(models[0], origin=origin_at(offset))
+    return models[0] if len(models) == 1 else concatenate(models)
+
+
+def origin_to_json(origin: Origin) -> dict[str, Any]:
+    """Return an origin as lists of numbers and texts, without the corrections."""
+    return {"names": list(origin.names)} | {name: array.tolist() for name, array in origin_arrays(origin).items()}
+
+
+def origin_from_json(data: Mapping[str, Any]) -> Origin:
+    """Return the origin that `origin_to_json` was given. ValueError: it is damaged."""
+    shapes = {"viewmats": (-1, 4, 4), "Ks": (-1, 3, 3), "sizes": (-1, 2)}
+    kinds = {"sizes": np.int64, "is_test": bool}
+    arrays = {}
+    for name in ("viewmats", "Ks", "sizes", "is_test", "scale", "rotation", "translation"):
+        kind = kinds.get(name, np.float64)
+        array = np.asarray(data[name])
+        if array.dtype.kind not in "biuf" or (array.size and np.dtype(kind).kind == "b" != array.dtype.kind):
+            raise ValueError(f"origin/{name} must be numbers; got {shortened(data[name])}")
+        arrays[name] = array.astype(kind).reshape(shapes.get(name, array.shape))
+    return origin_of(data, arrays)
+
+
+# Ranges and steps of numbers
+
+SPZ_STEP = 2.0**-12
+SPZ_REACH = 2048 - SPZ_STEP
+"""Largest coordinate of SPZ, which wraps those beyond."""
+SOG_LEVELS = 2**16 - 1
+MOST_ROUNDING = 0.1
+"""Largest rounding of a typical position by a format, in scales of its Gaussian, without a warning."""
+MOST_SINGLE_ROUNDING = 0.01
+"""Largest rounding of a typical position by float32, in scales of its Gaussian, that keeps the origin."""
+SLACK = 1e-3
+"""Part of a range that numbers may leave it by without being counted."""
+
+
+class NumberRange(NamedTuple):
+    """Largest numbers that a format holds; it cuts others."""
+
+    first: float = math.inf
+    """Largest size of a coefficient of degree 0."""
+    rest: float = math.inf
+    """Largest size of a coefficient above degree 0."""
+    log_scales: tuple[float, float] = (-math.inf, math.inf)
+
+
+RANGES = {
+    "SPZ": NumberRange(0.5 / 0.15, 1.0, (-10.0, 255 / 16 - 10)),
+    "compressed PLY": NumberRange(rest=4.0),
+    ".splat": NumberRange(0.5 / SH_C0),
+    ".ksplat": NumberRange(0.5 / SH_C0),
+}
+"""Ranges by the name of a format; the others have none."""
+OFFSET_PLACES = {
+    "ply": "the comment 'offset' in the file says so; a2tg convert --float64 keeps world coordinates",
+    "compressed.ply": "the comment 'offset' in the file says so",
+    "sog": "'offset' in its meta.json says so",
+}
+"""Where a file says what its positions are relative to, by gaussforge's name of its format."""
+
+
+def offset_for(kind: str, means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    """Return whole numbers [3] to subtract from positions so that a file can hold them; zeros if it can as they are.
+
+    Args:
+      kind: gaussforge's name of the format.
+      means: [N, 3] float64, in the original world.
+      log_scales: [N, 2], in the same world.
+    """
+    if not len(means):
+        return np.zeros(3)
+
+    def excess(positions: np.ndarray) -> float:
+        """Return the rounding of a typical position as a multiple of what is allowed."""
+        single = np.abs(positions - positions.astype(np.float32)).max(axis=1)
+        by_format = np.median(_rounding(kind, positions) / scales) / MOST_ROUNDING
+        return float(max(np.median(single / scales) / MOST_SINGLE_ROUNDING, by_format))
+
+    with np.errstate(all="ignore"):  # Numbers that are not finite are refused later.
+        offset: np.ndarray = np.rint(np.median(means, axis=0)) + 0.0  # Not -0.0.
+        scales = np.exp(np.asarray(log_scales, np.float64).mean(axis=1))
+        before, after = excess(means), excess(means - offset)
+        is_outside = kind == "spz" and bool(np.abs(means).max() > SPZ_REACH)
+    return offset if is_outside or (before > 1 and after < before / 2) else np.zeros(3)
+
+
+def origin_at(offset: np.ndarray) -> Origin | None:
+    """Return the origin, without cameras, of a model whose positions are relative to an offset [3]; None for zeros.
+
+    Raises:
+      ValueError: if the offset is not finite or too large.
+    """
+    if not offset.any():
+        return None
+    origin = Origin.of_cameras([], transform=dataclasses.replace(UNMOVED, translation=-offset))
+    check_origin(origin)
+    return origin
+
+
+def warn_of_offset(kind: str, offset: np.ndarray, path: str | os.PathLike[str]) -> None:
+    """Warn that the positions of a file are relative to an offset [3], unless it is zero."""
+    if offset.any():
+        place = OFFSET_PLACES.get(kind, "the file has no place to say so: write this down")
+        message = (
+            f"{os.fspath(path)}: positions are relative to ({', '.join(offset_words(offset))}), because the format "
+            f"would round such large coordinates too far; {place}"
+        )
+        warnings.warn(message, stacklevel=3)
+
+
+def offset_words(offset: np.ndarray) -> list[str]:
+    """Return the three numbers of an offset as text that a float64 is read back from."""
+    return [repr(float(value)).removesuffix(".0") for value in offset]
+
+
+def check_positions(kind: str, gaussians: Gaussians, name: str) -> None:
+    """Raise ValueError if a format cannot hold the positions; warn if it rounds them too far.
+
+    Args:
+      kind: gaussforge's name of the format.
+      gaussians: in the world of the file, at least one.
+      name: the file, for messages.
+    """
+    means = np.asarray(gaussians.means, np.float64)
+    farthest = np.abs(means).max()
+    if kind == "spz" and farthest > SPZ_REACH:
+        raise ValueError(
+            f"{name}: SPZ holds positions up to {SPZ_REACH:.0f} units from the origin, but one is {farthest:,.0f} "
+            "units away; write *.ply or *.sog, or scale the scene"
+        )
+    scales = np.exp(np.asarray(gaussians.log_scales, np.float64).mean(axis=1))
+    rounding = float(np.median(_rounding(kind, means) / scales))
+    if rounding > MOST_ROUNDING:
+        advice = "write *.ply or *.sog, or enlarge the scene" if kind == "spz" else "write *.ply"
+        message = f"{name}: positions are rounded by {rounding:.2g} times the scale of a typical Gaussian; {advice}"
+        warnings.warn(message, stacklevel=4)
+
+
+def _rounding(kind: str, means: np.ndarray) -> np.ndarray:
+    """Return the largest rounding [N] by the format of the coordinates of each position."""
+    if kind == "spz":
+        return np.full(len(means), SPZ_STEP / 2)
+    if kind != "sog":
+        return np.zeros(len(means))
+    # SOG keeps sign(x)·ln(1 + |x|), in even steps or as float32, whichever is coarser; its slope is 1 / (1 + |x|).
+    logarithms = np.sign(means) * np.log1p(np.abs(means))
+    step = np.ptp(logarithms, axis=0) / SOG_LEVELS
+    single = np.spacing(np.abs(logarithms).astype(np.float32))
+    rounding: np.ndarray = ((1 + np.abs(means)) * np.maximum(step, single) / 2).max(axis=1)
+    return rounding
+
+
+def cut_numbers(name: str, model: Model) -> list[str]:
+    """Return in words how many Gaussians a format, by its name, cuts the colours and the scales of."""
+    if name not in RANGES:
+        return []
+    gaussians = world_gaussians(model).gaussians
+    found, sizes = RANGES[name], np.abs(np.asarray(gaussians.sh))
+    if name == ".splat":
+        sizes = sizes[:, :1]
+    largest = np.where(np.arange(sizes.shape[1]) == 0, found.first, found.rest)[:, None] * (1 + SLACK)
+    low, high = found.log_scales
+    log_scales = np.asarray(gaussians.log_scales)
+    cut = {
+        "colours": np.any(sizes > largest, axis=(1, 2)),
+        "scales": np.any((log_scales < low - SLACK) | (log_scales > high + SLACK), axis=1),
+    }
+    return [
+        f"{what} of {counted(int(rows.sum()), 'Gaussian')} beyond the format's range (cut)"
+        for what, rows in cut.items()
+        if rows.any()
+    ]
