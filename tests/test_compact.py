@@ -43,7 +43,6 @@ from a2tg_jax.io.columns import (
     from_byte_planes,
     from_morton,
     from_planes,
-    green_apart,
     morton,
     quantised,
     to_byte_planes,
@@ -337,7 +336,7 @@ def test_other_appearances_are_refused(kind, bands, words):
 def test_numbers_that_are_not_finite_are_refused(field):
     gaussians = some_gaussians()
     spoiled = dataclasses.replace(gaussians, **{field: getattr(gaussians, field).at[3].set(jnp.nan)})
-    with pytest.raises(ValueError, match=rf"model\.{field} must be finite"):
+    with pytest.raises(ValueError, match=rf"{field}\S* must be finite"):
         encode_model(Model(spoiled))
 
 
@@ -560,7 +559,7 @@ def test_laws_of_quantisation(bits):
     rng = np.random.default_rng(bits)
     codes = rng.integers(0, 1 << bits, (3, 100))
     np.testing.assert_array_equal(from_planes(to_planes(codes, bits), 3), codes)
-    np.testing.assert_array_equal(with_green(green_apart(codes, bits), bits), codes)
+    np.testing.assert_array_equal(with_green(with_green(codes, bits, -1), bits), codes)
     np.testing.assert_array_equal(from_morton(morton(codes, bits), bits), codes)
     ends = Ends(-2.0, 3.0)
     np.testing.assert_array_equal(quantised(dequantised(codes, ends, bits), ends, bits), codes)

@@ -19,7 +19,7 @@ from a2tg_jax.appearance import Exponents, MovableKernels, TextureOptions, alloc
 from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io import gltf
+from a2tg_jax.io import gltf, other_programs
 from a2tg_jax.io.gltf import EXTENSION, load_gltf, save_gltf
 from a2tg_jax.io.gltf_container import Document
 from a2tg_jax.io.other_programs import joined_parts, matrix_of, upright
@@ -216,7 +216,7 @@ def test_a_moved_node_moves_the_model_and_its_cameras(tmp_path):
     described["nodes"] = [{"children": [1], "matrix": matrix_of(move).T.ravel().tolist()}, described["nodes"][0]]
     write_parts(path, described, binary)
     found = load_gltf(path)
-    wanted = joined_parts([(model, upright(model.origin, "y").then(move))], "y")
+    wanted = joined_parts([(model, matrix_of(upright(model.origin, "y").then(move)))], "y")
     assert_shows_the_same(found, wanted)
     np.testing.assert_allclose(own, matrix_of(upright(model.origin, "y")))
     assert np.abs(np.asarray(found.gaussians.means) - np.asarray(model.gaussians.means)).max() > 0.1
@@ -460,7 +460,7 @@ def test_no_more_numbers_than_the_file_can_hold(tmp_path, saved, monkeypatch):
         while num_read < 100 * path.stat().st_size:
             num_read += document.numbers(0, "VEC3", "means").nbytes
     assert num_read > 2**20
-    monkeypatch.setattr(gltf, "MOST_PARTS", 2)
+    monkeypatch.setattr(other_programs, "MOST_PARTS", 2)
     described["meshes"][0]["primitives"] *= 3
     write_parts(path, described, saved[1])
     refused(path, "holds more than 2 sets of splats")
@@ -486,8 +486,8 @@ def test_an_origin_elsewhere_is_taken_along():
     model = plain()
     origin = Origin.of_cameras(model.origin.cameras, transform=Similarity(2.0, np.eye(3), np.zeros(3)))
     model = dataclasses.replace(model, origin=origin)
-    assert joined_parts([(model, upright(origin, "y"))], "y") is model
-    assert joined_parts([(model, upright(None, "y"))], "y") is not model
+    assert joined_parts([(model, matrix_of(upright(origin, "y")))], "y") is model
+    assert joined_parts([(model, matrix_of(upright(None, "y")))], "y") is not model
 
 
 # The schema of the extension

@@ -10,7 +10,7 @@ from test_compact import MODELS, plain, textured
 from test_gltf import assert_shows_the_same
 
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io.other_programs import joined_parts, upright
+from a2tg_jax.io.other_programs import joined_parts, matrix_of, upright
 from a2tg_jax.io.usd import load_usd, save_usd
 from a2tg_jax.model import Model
 
@@ -81,7 +81,7 @@ def test_fields_of_other_programs(tmp_path):
     field.AddTranslateOp().Set(Gf.Vec3d(100, 0, 0))
     stage.GetRootLayer().Export(path)
     found = load_usd(path)
-    wanted = joined_parts([(Model(gaussians), Similarity(0.01, np.eye(3), np.array([1.0, 0, 0])))], "y")
+    wanted = joined_parts([(Model(gaussians), matrix_of(Similarity(0.01, np.eye(3), np.array([1.0, 0, 0]))))], "y")
     np.testing.assert_allclose(found.gaussians.means, wanted.gaussians.means, atol=1e-6)
     # The normal of a surflet is z, whatever its scale.
     np.testing.assert_allclose(found.gaussians.scales, 0.01 * gaussians.scales, rtol=1e-3)
@@ -181,4 +181,4 @@ def test_without_usd_core_the_error_says_what_to_install(tmp_path, monkeypatch):
 def test_a_model_keeps_its_place_in_the_original_world():
     """Lengths are those of the original world, and up is up."""
     model = plain()
-    assert joined_parts([(model, upright(model.origin, "z"))], "z") is model
+    assert joined_parts([(model, matrix_of(upright(model.origin, "z")))], "z") is model

@@ -154,7 +154,7 @@ def test_other_appearances_are_refused_by_name(template):
 
 def test_numbers_that_are_not_finite_are_refused():
     gaussians = some_gaussians()
-    with pytest.raises(ValueError, match=r"model\.sh must be finite"):
+    with pytest.raises(ValueError, match=r"gaussians\.sh must be finite"):
         encode_web_scene(Model(dataclasses.replace(gaussians, sh=gaussians.sh.at[2].set(jnp.inf))))
 
 

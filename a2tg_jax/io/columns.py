@@ -169,18 +169,14 @@ def dequantised(codes: np.ndarray, ends: Ends, bits: int) -> np.ndarray:
     return low + codes * ((high - low) / ((1 << bits) - 1))
 
 
-def green_apart(codes: np.ndarray, bits: int) -> np.ndarray:
-    """Return codes [3, n] of RGB as red − green, green, blue − green, modulo the range of their bytes."""
+def with_green(codes: np.ndarray, bits: int, sign: int = 1) -> np.ndarray:
+    """Return codes [3, n] as red + green, green, blue + green, modulo the range of their bytes; `sign` -1 undoes it.
+
+    Colours are kept as differences to green, which are about 0.
+    """
     red, green, blue = codes
     mask = (1 << 8 * num_bytes_of(bits)) - 1
-    return np.stack([(red - green) & mask, green, (blue - green) & mask])
-
-
-def with_green(codes: np.ndarray, bits: int) -> np.ndarray:
-    """Return the inverse of `green_apart`."""
-    red, green, blue = codes
-    mask = (1 << 8 * num_bytes_of(bits)) - 1
-    return np.stack([(red + green) & mask, green, (blue + green) & mask])
+    return np.stack([(red + sign * green) & mask, green, (blue + sign * green) & mask])
 
 
 def opacities_of(logits: np.ndarray) -> np.ndarray:
@@ -262,23 +258,8 @@ def num_bytes_of(bits: int) -> int:
     return -(-bits // 8)
 
 
-def to_planes(codes: np.ndarray, bits: int) -> np.ndarray:
-    """Return uint8 [C·bytes, n]: the lowest bytes of codes [C, n], column by column, then the next higher."""
-    codes = np.atleast_2d(codes)
-    planes = [(codes >> (8 * index)) & 255 for index in range(num_bytes_of(bits))]
-    return np.concatenate(planes).astype(np.uint8) if planes else np.zeros((0, codes.shape[1]), np.uint8)
-
-
-def from_planes(planes: np.ndarray, num_columns: int) -> np.ndarray:
-    """Return the codes [num_columns, n] that `to_planes` was given, as int64."""
-    codes = np.zeros((num_columns, planes.shape[1]), np.int64)
-    for index in range(len(planes) // num_columns):
-        codes |= planes[index * num_columns : (index + 1) * num_columns].astype(np.int64) << (8 * index)
-    return codes
-
-
 def to_byte_planes(values: np.ndarray) -> np.ndarray:
-    """Return uint8 [C·itemsize, n]: the bytes of numbers [C, n] of any type, lowest first, as in `to_planes`."""
+    """Return uint8 [C·itemsize, n]: the lowest bytes of numbers [C, n] of any type, column by column, then the next."""
     values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     num_columns, length = values.shape
     by_byte = values.view(np.uint8).reshape(num_columns, length, values.dtype.itemsize)
@@ -290,6 +271,18 @@ def from_byte_planes(planes: np.ndarray, num_columns: int, dtype: np.dtype) -> n
     dtype = np.dtype(dtype).newbyteorder("<")
     by_byte = planes.reshape(dtype.itemsize, num_columns, planes.shape[1]).transpose(1, 2, 0)
     return np.ascontiguousarray(by_byte).view(dtype)[..., 0]
+
+
+def to_planes(codes: np.ndarray, bits: int) -> np.ndarray:
+    """Return uint8 [C·bytes, n]: codes [C, n] as `to_byte_planes`, without the bytes that so few bits leave empty."""
+    codes = np.atleast_2d(codes).astype(np.int64)
+    return to_byte_planes(codes)[: num_bytes_of(bits) * len(codes)]
+
+
+def from_planes(planes: np.ndarray, num_columns: int) -> np.ndarray:
+    """Return the codes [num_columns, n] that `to_planes` was given, as int64."""
+    empty = np.zeros((8 * num_columns - len(planes), planes.shape[1]), np.uint8)
+    return from_byte_planes(np.concatenate([planes, empty]), num_columns, np.dtype(np.int64))
 
 
 # Named columns in one body
@@ -352,7 +345,7 @@ class ColumnWriter:
             self.num_unpacked += values.size
             return
         codes = quantised(values, ends, precision)
-        self.planes(name, to_planes(green_apart(codes, precision) if is_color else codes, precision))
+        self.planes(name, to_planes(with_green(codes, precision, -1) if is_color else codes, precision))
 
     def means(self, name: str, values: np.ndarray, precision: Precision) -> np.ndarray:
         """Write positions [3, n], and return their order [n] along the Z curve."""

@@ -15,7 +15,6 @@ import os
 import struct
 import zlib
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -25,8 +24,6 @@ from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.regular_files import is_regular, read_regular
-from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import (
     Choice,
     ColumnReader,
@@ -42,7 +39,6 @@ from a2tg_jax.io.columns import (
 )
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.io.model_file import (
-    LONGEST_REASON,
     appearance_from_dict,
     appearance_to_dict,
     background_of,
@@ -51,7 +47,7 @@ from a2tg_jax.io.model_file import (
     origin_shapes,
 )
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, ordered, rows_of_model
-from a2tg_jax.io.validate import check_model, check_suffix
+from a2tg_jax.io.validate import check_suffix, existing_bytes, reading
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.texture import MAX_SIDE
 
@@ -60,7 +56,6 @@ VERSION, SHAPED_VERSION = 1, 2
 """Versions of files without and with shapes of kernels, which readers of version 1 refuse."""
 HEAD = struct.Struct("<8sHIII")
 """Magic, version, bytes of the header as coded and as text, checksum of all that follows."""
-MOST_BYTES = 1 << 32
 ORIGIN_DTYPES = {
     "viewmats": "f8", "Ks": "f8", "sizes": "i4", "is_test": "u1", "scale": "f8", "rotation": "f8", "translation": "f8",
 }  # fmt: skip
@@ -153,10 +148,7 @@ def load_compact(path: str | os.PathLike[str]) -> Model:
       ValueError: if it is not a compact scene, is damaged, or is of another version.
     """
     check_suffix(path, "load_compact")
-    path = Path(path)
-    if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such compact scene")
-    return decode_model(read_regular(path, MOST_BYTES), str(path))
+    return decode_model(existing_bytes(path, "compact scene"), os.fspath(path))
 
 
 def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES, grids: Grids | None = None) -> bytes:
@@ -171,7 +163,6 @@ def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES, grids:
     check_gaussians(model.gaussians, "model.gaussians")
     check_encodable(model.appearance)
     data, num_unpacked = _encoded(model.live, choices, grids)
-    check_model(model)
     if num_unpacked > room_of(len(data)):  # So alike are its numbers that the file would be taken for a bomb.
         data, _ = _encoded(model.live, dataclasses.replace(choices, coder="none"), grids)
     return data
@@ -191,13 +182,23 @@ def grids_of(model: Model, choices: CompactChoices) -> Grids:
 
 def decode_model(data: bytes, where: str = "the compact scene") -> Model:
     """Return the model of the bytes of a file; errors call it `where`. Raises as `load_compact` does."""
-    try:
-        return _decoded(data)
-    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
-        reason = shortened(repr(error))
-        raise ValueError(f"{where}: the compact scene is damaged or of another version ({reason})") from error
-    except ValueError as error:
-        raise ValueError(f"{where}: {shortened(str(error), LONGEST_REASON)}") from error
+    with reading(where):
+        header, body = _unframed(data)
+        choices = config_from_dict(CompactChoices, header["choices"], "choices").check()
+        appearance = appearance_from_dict(header["appearance"])
+        check_encodable(appearance)
+        reader = ColumnReader(body, header, room_of(len(data)))
+        rows = _rows_of(reader, header, choices, appearance)
+        origin = None
+        if "origin" in header:
+            shapes = origin_shapes(len(header["origin"]["names"]))
+            arrays = {
+                name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()
+            }
+            arrays |= {"sizes": arrays["sizes"].astype(np.int64), "is_test": arrays["is_test"].astype(bool)}
+            origin = origin_of(header["origin"], arrays)
+        reader.end()
+        return model_of(rows, header["base_degree"], appearance, origin, background_of(header))
 
 
 def bytes_by_part(data: bytes) -> dict[str, int]:
@@ -257,23 +258,6 @@ def _framed(header: Mapping[str, Any], body: bytes, version: int = VERSION) -> b
 
 
 # From bytes to a model
-
-
-def _decoded(data: bytes) -> Model:
-    header, body = _unframed(data)
-    choices = config_from_dict(CompactChoices, header["choices"], "choices").check()
-    appearance = appearance_from_dict(header["appearance"])
-    check_encodable(appearance)
-    reader = ColumnReader(body, header, room_of(len(data)))
-    rows = _rows_of(reader, header, choices, appearance)
-    origin = None
-    if "origin" in header:
-        shapes = origin_shapes(len(header["origin"]["names"]))
-        arrays = {name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()}
-        arrays |= {"sizes": arrays["sizes"].astype(np.int64), "is_test": arrays["is_test"].astype(bool)}
-        origin = origin_of(header["origin"], arrays)
-    reader.end()
-    return model_of(rows, header["base_degree"], appearance, origin, background_of(header))
 
 
 def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:

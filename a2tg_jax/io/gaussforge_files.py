@@ -24,18 +24,17 @@ import numpy as np
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.data.ply import OFFSET
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import morton
 from a2tg_jax.io.other_programs import (
     check_positions,
     origin_at,
-    reading,
     third_log_scales,
     warn_of_offset,
     world_gaussians,
 )
 from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, offset_comment
+from a2tg_jax.io.validate import existing_bytes, reading
 from a2tg_jax.model import Model
 
 KINDS = ("compressed.ply", "spz", "sog", "splat")
@@ -88,11 +87,7 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
       FileNotFoundError: if there is no such file.
       ValueError: if gaussforge is not installed or cannot read the file, or a number is not finite.
     """
-    kind, path = _kind_of(path), Path(path)
-    if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such file")
-    with open_regular(path) as file:
-        data = file.read()
+    kind, path, data = _kind_of(path), Path(path), existing_bytes(path, "file")
     header: dict[str, Any] = {}
     if kind == "sog":
         with (
@@ -104,7 +99,8 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
             header = found if isinstance(found, dict) else {}
     converted = _converted(data, kind, "ply", path)
     gaussians = decode_ply(io.BytesIO(converted), path, is_flat=header.get("model") == SOG_FLAT).gaussians
-    origin = reading(path, lambda: origin_at(np.array(header.get(OFFSET, (0, 0, 0)), np.float64).reshape(3)))
+    with reading(path):
+        origin = origin_at(np.array(header.get(OFFSET, (0, 0, 0)), np.float64).reshape(3))
     return Model(gaussians, origin=origin)
 
 

@@ -18,7 +18,6 @@ from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
 from a2tg_jax.appearance.parts import EXTENT, MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import LARGEST_FLOAT, Ends, dequantised, ends_of, quantised
 from a2tg_jax.io.config_json import config_from_dict
@@ -27,7 +26,6 @@ from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict, bac
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
 from a2tg_jax.io.other_programs import (
     HIGHEST_DEGREE,
-    MOST_PARTS,
     Ellipsoids,
     degree_to_read,
     gaussians_of,
@@ -36,12 +34,10 @@ from a2tg_jax.io.other_programs import (
     matrix_of,
     origin_from_json,
     origin_to_json,
-    reading,
-    similarity_of,
     splats_of,
     upright,
 )
-from a2tg_jax.io.validate import check_model, check_suffix, live_model
+from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
 from a2tg_jax.model import Model
 from a2tg_jax.texture import MAX_SIDE
 
@@ -174,22 +170,17 @@ def load_gltf(path: str | os.PathLike[str]) -> Model:
       ValueError: if it is not glTF 2.0, is damaged, holds no splats, or needs an extension that is not known here.
     """
     check_suffix(path, "load_gltf")
-
-    def loaded() -> Model:
-        document, parts = Document(path), list[tuple[Model, Similarity]]()
+    with reading(path):
+        document = Document(path)
         if unknown := [name for name in document.json.get("extensionsRequired", []) if name not in READ]:
             raise ValueError(f"needs the extension {shortened(unknown[0])}, which this program does not read")
-        for node, matrix in mesh_nodes(document):
-            for primitive in document.entry("meshes", node["mesh"])["primitives"]:
-                if SPLATS in primitive.get("extensions", {}):
-                    parts.append((_model_of(document, primitive), similarity_of(matrix, "the transform of its node")))
-                if len(parts) > MOST_PARTS:
-                    raise ValueError(f"holds more than {MOST_PARTS} sets of splats")
-        if not parts:
-            raise ValueError(f"holds no splats ({SPLATS})")
+        parts = (
+            (_model_of(document, primitive), matrix)
+            for node, matrix in mesh_nodes(document)
+            for primitive in document.entry("meshes", node["mesh"])["primitives"]
+            if SPLATS in primitive.get("extensions", {})
+        )
         return joined_parts(parts, "y")
-
-    return reading(path, loaded)
 
 
 def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:

@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, read_regular
 from a2tg_jax.host.text import shortened
+from a2tg_jax.io.validate import existing_bytes
 
 MAGIC, VERSION = b"glTF", 2
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
@@ -81,9 +83,7 @@ class Builder:
     def save(self, path: Path, described: Mapping[str, Any]) -> None:
         """Write the file, *.gltf with a *.bin beside it, any other name as one *.glb.
 
-        Args:
-          path: the file; an older one is replaced once the new one is whole.
-          described: the JSON without accessors and buffers.
+        Older files are replaced once the new ones are whole. `described` is the JSON without accessors and buffers.
 
         Raises:
           ValueError: if one file cannot hold so many bytes.
@@ -123,9 +123,7 @@ class Document:
 
     def __init__(self, path: str | os.PathLike[str]):
         self.path = Path(path)
-        if not is_regular(self.path):
-            raise FileNotFoundError(f"{self.path}: no such glTF file")
-        data = read_regular(self.path, MOST_ARRAY_BYTES)
+        data = existing_bytes(path, "glTF file")
         text, self._binary = _split_glb(data) if data[:4] == MAGIC else (data, None)
         self.json = parse_json(text)
         if not isinstance(self.json, dict) or not isinstance(self.json.get("asset"), dict):
@@ -149,13 +147,8 @@ class Document:
     def numbers(self, index: Any, kind: str, what: str) -> np.ndarray:
         """Return the numbers of an accessor as float32 [n, columns]; integers that are normalised become fractions.
 
-        Args:
-          index: its index.
-          kind: its type, such as "VEC3".
-          what: its name in errors.
-
         Raises:
-          ValueError: if there is none, it is of another type, or reaches beyond its buffer.
+          ValueError: naming it `what`, if there is none, it is of another kind, or reaches beyond its buffer.
         """
         accessor = self.entry("accessors", index)
         if accessor.get("type") != kind or accessor.get("componentType") not in COMPONENTS:
@@ -322,15 +315,7 @@ def _local_matrix(node: Mapping[str, Any]) -> np.ndarray:
     if "matrix" in node:
         return vector("matrix", [0.0] * 16).reshape(4, 4).T
     rotation = vector("rotation", [0.0, 0.0, 0.0, 1.0])
-    x, y, z, w = rotation / max(np.linalg.norm(rotation), 1e-30)
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
     matrix = np.eye(4)
-    matrix[:3, :3] = turn * vector("scale", [1.0, 1.0, 1.0])
+    matrix[:3, :3] = Rotation.from_quat(rotation).as_matrix() * vector("scale", [1.0, 1.0, 1.0])
     matrix[:3, 3] = vector("translation", [0.0, 0.0, 0.0])
     return matrix

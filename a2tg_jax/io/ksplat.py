@@ -10,7 +10,6 @@ full ones first. Level 0 is written, up to degree 2, beyond which GaussianSplats
 
 import os
 import struct
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,16 +17,14 @@ import numpy as np
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io.other_programs import (
     Ellipsoids,
     gaussians_of,
-    reading,
     splats_of,
     warn_of_offset,
     world_gaussians,
 )
-from a2tg_jax.io.validate import check_model
+from a2tg_jax.io.validate import check_model, existing_bytes, reading
 from a2tg_jax.model import Model
 
 HEADER_BYTES, SECTION_BYTES = 4096, 1024
@@ -79,20 +76,13 @@ def load_ksplat(path: str | os.PathLike[str]) -> Gaussians:
       FileNotFoundError: if there is no such file.
       ValueError: if it is no such file, is cut off, contradicts itself, or holds no splats.
     """
-    path = Path(path)
-    if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such file")
-    with open_regular(path) as file:
-        data = file.read()
-
-    def loaded() -> Gaussians:
+    data = existing_bytes(path, "file")
+    with reading(path):
         with np.errstate(over="ignore", invalid="ignore"):  # What is not finite is left out.
             splats = _read(data)
         gaussians = gaussians_of(splats, path, is_flat=False)
         check_model(Model(gaussians))
-        return gaussians
-
-    return reading(path, loaded)
+    return gaussians
 
 
 def _read(data: bytes) -> Ellipsoids:

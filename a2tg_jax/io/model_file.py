@@ -26,13 +26,11 @@ from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
-from a2tg_jax.io.validate import check_model, check_suffix, live_model
+from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
 from a2tg_jax.model import Model
 
 FORMAT = "a2tg-jax model"
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
-LONGEST_REASON = 500
-"""Largest number of characters of an error about a file, whose own text may be long."""
 APPEARANCE, ORIGIN, CORRECTIONS = "appearance/", "origin/", "corrections/"
 """Prefixes of the names of their arrays."""
 
@@ -65,8 +63,6 @@ def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, 
 def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appearance]] = ()) -> Model:
     """Return the model that `save_model` wrote.
 
-    A model of version 0.1.0, which knew one kind of textures, gets them with the default options.
-
     Args:
       path: the file.
       appearances: classes of appearances that are not this package's.
@@ -77,29 +73,18 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
     """
     check_suffix(path, "load_model")
     header, arrays = read_archive(path, format=FORMAT)
-    try:
+    with reading(path):
         gaussians = Gaussians(**{name: arrays[name] for name in FIELDS})  # type: ignore[arg-type]
         check_gaussians(gaussians)
         gaussians = jax.tree.map(jnp.asarray, gaussians)
+        appearance = appearance_from_dict(header["appearance"], appearances)
         shown = {name.removeprefix(APPEARANCE): array for name, array in arrays.items() if name.startswith(APPEARANCE)}
-        if "appearance" in header:
-            appearance = appearance_from_dict(header["appearance"], appearances)
-        else:  # Version 0.1
-            shown = {name: arrays[name] for name in ("sizes", "texels") if name in arrays}
-            appearance = appearance_for(TextureOptions(), has_textures=bool(shown))
-        shown_by = with_arrays(appearance, shown, gaussians.sh_degree)
         of_origin = {name.removeprefix(ORIGIN): array for name, array in arrays.items() if name.startswith(ORIGIN)}
         origin = origin_of(header["origin"], of_origin) if "origin" in header else None
+        shown_by = with_arrays(appearance, shown, gaussians.sh_degree)
         model = Model(gaussians, shown_by, background=background_of(header), origin=origin)
         check_model(model)
         return model
-    except KeyError as error:
-        raise ValueError(f"{os.fspath(path)}: the model lacks {error}; it is damaged or of another version") from error
-    except (TypeError, IndexError, AttributeError, OverflowError) as error:
-        reason = shortened(str(error))
-        raise ValueError(f"{os.fspath(path)}: the model is damaged or of another version ({reason})") from error
-    except ValueError as error:
-        raise ValueError(f"{os.fspath(path)}: {shortened(str(error), LONGEST_REASON)}") from error
 
 
 def number_in_file(path: str | os.PathLike[str]) -> int:

@@ -8,7 +8,6 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from a2tg_jax.appearance import Appearance, in_words
 from a2tg_jax.appearance.files import arrays_of, with_arrays
@@ -68,24 +67,19 @@ def check_encodable(
 
 
 def rows_of_model(model: Model) -> Rows:
-    """Return the tables of a model of which all rows exist, in the model's order; finite, or ValueError names the
-    field."""
-    gaussians = model.gaussians
-    fields = {field.name: np.asarray(getattr(gaussians, field.name)) for field in dataclasses.fields(gaussians)}
-    shown = arrays_of(model.appearance, gaussians.sh_degree)
-    for name, values in (*fields.items(), *shown.items()):
-        if not np.isfinite(values).all():
-            raise ValueError(f"model.{name} must be finite; some values are NaN or infinite")
-    sh = fields["sh"]
+    """Return the tables of a model of which all rows exist, in its order. Raises as `check_model`."""
+    check_model(model)
+    gaussians, shown = model.gaussians, arrays_of(model.appearance, model.gaussians.sh_degree)
+    sh = np.asarray(gaussians.sh)
     bands = [sh[:, NUM_BASES[degree] - 2 * degree - 1 : NUM_BASES[degree]] for degree in range(gaussians.sh_degree + 1)]
     degrees = np.full(gaussians.num, gaussians.sh_degree)
     if model.appearance.bands is not None:
         degrees = np.asarray(shown["degrees"], np.int64)
         bands += [shown[f"band_{degree}"] for degree in range(gaussians.sh_degree + 1, len(NUM_BASES))]
-    return Rows(
-        fields["means"], fields["quats"], fields["log_scales"], fields["logit_opacities"], degrees, tuple(bands),
-        shown.get("sizes"), shown.get("texels"), shown.get("shapes"),
-    )  # fmt: skip
+    fields = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
+    means, quats, log_scales, logits = map(np.asarray, fields)
+    optional = (shown.get(name) for name in ("sizes", "texels", "shapes"))
+    return Rows(means, quats, log_scales, logits, degrees, tuple(bands), *optional)
 
 
 def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:
@@ -98,24 +92,21 @@ def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:
     """
     quats = rows.quats[order]
     quats, axis = nearest_half_turn(quats) if turns else (with_positive_w(quats), np.zeros(len(order), np.int64))
+    degrees, bands = rows.degrees[order], []
+    for degree, band in enumerate(rows.bands):  # The n-th splat of that degree or more has the n-th row.
+        places = np.cumsum(rows.degrees >= degree) - 1
+        bands.append(band[places[order[degrees >= degree]]])
     return Rows(
         means=rows.means[order],
         quats=quats,
         log_scales=rows.log_scales[order],
         logit_opacities=rows.logit_opacities[order],
-        degrees=rows.degrees[order],
-        bands=tuple(band[_owned(rows.degrees, order, degree)] for degree, band in enumerate(rows.bands)),
+        degrees=degrees,
+        bands=tuple(bands),
         sizes=None if rows.sizes is None else rows.sizes[order],
         texels=None if rows.texels is None or rows.sizes is None else rows.texels[_texels(rows.sizes, order, axis)],
         shapes=None if rows.shapes is None else rows.shapes[order],
     )
-
-
-def _owned(degrees: np.ndarray, order: np.ndarray, degree: int) -> np.ndarray:
-    """Return the rows of a band, in the order of their splats."""
-    places = np.cumsum(degrees >= degree) - 1
-    owned: np.ndarray = places[order[degrees[order] >= degree]]
-    return owned
 
 
 def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -169,17 +160,9 @@ def model_of(
     Raises:
       ValueError: if tables disagree.
     """
-
-    def as_float(x: np.ndarray) -> Array:
-        return jnp.asarray(np.asarray(x, np.float32))
-
-    gaussians = Gaussians(
-        means=as_float(rows.means),
-        quats=as_float(rows.quats),
-        log_scales=as_float(rows.log_scales),
-        logit_opacities=as_float(rows.logit_opacities),
-        sh=as_float(np.concatenate(rows.bands[: base_degree + 1], axis=1)),
-    )
+    sh = np.concatenate(rows.bands[: base_degree + 1], axis=1)
+    fields = (rows.means, rows.quats, rows.log_scales, rows.logit_opacities, sh)
+    gaussians = Gaussians(*(jnp.asarray(np.asarray(values, np.float32)) for values in fields))
     arrays: dict[str, np.ndarray] = {}
     if rows.sizes is not None and rows.texels is not None:
         arrays = {"sizes": rows.sizes, "texels": np.asarray(rows.texels, np.float32)}

@@ -9,8 +9,8 @@ import dataclasses
 import math
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,11 +21,13 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity, transform_gaussians
 from a2tg_jax.host.text import counted, shortened
-from a2tg_jax.io.model_file import LONGEST_REASON, origin_arrays, origin_of
+from a2tg_jax.io.model_file import origin_arrays, origin_of
 from a2tg_jax.io.validate import check_origin
 from a2tg_jax.model import Model, concatenate
 
 Up = Literal["y", "z"]
+Kind = str
+"""gaussforge's name of a format, such as "spz"; "ply" is every one with positions in float32."""
 UPRIGHT: Mapping[Up, np.ndarray] = {
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
     "z": np.eye(3),
@@ -44,7 +46,6 @@ SAME_SCALE = 1e-3
 """Largest difference of the scales of the axes of a transform, relative to the largest."""
 MOST_PARTS = 256
 """Largest number of sets of splats in one file."""
-Result = TypeVar("Result")
 
 
 # From a model to a file
@@ -98,14 +99,9 @@ def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False)
 
 
 def world_gaussians(
-    gaussians: Gaussians | Model, transform: Similarity | None = None, kind: str = "ply"
+    gaussians: Gaussians | Model, transform: Similarity | None = None, kind: Kind = "ply"
 ) -> WorldGaussians:
-    """Return the Gaussians of a model without what they show, in the original world.
-
-    Args:
-      gaussians, transform: as in `save_ply`.
-      kind: gaussforge's name of the format.
-    """
+    """Return the Gaussians of a model without what they show, in the original world; arguments as in `save_ply`."""
     plain = plain_gaussians(gaussians)
     if transform is None and isinstance(gaussians, Model) and gaussians.origin is not None:
         transform = gaussians.origin.transform
@@ -154,13 +150,10 @@ def linear_colors(colors: np.ndarray) -> np.ndarray:
 def gaussians_of(
     splats: Ellipsoids, path: str | os.PathLike[str], *, is_flat: bool, keeps_all: bool = False
 ) -> Gaussians:
-    """Return the Gaussians of splats.
+    """Return the Gaussians of the splats of a file, of which the third axis is the normal if it `is_flat`.
 
-    Args:
-      splats: the splats.
-      path: their file, for warnings.
-      is_flat: the third axis is the normal; else the thinnest is.
-      keeps_all: also splats with numbers that are not finite; else these are left out with a warning.
+    Else the thinnest axis becomes the normal. Splats with numbers that are not finite are left out with a warning,
+    unless `keeps_all`.
     """
     if not keeps_all:
         kept = whole_rows(os.fspath(path), splats.scales, splats.means, splats.quats, splats.opacities, splats.sh)
@@ -177,14 +170,10 @@ def gaussians_of(
 
 
 def whole_rows(name: str, scales: np.ndarray, *columns: np.ndarray) -> np.ndarray:
-    """Return which rows [N] have finite numbers only. The others are counted in a warning.
+    """Return which rows [N] have finite numbers only. The others are counted in a warning that names the file.
 
-    If no row is finite, all are returned, for the checks of a model to refuse.
-
-    Args:
-      name: the file, for the warning.
-      scales: [N, 2] or [N, 3], or their logarithms. The smallest of three may be −inf: `flattened` drops it.
-      columns: other arrays [N, ...].
+    If no row is finite, all are returned, for the checks of a model to refuse. Of three scales, or their logarithms,
+    the smallest may be −inf: `flattened` drops it.
     """
     seen = np.sort(scales, axis=1)[:, -2:]  # NaN is sorted to the end.
     finite = [np.isfinite(column).all(axis=tuple(range(1, column.ndim))) for column in (seen, *columns)]
@@ -204,12 +193,8 @@ def whole_rows(name: str, scales: np.ndarray, *columns: np.ndarray) -> np.ndarra
 def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return quaternions [N, 4] and log-scales [N, 2] of ellipsoids [N, 3], with the thinnest axis as the normal.
 
-    The axes are moved around in their cycle, so that the rotation stays one; of two equally thin the later goes.
-
-    Args:
-      quats: [N, 4] wxyz.
-      log_scales: [N, 3].
-      name: the file, for the warning that some ellipsoids are not flat.
+    The axes are moved around in their cycle, so that the rotation stays one; of two equally thin the later goes. A
+    warning that some ellipsoids are not flat names the file.
     """
     if len(log_scales):
         # A file that rounds scales gives all flat Gaussians one third scale, its smallest, and most are far wider.
@@ -240,17 +225,6 @@ def degree_to_read(degree: int, name: str) -> int:
         message = f"{name}: has SH of degree {degree}; degree {HIGHEST_DEGREE} is read, and what is above it left out"
         warnings.warn(message, stacklevel=4)
     return min(degree, HIGHEST_DEGREE)
-
-
-def reading(path: str | os.PathLike[str], read: Callable[[], Result]) -> Result:
-    """Return what `read` returns. Errors in what a file says become one ValueError that names it."""
-    where = os.fspath(path)
-    try:
-        return read()
-    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
-        raise ValueError(f"{where}: is damaged or of another version ({shortened(repr(error))})") from error
-    except ValueError as error:
-        raise ValueError(f"{where}: {shortened(str(error).removeprefix(f'{where}: '), LONGEST_REASON)}") from error
 
 
 # Worlds
@@ -292,7 +266,7 @@ def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
     return Similarity(largest, u @ v, matrix[:3, 3])
 
 
-def joined_parts(parts: Sequence[tuple[Model, Similarity]], up: Up) -> Model:
+def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
     """Return the parts of a file as one model in its own world, which has +z up (host).
 
     A part stays as it is where its file places it as it was written. Else it moves, and its origin along. Positions
@@ -300,12 +274,15 @@ def joined_parts(parts: Sequence[tuple[Model, Similarity]], up: Up) -> Model:
     model without one then has.
 
     Args:
-      parts: at least one model as the file holds it, and the similarity from there to the world of the file.
+      parts: models as the file holds them, and the matrices from there to the world of the file.
       up: the axis that is up there.
     """
     origin, offset, models = None, None, list[Model]()
-    for model, world in parts:
+    for model, matrix in parts:
+        if len(models) == MOST_PARTS:
+            raise ValueError(f"holds more than {MOST_PARTS} sets of splats")
         origin = origin or model.origin
+        world = similarity_of(matrix, "the transform of its splats")
         move = world.then(upright(origin, up).inverse())
         if is_same := np.allclose(matrix_of(move), np.eye(4), rtol=0, atol=SAME_PLACE):
             move = UNMOVED
@@ -316,7 +293,9 @@ def joined_parts(parts: Sequence[tuple[Model, Similarity]], up: Up) -> Model:
         if offset.any():
             move = dataclasses.replace(move, translation=move.translation - offset)
         models.append(model if is_same and not offset.any() else model.transform(move))
-    if offset is not None and models[0].origin is None:
+    if not models or offset is None:
+        raise ValueError("holds no splats")
+    if models[0].origin is None:
         models[0] = dataclasses.replace(models[0], origin=origin_at(offset))
     return models[0] if len(models) == 1 else concatenate(models)
 
@@ -379,13 +358,10 @@ OFFSET_PLACES = {
 """Where a file says what its positions are relative to, by gaussforge's name of its format."""
 
 
-def offset_for(kind: str, means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
-    """Return whole numbers [3] to subtract from positions so that a file can hold them; zeros if it can as they are.
+def offset_for(kind: Kind, means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    """Return whole numbers [3] to subtract from positions [N, 3] so that a format can hold them; zeros if it can now.
 
-    Args:
-      kind: gaussforge's name of the format.
-      means: [N, 3] float64, in the original world.
-      log_scales: [N, 2], in the same world.
+    Positions are float64, and they and the log-scales [N, 2] are in the original world.
     """
     if not len(means):
         return np.zeros(3)
@@ -417,7 +393,7 @@ def origin_at(offset: np.ndarray) -> Origin | None:
     return origin
 
 
-def warn_of_offset(kind: str, offset: np.ndarray, path: str | os.PathLike[str]) -> None:
+def warn_of_offset(kind: Kind, offset: np.ndarray, path: str | os.PathLike[str]) -> None:
     """Warn that the positions of a file are relative to an offset [3], unless it is zero."""
     if offset.any():
         place = OFFSET_PLACES.get(kind, "the file has no place to say so: write this down")
@@ -433,13 +409,10 @@ def offset_words(offset: np.ndarray) -> list[str]:
     return [repr(float(value)).removesuffix(".0") for value in offset]
 
 
-def check_positions(kind: str, gaussians: Gaussians, name: str) -> None:
-    """Raise ValueError if a format cannot hold the positions; warn if it rounds them too far.
+def check_positions(kind: Kind, gaussians: Gaussians, name: str) -> None:
+    """Raise ValueError if a format cannot hold the positions of one or more Gaussians; warn if it rounds them too far.
 
-    Args:
-      kind: gaussforge's name of the format.
-      gaussians: in the world of the file, at least one.
-      name: the file, for messages.
+    Messages name the file.
     """
     means = np.asarray(gaussians.means, np.float64)
     farthest = np.abs(means).max()
@@ -456,7 +429,7 @@ def check_positions(kind: str, gaussians: Gaussians, name: str) -> None:
         warnings.warn(message, stacklevel=4)
 
 
-def _rounding(kind: str, means: np.ndarray) -> np.ndarray:
+def _rounding(kind: Kind, means: np.ndarray) -> np.ndarray:
     """Return the largest rounding [N] by the format of the coordinates of each position."""
     if kind == "spz":
         return np.full(len(means), SPZ_STEP / 2)

@@ -37,13 +37,12 @@ from a2tg_jax.io.other_programs import (
     offset_for,
     offset_words,
     origin_at,
-    reading,
     third_log_scales,
     warn_of_offset,
     whole_rows,
     world_gaussians,
 )
-from a2tg_jax.io.validate import check_model, check_suffix
+from a2tg_jax.io.validate import check_model, check_suffix, reading
 from a2tg_jax.model import Model
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -100,16 +99,13 @@ def save_ply(
 def encode_ply(
     gaussians: Gaussians, third: np.ndarray | None, offset: np.ndarray | None = None, means: np.ndarray | None = None
 ) -> bytes:
-    """Return a PLY file of Gaussians.
+    """Return a PLY file of Gaussians. ValueError: `load_ply` would refuse them.
 
     Args:
       gaussians: N Gaussians.
       third: logarithms [N, 1] of third scales; None leaves these out.
-      offset: [3] what the means are relative to, for a comment; None or zeros if nothing.
-      means: [N, 3] to write as float64 in place of those of the Gaussians.
-
-    Raises:
-      ValueError: if `load_ply` would refuse the Gaussians, as it does numbers that are not finite.
+      offset: [3] what the means are relative to, for a comment.
+      means: [N, 3] to write as float64 instead of the Gaussians' own.
     """
     check_model(Model(gaussians))
     sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
@@ -178,12 +174,9 @@ def load_ply_model(path: str | os.PathLike[str]) -> Model:
 
 
 def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
-    """Read Gaussians from an open PLY file, as `load_ply_model` does.
+    """Read Gaussians from an open PLY file, as `load_ply_model` does; messages name the path.
 
-    Args:
-      file: at its beginning.
-      path: the name for messages.
-      is_flat: whether the splats are known to be flat; if not, the header may say so.
+    If the splats are not known to be flat, the header may say so.
     """
     ply = PlyFile(file, path)
     vertices = unpacked_vertices(ply) if [*ply.counts][:1] == ["chunk"] else _vertices(ply)
@@ -204,12 +197,9 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
         means = (means - inside).astype(np.float32)
     gaussians = Gaussians(*(jnp.asarray(rows) for rows in (means, quats, log_scales, logits[kept], sh[kept])))
-
-    def checked() -> Model:
+    with reading(path):
         check_model(Model(gaussians))
         return Model(gaussians, origin=origin_at(inside + ply.offset))
-
-    return reading(path, checked)
 
 
 def _vertices(ply: PlyFile) -> np.ndarray:
@@ -263,11 +253,7 @@ SH_RANGE = 8.0
 
 
 def unpacked_vertices(ply: PlyFile) -> np.ndarray:
-    """Return the vertices of a packed PLY, structured, with the attribute names of 3DGS; float32.
-
-    Raises:
-      ValueError: naming the file, if it is cut off, not binary, or its elements do not fit each other.
-    """
+    """Return the vertices of a packed PLY, structured, with the attribute names of 3DGS; float32."""
     path, names = ply.path, list(ply.counts)
     if names not in (["chunk", "vertex"], ["chunk", "vertex", "sh"]):
         raise ValueError(f"{path}: a packed PLY has the elements chunk, vertex and sh; this one has {names}")

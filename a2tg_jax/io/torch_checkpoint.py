@@ -25,8 +25,8 @@ import numpy as np
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.other_programs import degree_to_read, flattened, reading, whole_rows
-from a2tg_jax.io.validate import check_model
+from a2tg_jax.io.other_programs import degree_to_read, flattened, whole_rows
+from a2tg_jax.io.validate import check_model, reading
 from a2tg_jax.model import Model
 
 STORAGES = {
@@ -70,7 +70,8 @@ def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
         except Exception as error:  # A damaged pickle may raise anything.
             reason = shortened(str(error) or type(error).__name__, 200)
             raise ValueError(f"{path}: is no checkpoint of PyTorch 1.6 or newer, or is damaged ({reason})") from error
-    return reading(path, lambda: _gaussians_of(arrays, path))
+    with reading(path):
+        return _gaussians_of(arrays, path)
 
 
 class _Refused(Exception):
@@ -85,13 +86,11 @@ class _Storage(NamedTuple):
     num: int
 
 
-class _Tensor(NamedTuple):
+class _Tensor:
     """A view into a storage."""
 
-    storage: _Storage
-    offset: int
-    size: tuple[int, ...]
-    stride: tuple[int, ...]
+    def __init__(self, storage: _Storage, offset: int, size: Any, stride: Any, *rest: Any):
+        self.storage, self.offset, self.size, self.stride = storage, offset, tuple(size), tuple(stride)
 
 
 class _Ignored:
@@ -100,12 +99,7 @@ class _Ignored:
     def __init__(self, *arguments: Any):
         pass
 
-    def __setstate__(self, state: Any) -> None:
-        pass
-
-
-def _tensor(storage: _Storage, offset: int, size: Any, stride: Any, *rest: Any) -> _Tensor:
-    return _Tensor(storage, offset, tuple(size), tuple(stride))
+    __setstate__ = __init__
 
 
 def _parameter(data: Any, *rest: Any) -> Any:
@@ -113,7 +107,7 @@ def _parameter(data: Any, *rest: Any) -> Any:
 
 
 KNOWN: dict[str, Callable[..., Any]] = {
-    "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch._utils._rebuild_tensor_v2": _Tensor,
     "torch._utils._rebuild_parameter": _parameter,
     "torch.nn.parameter.Parameter": _parameter,
     "collections.OrderedDict": collections.OrderedDict,

@@ -15,14 +15,12 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.model_file import background_of
 from a2tg_jax.io.other_programs import (
-    MOST_PARTS,
     Ellipsoids,
     Up,
     degree_to_read,
@@ -31,12 +29,10 @@ from a2tg_jax.io.other_programs import (
     matrix_of,
     origin_from_json,
     origin_to_json,
-    reading,
-    similarity_of,
     splats_of,
     upright,
 )
-from a2tg_jax.io.validate import check_model, check_suffix, live_model
+from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
 from a2tg_jax.model import Model
 
 ORIGIN = "a2tg:origin"
@@ -138,29 +134,20 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such USD file")
     open_regular(path, MOST_ARRAY_BYTES).close()
-
-    def loaded() -> Model:
+    with reading(path):
         try:
             stage = usd.Usd.Stage.Open(str(path))
             up: Up = "z" if usd.UsdGeom.GetStageUpAxis(stage) == usd.UsdGeom.Tokens.z else "y"
             unit = float(usd.UsdGeom.GetStageMetersPerUnit(stage))
-            parts: list[tuple[Model, Similarity]] = []
+            parts = []
             for prim in stage.Traverse():
-                if not prim.IsA(usd.UsdVol.ParticleField):
-                    continue
-                field = usd.UsdVol.ParticleField(prim)
-                matrix = np.array(field.ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())).T
-                matrix[:3] *= unit
-                parts.append((_model_of(usd, prim, path), similarity_of(matrix, "the transform of its splats")))
-                if len(parts) > MOST_PARTS:
-                    raise ValueError(f"holds more than {MOST_PARTS} particle fields")
-            if not parts:
-                raise ValueError("holds no splats (ParticleField)")
+                if prim.IsA(usd.UsdVol.ParticleField):
+                    world = usd.UsdVol.ParticleField(prim).ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())
+                    matrix = np.diag([unit, unit, unit, 1.0]) @ np.array(world).T
+                    parts.append((_model_of(usd, prim, path), matrix))
             return joined_parts(parts, up)
         except RuntimeError as error:  # Those of usd-core, of several lines.
             raise ValueError(f"is no USD file, or is damaged ({shortened(str(error))})") from error
-
-    return reading(path, loaded)
 
 
 def _model_of(usd: Any, prim: Any, path: Path) -> Model:

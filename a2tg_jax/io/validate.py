@@ -3,9 +3,10 @@
 Native loops trust the layout of their arrays, so the loaders of models and of checkpoints come through here first.
 """
 
+import contextlib
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,13 @@ from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, check_shape, dtyp
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import check_similarity
+from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, read_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model, check_is_model
 
 LARGEST_LOG_SCALE = math.log(LARGEST_NUMBER)
+LONGEST_REASON = 500
+"""Largest number of characters of an error about a file, whose own text may be long."""
 FUNCTIONS = {
     ".npz": "model", ".a2tgz": "compact", ".ply": "ply", ".glb": "gltf", ".gltf": "gltf",
     ".usdz": "usd", ".usdc": "usd", ".usda": "usd", ".usd": "usd",
@@ -41,20 +45,40 @@ def check_suffix(path: str | os.PathLike[str], function: str) -> None:
         )
 
 
-def live_model(path: str | os.PathLike[str], model: Model, function: str, *, is_whole: bool = True) -> Model:
-    """Return the model of existing rows that a function writes to a file.
+def live_model(path: str | os.PathLike[str], model: Model, function: str) -> Model:
+    """Return the model of existing rows that a function such as "save_gltf" writes to a file.
 
     Raises:
-      ValueError: if the suffix is another format's, or the value is no model that can be loaded again; `is_whole` False
-        leaves the numbers for later.
+      ValueError: if the suffix is another format's, or the value is no model that can be loaded again.
     """
     check_suffix(path, function)
     check_is_model(model)
     check_gaussians(model.gaussians, "model.gaussians")
     model = model.live
-    if is_whole:
-        check_model(model)
+    check_model(model)
     return model
+
+
+def existing_bytes(path: str | os.PathLike[str], what: str) -> bytes:
+    """Return the bytes of a regular file. FileNotFoundError: there is no such file, which is `what`."""
+    if not is_regular(path):
+        raise FileNotFoundError(f"{os.fspath(path)}: no such {what}")
+    return read_regular(path, MOST_ARRAY_BYTES)
+
+
+@contextlib.contextmanager
+def reading(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn errors in what a file says into one ValueError that names it."""
+    where = os.fspath(path)
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"{where}: lacks {shortened(str(error))}; it is damaged or of another version") from error
+    except (TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{where}: is damaged or of another version ({shortened(repr(error))})") from error
+    except ValueError as error:
+        reason = shortened(str(error), LONGEST_REASON)
+        raise ValueError(reason if reason.startswith(where) else f"{where}: {reason}") from error
 
 
 def check_model(model: Model) -> None:
@@ -113,12 +137,9 @@ def check_bounded(name: str, tree: object) -> None:
     check_finite(name, tree)
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         values = np.asarray(leaf)
-        if not np.issubdtype(values.dtype, np.floating) or not values.size:
-            continue
-        for value in (values.max(), values.min()):
-            if abs(value) > LARGEST_NUMBER:
-                label = f"{name}{jax.tree_util.keystr(path)}"
-                raise ValueError(f"{label} must lie within ±{LARGEST_NUMBER:g}; got {value:g}")
+        if np.issubdtype(values.dtype, np.floating) and (large := values[np.abs(values) > LARGEST_NUMBER]).size:
+            label = f"{name}{jax.tree_util.keystr(path)}"
+            raise ValueError(f"{label} must lie within ±{LARGEST_NUMBER:g}; got {large[0]:g}")
 
 
 def check_count(name: str, value: object, most: int) -> None:

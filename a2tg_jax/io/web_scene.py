@@ -29,12 +29,12 @@ from a2tg_jax.io.columns import (
     AxisSteps,
     dequantised,
     ends_of,
-    green_apart,
     logits_of,
     opacities_of,
     quantised,
     room_of,
     to_planes,
+    with_green,
     with_w,
 )
 from a2tg_jax.io.model_rows import Rows, model_of, ordered, rows_of_model
@@ -182,7 +182,7 @@ def _coded(
         ends[name] = list(found)
         codes = quantised(values, found, BITS[name])
         keep(name, dequantised(codes, found, BITS[name]))
-        return green_apart(codes, BITS[name]) if is_color else codes
+        return with_green(codes, BITS[name], -1) if is_color else codes
 
     axes = [AxisSteps.of(x, MEANS_BITS) for x in rows.means.T]
     means = np.stack([axis.codes(x, MEANS_BITS) for axis, x in zip(axes, rows.means.T, strict=True)])
@@ -245,10 +245,7 @@ def _origin_to_dict(model: Model) -> dict[str, Any]:
             origin.names, origin.is_test, origin.sizes, origin.viewmats, origin.Ks, strict=True
         )
     ]
-    return {"background": as_floats(model.background), "cameras": cameras, "first": _first_camera(origin)}
-
-
-def _first_camera(origin: Origin) -> int:
-    """Return the index of the camera at which the viewer opens: the most central one of the training cameras."""
+    # The viewer opens at the most central one of the training cameras.
     candidates = np.flatnonzero(~origin.is_test) if not np.all(origin.is_test) else np.arange(len(origin.is_test))
-    return int(candidates[central_camera(origin.viewmats[candidates])]) if len(candidates) else 0
+    first = int(candidates[central_camera(origin.viewmats[candidates])]) if len(candidates) else 0
+    return {"background": as_floats(model.background), "cameras": cameras, "first": first}

@@ -19,8 +19,7 @@ from a2tg_jax.host.machine import ALONE, Devices, Machine, this_machine
 from a2tg_jax.host.text import counted, shortened
 from a2tg_jax.io.archive import read_archive, write_archive
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config
-from a2tg_jax.io.model_file import LONGEST_REASON
-from a2tg_jax.io.validate import check_count, check_finite, check_like, check_model
+from a2tg_jax.io.validate import check_count, check_finite, check_like, check_model, reading
 from a2tg_jax.model import Model
 from a2tg_jax.training.corrections import initial_corrections
 from a2tg_jax.training.options import System
@@ -191,16 +190,8 @@ def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = 
       ValueError: if it is no checkpoint, is damaged, is of another version, or its system is unknown.
     """
     header, arrays = read_archive(path)
-    try:
+    with reading(path):
         return _checkpoint_of(header, arrays, str(path), system)
-    except KeyError as error:
-        raise ValueError(f"{path}: the checkpoint lacks {error}; it is damaged or of another version") from error
-    except (TypeError, IndexError, AttributeError, OverflowError) as error:
-        reason = shortened(str(error))
-        raise ValueError(f"{path}: the checkpoint is damaged or of another version ({reason})") from error
-    except ValueError as error:
-        reason = shortened(str(error), LONGEST_REASON)
-        raise ValueError(reason if str(path) in reason else f"{path}: {reason}") from error
 
 
 def _checkpoint_of(
