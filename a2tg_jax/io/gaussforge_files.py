@@ -26,13 +26,7 @@ from a2tg_jax.data.ply import OFFSET
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import morton
-from a2tg_jax.io.other_programs import (
-    check_positions,
-    origin_at,
-    third_log_scales,
-    warn_of_offset,
-    world_gaussians,
-)
+from a2tg_jax.io.other_programs import check_positions, origin_at, third_log_scales, warn_of_offset, world_gaussians
 from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, offset_comment
 from a2tg_jax.io.validate import existing_bytes, reading
 from a2tg_jax.model import Model
@@ -62,7 +56,7 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
     check_positions(kind, gaussians, str(path))
     # In the order of a Z curve through the means.
     means = np.asarray(gaussians.means, np.float64)
-    low, high = means.min(axis=0), means.max(axis=0)
+    low, high = means.min(axis=0, initial=0.0), means.max(axis=0, initial=0.0)
     codes = ((means - low) / np.maximum(high - low, 1e-30) * (2**CURVE_BITS - 1)).astype(np.int64)
     gaussians = gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]
     third = third_log_scales(np.asarray(gaussians.log_scales)).min(axis=0, keepdims=True, initial=0.0)

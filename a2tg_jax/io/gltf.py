@@ -19,24 +19,12 @@ from a2tg_jax.appearance.parts import EXTENT, MAX_DEGREE, log_exponents_of, shap
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.text import shortened
+from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.columns import LARGEST_FLOAT, Ends, dequantised, ends_of, quantised
 from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes
 from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict, background_of
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
-from a2tg_jax.io.other_programs import (
-    HIGHEST_DEGREE,
-    Ellipsoids,
-    degree_to_read,
-    gaussians_of,
-    joined_parts,
-    linear_colors,
-    matrix_of,
-    origin_from_json,
-    origin_to_json,
-    splats_of,
-    upright,
-)
 from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
 from a2tg_jax.model import Model
 from a2tg_jax.texture import MAX_SIDE
@@ -92,7 +80,7 @@ def save_gltf(
         raise ValueError("model has no Gaussians; a glTF file has at least one")
     if textures:
         check_encodable(model.appearance, "a glTF file", "a *.ply, or textures=False here, holds their plain splats")
-    builder, splats = Builder(), splats_of(model, keeps_shapes=textures)
+    builder, splats = Builder(), others.splats_of(model, keeps_shapes=textures)
     attributes = {
         MEANS: builder.add(splats.means, has_bounds=True),
         ROTATION: builder.add(splats.quats[:, [1, 2, 3, 0]]),
@@ -100,7 +88,7 @@ def save_gltf(
         OPACITY: builder.add(splats.opacities),
     }
     # Linear RGB and opacity as bytes, for programs that show points.
-    shown = linear_colors(np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0))
+    shown = others.linear_colors(np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0))
     points = np.rint(255 * np.concatenate([shown, splats.opacities[:, None]], axis=1)).astype(np.uint8)
     attributes["COLOR_0"] = builder.add(points, normalized=True)
     for degree in range(NUM_BASES.index(splats.sh.shape[1]) + 1):
@@ -115,8 +103,9 @@ def save_gltf(
         kept["appearance"] = appearance_to_dict(model.appearance)
     kept["background"] = list(model.background)
     if model.origin is not None:
-        kept["origin"] = origin_to_json(model.origin)
-    node = {"name": "splats", "mesh": 0, "matrix": matrix_of(upright(model.origin, "y")).T.ravel().tolist()}
+        kept["origin"] = others.origin_to_json(model.origin)
+    matrix = others.matrix_of(others.upright(model.origin, "y"))
+    node = {"name": "splats", "mesh": 0, "matrix": matrix.T.ravel().tolist()}
     primitive = {"attributes": attributes, "mode": 0, "extensions": {SPLATS: described}, "extras": {OWN: kept}}
     whole = {
         "asset": {"version": "2.0", "generator": "a2tg-jax"},
@@ -180,7 +169,7 @@ def load_gltf(path: str | os.PathLike[str]) -> Model:
             for primitive in document.entry("meshes", node["mesh"])["primitives"]
             if SPLATS in primitive.get("extensions", {})
         )
-        return joined_parts(parts, "y")
+        return others.joined_parts(parts, "y")
 
 
 def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
@@ -193,20 +182,20 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
             warnings.warn(f"{document.path}: {message}", stacklevel=5)
     extras = primitive.get("extras", {})
     kept = extras.get(OWN, {}) if isinstance(extras, dict) else {}
-    origin = origin_from_json(kept["origin"]) if "origin" in kept else None
+    origin = others.origin_from_json(kept["origin"]) if "origin" in kept else None
     extended = described.get("extensions", {}).get(EXTENSION)
     if extended is not None:
         shown, rows, base_degree = _shown(document, extended, splats)
         appearance = _kept_appearance(kept, shown, is_described=True)
         return model_of(rows, base_degree, appearance, origin, background_of(kept))
-    gaussians = gaussians_of(splats, document.path, is_flat=False)
+    gaussians = others.gaussians_of(splats, document.path, is_flat=False)
     appearance = _kept_appearance(kept, Appearance(), is_described=False)
     model = Model(gaussians, appearance, background=background_of(kept), origin=origin)
     check_model(model)
     return model
 
 
-def _splats(document: Document, attributes: Mapping[str, Any]) -> Ellipsoids:
+def _splats(document: Document, attributes: Mapping[str, Any]) -> others.Ellipsoids:
     def numbers(name: str, kind: str) -> np.ndarray:
         if name not in attributes:
             raise ValueError(f"its splats lack {name}")
@@ -214,17 +203,17 @@ def _splats(document: Document, attributes: Mapping[str, Any]) -> Ellipsoids:
 
     means, quats = numbers(MEANS, "VEC3"), numbers(ROTATION, "VEC4")[:, [3, 0, 1, 2]]
     scales, opacities = numbers(SCALE, "VEC3"), numbers(OPACITY, "SCALAR")[:, 0]
-    tried = range(HIGHEST_DEGREE + 2)  # One more than is read, for the warning.
+    tried = range(others.HIGHEST_DEGREE + 2)  # One more than is read, for the warning.
     found = max((degree for degree in tried if coefficient(degree, 0) in attributes), default=0)
-    degree = degree_to_read(found, str(document.path))
+    degree = others.degree_to_read(found, str(document.path))
     names = [coefficient(band, order) for band in range(degree + 1) for order in range(2 * band + 1)]
     columns = [means, quats, scales, opacities, *(numbers(name, "VEC3") for name in names)]
     if len({len(column) for column in columns}) > 1:
         raise ValueError("the attributes of its splats differ in length")
-    return Ellipsoids(means, quats, scales, opacities, np.stack(columns[4:], axis=1))
+    return others.Ellipsoids(means, quats, scales, opacities, np.stack(columns[4:], axis=1))
 
 
-def _shown(document: Document, described: Mapping[str, Any], splats: Ellipsoids) -> tuple[Appearance, Rows, int]:
+def _shown(document: Document, described: Mapping[str, Any], splats: others.Ellipsoids) -> tuple[Appearance, Rows, int]:
     """Return the template, the tables and the degree of all splats, from the object of the extension.
 
     Raises:
@@ -262,7 +251,7 @@ def _shown(document: Document, described: Mapping[str, Any], splats: Ellipsoids)
         if len(log_exponents) != num:
             raise ValueError(f"{EXTENSION}.shapes must be {num} numbers; got {len(log_exponents)}")
         shapes = shapes_of(log_exponents)
-    gaussians = gaussians_of(splats, document.path, is_flat=has_textures or has_shapes, keeps_all=True)
+    gaussians = others.gaussians_of(splats, document.path, is_flat=has_textures or has_shapes, keeps_all=True)
     sh = splats.sh if not has_degrees else np.pad(splats.sh, ((0, 0), (0, NUM_BASES[-1] - highest), (0, 0)))
     counts = [count for count in NUM_BASES if count <= sh.shape[1]]
     bands = [sh[degrees >= degree, count - 2 * degree - 1 : count] for degree, count in enumerate(counts)]

@@ -17,13 +17,7 @@ import numpy as np
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.io.other_programs import (
-    Ellipsoids,
-    gaussians_of,
-    splats_of,
-    warn_of_offset,
-    world_gaussians,
-)
+from a2tg_jax.io.other_programs import Ellipsoids, gaussians_of, splats_of, warn_of_offset, world_gaussians
 from a2tg_jax.io.validate import check_model, existing_bytes, reading
 from a2tg_jax.model import Model
 

@@ -30,18 +30,7 @@ from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.ply import OFFSET, PlyFile
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
-from a2tg_jax.io.other_programs import (
-    LEAST_OPACITY,
-    degree_to_read,
-    flattened,
-    offset_for,
-    offset_words,
-    origin_at,
-    third_log_scales,
-    warn_of_offset,
-    whole_rows,
-    world_gaussians,
-)
+from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.validate import check_model, check_suffix, reading
 from a2tg_jax.model import Model
 
@@ -88,12 +77,12 @@ def save_ply(
         it does numbers that are not finite.
     """
     check_suffix(path, "save_ply")
-    found = world_gaussians(gaussians, transform)
-    third = third_log_scales(np.asarray(found.gaussians.log_scales)) if third_scale else None
+    found = others.world_gaussians(gaussians, transform)
+    third = others.third_log_scales(np.asarray(found.gaussians.log_scales)) if third_scale else None
     means, offset = (found.means, np.zeros(3)) if float64 else (None, found.offset)
     with replacing(path) as temporary:
         temporary.write_bytes(encode_ply(found.gaussians, third, offset, means))
-    warn_of_offset("ply", offset, path)
+    others.warn_of_offset("ply", offset, path)
 
 
 def encode_ply(
@@ -133,7 +122,7 @@ def encode_ply(
 
 def offset_comment(offset: np.ndarray) -> str:
     """Return the line of a header that says what positions are relative to; "" for zeros."""
-    return f"comment {OFFSET} {' '.join(offset_words(offset))}\n" if offset.any() else ""
+    return f"comment {OFFSET} {' '.join(others.offset_words(offset))}\n" if offset.any() else ""
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
@@ -159,7 +148,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     check_suffix(path, "load_ply")
     model = load_ply_model(path)
     if model.origin is not None:
-        offset = ", ".join(offset_words(-model.origin.transform.translation))
+        offset = ", ".join(others.offset_words(-model.origin.transform.translation))
         warnings.warn(f"{path}: positions are relative to ({offset}); load_splats keeps this offset", stacklevel=2)
     return model.gaussians
 
@@ -186,20 +175,20 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     means, quats = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1), _columns(vertices, QUATS)
     # Some programs write infinite logits for opacities 0 and 1.
     logits = vertices["opacity"]
-    most = np.where(logits > 0, -np.log(LEAST_OPACITY), np.log(LEAST_OPACITY))
+    most = np.where(logits > 0, -np.log(others.LEAST_OPACITY), np.log(others.LEAST_OPACITY))
     logits = np.where(np.isinf(logits), most, logits).astype(np.float32)
     sh = _sh_of(vertices, path)
-    kept = whole_rows(str(path), log_scales, means, quats, logits, sh)
+    kept = others.whole_rows(str(path), log_scales, means, quats, logits, sh)
     means, quats, log_scales = means[kept], quats[kept], log_scales[kept]
     if has_third:
-        quats, log_scales = flattened(quats, log_scales, str(path))
-    inside = offset_for("ply", means, log_scales)  # Zeros where the file has float32.
+        quats, log_scales = others.flattened(quats, log_scales, str(path))
+    inside = others.offset_for("ply", means, log_scales)  # Zeros where the file has float32.
     with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
         means = (means - inside).astype(np.float32)
     gaussians = Gaussians(*(jnp.asarray(rows) for rows in (means, quats, log_scales, logits[kept], sh[kept])))
     with reading(path):
         check_model(Model(gaussians))
-        return Model(gaussians, origin=origin_at(inside + ply.offset))
+        return Model(gaussians, origin=others.origin_at(inside + ply.offset))
 
 
 def _vertices(ply: PlyFile) -> np.ndarray:
@@ -226,7 +215,7 @@ def _sh_of(vertices: np.ndarray, path: Path) -> np.ndarray:
     rest = [f"f_rest_{i}" for i in range(len(found))]
     if len(rest) not in NUM_REST or found != set(rest):
         raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 4 have 0, 9, 24, 45 or 72")
-    num_bases = NUM_BASES[degree_to_read(NUM_REST.index(len(rest)), str(path))]
+    num_bases = NUM_BASES[others.degree_to_read(NUM_REST.index(len(rest)), str(path))]
     sh = np.zeros((len(vertices), num_bases, 3), np.float32)
     sh[:, 0] = _columns(vertices, SH_DEGREE0)
     if rest:
@@ -279,17 +268,22 @@ def unpacked_vertices(ply: PlyFile) -> np.ndarray:
     columns = dict(zip(AXES, within("", AXES, _unpacked(vertices["packed_position"], (11, 10, 11))), strict=True))
     scales = within("scale_", AXES, _unpacked(vertices["packed_scale"], (11, 10, 11)))
     columns |= {f"scale_{k}": scale for k, scale in enumerate(scales)}
-    # The highest bits of a rotation hold the index of its largest number, which follows from the others.
+    # The highest bits of a rotation hold the index of its largest number, which follows from the smaller.
     packed = vertices["packed_rotation"]
-    others = np.stack([(share - 0.5) * np.sqrt(2) for share in _unpacked(packed & np.uint32((1 << 30) - 1), (10,) * 3)])
-    largest, index = np.sqrt(np.maximum(1 - np.sum(others**2, axis=0), 0.0)), (packed >> np.uint32(30)).astype(np.int64)
-    before, after = np.stack([*others, others[2]]), np.stack([others[0], *others])
+    smaller = np.stack(
+        [(share - 0.5) * np.sqrt(2) for share in _unpacked(packed & np.uint32((1 << 30) - 1), (10,) * 3)]
+    )
+    largest, index = (
+        np.sqrt(np.maximum(1 - np.sum(smaller**2, axis=0), 0.0)),
+        (packed >> np.uint32(30)).astype(np.int64),
+    )
+    before, after = np.stack([*smaller, smaller[2]]), np.stack([smaller[0], *smaller])
     columns |= {f"rot_{k}": np.where(index == k, largest, np.where(index > k, before[k], after[k])) for k in range(4)}
     *colors, opacity = _unpacked(vertices["packed_color"], (8,) * 4)
     if set(COLOR_BOUNDS) <= set(ply.fields["chunk"]):
         colors = within("", CHANNELS, colors)
     columns |= {f"f_dc_{k}": (color - 0.5) / SH_C0 for k, color in enumerate(colors)}
-    opacity = np.clip(opacity, LEAST_OPACITY, 1 - LEAST_OPACITY)
+    opacity = np.clip(opacity, others.LEAST_OPACITY, 1 - others.LEAST_OPACITY)
     columns["opacity"] = np.log(opacity) - np.log1p(-opacity)
     for name in ply.fields["sh"] if rest else ():
         codes = rest[0][name].astype(np.float64)

@@ -19,19 +19,8 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, open_regular
 from a2tg_jax.host.text import shortened
+from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.model_file import background_of
-from a2tg_jax.io.other_programs import (
-    Ellipsoids,
-    Up,
-    degree_to_read,
-    gaussians_of,
-    joined_parts,
-    matrix_of,
-    origin_from_json,
-    origin_to_json,
-    splats_of,
-    upright,
-)
 from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
 from a2tg_jax.model import Model
 
@@ -80,7 +69,7 @@ def import_usd() -> Any:
 
 def _stage_of(model: Model, ellipsoids: bool) -> Any:
     """Return a stage of one particle field."""
-    usd, splats = import_usd(), splats_of(model)
+    usd, splats = import_usd(), others.splats_of(model)
     stage = usd.Usd.Stage.CreateInMemory()
     usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.z)
     usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -93,7 +82,7 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
         for name in ATTRIBUTES:
             getattr(usd.UsdVol, f"ParticleField{name}AttributeAPI").Apply(prim)
         getattr(usd.UsdVol, SURFLET).Apply(prim)
-    matrix = matrix_of(upright(model.origin, "z"))
+    matrix = others.matrix_of(others.upright(model.origin, "z"))
     field.AddTransformOp().Set(usd.Gf.Matrix4d(*matrix.T.ravel().tolist()))
     volume, arrays = usd.UsdVol, usd.Vt
     harmonics = volume.ParticleFieldSphericalHarmonicsAttributeAPI(prim)
@@ -114,7 +103,7 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
         corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
         field.CreateExtentAttr(usd.Vt.Vec3fArray.FromNumpy(corners))
     if model.origin is not None:
-        kept = origin_to_json(model.origin) | {"background": list(model.background)}
+        kept = others.origin_to_json(model.origin) | {"background": list(model.background)}
         prim.SetCustomDataByKey(ORIGIN, json.dumps(kept, allow_nan=False))
     return stage
 
@@ -137,7 +126,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
     with reading(path):
         try:
             stage = usd.Usd.Stage.Open(str(path))
-            up: Up = "z" if usd.UsdGeom.GetStageUpAxis(stage) == usd.UsdGeom.Tokens.z else "y"
+            up: others.Up = "z" if usd.UsdGeom.GetStageUpAxis(stage) == usd.UsdGeom.Tokens.z else "y"
             unit = float(usd.UsdGeom.GetStageMetersPerUnit(stage))
             parts = []
             for prim in stage.Traverse():
@@ -145,7 +134,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
                     world = usd.UsdVol.ParticleField(prim).ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())
                     matrix = np.diag([unit, unit, unit, 1.0]) @ np.array(world).T
                     parts.append((_model_of(usd, prim, path), matrix))
-            return joined_parts(parts, up)
+            return others.joined_parts(parts, up)
         except RuntimeError as error:  # Those of usd-core, of several lines.
             raise ValueError(f"is no USD file, or is damaged ({shortened(str(error))})") from error
 
@@ -155,17 +144,17 @@ def _model_of(usd: Any, prim: Any, path: Path) -> Model:
     kernels = set(prim.GetAppliedSchemas()) & {SURFLET, ELLIPSOID}
     if len(kernels) != 1:
         raise ValueError(f"its particle field {shortened(str(prim.GetPath()))} must have a kernel of Gaussians")
-    gaussians = gaussians_of(_splats(usd, prim, path), path, is_flat=SURFLET in kernels)
+    gaussians = others.gaussians_of(_splats(usd, prim, path), path, is_flat=SURFLET in kernels)
     kept = prim.GetCustomDataByKey(ORIGIN)
     described = parse_json(kept) if isinstance(kept, str) else None
-    origin = None if described is None else origin_from_json(described)
+    origin = None if described is None else others.origin_from_json(described)
     background = background_of({} if described is None else {"origin": described})
     model = Model(gaussians, background=background, origin=origin)
     check_model(model)
     return model
 
 
-def _splats(usd: Any, prim: Any, path: Path) -> Ellipsoids:
+def _splats(usd: Any, prim: Any, path: Path) -> others.Ellipsoids:
     """Return the numbers of a particle field.
 
     Attributes that are too long are cut, and those that are missing or too short have the values of the schema.
@@ -180,14 +169,14 @@ def _splats(usd: Any, prim: Any, path: Path) -> Ellipsoids:
     if sh is None:
         sh = np.zeros((num, 1, 3), np.float32)
     else:
-        sh = sh.reshape(num, bases, 3)[:, : NUM_BASES[degree_to_read(int(degree), str(path))]]
+        sh = sh.reshape(num, bases, 3)[:, : NUM_BASES[others.degree_to_read(int(degree), str(path))]]
 
     def column(name: str, default: tuple[float, ...]) -> np.ndarray:
         values = _numbers(usd, prim, name, len(default), num)
         return np.tile(np.asarray(default, np.float32), (num, 1)) if values is None else values
 
     quats = column("orientations", (0.0, 0.0, 0.0, 1.0))[:, [3, 0, 1, 2]]
-    return Ellipsoids(means, quats, column("scales", (1.0, 1.0, 1.0)), column("opacities", (1.0,))[:, 0], sh)
+    return others.Ellipsoids(means, quats, column("scales", (1.0, 1.0, 1.0)), column("opacities", (1.0,))[:, 0], sh)
 
 
 def _numbers(usd: Any, prim: Any, name: str, columns: int, wanted: int | None = None) -> np.ndarray | None:
