@@ -112,17 +112,6 @@ def test_few_gaussians(tmp_path, num):
     assert np.isfinite(load_model(tmp_path / "m.npz").render(camera).color).all()
 
 
-def test_a_model_of_the_first_version(tmp_path):
-    gaussians, arrays = some_gaussians(), some_textures()
-    fields = {field.name: getattr(gaussians, field.name) for field in dataclasses.fields(gaussians)}
-    write_archive(tmp_path / "plain.npz", {}, fields, format=FORMAT)
-    assert_same_model(load_model(tmp_path / "plain.npz"), Model(gaussians))
-    sizes, texels = np.array(SIZES), np.concatenate([array.reshape(-1, 4) for array in arrays])
-    write_archive(tmp_path / "textured.npz", {}, fields | {"sizes": sizes, "texels": texels}, format=FORMAT)
-    wanted = Model(gaussians, Appearance(texture=Texture(textures_from_arrays(arrays))))
-    assert_same_model(load_model(tmp_path / "textured.npz"), wanted)
-
-
 def test_models_of_version_0_2(tmp_path):
     """One appearance held another one, whose arrays were inner.NAME, and the background was in the origin."""
     wanted = dataclasses.replace(textured_model(), gaussians=some_gaussians())

@@ -95,9 +95,7 @@ def test_textures_are_kept_as_they_are_seen():
     texture = dataclasses.replace(base.appearance.texture, options=options)
     model = dataclasses.replace(base, appearance=dataclasses.replace(base.appearance, texture=texture))
     found = again(model)
-    assert found.appearance.texture_options == dataclasses.replace(
-        TextureOptions(), uv="align-corners", outside="identity", max_alpha=options.max_alpha
-    )
+    assert found.appearance.texture_options == dataclasses.replace(options, rgb="signed", alpha="projected")
     camera = model.origin.cameras[0]
     difference = np.abs(np.asarray(found.render(camera).color) - np.asarray(model.render(camera).color))
     assert difference.mean() < 0.01

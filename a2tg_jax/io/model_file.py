@@ -128,7 +128,7 @@ def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
 
 def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]] = ()) -> Appearance:
     """Return the template that `appearance_to_dict` described, or version 0.2. ValueError: its class is unknown."""
-    name, module, options = data["name"], data["module"], data["options"]
+    name, options, module = data["name"], data["options"], data["module"]
     is_own = module.partition(".")[0] == __name__.partition(".")[0]
     if is_own and "parts" not in data:
         if name in OLD_PARTS:

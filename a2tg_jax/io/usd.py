@@ -128,15 +128,19 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
             stage = usd.Usd.Stage.Open(str(path))
             up: others.Up = "z" if usd.UsdGeom.GetStageUpAxis(stage) == usd.UsdGeom.Tokens.z else "y"
             unit = float(usd.UsdGeom.GetStageMetersPerUnit(stage))
-            parts = []
-            for prim in stage.Traverse():
-                if prim.IsA(usd.UsdVol.ParticleField):
-                    world = usd.UsdVol.ParticleField(prim).ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())
-                    matrix = np.diag([unit, unit, unit, 1.0]) @ np.array(world).T
-                    parts.append((_model_of(usd, prim, path), matrix))
-            return others.joined_parts(parts, up)
+            fields = (prim for prim in stage.Traverse() if prim.IsA(usd.UsdVol.ParticleField))
+            return others.joined_parts(
+                ((_model_of(usd, prim, path), _world_of(usd, prim, unit)) for prim in fields), up
+            )
         except RuntimeError as error:  # Those of usd-core, of several lines.
             raise ValueError(f"is no USD file, or is damaged ({shortened(str(error))})") from error
+
+
+def _world_of(usd: Any, prim: Any, unit: float) -> np.ndarray:
+    """Return the matrix [4, 4] from a particle field to the world, in metres."""
+    placed = usd.UsdVol.ParticleField(prim).ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())
+    matrix: np.ndarray = np.diag([unit, unit, unit, 1.0]) @ np.array(placed, np.float64).T
+    return matrix
 
 
 def _model_of(usd: Any, prim: Any, path: Path) -> Model:
