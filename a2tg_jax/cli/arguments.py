@@ -18,7 +18,7 @@ from tyro.conf import arg
 
 from a2tg_jax.cli.errors import UNRECOGNIZED, plain, told_unknown, unknown_words
 from a2tg_jax.cli.values import registry
-from a2tg_jax.host.urls import is_url, without_secrets
+from a2tg_jax.host.remote_files import is_url, without_secrets
 
 Parsed = TypeVar("Parsed")
 

@@ -26,9 +26,9 @@ from a2tg_jax.cli.train import Demo, Train, other_systems_text, tell_result, tra
 from a2tg_jax.cli.view import Export, ViewCommand
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
+from a2tg_jax.host.remote_files import is_url
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.host.urls import is_url
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.results.checks import check_weights
 from a2tg_jax.results.compression import compress

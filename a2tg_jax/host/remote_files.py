@@ -1,15 +1,18 @@
 """Files in object storage and wherever else fsspec reaches, at paths of universal_pathlib.
 
 Such a path has pathlib's methods and is annotated as `Path`. Each request to a store takes a while, so every folder is
-listed once, and files are fetched whole. A request that fails is tried again.
+listed once, and files are fetched whole. A request that fails is tried again. URLs hold no secrets, because the run
+folder keeps them.
 """
 
 import errno
 import functools
 import os
+import re
 import tempfile
 import threading
 import time
+import urllib.request
 import warnings
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -18,7 +21,6 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple, Protocol, TypeVar, cast
 
 from a2tg_jax.host.text import shortened
-from a2tg_jax.host.urls import checked_url, path_here
 
 PAUSES = (1.0, 4.0, 15.0)
 """Seconds between the attempts to read something."""
@@ -28,6 +30,12 @@ LIBRARIES = ("s3fs", "gcsfs", "adlfs", "paramiko", "aiohttp")
 """Libraries of stores whose packages have their modules' names."""
 FINAL = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, NotImplementedError)
 """Errors for which another attempt makes no sense."""
+URL = re.compile(r"[A-Za-z][\w+.:-]+://")
+USER = re.compile(r"([\w+.-]+)://([^/]*)@")
+"""Scheme, and what precedes the host; in chained URLs too."""
+QUERY = re.compile(r"(https?://[^?]*)\?.+", re.IGNORECASE | re.DOTALL)
+REVISIONS = ("git", "github")
+"""Schemes that write an owner, a repository and a revision where others have a user and a password."""
 
 Result = TypeVar("Result")
 
@@ -66,6 +74,58 @@ _lock = threading.Lock()
 def is_remote(path: str | os.PathLike[str] | RemotePath) -> bool:
     """Return whether a path is one of universal_pathlib that the operating system does not know."""
     return not isinstance(path, str | os.PathLike)
+
+
+def is_url(text: str) -> bool:
+    """Return whether a text is a URL, such as s3://bucket/scene."""
+    return URL.match(text) is not None
+
+
+def path_here(text: str) -> Path | None:
+    """Return the path on this machine that a text means, file:// included; None for the URL of a store.
+
+    Raises:
+      ValueError: if file:// has a host, or no path.
+    """
+    if not is_url(text):
+        return Path(text)
+    scheme, _, place = text.partition("://")
+    if scheme.lower() != "file":
+        return None
+    host, _, path = place.partition("/")
+    if host.lower() not in ("", "localhost") or not path:
+        raise ValueError(f"{text}: is no file of this machine; write file:///full/path")
+    return Path(urllib.request.url2pathname(f"/{path}"))
+
+
+def checked_url(url: str) -> str:
+    """Return the URL of a store, without slashes at its end.
+
+    Raises:
+      ValueError: if it holds a secret, which is left out of the message, or names no folder.
+    """
+    told = without_secrets(url)
+    if told != url:
+        raise ValueError(
+            f"{told}: has a password, token or signature, which the run folder would keep; leave it out, and give it "
+            "in fsspec's configuration (~/.config/fsspec)"
+        )
+    kept = url.rstrip("/")
+    if kept.endswith(":"):
+        raise ValueError(f"{url}: names no folder; write {kept}//bucket/scene")
+    return kept
+
+
+def without_secrets(url: str) -> str:
+    """Return a URL with "…" for passwords, and for users and queries of web addresses."""
+    return QUERY.sub(r"\1?…", USER.sub(_without_password, url))
+
+
+def _without_password(match: re.Match[str]) -> str:
+    scheme, (user, colon, _) = match[1], match[2].partition(":")
+    if scheme.lower().endswith(("http", "https")):
+        return f"{scheme}://…@"
+    return f"{scheme}://{user}:…@" if colon and scheme.lower() not in REVISIONS else match[0]
 
 
 def located(path: str | os.PathLike[str] | RemotePath) -> Path:

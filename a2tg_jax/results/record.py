@@ -34,8 +34,8 @@ from a2tg_jax.data.scene import scene_name
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.host.remote_files import checked_url, is_url, path_here
 from a2tg_jax.host.text import shortened
-from a2tg_jax.host.urls import checked_url, is_url, path_here
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.results.finish_options import read_finish
 from a2tg_jax.results.folder import RunFolder

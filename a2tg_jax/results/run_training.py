@@ -12,7 +12,7 @@ from a2tg_jax.data import Scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import Devices, this_machine
-from a2tg_jax.host.urls import is_url
+from a2tg_jax.host.remote_files import is_url
 from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.formats import load_splats
