@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from PIL import ExifTags, Image, ImageOps
-from test_data_transforms import shares_seen
+from test_data_transforms import dot_place as place_of, save_dot, shares_seen
 
 from a2tg_jax.data import load_scene, view_image
 from a2tg_jax.data.colmap_library import pycolmap
@@ -41,18 +41,9 @@ def camera_pose(index, count):
     return np.concatenate([rotation, -rotation @ center[:, None]], axis=1)
 
 
-def dot_image(place, width=WIDTH, height=HEIGHT):
-    """A black image with a smooth white dot around a place (x, y); pixel centres are at +0.5."""
-    y, x = np.indices((height, width)) + 0.5
-    dot = np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / 8)
-    return np.repeat(np.rint(255 * dot)[..., None], 3, axis=2).astype(np.uint8)
-
-
 def dot_place(image):
     """(x, y) of the centre of the dot."""
-    weights = image[..., 0].astype(float)
-    y, x = np.indices(weights.shape) + 0.5
-    return np.array([(weights * x).sum(), (weights * y).sum()]) / weights.sum()
+    return place_of(image[..., 0].astype(float))
 
 
 def write_scene(folder, *, models=("PINHOLE",), num_views=9, num_points=50, text=False, names=None):
@@ -69,9 +60,7 @@ def write_scene(folder, *, models=("PINHOLE",), num_views=9, num_points=50, text
         pose = colmap.Rigid3d(camera_pose(index, len(names)))
         image = colmap.Image(image_id=index + 1, camera_id=index + 1, name=name)
         reconstruction.add_image_with_trivial_frame(image, pose)
-        file = folder / "images" / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(dot_image(camera.img_from_cam(pose * TARGET))).save(file)
+        save_dot(folder / "images" / name, camera.img_from_cam(pose * TARGET), (WIDTH, HEIGHT))
     rng = np.random.default_rng(0)
     for index in range(num_points):
         point = TARGET if index == 0 else rng.normal(size=3)
