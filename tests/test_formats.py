@@ -33,8 +33,8 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
-from a2tg_jax.io.gaussforge_files import KINDS
 from a2tg_jax.io.model_file import number_in_file
+from a2tg_jax.io.splat_files import KINDS
 from a2tg_jax.results import init_file, run_training
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.init_file import check_init, write_first_stage

@@ -12,7 +12,7 @@ import surface_quality
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_points
-from a2tg_jax.io.other_programs import upright_from
+from a2tg_jax.io.other_programs import upright
 from a2tg_jax.mesh import distance
 from a2tg_jax.mesh.blocks import BlockGrid, unique_blocks
 from a2tg_jax.mesh.depth_maps import RenderedDepth
@@ -179,7 +179,7 @@ def test_files_are_read_back_by_another_library(sphere, tmp_path, suffix):
     (path,) = a2tg.save_mesh(tmp_path / f"mesh{suffix}", sphere, similarity)
     read = trimesh.load(path, force="mesh", process=False)
     np.testing.assert_array_equal(read.faces, sphere.faces)
-    placed = upright_from(2.0, "y").apply(sphere.vertices)
+    placed = upright(similarity, "y").apply(sphere.vertices)
     wanted = placed if suffix == ".glb" else similarity.inverse().apply(sphere.vertices)
     np.testing.assert_allclose(read.vertices, wanted, atol=1e-5)
     if suffix == ".ply":

@@ -129,7 +129,7 @@ class PlyFile:
 def read_ply_points(path: Path) -> PointCloud:
     """Return the points of a PLY file whose first element is `vertex` with x, y, z.
 
-    Positions that are relative to an offset, as `save_ply` writes those of maps, are in the original world.
+    Positions that are relative to an offset, as `save_ply` writes map coordinates, are in the original world.
 
     Colours are whole numbers of 8 bits or, if some are above 255, of 16 or 32; or floats in [0, 1] or, if their mean
     is above 1, in 0..255 (above 255: 0..65535). Numbers beyond are clipped. Gaussians have the colours of their f_dc.

@@ -42,7 +42,7 @@ def write_archive(
 def read_archive(
     path: str | os.PathLike[str], *, format: str = FORMAT, names: Collection[str] | None = None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the header and the arrays that `write_archive` was given, all or those of some names.
+    """Return the header and the arrays that `write_archive` was given; `names` selects arrays.
 
     Raises:
       FileNotFoundError: if there is no such file.

@@ -40,7 +40,7 @@ LONGEST_WEBP_SIDE = 16_383
 
 
 def room_of(num_bytes: int) -> int:
-    """Return how many bytes a file of so many may unpack to."""
+    """Return how many bytes a file of this size may unpack to."""
     return FREE_ROOM + LARGEST_RATIO * num_bytes
 
 
@@ -233,7 +233,7 @@ class AxisSteps(NamedTuple):
 
 
 def morton(codes: np.ndarray, bits: int) -> np.ndarray:
-    """Return [n] places along the Z curve of codes [3, n] of so many bits: theirs by turns, x lowest; int64."""
+    """Return [n] places along the Z curve of codes [3, n]: their bits by turns, x lowest; int64."""
     key = np.zeros(codes.shape[1], np.int64)
     for bit in range(bits):
         for axis in range(3):
@@ -254,7 +254,7 @@ def from_morton(key: np.ndarray, bits: int) -> np.ndarray:
 
 
 def num_bytes_of(bits: int) -> int:
-    """Return the bytes that so many bits take."""
+    """Return the number of whole bytes that hold this number of bits."""
     return -(-bits // 8)
 
 
@@ -293,7 +293,7 @@ class ColumnWriter:
 
     Args:
       coder: of all parts.
-      ends: ends of groups kept in bits, as in `layout`; those of other groups follow from their numbers.
+      ends: ends of groups kept in bits, as in `layout`; ends of other groups follow from their numbers.
     """
 
     def __init__(self, coder: Choice, ends: Mapping[str, Sequence[float]] = MappingProxyType({})):
@@ -367,11 +367,11 @@ class ColumnReader:
 
     Args:
       body: the coded bytes.
-      layout: what was written beside them.
-      room: so many bytes may be unpacked in all.
+      layout: `ColumnWriter.layout`.
+      room: largest number of bytes to unpack.
 
     Raises:
-      ValueError: if the lengths are not those of the body.
+      ValueError: if the lengths do not fit the body.
     """
 
     def __init__(self, body: bytes, layout: Mapping[str, Any], room: int):

@@ -8,13 +8,12 @@ from pathlib import Path
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.compact import load_compact, save_compact
-from a2tg_jax.io.gaussforge_files import import_gaussforge, load_by_gaussforge, save_by_gaussforge
 from a2tg_jax.io.gltf import load_gltf, save_gltf
 from a2tg_jax.io.gltf_container import buffer_files
-from a2tg_jax.io.ksplat import load_ksplat, save_ksplat
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.other_programs import cut_numbers
 from a2tg_jax.io.ply import load_ply_model, save_ply
+from a2tg_jax.io.splat_files import import_gaussforge, load_by_gaussforge, load_ksplat, save_by_gaussforge, save_ksplat
 from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians
 from a2tg_jax.io.usd import import_usd, load_usd, save_usd
 from a2tg_jax.model import Model

@@ -15,6 +15,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
+from a2tg_jax.appearance.base import PARTS
 from a2tg_jax.appearance.parts import EXTENT, MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
@@ -263,7 +264,7 @@ def _shown(document: Document, described: Mapping[str, Any], splats: others.Elli
 
 
 def _texels(document: Document, described: Mapping[str, Any], count: int) -> np.ndarray:
-    """Return the texels [T, 4] of textures of so many."""
+    """Return the texels [T, 4] of all textures, of which `count` must be there."""
     if described.get("extent", EXTENT) != EXTENT:
         raise ValueError(f"{EXTENSION}.extent must be {EXTENT}; got {shortened(described['extent'])}")
     texels = np.zeros((0, 4), np.float32)
@@ -290,12 +291,10 @@ def _kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_described
     if "appearance" not in kept:
         return shown
     appearance = appearance_from_dict(kept["appearance"])
-    own, told = appearance.texture_options, shown.texture_options
-    is_same = appearance.is_portable and (own is None) == (told is None)
-    for part in ("bands", "exponents"):
-        is_same &= (getattr(appearance, part) is None) == (getattr(shown, part) is None)
-    if is_same and is_described:
-        is_same = appearance.alpha_limit == shown.alpha_limit and all(
-            getattr(own, field, None) == getattr(told, field, None) for field in ("uv", "outside", "rgb", "alpha")
+    own, there = appearance.texture_options, shown.texture_options
+    is_same = all((getattr(appearance, part) is None) == (getattr(shown, part) is None) for part in PARTS)
+    if is_described:
+        is_same &= appearance.alpha_limit == shown.alpha_limit and all(
+            getattr(own, field, None) == getattr(there, field, None) for field in ("uv", "outside", "rgb", "alpha")
         )
-    return appearance if is_same else shown
+    return appearance if appearance.is_portable and is_same else shown

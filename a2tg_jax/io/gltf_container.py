@@ -86,7 +86,7 @@ class Builder:
         Older files are replaced once the new ones are whole. `described` is the JSON without accessors and buffers.
 
         Raises:
-          ValueError: if one file cannot hold so many bytes.
+          ValueError: if these are more bytes than a *.glb holds.
         """
         buffer: dict[str, Any] = {"byteLength": self._num_bytes}
         whole = {**described, "accessors": self.accessors, "bufferViews": self._views, "buffers": [buffer]}

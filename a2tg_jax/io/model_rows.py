@@ -1,6 +1,6 @@
 """A model as plain tables of numbers, in the order of a Z curve, and the model again.
 
-Splats that are near each other stand near each other, so that what they show is alike. Each is turned by half about one
+Neighbouring rows are near each other in space, so that their numbers are alike. Each splat is turned by half about one
 of its own axes if that makes its rotation smaller, and its texture is mirrored along: it looks the same.
 """
 

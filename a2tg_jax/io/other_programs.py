@@ -230,14 +230,10 @@ def degree_to_read(degree: int, name: str) -> int:
 # Worlds
 
 
-def upright(origin: Origin | None, up: Up) -> Similarity:
-    """Return the similarity from a model's world to that of a file with this axis up."""
-    return upright_from(1.0 if origin is None else float(origin.transform.scale), up)
-
-
-def upright_from(scale: float, up: Up) -> Similarity:
-    """Return the same, given the factor of lengths from the original world to the model's."""
-    return Similarity(1.0 / scale, UPRIGHT[up], np.zeros(3))
+def upright(origin: Origin | Similarity | None, up: Up) -> Similarity:
+    """Return the similarity from the world of a model, given its origin or transform, to a file's with this axis up."""
+    transform = origin.transform if isinstance(origin, Origin) else origin
+    return Similarity(1.0 if transform is None else 1.0 / float(transform.scale), UPRIGHT[up], np.zeros(3))
 
 
 def matrix_of(similarity: Similarity) -> np.ndarray:
@@ -333,23 +329,13 @@ SLACK = 1e-3
 """Part of a range that numbers may leave it by without being counted."""
 
 
-class NumberRange(NamedTuple):
-    """Largest numbers that a format holds; it cuts others."""
-
-    first: float = math.inf
-    """Largest size of a coefficient of degree 0."""
-    rest: float = math.inf
-    """Largest size of a coefficient above degree 0."""
-    log_scales: tuple[float, float] = (-math.inf, math.inf)
-
-
 RANGES = {
-    "SPZ": NumberRange(0.5 / 0.15, 1.0, (-10.0, 255 / 16 - 10)),
-    "compressed PLY": NumberRange(rest=4.0),
-    ".splat": NumberRange(0.5 / SH_C0),
-    ".ksplat": NumberRange(0.5 / SH_C0),
+    "SPZ": (0.5 / 0.15, 1.0, -10.0, 255 / 16 - 10),
+    "compressed PLY": (math.inf, 4.0, -math.inf, math.inf),
+    ".splat": (0.5 / SH_C0, math.inf, -math.inf, math.inf),
+    ".ksplat": (0.5 / SH_C0, math.inf, -math.inf, math.inf),
 }
-"""Ranges by the name of a format; the others have none."""
+"""Largest coefficients of degree 0 and above it, least and largest log-scale that a format holds; it cuts others."""
 OFFSET_PLACES = {
     "ply": "the comment 'offset' in the file says so; a2tg convert --float64 keeps world coordinates",
     "compressed.ply": "the comment 'offset' in the file says so",
@@ -448,11 +434,10 @@ def cut_numbers(name: str, model: Model) -> list[str]:
     if name not in RANGES:
         return []
     gaussians = world_gaussians(model).gaussians
-    found, sizes = RANGES[name], np.abs(np.asarray(gaussians.sh))
+    (first, rest, low, high), sizes = RANGES[name], np.abs(np.asarray(gaussians.sh))
     if name == ".splat":
         sizes = sizes[:, :1]
-    largest = np.where(np.arange(sizes.shape[1]) == 0, found.first, found.rest)[:, None] * (1 + SLACK)
-    low, high = found.log_scales
+    largest = np.where(np.arange(sizes.shape[1]) == 0, first, rest)[:, None] * (1 + SLACK)
     log_scales = np.asarray(gaussians.log_scales)
     cut = {
         "colours": np.any(sizes > largest, axis=(1, 2)),

@@ -5,7 +5,7 @@ opacities as logits, scales as logarithms, quaternions wxyz. f_rest lists the co
 channel: all of red, then green, then blue. scale_2 belongs to the axis along the normal; files of 2DGS lack it. The
 comment "SplatRenderMode: 2dgs" says that splats are flat. What splats show besides has no place in this format:
 textures, movable kernels and billboards, and with them the colours and opacities that they carry, are lost;
-`save_model` keeps all. Positions that float32 would round too far, as those of maps, are relative to an offset:
+`save_model` keeps all. Positions that float32 would round too far, such as map coordinates, are relative to an offset:
 "comment offset X Y Z".
 
 SuperSplat packs a Gaussian into sixteen bytes, within the bounds of its chunk of 256. Elements: `chunk` (float: bounds
@@ -39,12 +39,12 @@ SH_DEGREE0, SH_REST = tuple(f"f_dc_{i}" for i in range(3)), tuple(f"f_rest_{i}" 
 SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
 COLORS = ("red", "green", "blue")
-"""What some programs write in place of f_dc_*."""
+"""Colours that some programs write instead of f_dc_*."""
 NUM_REST = (0, 9, 24, 45, 72)
 """Number of attributes f_rest_* by degree of the spherical harmonics; some programs write degree 4."""
 THIRD_SCALE = "scale_2"
 FLAT_MARK = "SplatRenderMode: 2dgs"
-"""Comment in the header by which programs tell flat splats from ellipsoids."""
+"""Comment in the header that marks flat splats."""
 
 
 def save_ply(

@@ -79,7 +79,7 @@ def encode_web_scene(
     """
     model, rows = _shown(model)
     steps, tables = _coded(rows)
-    # Each table has so many columns for each row of the scene, and a chunk those of its rows.
+    # A chunk has the columns of its rows from each table; a row of the scene owns one column, several or none.
     num = len(rows.means)
     chunk = int(np.clip(-(-num // 16), LEAST_CHUNK, LARGEST_CHUNK))
     cut = [(codes.astype(np.uint8), np.concatenate([[0], np.cumsum(counts)])) for codes, counts in tables]

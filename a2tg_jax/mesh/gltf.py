@@ -10,7 +10,7 @@ from PIL import Image
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.gltf import OWN
 from a2tg_jax.io.gltf_container import Builder
-from a2tg_jax.io.other_programs import linear_colors, matrix_of, upright_from
+from a2tg_jax.io.other_programs import linear_colors, matrix_of, upright
 from a2tg_jax.mesh.triangles import Mesh
 
 JPEG_QUALITY = 92
@@ -33,7 +33,7 @@ def save_glb(path: Path, mesh: Mesh, transform: Similarity | None) -> None:
     primitive, material = _primitive(mesh, middle, builder)
     node: dict[str, Any] = {"name": "mesh", "mesh": 0}
     if transform is not None:
-        node["matrix"] = matrix_of(upright_from(float(transform.scale), "y")).T.ravel().tolist()
+        node["matrix"] = matrix_of(upright(transform, "y")).T.ravel().tolist()
         if _middle(mesh.transform(transform.inverse()).vertices).any():
             kept = {"scale": float(transform.scale), "rotation": np.asarray(transform.rotation).tolist()}
             node["extras"] = {OWN: kept | {"translation": np.asarray(transform.translation).tolist()}}

@@ -1,0 +1,292 @@
+"""Files of other programs' splats: SPZ, SOG, compressed PLY and .splat by the library gaussforge, and .ksplat.
+
+Gaussians pass to gaussforge through a PLY file in memory. Rows are written in the order of a Z curve, and all with one
+third scale, the smallest: formats that round scales by a table then spend one entry on it. What a format can say of
+flat splats is added to its file. gaussforge 0.6 writes the spherical harmonics of compressed PLY in another order than
+it reads them. Here they have the order that SuperSplat reads. Its .ksplat files are empty for GaussianSplats3D.
+
+A *.ksplat of GaussianSplats3D, version 0.1, is a header of 4096 bytes, then one of 1024 for each section, then the
+sections. Splats are rows of fixed size: position, scales, rotation (wxyz), colour of degree 0 and opacity in a byte
+each, and spherical harmonics, degree by degree and within each channel by channel. Compression level 0 has floats.
+Level 1 has halves, and positions as 16 bits around the centre of a bucket; level 2 is level 1 with spherical harmonics
+in bytes. A section of level 1 or 2 begins with the lengths of its partially filled buckets and the centres of all
+buckets. Its splats are in the order of the buckets, the full ones first. Level 0 is written, up to degree 2, beyond
+which GaussianSplats3D does not go.
+"""
+
+import contextlib
+import dataclasses
+import importlib
+import io
+import json
+import os
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.core.gaussians import SH_C0, Gaussians
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.data.ply import OFFSET
+from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.text import shortened
+from a2tg_jax.io import other_programs as others
+from a2tg_jax.io.columns import morton
+from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, offset_comment
+from a2tg_jax.io.validate import check_model, existing_bytes, reading
+from a2tg_jax.model import Model
+
+KINDS = ("compressed.ply", "spz", "sog", "splat")
+"""gaussforge's names of formats, which are the suffixes."""
+LEAST_LOG_SCALE = -20.0
+CURVE_BITS = 16
+SOG_HEADER, SOG_FLAT = "meta.json", "2dgs"
+MOST_HEADER_BYTES = 1 << 24
+
+
+def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
+    """Write the Gaussians of a model, in its original world, in the format of the suffix.
+
+    Positions that the format would round too far are relative to whole numbers, which a warning says, and compressed
+    PLY and SOG too. If it rounds them by a tenth of a typical scale even so, another warning says this.
+
+    Raises:
+      ValueError: if gaussforge is not installed or cannot write them, there are none, or the format cannot hold their
+        positions.
+    """
+    kind = _kind_of(path)
+    gaussians, offset, _ = others.world_gaussians(model, kind=kind)
+    if not gaussians.num:
+        raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
+    others.check_positions(kind, gaussians, str(path))
+    # In the order of a Z curve through the means.
+    means = np.asarray(gaussians.means, np.float64)
+    low, high = means.min(axis=0, initial=0.0), means.max(axis=0, initial=0.0)
+    codes = ((means - low) / np.maximum(high - low, 1e-30) * (2**CURVE_BITS - 1)).astype(np.int64)
+    gaussians = gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]
+    third = others.third_log_scales(np.asarray(gaussians.log_scales)).min(axis=0, keepdims=True, initial=0.0)
+    if kind == "compressed.ply":
+        # gaussforge takes the order channel by channel of SH above degree 0 for the order coefficient by coefficient.
+        sh = np.asarray(gaussians.sh)
+        rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, sh.shape[1] - 1, 3)
+        gaussians = dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], rest], axis=1)))
+    ply = encode_ply(gaussians, np.repeat(third.clip(LEAST_LOG_SCALE), gaussians.num, axis=0))
+    data = _marked(_converted(ply, "ply", kind, Path(path)), kind, offset)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+    others.warn_of_offset(kind, offset, path)
+
+
+def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
+    """Read Gaussians from a file, in its world. others.Ellipsoids are flattened as `load_ply` does, with a warning.
+
+    If positions of a SOG file are relative to an offset, the model's origin has this.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if gaussforge is not installed or cannot read the file, or a number is not finite.
+    """
+    kind, path, data = _kind_of(path), Path(path), existing_bytes(path, "file")
+    header: dict[str, Any] = {}
+    if kind == "sog":
+        with (
+            contextlib.suppress(zipfile.BadZipFile, KeyError, ValueError, OSError, NotImplementedError, RuntimeError),
+            zipfile.ZipFile(io.BytesIO(data)) as archive,
+            archive.open(SOG_HEADER) as entry,
+        ):
+            found = json.loads(entry.read(MOST_HEADER_BYTES))
+            header = found if isinstance(found, dict) else {}
+    converted = _converted(data, kind, "ply", path)
+    gaussians = decode_ply(io.BytesIO(converted), path, is_flat=header.get("model") == SOG_FLAT).gaussians
+    with reading(path):
+        origin = others.origin_at(np.array(header.get(OFFSET, (0, 0, 0)), np.float64).reshape(3))
+    return Model(gaussians, origin=origin)
+
+
+def import_gaussforge(path: Path) -> Any:
+    """Return the library for a file.
+
+    Raises:
+      ValueError: if it is not installed.
+    """
+    try:
+        return importlib.import_module("gaussforge")
+    except ImportError as error:
+        raise ValueError(f"{path}: needs gaussforge: pip install 'a2tg-jax[formats]'") from error
+
+
+def _kind_of(path: str | os.PathLike[str]) -> str:
+    """Return gaussforge's name of the format of a file."""
+    return next(kind for kind in KINDS if Path(path).name.lower().endswith(f".{kind}"))
+
+
+def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
+    """Return the bytes of one format as another's."""
+    result = import_gaussforge(path).GaussForge().convert(data, before, after)
+    converted: bytes = result.get("data", b"")
+    if not converted:
+        reason = shortened(str(result.get("error", "no splats in it")), 200)
+        raise ValueError(f"{path}: gaussforge says: {reason}; the file is damaged, or of another format")
+    return converted
+
+
+def _marked(data: bytes, kind: str, offset: np.ndarray) -> bytes:
+    """Return a file that says that its splats are flat, and what they are relative to, if its format can."""
+    if kind == "compressed.ply":
+        return data.replace(b" 1.0\n", f" 1.0\ncomment {FLAT_MARK}\n{offset_comment(offset)}".encode(), 1)
+    if kind != "sog":
+        return data
+    marked = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(marked, "w") as new:
+        for entry in old.infolist():
+            content = old.read(entry)
+            if entry.filename == SOG_HEADER:
+                header = {**json.loads(content), "model": SOG_FLAT}
+                header |= {OFFSET: offset.tolist()} if offset.any() else {}
+                content = json.dumps(header, separators=(",", ":")).encode()
+            new.writestr(zipfile.ZipInfo(entry.filename), content)
+    return marked.getvalue()
+
+
+# .ksplat
+
+HEADER_BYTES, SECTION_BYTES = 4096, 1024
+HEADER = struct.Struct("<2B2x4IH2x5f")
+"""Version, largest and present number of sections, of splats, level, centre of the scene, least and largest number of
+the spherical harmonics of level 2."""
+SECTION = struct.Struct("<4IfH2x4IH")
+"""Present and largest number of splats, bucket size, number of buckets, their side, bytes of a bucket's centre, range
+of positions, bytes, numbers of full and partially filled buckets, degree of spherical harmonics."""
+VERSION = (0, 1)
+BUCKET_BYTES = 12
+DEFAULT_RANGE, DEFAULT_ENDS = 32767, (-1.5, 1.5)
+HIGHEST_DEGREE = 2
+
+
+def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
+    """Write the Gaussians of a model, in its original world, at compression level 0, with degrees up to 2.
+
+    Positions that float32 would round too far are relative to whole numbers, which a warning says.
+
+    Raises:
+      ValueError: if there are none, or they would not load.
+    """
+    gaussians, offset, _ = others.world_gaussians(model)
+    if not gaussians.num:
+        raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
+    check_model(Model(gaussians))
+    splats = others.splats_of(Model(gaussians))
+    degree = min(gaussians.sh_degree, HIGHEST_DEGREE)
+    rows = np.zeros(gaussians.num, _row_type(0, degree))
+    rows["means"], rows["scales"], rows["quats"] = splats.means, splats.scales, splats.quats
+    colors = np.concatenate([0.5 + SH_C0 * splats.sh[:, 0], splats.opacities[:, None]], axis=1)
+    rows["colors"] = np.rint(255 * np.clip(colors, 0, 1))
+    bands = [splats.sh[:, band**2 : (band + 1) ** 2] for band in range(1, degree + 1)]
+    if bands:
+        rows["rest"] = np.concatenate([band.transpose(0, 2, 1).reshape(len(rows), -1) for band in bands], axis=1)
+    num = gaussians.num
+    header = HEADER.pack(*VERSION, 1, 1, num, num, 0, 0.0, 0.0, 0.0, *DEFAULT_ENDS).ljust(HEADER_BYTES, b"\0")
+    section = SECTION.pack(num, num, 0, 0, 0.0, 0, 0, rows.nbytes, 0, 0, degree).ljust(SECTION_BYTES, b"\0")
+    with replacing(path) as temporary:
+        temporary.write_bytes(header + section + rows.tobytes())
+    others.warn_of_offset("ksplat", offset, path)
+
+
+def load_ksplat(path: str | os.PathLike[str]) -> Gaussians:
+    """Read Gaussians of any compression level, in the world of the file. Ellipsoids are flattened as in `load_ply`.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is no such file, is cut off, contradicts itself, or holds no splats.
+    """
+    data = existing_bytes(path, "file")
+    with reading(path):
+        with np.errstate(over="ignore", invalid="ignore"):  # What is not finite is left out.
+            splats = _read(data)
+        gaussians = others.gaussians_of(splats, path, is_flat=False)
+        check_model(Model(gaussians))
+    return gaussians
+
+
+def _read(data: bytes) -> others.Ellipsoids:
+    """Return the splats of all sections."""
+    if len(data) < HEADER_BYTES:
+        raise ValueError(
+            f"is no .ksplat file, or is cut off: its header has {HEADER_BYTES} bytes, the file {len(data)}"
+        )
+    major, minor, num_sections, _, _, _, level, *_, low, high = HEADER.unpack_from(data)
+    if (major, minor) != VERSION or level > 2:
+        raise ValueError(
+            f"is no .ksplat file of version 0.1 and compression level 0 to 2; got {major}.{minor}, level {level}"
+        )
+    start = HEADER_BYTES + num_sections * SECTION_BYTES
+    if start > len(data):
+        raise ValueError(f"is cut off: {num_sections} sections were announced")
+    ends = (low or DEFAULT_ENDS[0], high or DEFAULT_ENDS[1])
+    found = []
+    for index in range(num_sections):
+        section = SECTION.unpack_from(data, HEADER_BYTES + index * SECTION_BYTES)
+        splats, start = _read_section(data, start, section, level, ends)
+        found.append(splats)
+    num_bases = max((splats.sh.shape[1] for splats in found), default=1)
+    padded = [
+        splats._replace(sh=np.pad(splats.sh, ((0, 0), (0, num_bases - splats.sh.shape[1]), (0, 0)))) for splats in found
+    ]
+    if not sum(len(splats.means) for splats in found):
+        raise ValueError("holds no splats")
+    return others.Ellipsoids(*(np.concatenate(columns) for columns in zip(*padded, strict=True)))
+
+
+def _read_section(
+    data: bytes, start: int, section: tuple[Any, ...], level: int, ends: tuple[float, float]
+) -> tuple[others.Ellipsoids, int]:
+    """Return the splats of a section that begins at a byte, and the byte after it."""
+    num, most, size, num_buckets, side, centre_bytes, reach, _, num_full, num_partial, degree = section
+    if degree >= len(NUM_BASES) or num > most or num_full + num_partial != num_buckets:
+        raise ValueError(
+            f"is damaged: a section has {num} of {most} splats of degree {degree}, and {num_full} full and "
+            f"{num_partial} other buckets of {num_buckets}"
+        )
+    if num_buckets and centre_bytes != BUCKET_BYTES:
+        raise ValueError(f"is damaged: a section has bucket centres of {centre_bytes} bytes, not {BUCKET_BYTES}")
+    dtype = _row_type(level, degree)
+    first = start + 4 * num_partial + BUCKET_BYTES * num_buckets
+    stop = first + most * dtype.itemsize
+    if stop > len(data):
+        raise ValueError(f"is cut off: a section ends at byte {stop:,} of {len(data):,}")
+    rows = np.frombuffer(data, dtype, num, first)
+    means = rows["means"].astype(np.float64)
+    if level:
+        partial = np.frombuffer(data, "<u4", num_partial, start).astype(np.int64)
+        bounds = np.cumsum(np.concatenate([np.full(num_full, size, np.int64), partial]))
+        if num > (bounds[-1] if num_buckets else 0):
+            raise ValueError(f"is damaged: the buckets of a section have fewer than its {num} splats")
+        centres = np.frombuffer(data, "<f4", 3 * num_buckets, start + 4 * num_partial).reshape(-1, 3)
+        reach = reach or DEFAULT_RANGE
+        bucket = np.searchsorted(bounds, np.arange(num), side="right")
+        means = (means - reach) * (side / 2 / reach) + centres[bucket]
+    rest = np.asarray(rows["rest"], np.float64)
+    if level == 2:
+        rest = ends[0] + rest / 255 * (ends[1] - ends[0])
+    colors = rows["colors"] / 255
+    sh = np.zeros((num, NUM_BASES[degree], 3))
+    sh[:, 0] = (colors[:, :3] - 0.5) / SH_C0
+    for band in range(1, degree + 1):
+        low, high = band**2, (band + 1) ** 2
+        sh[:, low:high] = rest[:, 3 * (low - 1) : 3 * (high - 1)].reshape(num, 3, high - low).transpose(0, 2, 1)
+    numbers = (means, rows["quats"], rows["scales"], colors[:, 3], sh)
+    return others.Ellipsoids(*(values.astype(np.float32) for values in numbers)), stop
+
+
+def _row_type(level: int, degree: int) -> np.dtype:
+    """Return the bytes of one splat."""
+    mean, number, rest = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))[level]
+    return np.dtype(
+        [
+            ("means", mean, 3), ("scales", number, 3), ("quats", number, 4), ("colors", "u1", 4),
+            ("rest", rest, (3 * (NUM_BASES[degree] - 1),)),
+        ]
+    )  # fmt: skip
