@@ -81,7 +81,7 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
 
 
 def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
-    """Read Gaussians from a file, in its world. others.Ellipsoids are flattened as `load_ply` does, with a warning.
+    """Read Gaussians from a file, in its world. Ellipsoids are flattened as `load_ply` does, with a warning.
 
     If positions of a SOG file are relative to an offset, the model's origin has this.
 
