@@ -57,6 +57,7 @@ def encode(coder: str, planes: np.ndarray) -> bytes:
     num, height, width = _webp_shape(*planes.shape)
     if max(num * height, width) > LONGEST_WEBP_SIDE:
         raise ValueError(f"coder: {planes.size} bytes are more than an image of WebP holds; choose another")
+    # Lossless WebP predicts pixels from neighbours in rows and columns, so an image is about square.
     pixels = np.zeros((num * WEBP_CHANNELS, height * width), np.uint8)
     pixels[: len(planes), : planes.shape[1]] = planes
     image = pixels.reshape(num, WEBP_CHANNELS, height * width).transpose(0, 2, 1).reshape(num * height, width, -1)
@@ -91,7 +92,7 @@ def _decoded(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarra
         return np.frombuffer(data, np.uint8)
     if coder == "lzma":
         stream = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=LZMA_FILTERS)
-        found = stream.decompress(data, size + 1)
+        found = stream.decompress(data, size + 1)  # One byte more shows that there is too much.
         if not stream.eof or stream.unused_data:
             raise ValueError("it does not end where it should")
         return np.frombuffer(found, np.uint8)
@@ -358,6 +359,7 @@ class ColumnWriter:
             self.numbers(name, values[:, order], precision)
         else:
             self.layout["ends"][name] = [number for axis in axes for number in axis]
+            # Neighbours on the curve have keys that differ little: most high bytes of the differences are 0.
             self.planes(name, to_planes(np.diff(key[order], prepend=0), 3 * bits))
         return order
 
@@ -419,7 +421,7 @@ class ColumnReader:
     def indices(self, name: str, length: int, count: int) -> np.ndarray:
         if count == 0 and length:
             raise ValueError(f"{name} are of a table that is empty")
-        self._take_room(name, length)
+        self._take_room(name, length)  # A table of one row has no bytes, but the indices take memory.
         num_planes = num_bytes_of(max(count - 1, 0).bit_length())
         indices: np.ndarray = from_planes(self.planes(name, num_planes, length), 1)[0]
         if length and indices.max() >= count:
@@ -435,7 +437,7 @@ class ColumnReader:
             planes = self.planes(name, num_columns * dtype.itemsize, length)
             return _finite(name, from_byte_planes(planes, num_columns, dtype))
         ends = Ends(*self._ends(name, 2))
-        if ends.low == ends.high:
+        if ends.low == ends.high:  # There are no bytes, but the numbers take memory.
             self._take_room(name, num_columns * length)
             self.planes(name, 0, length)
             return np.full((num_columns, length), ends.low, np.float32)

@@ -92,6 +92,7 @@ def save_gltf(
     shown = others.linear_colors(np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0))
     points = np.rint(255 * np.concatenate([shown, splats.opacities[:, None]], axis=1)).astype(np.uint8)
     attributes["COLOR_0"] = builder.add(points, normalized=True)
+    # The extension stores each coefficient as an attribute of its own, not as one array.
     for degree in range(NUM_BASES.index(splats.sh.shape[1]) + 1):
         for order in range(2 * degree + 1):
             index = NUM_BASES[degree] - 2 * degree - 1 + order

@@ -223,6 +223,7 @@ def _named_file(path: Path, uri: str) -> Path:
     name = urllib.parse.unquote(uri, errors="strict")
     if len(name.encode("utf-8", "surrogatepass")) > LONGEST_NAME:
         raise ValueError(f"its buffer has too long a name ({shortened(uri)})")
+    # Links are resolved first, so that none leads out of the folder.
     folder = path.parent.resolve()
     file = (folder / name).resolve() if "://" not in uri else None
     if file is None or not file.is_relative_to(folder):
@@ -282,7 +283,7 @@ def mesh_nodes(document: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]
         roots = [index for index in range(len(nodes)) if index not in children]
     seen: set[int] = set()
     waiting = [(index, np.eye(4)) for index in reversed(roots)]
-    while waiting:
+    while waiting:  # No recursion: a file may nest nodes deeper than Python calls functions.
         index, parent = waiting.pop()
         node = document.entry("nodes", index)
         if index in seen:

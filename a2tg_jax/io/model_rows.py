@@ -12,7 +12,7 @@ import numpy as np
 from a2tg_jax.appearance import Appearance, in_words
 from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.origin import BLACK, Color, Origin
+from a2tg_jax.core.origin import Color, Origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
@@ -114,6 +114,7 @@ def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarra
     areas = sizes.prod(axis=1)
     starts = (np.cumsum(areas) - areas)[order]
     areas = areas[order]
+    # The place of each texel within its texture, then its row and column, which a half-turn reverses.
     within = np.arange(areas.sum()) - np.repeat(np.cumsum(areas) - areas, areas)
     heights, widths = (np.repeat(side, areas) for side in sizes[order].T)
     row, column = np.divmod(within, np.maximum(widths, 1))
@@ -145,9 +146,7 @@ def with_positive_w(quats: np.ndarray) -> np.ndarray:
     return positive
 
 
-def model_of(
-    rows: Rows, base_degree: int, appearance: Appearance, origin: Origin | None, background: Color = BLACK
-) -> Model:
+def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origin | None, background: Color) -> Model:
     """Return the model of tables, float32.
 
     Args:

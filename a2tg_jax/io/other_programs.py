@@ -201,7 +201,7 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
         others, third = log_scales[:, :2], log_scales[:, 2]
         if third.min() == third.max() <= others.min() and third[0] < np.median(others) + np.log(0.1):
             return quats, others
-    thinnest = 2 - np.argmin(log_scales[:, ::-1], axis=1)
+    thinnest = 2 - np.argmin(log_scales[:, ::-1], axis=1)  # The last of equal ones.
     kept = np.take_along_axis(log_scales, (thinnest[:, None] + np.array([[1, 2]])) % 3, axis=1)
     dropped = np.take_along_axis(log_scales, thinnest[:, None], axis=1)[:, 0]
     num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(2 * THICKNESS))
@@ -257,7 +257,7 @@ def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
     if np.ptp(scales) > SAME_SCALE * largest or not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise ValueError(f"{what} scales its axes differently; apply it to the splats in another program first")
     rotation = matrix[:3, :3] / largest
-    u, _, v = np.linalg.svd(rotation)
+    u, _, v = np.linalg.svd(rotation)  # u·v is the rotation nearest to a rounded one.
     check_similarity(Similarity(largest, rotation, matrix[:3, 3]), what)
     return Similarity(largest, u @ v, matrix[:3, 3])
 

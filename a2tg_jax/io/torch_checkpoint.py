@@ -175,6 +175,7 @@ def _tensors_of(value: Any) -> dict[str, _Tensor]:
         found = {name: parts[place] for name, place in TUPLE_2DGS.items()} if len(parts) >= TUPLE_LENGTH - 1 else {}
     else:
         own = dict[str, _Tensor]()
+        # A pickle may refer to one dictionary from many places, so that a walk would never end.
         for index, (name, node) in enumerate(_nodes(value)):
             if index >= MOST_NODES:
                 raise _Refused(f"has dictionaries of more than {MOST_NODES:,} values")
@@ -212,6 +213,7 @@ def _array(tensor: _Tensor, archive: zipfile.ZipFile, folder: str) -> np.ndarray
         raise _Refused("has a storage of another size than its tensor says")
     if num > storage.num or (num and tensor.offset + sum(steps) >= storage.num):
         raise _Refused("has a tensor that reaches beyond its storage")
+    # The checks above keep every element that the strides reach within the storage.
     flat = np.frombuffer(archive.read(entry), dtype)
     strides = [stride * dtype.itemsize for stride in tensor.stride]
     return np.array(np.lib.stride_tricks.as_strided(flat[tensor.offset :], size, strides), np.float32)

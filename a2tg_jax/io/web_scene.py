@@ -217,7 +217,7 @@ def importance(rows: Rows, origin: Origin | None) -> np.ndarray:
     areas: np.ndarray = opacities_of(rows.logit_opacities) * np.exp(rows.log_scales.astype(np.float64).sum(axis=1))
     if origin is None or not len(origin.viewmats):
         return areas
-    viewmats = origin.viewmats[:: -(-len(origin.viewmats) // MOST_CAMERAS)]
+    viewmats = origin.viewmats[:: -(-len(origin.viewmats) // MOST_CAMERAS)]  # Evenly chosen.
     centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
     squares = np.stack([np.sum((rows.means - center) ** 2, axis=1) for center in centers])
     least = NEAREST * np.median(squares) if squares.size else 1.0
