@@ -13,7 +13,6 @@ from .appearance import (
 from .core.bilinear import TextureRegion as TextureRegion
 from .core.cameras import Camera as Camera, resize_camera as resize_camera
 from .core.gaussians import Gaussians as Gaussians, init_from_points as init_from_points
-from .core.gradient_statistics import GradientStatistics as GradientStatistics
 from .core.optim import adam_init as adam_init, adam_update as adam_update, exponential_decay as exponential_decay
 from .core.origin import Origin as Origin
 from .core.paths import look_at as look_at, path_through as path_through, smooth_path as smooth_path
@@ -45,6 +44,7 @@ from .events import (
     Change as Change,
     Due as Due,
     EventInfo as EventInfo,
+    GradientStatistics as GradientStatistics,
     HostEvent as HostEvent,
     StepEvent as StepEvent,
     Times as Times,

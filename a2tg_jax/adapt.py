@@ -14,11 +14,10 @@ from jax.typing import ArrayLike
 from a2tg_jax.appearance import in_words
 from a2tg_jax.core.budget import MOST_ROOM, bytes_of, event_budget, within_budget
 from a2tg_jax.core.checks import check_int, check_literal, check_number, check_shape
-from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
-from a2tg_jax.events import Change, Due, HostEvent, Seen, Statistic, iterations_at
+from a2tg_jax.events import Change, Due, GradientStatistics, HostEvent, Seen, Statistic, iterations_at
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.rows import on_host
 from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures, checked_sizes
@@ -159,10 +158,13 @@ class Upscale(HostEvent):
         old_sizes, scales, averages = textures.sizes, on_host(model.gaussians.scales), on_host(state.average())
         # Rows that do not exist yet count for nothing, and get nothing.
         sizes, new_sizes = old_sizes[:num], old_sizes.copy()
-        proposed = next_sizes(
-            sizes, scales[:num], k_a=self.k_a, k_s=self.k_s, cap=self.cap,
-            anisotropic=self.anisotropic, axes=self.axes,
-        )  # fmt: skip
+
+        def propose(sizes: np.ndarray, anisotropic: bool) -> np.ndarray:
+            return next_sizes(
+                sizes, scales[:num], k_a=self.k_a, k_s=self.k_s, cap=self.cap, anisotropic=anisotropic, axes=self.axes
+            )
+
+        proposed = propose(sizes, self.anisotropic)
         if self.select == "budget":
             rule = {"budget_bytes": event_budget(self._budget_bytes, model.num_bytes, due.index, due.count)}
         else:
@@ -171,8 +173,16 @@ class Upscale(HostEvent):
         grown = np.where(mask[:, None], proposed, sizes)
         unused = self._unused(sizes[mask], scales[:num][mask])
         if self.select == "budget" and due.index == due.count and (grown == proposed).all():
+            # All took what they proposed, and bytes are left: further upscalings, at last of both axes.
             left = rule["budget_bytes"] - _bytes_between(sizes, grown)
-            grown = self._with_the_rest(averages[:num], grown, scales[:num], left)
+            for anisotropic in (self.anisotropic, False):
+                mask = np.ones(1, bool)
+                while mask.any():
+                    last = grown
+                    proposed = propose(last, anisotropic)
+                    mask = select(averages[:num], last, proposed, budget_bytes=left)
+                    grown = np.where(mask[:, None], proposed, last)
+                    left -= _bytes_between(last, grown)
         new_sizes[:num] = grown
         kept = None if self.moments == "copied" else (new_sizes == old_sizes).all(axis=1)
         rebuilt = reallocate(textures, new_sizes, moments, tuple(due.shapes), kept, textures.shape)
@@ -190,23 +200,6 @@ class Upscale(HostEvent):
         if (thin != round_).any():
             return None
         return f"{' and '.join(names)} made no difference, for no Gaussian whose texture grew was elongated and thin"
-
-    def _with_the_rest(self, averages: np.ndarray, sizes: np.ndarray, scales: np.ndarray, left: float) -> np.ndarray:
-        """Return the sizes after further upscalings if bytes are left after all textures took what they proposed.
-
-        When thin Gaussians have what they propose as well, both axes double.
-        """
-        for anisotropic in (self.anisotropic, False):
-            is_chosen = np.ones(1, bool)
-            while is_chosen.any():
-                proposed = next_sizes(
-                    sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=self.cap, anisotropic=anisotropic, axes=self.axes
-                )
-                is_chosen = select(averages, sizes, proposed, budget_bytes=left)
-                grown = np.where(is_chosen[:, None], proposed, sizes)
-                left -= _bytes_between(sizes, grown)
-                sizes = grown
-        return sizes
 
 
 def next_sizes(
@@ -259,13 +252,8 @@ def next_sizes(
 
 
 def most_textures(sizes: np.ndarray, num_bytes: float, cap: int) -> Shape:
-    """Return a shape with room for all textures that `next_sizes` can make of some within a number of bytes (host).
-
-    Args:
-      sizes: [N, 2] present (Tv, Tu).
-      num_bytes: of all textures, at most.
-      cap: largest side.
-    """
+    """Return a shape with room for all textures that `next_sizes` can make of sizes [N, 2] within a number of bytes
+    (host)."""
     reached, num_before = np.unique(sizes, axis=0), 0
     while len(reached) > num_before:
         num_before = len(reached)

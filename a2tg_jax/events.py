@@ -11,19 +11,22 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from a2tg_jax.appearance.base import clear_rows
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import check_mask
+from a2tg_jax.core.checks import check_floats, check_mask, check_shape
+from a2tg_jax.core.numerics import safe_divide, safe_norm
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.pytree import combine, partition
+from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.table import Shape, Table, is_table
 from a2tg_jax.data import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.rows import on_host, placed_like, rows_moved
+from a2tg_jax.parallel.rows import on_host, placed_like, rows_moved, zeros_beside
 from a2tg_jax.rasterize.pixel import Statistic as Statistic
 
 LEAST_LEFT = 2
@@ -171,11 +174,8 @@ class Event:
         return ()
 
     def gather(self, state: Any, rows: np.ndarray) -> Any:
-        """Return the state whose row i is the former row rows[i] (host). The default wants a row for each Gaussian.
-
-        Raises:
-          ValueError: if an array has not.
-        """
+        """Return the state whose row i is the former row rows[i] (host). The default wants a row for each Gaussian, or
+        raises ValueError."""
 
         def moved(leaf: Array) -> Array:
             if leaf.ndim and leaf.shape[0] != len(rows):
@@ -244,13 +244,9 @@ class HostEvent(Event):
         self, model: Model, moments: AdamState, num_bytes: float, num_iterations: int
     ) -> tuple[Model, AdamState]:
         """Return model and moments with padding that the event will fill, so that its changes keep all shapes and no
-        step is compiled anew (host). The default adds none.
+        step is compiled again (host). The default adds none.
 
-        Args:
-          model: before the stage, or when it goes on.
-          moments: of the model.
-          num_bytes: bytes of the model when the event first happens, about.
-          num_iterations: length of the stage.
+        It is called before the stage, or when it goes on; the model has about `num_bytes` when the event first happens.
         """
         return model, moments
 
@@ -262,10 +258,7 @@ class HostEvent(Event):
 def iterations_at(fractions: tuple[float, ...], num_iterations: int, *, with_end: bool = False) -> tuple[int, ...]:
     """Return the iterations at fractions of a stage, ascending; in a short stage two of them may be one (host).
 
-    Args:
-      fractions: the event's field `at`, ascending, between 0 and 1.
-      num_iterations: length of the stage.
-      with_end: whether the last fraction may be 1, the end of the stage.
+    The last fraction of the event's field `at` may be 1, the end of the stage, if `with_end`.
 
     Raises:
       ValueError: if the fractions are not ascending or out of range.
@@ -277,7 +270,7 @@ def iterations_at(fractions: tuple[float, ...], num_iterations: int, *, with_end
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
 
 
-def keep_rows(model: Model, moments: AdamState, state: Any, is_kept: Any) -> Change:
+def keep_rows(model: Model, moments: AdamState, state: Any, is_kept: Array | np.ndarray) -> Change:
     """Return the change by an event on the host that removes Gaussians, so that no step is compiled again (host).
 
     All shapes stay: the rows of the Gaussians that are kept come first, in their order, and `Model.num_live` falls.
@@ -306,24 +299,19 @@ def keep_rows(model: Model, moments: AdamState, state: Any, is_kept: Any) -> Cha
     return Change(model, moments, state, rows=rows)
 
 
-def gather_rows(model: Model, rows: Any) -> Model:
+def gather_rows(model: Model, rows: Array | np.ndarray) -> Model:
     """Return the model whose row i is the former row rows[i], of all N."""
-    gaussians, appearance = _moved((model.gaussians, model.appearance), rows)
+    gaussians, appearance = jax.tree.map(
+        lambda leaf: leaf.gather(rows) if isinstance(leaf, Table) else rows_moved(leaf, rows),
+        (model.gaussians, model.appearance),
+        is_leaf=is_table,
+    )
     return dataclasses.replace(model, gaussians=gaussians, appearance=appearance)
 
 
-def gather_moments(moments: AdamState, rows: Any) -> AdamState:
+def gather_moments(moments: AdamState, rows: Array | np.ndarray) -> AdamState:
     """Return the moments whose row i is the former row rows[i], of all N."""
     return dataclasses.replace(moments, mu=gather_rows(moments.mu, rows), nu=gather_rows(moments.nu, rows))
-
-
-def _moved(tree: Any, rows: Any) -> Any:
-    """Return arrays and tables whose row i is the former row rows[i]."""
-    return jax.tree.map(
-        lambda leaf: leaf.gather(rows) if isinstance(leaf, Table) else rows_moved(leaf, rows),
-        tree,
-        is_leaf=is_table,
-    )
 
 
 def clear_moments(model: Model, moments: AdamState, is_cleared: Array) -> AdamState:
@@ -337,3 +325,55 @@ def clear_moments(model: Model, moments: AdamState, is_cleared: Array) -> AdamSt
         return floats
 
     return dataclasses.replace(moments, mu=cleared(moments.mu), nu=cleared(moments.nu))
+
+
+# The average gradient of each Gaussian over the views that saw it, by which events choose where to add detail. A²TG
+# averages ‖Σ_pixels |∂L/∂mean|‖ to choose what gets texels; adaptive density control averages the norm of the gradient
+# of the projected mean to choose what is cloned or split.
+
+
+def read_probe(found: Array, statistic: str, width: int, height: int) -> tuple[Array, Array]:
+    """Return the statistic of each Gaussian [..., N, 3], on the screen in units of half an image, and whether it was
+    composited at one or more pixels [..., N].
+
+    The gradients [..., N, 4] of one view or several are those at a probe (`render.render_traced`). The statistic is of
+    the "position" in the world, or another one on the screen.
+    """
+    gradients = found[..., :3]
+    if statistic != "position":
+        half = jnp.asarray([width / 2, height / 2, 1.0], found.dtype)
+        gradients = gradients * half.reshape((1,) * (found.ndim - 1) + (3,))
+    return gradients, found[..., 3] > 0
+
+
+@pytree
+class GradientStatistics:
+    """Sums from which each Gaussian's average gradient norm over views is computed."""
+
+    total: Array
+    """[N] sum of the norms since the last event."""
+    views: Array
+    """[N] int32 number of views in which the Gaussian was composited at one or more pixels."""
+
+    @staticmethod
+    def init(num: int, dtype: DTypeLike = jnp.float32, like: Array | None = None) -> "GradientStatistics":
+        """Return empty sums for `num` Gaussians, spread like the rows of an array; None: on one device."""
+        return GradientStatistics(zeros_beside(like, (num,), dtype), zeros_beside(like, (num,), jnp.int32))
+
+    def observe(self, norms: Array, is_visible: Array) -> "GradientStatistics":
+        """Add one view: `norms` [N] where `is_visible` [N]."""
+        check_floats("norms", norms, self.total.shape)
+        check_shape("is_visible", is_visible, self.total.shape)
+        total = self.total + jnp.where(is_visible, norms, 0.0)
+        return GradientStatistics(total, self.views + is_visible.astype(jnp.int32))
+
+    def observe_views(self, gradients: Array, is_visible: Array) -> "GradientStatistics":
+        """Add V views in order: the norms of `gradients` [V, N, 3] where `is_visible` [V, N]."""
+        state = self
+        for gradient, is_seen in zip(gradients, is_visible, strict=True):
+            state = state.observe(safe_norm(gradient), is_seen)
+        return state
+
+    def average(self) -> Array:
+        """Return the average norm [N] over the views that saw the Gaussian; 0 if none did."""
+        return safe_divide(self.total, self.views.astype(self.total.dtype))

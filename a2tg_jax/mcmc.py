@@ -69,11 +69,9 @@ def relocate(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | i
     Raises:
       ValueError: if a leaf of `moments` has another leading axis.
     """
-    _check_moments(gaussians, moments)
-    check_shape("num_live", num_live, ())
+    _check_moments(gaussians, moments, num_live)
     num_live = jnp.asarray(num_live, jnp.int32)
-    moves = plan_relocation(key, gaussians.opacities, num_live)
-    return MoveResult(_copy_hosts(gaussians, moves), _zero_rows(moments, moves.is_reset), num_live, moves.info)
+    return _moved(gaussians, moments, num_live, plan_relocation(key, gaussians.opacities, num_live))
 
 
 def grow(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int, cap: Array | int) -> MoveResult:
@@ -94,15 +92,12 @@ def grow(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int, 
     Raises:
       ValueError: if a cap that is not traced exceeds N, or a leaf of `moments` has another leading axis.
     """
-    _check_moments(gaussians, moments)
-    check_shape("num_live", num_live, ())
+    _check_moments(gaussians, moments, num_live)
     check_shape("cap", cap, ())
     if not isinstance(cap, jax.core.Tracer) and int(cap) > gaussians.num:
         raise ValueError(f"cap must be at most the {gaussians.num} rows that are allocated; got {int(cap)}")
     num_live = jnp.asarray(num_live, jnp.int32)
-    moves = plan_growth(key, gaussians.opacities, num_live, cap)
-    moments = _zero_rows(moments, moves.is_reset)
-    return MoveResult(_copy_hosts(gaussians, moves), moments, num_live + moves.info.num_added, moves.info)
+    return _moved(gaussians, moments, num_live, plan_growth(key, gaussians.opacities, num_live, cap))
 
 
 class Moves(NamedTuple):
@@ -124,8 +119,7 @@ DrawHosts = Callable[[Array, Array, Array], Array]
 def plan_relocation(key: Array, opacities: Array, num_live: Array, draw: DrawHosts | None = None) -> Moves:
     """Plan what `relocate` does to rows of these opacities [N], of which the first `num_live` exist.
 
-    Args:
-      draw: chooses the hosts; None draws them with probability ∝ opacity.
+    Hosts are drawn by `draw`, or with probability ∝ opacity.
     """
     is_live, is_host = _live_and_hosts(opacities, num_live)
     is_dead = is_live & ~is_host
@@ -147,9 +141,7 @@ def plan_growth(
 ) -> Moves:
     """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist.
 
-    Args:
-      least: grow to at least this number, as far as the cap allows.
-      draw: chooses the hosts; None draws them with probability ∝ opacity.
+    They grow to at least `least`, as far as the cap allows. Hosts are drawn by `draw`, or with probability ∝ opacity.
     """
     is_live, is_host = _live_and_hosts(opacities, num_live)
     has_hosts = jnp.any(is_host)
@@ -196,18 +188,10 @@ def perturb(key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array |
 
 
 def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
-    """Draw a host for every row, independently and with probability proportional to its opacity.
+    """Draw a host [N] int32 for every row, independently and with probability proportional to its opacity.
 
-    Two draws, a block of about √N hosts and then a host in it: one cumulative sum over a million float32 weights
-    would have a resolution of a tenth of a weight.
-
-    Args:
-      key: a random key.
-      opacities: [N] in (0, 1).
-      is_host: [N], which rows may be drawn.
-
-    Returns:
-      [N] int32 rows for which `is_host` holds; all 0 if there are none.
+    Two draws, a block of about √N hosts and then a host in it: one cumulative sum over a million float32 weights would
+    have a resolution of a tenth of a weight. All are 0 if no row may be drawn.
     """
     num = opacities.shape[0]
     if num == 0:
@@ -223,19 +207,13 @@ def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
     u_block, u_within = jax.random.uniform(key, (2, num), opacities.dtype)
     block = jnp.searchsorted(blocks, u_block * blocks[-1], side="right")
     block = jnp.minimum(block, jnp.maximum(num_hosts - 1, 0) // width).astype(jnp.int32)
-    place = block * width + _first_above(within, block, u_within * within[block, -1])
-    return rows[jnp.clip(place, 0, jnp.maximum(num_hosts - 1, 0))].astype(jnp.int32)
-
-
-def _first_above(tables: Array, which: Array, targets: Array) -> Array:
-    """Return [N] int32, the first column above the target in row `which` of ascending `tables` [B, 2^k]."""
-    step = tables.shape[1] // 2
-    column = jnp.zeros_like(which)
+    # By bisection, the first column above the target in the block's ascending row.
+    target, column, step = u_within * within[block, -1], jnp.zeros_like(block), width // 2
     while step:
-        is_below = tables[which, column + (step - 1)] <= targets
-        column = jnp.where(is_below, column + step, column)
+        column = jnp.where(within[block, column + (step - 1)] <= target, column + step, column)
         step //= 2
-    return column
+    place = block * width + column
+    return rows[jnp.clip(place, 0, jnp.maximum(num_hosts - 1, 0))].astype(jnp.int32)
 
 
 def _live_and_hosts(opacities: Array, num_live: Array) -> tuple[Array, Array]:
@@ -250,29 +228,29 @@ def _copied_rows(hosts: Array, is_target: Array) -> tuple[Array, Array]:
     return jnp.where(is_target, hosts, jnp.arange(hosts.shape[0], dtype=jnp.int32)), num_draws
 
 
-def _copy_hosts(gaussians: Gaussians, moves: Moves) -> Gaussians:
-    """Return the rows copied from their hosts after sharing."""
-    shared = share(gaussians.logit_opacities, gaussians.log_scales, moves.num_shares)
-    return dataclasses.replace(gaussians, logit_opacities=shared[0], log_scales=shared[1])[moves.rows]
+def _moved(gaussians: Gaussians, moments: Any, num_live: Array, moves: Moves) -> MoveResult:
+    """Copy rows from their hosts after sharing, and clear their moments."""
+    logits, scales = share(gaussians.logit_opacities, gaussians.log_scales, moves.num_shares)
+    copied = dataclasses.replace(gaussians, logit_opacities=logits, log_scales=scales)[moves.rows]
+    moments = jax.tree.map(
+        lambda x: jnp.where(moves.is_reset.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x), moments
+    )
+    return MoveResult(copied, moments, num_live + moves.info.num_added, moves.info)
 
 
-def _zero_rows(tree: Any, is_zeroed: Array) -> Any:
-    """Return the pytree with the marked rows of every leaf at zero."""
-    return jax.tree.map(lambda x: jnp.where(is_zeroed.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x), tree)
-
-
-def _check_moments(gaussians: Gaussians, moments: object) -> None:
+def _check_moments(gaussians: Gaussians, moments: object, num_live: Array | int) -> None:
     """Raise ValueError unless the Gaussians are well formed and every leaf has one row for each of them."""
     check_gaussians(gaussians)
+    check_shape("num_live", num_live, ())
     for leaf in jax.tree.leaves(moments):
         if leaf.ndim == 0 or leaf.shape[0] != gaussians.num:
             raise ValueError(f"every leaf of moments must have {gaussians.num} rows; got shape {leaf.shape}")
 
 
-def densify_times(num_iterations: int, last: float = 5 / 6) -> Times:
+def densify_times(num_iterations: int) -> Times:
     """Return the times of densification: the paper's 500, 25,000 and every 100 of 30,000 iterations, scaled."""
     every = max(10, round(num_iterations / 300))
-    return Times(round(num_iterations / 60), int(last * num_iterations + 1e-9), every)
+    return Times(round(num_iterations / 60), int(5 / 6 * num_iterations + 1e-9), every)
 
 
 @pytree

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, count_floats, in_words, template_of
 from a2tg_jax.appearance.base import check_arrays_given, join_rows, take_rows
@@ -121,11 +122,8 @@ class Model:
         return self.appearance.textures
 
     def with_textures(self, textures: Textures) -> "Model":
-        """Return the same model with other textures.
-
-        Raises:
-          ValueError: if the model has none; the message says how to build one that has.
-        """
+        """Return the same model with other textures. ValueError: it has none; the message says how to build one that
+        has."""
         return dataclasses.replace(self, appearance=self.appearance.with_textures(textures))
 
     @property
@@ -161,7 +159,7 @@ class Model:
         self,
         camera: Camera,
         *,
-        features: Any = None,
+        features: ArrayLike | None = None,
         background: Any = None,
         settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     ) -> RenderOutput:
@@ -280,14 +278,11 @@ def concatenate(models: Sequence[Model]) -> Model:
                 move = f"models[{index}].origin.transform.inverse().then(models[0].origin.transform)"
                 warnings.warn(f"models[{index}] is relative to another offset; transform it by {move}", stacklevel=2)
     highest = max(model.gaussians.sh.shape[1] for model in models)
-    several = [_with_bases(model.gaussians, 0 if first.appearance.bands is not None else highest) for model in models]
+    several = [model.gaussians for model in models]
+    if first.appearance.bands is None:
+        pads = [((0, 0), (0, highest - own.sh.shape[1]), (0, 0)) for own in several]
+        several = [dataclasses.replace(own, sh=jnp.pad(own.sh, pad)) for own, pad in zip(several, pads, strict=True)]
     if len({gaussians.sh_degree for gaussians in several}) > 1:
         raise ValueError(f"models must have one degree below their bands; got {[g.sh_degree for g in several]}")
     gaussians, appearance = join_rows([(own, model.appearance) for own, model in zip(several, models, strict=True)])
     return dataclasses.replace(first, gaussians=gaussians, appearance=appearance)
-
-
-def _with_bases(gaussians: Gaussians, num: int) -> Gaussians:
-    """Return Gaussians with at least `num` spherical harmonics, new ones zero."""
-    missing = max(0, num - gaussians.sh.shape[1])
-    return dataclasses.replace(gaussians, sh=jnp.pad(gaussians.sh, ((0, 0), (0, missing), (0, 0))))

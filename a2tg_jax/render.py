@@ -137,10 +137,7 @@ _pending: collections.deque[tuple[Any, int]] = collections.deque(maxlen=64)
 
 def with_features(appearance: Appearance, features: ArrayLike | None, gaussians: Gaussians) -> Appearance:
     """Return the appearance that shows features [N, D] instead of colours; the same one if features is None.
-
-    Raises:
-      ValueError: if the features are not floats [N, D] of the Gaussians' dtype, D >= 1.
-    """
+    ValueError: they are not floats of the Gaussians' dtype, D >= 1."""
     if features is None:
         return appearance
     features = plain_array("features", features, gaussians.means.dtype)
@@ -165,11 +162,8 @@ def check_background(background: ArrayLike, num_colors: int = 3) -> None:
 
 
 def appearance_of(gaussians: Gaussians, textures: Textures | None, settings: RenderSettings) -> Appearance:
-    """Return the appearance of Gaussians and their textures, whose options are `settings.texture`.
-
-    Raises:
-      ValueError: if the textures do not fit the Gaussians, or there are no settings.
-    """
+    """Return the appearance of Gaussians and their textures, whose options are `settings.texture`. ValueError: the
+    textures do not fit the Gaussians, or there are no settings."""
     check_kind("settings", settings, RenderSettings)
     appearance = appearance_for(settings.texture, has_textures=textures is not None)
     if textures is None:

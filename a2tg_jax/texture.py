@@ -52,11 +52,8 @@ def check_textures(textures: Textures, num: int | None = None, name: str = "text
 
 
 def checked_sizes(sizes: ArrayLike, name: str = "sizes") -> np.ndarray:
-    """Return the sizes of textures as an array (host).
-
-    Raises:
-      ValueError: unless they are integers [N, 2], each side 1 to 16, or both 0.
-    """
+    """Return the sizes of textures as an array (host). ValueError: they are not integers [N, 2], each side 1 to 16, or
+    both 0."""
     if isinstance(sizes, Table):
         raise ValueError(f"{name} must be integers [N, 2]; got {type(sizes).__name__}: pass textures.sizes")
     check_unmasked(name, sizes)

@@ -22,9 +22,8 @@ from lab.jobs import MOST_TRAIN_VIEWS, background_of
 from lab.measured import measured_once
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.data import view_image
-from a2tg_jax.events import Change, Due, HostEvent
+from a2tg_jax.events import Change, Due, HostEvent, read_probe
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render

@@ -12,11 +12,10 @@ from a2tg_jax.adapt import Upscale, most_textures, next_sizes, reallocate, selec
 from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
 from a2tg_jax.core.budget import event_budget
 from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.table import Shape, plan_places
-from a2tg_jax.events import Due
+from a2tg_jax.events import Due, GradientStatistics
 from a2tg_jax.model import Model
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.texture import allocate_textures, texture_arrays, textures_from_arrays

@@ -17,11 +17,10 @@ from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.budget import bytes_per_gaussian, megabytes_of, number_to_reach
 from a2tg_jax.core.gaussians import init_from_points, logit
-from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.densify.clone_split import FillingDensity
-from a2tg_jax.events import Due, Now, Times
+from a2tg_jax.events import Due, GradientStatistics, Now, Times
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.mcmc import FillingMcmc
 from a2tg_jax.model import Model

@@ -14,7 +14,7 @@ from a2tg_jax import Model
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, allocate_appearance
 from a2tg_jax.appearance.files import arrays_of
-from a2tg_jax.appearance.parts import exponents_of
+from a2tg_jax.appearance.parts import log_exponents_of
 from a2tg_jax.core.budget import bytes_of, event_budget
 from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.densify.view_dependence import AdaptDegrees
@@ -208,7 +208,7 @@ def test_what_the_shares_decide_is_no_option(changes, message):
 def test_the_least_exponent_reaches_both_stages(scene):
     system = smoke(kernel_rate=1.0, exponents={"least": 0.8})
     model = a2tg.fit(scene, system, progress=False).model
-    exponents = exponents_of(model.appearance.shapes)[: model.num]
+    exponents = np.exp(log_exponents_of(model.appearance.shapes))[: model.num]
     np.testing.assert_allclose(exponents.min(), 0.8, rtol=1e-5)
     assert exponents.max() > 1
 
@@ -225,8 +225,8 @@ def test_exponents_are_limited_whatever_other_parts_there_are():
     for template in (Appearance(exponents=Exponents()), whole):
         limit = jax.jit(lambda model: LimitExponents(0.6).apply(None, model, None, ()).model)
         limited = limit(some_model(template, shapes))
-        exponents = exponents_of(limited.appearance.shapes)
-        np.testing.assert_allclose(exponents, np.maximum(exponents_of(shapes), 0.6), rtol=1e-6)
+        exponents = np.exp(log_exponents_of(limited.appearance.shapes))
+        np.testing.assert_allclose(exponents, np.maximum(np.exp(log_exponents_of(shapes)), 0.6), rtol=1e-6)
 
 
 @pytest.mark.parametrize("least", [0.0, 0.3, 0.36])
@@ -234,7 +234,8 @@ def test_a_limit_below_all_exponents_changes_none(least):
     shapes = jnp.linspace(-20.0, 20.0, some_gaussians().num)
     model = some_model(Appearance(exponents=Exponents()), shapes)
     limited = LimitExponents(least).apply(None, model, None, ()).model
-    np.testing.assert_allclose(exponents_of(limited.appearance.shapes), exponents_of(shapes), rtol=1e-6)
+    before, after = log_exponents_of(shapes), log_exponents_of(limited.appearance.shapes)
+    np.testing.assert_allclose(np.exp(after), np.exp(before), rtol=1e-6)
 
 
 def test_a_limit_of_exponents_needs_exponents():

@@ -9,11 +9,10 @@ import pytest
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, logit, rotation_matrices
-from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.densify.clone_split import CloneSplitPrune, Edit, OpacityReset, apply_edit, reset_interval
-from a2tg_jax.events import Change, EventInfo, Now, Seen
+from a2tg_jax.events import Change, EventInfo, Now, Seen, read_probe
 from a2tg_jax.model import Model
 
 NUM, LIVE, SCENE_SCALE = 60, 25, 2.0

@@ -14,8 +14,7 @@ from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_s
 import a2tg_jax as a2tg
 from a2tg_jax import Appearance, Model, RenderSettings, Texture, view_gradients
 from a2tg_jax.appearance import projected
-from a2tg_jax.core.gradient_statistics import read_probe
-from a2tg_jax.events import Seen
+from a2tg_jax.events import Seen, read_probe
 from a2tg_jax.rasterize.views import render_traced
 
 

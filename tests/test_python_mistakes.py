@@ -165,7 +165,7 @@ KINDS = {
     "got Scene: say polish(model, scene.train)": lambda: a2tg.polish(MODEL, scene()),
     "model must be a Model; got tuple: say polish": lambda: a2tg.polish(scene().train, MODEL),
     "cameras[0] must be a Camera; got View: use view.camera": lambda: a2tg.smooth_path(scene().train, 5),
-    "cameras must be a list of cameras, such as": lambda: a2tg.smooth_path(scene(), 5),
+    "cameras must be a Camera or an Iterable; got Scene": lambda: a2tg.smooth_path(scene(), 5),
     "model must be a Model; got Gaussians: say Model(gaussians)": lambda: a2tg.save_model("g.npz", GAUSSIANS),
     "model must be a Model; got Gaussians": lambda: a2tg.save_compact("g.a2tgz", GAUSSIANS),
     "model must be a Model; got ArrayImpl": lambda: a2tg.value_and_grad(jnp.sum)(jnp.ones(3)),

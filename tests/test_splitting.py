@@ -11,7 +11,6 @@ from test_mcmc import random_gaussians
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import rotation_matrices
-from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState, adam_init
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.densify.splitting import (
@@ -22,7 +21,7 @@ from a2tg_jax.densify.splitting import (
     logits_of_halves,
     split_rows,
 )
-from a2tg_jax.events import Now, Seen, Times
+from a2tg_jax.events import GradientStatistics, Now, Seen, Times
 from a2tg_jax.mcmc import plan_growth, plan_relocation
 from a2tg_jax.model import Model
 

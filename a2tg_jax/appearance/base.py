@@ -16,7 +16,7 @@ An appearance whose arrays are None is a template, such as the one of a stage: i
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import FLOATS, described
 from a2tg_jax.core.gaussians import Gaussians, logit, share
-from a2tg_jax.core.numerics import at_least
+from a2tg_jax.core.numerics import Integer, at_least
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
 from a2tg_jax.core.table import Table, check_places, check_table, is_table
@@ -80,8 +80,6 @@ class Appearance:
 
     def __post_init__(self) -> None:
         """Refuse exponents where the kernel is not a Gaussian; take the default limit of alpha for None."""
-        if self.max_alpha == MAX_ALPHA and self.texture is None:
-            object.__setattr__(self, "max_alpha", None)  # Appearances that show the same are equal.
         if self.exponents is not None and type(self).falloff is not Appearance.falloff:
             raise ValueError(f"exponents replace a Gaussian falloff, and {type(self).__name__} has another one")
         # Equal appearances have one form, so that systems share stages, and models compiled programs.
@@ -101,7 +99,7 @@ class Appearance:
         """Return the peak opacities [N], before falloff and alpha factor."""
         return gaussians.opacities
 
-    def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+    def own_colors(self, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:
         """Return the colours [N, D] in this view.
 
         By default, D = 3 of spherical harmonics up to `degree`, which may be traced.
@@ -240,11 +238,7 @@ class Appearance:
         return None if self.exponents is None else self.exponents.shapes
 
     def with_textures(self, textures: Textures) -> Self:
-        """Return the appearance with other textures.
-
-        Raises:
-          ValueError: if it has none.
-        """
+        """Return the appearance with other textures. ValueError: it has none."""
         if self.texture is None:
             raise ValueError(
                 f"no textures to replace in {in_words(self)}: build a model with Appearance(texture=Texture(textures))"
@@ -303,14 +297,14 @@ def gaussian_cutoff(peak: Array) -> Array:
 # The composition of an appearance with its parts, for the renderer
 
 
-def color_sums(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+def color_sums(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:
     """Return the sums of spherical harmonics [N, 3] behind the colours, of either sign; linear in the coefficients."""
     own = sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
     bands = appearance.bands
     return own if bands is None else own + bands.color_sums(gaussians, camera.center, degree)
 
 
-def colors_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Any) -> Array:
+def colors_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:
     """Return the colours [N, D], or the features, of the splats in a view."""
     for given in (appearance.features, appearance.given_colors):
         if given is not None:
@@ -344,14 +338,12 @@ def empty_values(appearance: Appearance) -> tuple[float, ...]:
 
 # Templates and arrays
 
+A = TypeVar("A", bound=Appearance)
+
 
 def without_arrays(node: Any, instead: Callable[[str], Any], name: str = "") -> Any:
-    """Return an appearance or a part with a value in place of each array field that is not None.
-
-    Args:
-      node: the appearance.
-      instead: makes the value of the field's path, such as "texture.texels".
-    """
+    """Return an appearance or a part with a value, made of the field's path such as "texture.texels", for each array
+    field that is not None."""
     changes = {}
     for field in array_fields(node):
         value, path = getattr(node, field.name), f"{name}.{field.name}" if name else field.name
@@ -362,18 +354,19 @@ def without_arrays(node: Any, instead: Callable[[str], Any], name: str = "") -> 
     return dataclasses.replace(node, **changes) if changes else node
 
 
-def template_of(appearance: Appearance) -> Any:
+def template_of(appearance: A) -> A:
     """Return the appearance without its arrays: its options."""
-    return without_arrays(appearance, lambda path: None)
+    template: A = without_arrays(appearance, lambda path: None)
+    return template
 
 
-def allocate_appearance(template: Appearance, key: Array, gaussians: Gaussians) -> Any:
+def allocate_appearance(template: A, key: Array, gaussians: Gaussians) -> A:
     """Return an appearance of the options of a template, with initial arrays for N Gaussians (host)."""
     parts = {name: part.allocate(gaussians) for name in PARTS if (part := getattr(template, name)) is not None}
     return dataclasses.replace(template, **parts).allocate(key, gaussians)
 
 
-def projected(appearance: Appearance) -> Any:
+def projected(appearance: A) -> A:
     """Return the appearance with all numbers moved to where they are allowed, after an update; traceable."""
     parts = {name: part.project() for name in PARTS if (part := getattr(appearance, name)) is not None}
     return dataclasses.replace(appearance, **parts).project()
@@ -390,7 +383,7 @@ def count_floats(appearance: Appearance, num: int) -> int:
     return total
 
 
-def check_appearance(appearance: Any, gaussians: Gaussians) -> None:
+def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
     """Raise ValueError, naming the field, unless the arrays of an appearance are there and fit the Gaussians (host)."""
     kind = type(appearance).__name__
     check_arrays_given(appearance)

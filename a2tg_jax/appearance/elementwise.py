@@ -207,17 +207,15 @@ def takes_arrays(static: StaticShading, arguments: Arguments) -> bool:
 
     A matrix product in `shade` takes scalars only: with arrays of pixels it would contract the pixels.
     """
-    functions = arguments.of(ODD_SHAPE)
-    return all(_is_elementwise(getattr(static.functions, name), functions[name], arguments) for name in functions)
-
-
-def _is_elementwise(function: Callable[..., Any], given: tuple[Any, ...], arguments: Arguments) -> bool:
-    try:
-        results = jax.make_jaxpr(function)(*given).jaxpr.outvars
-    except Exception:  # Any error of the user's code: it has passed with scalars, so it cannot take arrays.
-        return False
     shapes = ODD_SHAPE, (arguments.num_colors, *ODD_SHAPE)
-    return all(isinstance(result, jax.extend.core.Literal) or result.aval.shape in shapes for result in results)
+    for name, given in arguments.of(ODD_SHAPE).items():
+        try:
+            results = jax.make_jaxpr(getattr(static.functions, name))(*given).jaxpr.outvars
+        except Exception:  # Any error of the user's code: it has passed with scalars, so it cannot take arrays.
+            return False
+        if not all(isinstance(own, jax.extend.core.Literal) or own.aval.shape in shapes for own in results):
+            return False
+    return True
 
 
 def elementwise_functions(static: StaticShading, arguments: Arguments) -> Elementwise:

@@ -17,6 +17,7 @@ from a2tg_jax.appearance.base import Appearance, allocate_appearance, array_fiel
 from a2tg_jax.appearance.parts import (
     MAX_DEGREE,
     Bands,
+    Coefficients,
     Exponents,
     bands_of_dense,
     degrees_of_sizes,
@@ -32,12 +33,8 @@ OLD_INNER = "inner."
 
 
 def arrays_of(appearance: Appearance, sh_degree: int) -> dict[str, np.ndarray]:
-    """Return named arrays without padding, which `with_arrays` reads (host).
-
-    Args:
-      appearance: of N Gaussians, of which all rows exist.
-      sh_degree: degree of their own spherical harmonics.
-    """
+    """Return named arrays without padding, which `with_arrays` reads (host). All rows of the appearance exist;
+    `sh_degree` is the degree of their own spherical harmonics."""
     arrays: dict[str, np.ndarray] = {}
     if appearance.bands is not None and (coefficients := appearance.bands.coefficients) is not None:
         degrees, dense = degrees_of_sizes(coefficients.sizes, sh_degree), dense_bands(coefficients, sh_degree)
@@ -59,17 +56,9 @@ def arrays_of(appearance: Appearance, sh_degree: int) -> dict[str, np.ndarray]:
     return arrays
 
 
-def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degree: int) -> Any:
-    """Return an appearance of the options of a template, with the arrays of a file (host).
-
-    Args:
-      template: with its options.
-      arrays: as `arrays_of` returns them, or as version 0.2 wrote them.
-      sh_degree: degree of the Gaussians' own spherical harmonics.
-
-    Raises:
-      ValueError: if an array is missing, or its shape does not fit the others.
-    """
+def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degree: int) -> Appearance:
+    """Return an appearance of the options of a template, with the arrays of a file, as `arrays_of` returns them or
+    version 0.2 wrote them (host). ValueError: an array is missing, or its shape does not fit the others."""
     arrays = {name.replace(OLD_INNER, ""): array for name, array in arrays.items()}
     changes: dict[str, Any] = {}
     if template.bands is not None:
@@ -121,7 +110,7 @@ def _textures(arrays: Mapping[str, np.ndarray], sizes_name: str, texels_name: st
     return Textures.of_flat(sizes.astype(np.int64), texels)
 
 
-def _coefficients(arrays: Mapping[str, np.ndarray], sh_degree: int) -> Any:
+def _coefficients(arrays: Mapping[str, np.ndarray], sh_degree: int) -> Coefficients:
     degrees, base = _found(arrays, "degrees"), int(_found(arrays, "base_degree"))
     if degrees.ndim != 1 or not np.issubdtype(degrees.dtype, np.integer) or not 0 <= base <= MAX_DEGREE:
         raise ValueError(f"degrees must be integers [N] above a base degree in 0..3; got {degrees.shape}, {base}")

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike, DTypeLike
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, Gaussians, logit
-from a2tg_jax.core.numerics import normalize, within
+from a2tg_jax.core.numerics import Integer, normalize, within
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, sh_basis
 from a2tg_jax.core.table import Places, Size, Table, check_places, check_table
@@ -140,14 +140,9 @@ class Texture(Part):
         most_alpha = jnp.inf if options.alpha == "global-maximum" else 1.0
         least, most = (0.0, 1.0) if options.rgb == "unit" else (-jnp.inf, jnp.inf)
 
-        def projected(texels: Array) -> Array:
-            bounds = (
-                jnp.asarray([rgb] * 3 + [alpha], texels.dtype) for rgb, alpha in ((least, 0.0), (most, most_alpha))
-            )
-            return jnp.clip(texels, *(bound[None, None, None] for bound in bounds))
-
         assert self.texels is not None
-        buckets = tuple(map(projected, self.texels.buckets))
+        bounds = jnp.asarray([[least] * 3 + [0.0], [most] * 3 + [most_alpha]], self.texels.buckets[0].dtype)
+        buckets = tuple(jnp.clip(texels, *bounds[:, None, None, None]) for texels in self.texels.buckets)
         return dataclasses.replace(self, texels=dataclasses.replace(self.texels, buckets=buckets))
 
     def shown(self) -> Textures:
@@ -159,7 +154,15 @@ class Texture(Part):
         textures, options = self.texels.nearest_places(), self.options
         if options.rgb == "signed" and options.alpha == "projected":
             return textures
-        divisor = _largest_alpha(textures) + 1e-6 if options.alpha == "global-maximum" else None
+        divisor = None
+        if options.alpha == "global-maximum":
+            # The largest alpha without padding; 1 if all textures are empty. Several equal maxima share the gradient.
+            alphas = [] if any(bucket.size for bucket in textures.buckets) else [jnp.ones(1, textures.buckets[0].dtype)]
+            for index, bucket in enumerate(textures.buckets):
+                num_used = jnp.sum(textures.bucket == index, dtype=jnp.int32)
+                is_used = jnp.arange(bucket.shape[0], dtype=jnp.int32) < num_used
+                alphas.append(jnp.where(is_used[:, None, None], bucket[..., 3], -jnp.inf).reshape(-1))
+            divisor = jnp.max(jnp.concatenate(alphas)) + 1e-6
 
         def shown(texels: Array) -> Array:
             rgb, alpha = texels[..., :3], texels[..., 3:]
@@ -188,8 +191,11 @@ class Texture(Part):
     def peaks(self) -> Array:
         """Return the largest alpha factor [N] of each splat; only for bounds, without gradient."""
         textures = self.shown()
-        capacities = [bucket.shape[0] for bucket in textures.buckets]
-        peaks = jnp.stack([_padded_peaks(bucket, max(capacities)) for bucket in textures.buckets])
+        most, columns = max(map(len, textures.buckets)), []
+        for bucket in textures.buckets:  # 1 of an empty texture, 0 past the capacity.
+            own = jnp.max(bucket[..., 3], axis=(1, 2)) if bucket.size else jnp.ones(most, bucket.dtype)
+            columns.append(jnp.pad(own, (0, most - len(own))))
+        peaks = jnp.stack(columns)
         peaks = jax.lax.stop_gradient(peaks[textures.bucket, textures.row])
         return jnp.maximum(peaks, 1.0) if self.options.outside == "identity" else peaks
 
@@ -210,27 +216,6 @@ class Texture(Part):
             red, green, blue = (jnp.where(is_inside, channel, 0.0) for channel in (red, green, blue))
             alpha = jnp.where(is_inside, alpha, 1.0)
         return (red, green, blue), alpha
-
-
-def _largest_alpha(textures: Textures) -> Array:
-    """Return the largest alpha of all texels without padding, or 1 if all textures are empty.
-
-    Several equal maxima share the gradient.
-    """
-    alphas = [jnp.ones(1, textures.buckets[0].dtype)] if not any(bucket.size for bucket in textures.buckets) else []
-    for index, bucket in enumerate(textures.buckets):
-        num_used = jnp.sum(textures.bucket == index, dtype=jnp.int32)
-        is_used = jnp.arange(bucket.shape[0], dtype=jnp.int32) < num_used
-        alphas.append(jnp.where(is_used[:, None, None], bucket[..., 3], -jnp.inf).reshape(-1))
-    return jnp.max(jnp.concatenate(alphas))
-
-
-def _padded_peaks(bucket: Array, length: int) -> Array:
-    """Return the largest alpha [length] of each texture of a bucket: 1 if empty, 0 past the capacity."""
-    if not bucket.size:
-        return jnp.ones(length, bucket.dtype)
-    peaks = jnp.max(bucket[..., 3], axis=(1, 2))
-    return jnp.pad(peaks, (0, length - peaks.shape[0]))
 
 
 def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
@@ -288,24 +273,14 @@ class Curve(NamedTuple):
     """[N] δ^β."""
 
 
-def exponents_of(shapes: Array) -> Array:
-    """Return the exponents β = exp(tanh s), in (1/e, e), of shapes."""
-    return jnp.exp(LARGEST_LOG_EXPONENT * jnp.tanh(shapes))
-
-
 def log_exponents_of(shapes: np.ndarray) -> np.ndarray:
     """Return the logarithms of the exponents of shapes, within ±1, as files keep them (host)."""
     return LARGEST_LOG_EXPONENT * np.tanh(np.asarray(shapes, np.float64))
 
 
 def shapes_of(log_exponents: np.ndarray) -> np.ndarray:
-    """Return the shapes of logarithms of exponents in a file (host).
-
-    Logarithms that rounding has moved beyond ±1 are cut to ±1.
-
-    Raises:
-      ValueError: if one is NaN or farther out than rounding moves it.
-    """
+    """Return the shapes of logarithms of exponents in a file (host). Logarithms that rounding has moved beyond ±1 are
+    cut to ±1; ValueError: one is NaN or farther out than rounding moves it."""
     shares = np.asarray(log_exponents, np.float64) / LARGEST_LOG_EXPONENT
     if not (np.abs(shares) <= MOST_ROUNDED).all():
         raise ValueError(f"the logarithms of the exponents of kernels must be within ±{LARGEST_LOG_EXPONENT:g}")
@@ -313,8 +288,8 @@ def shapes_of(log_exponents: np.ndarray) -> np.ndarray:
 
 
 def curves_of(shapes: Array) -> Curve:
-    """Return the curves of shapes [N]."""
-    exponents = exponents_of(shapes)
+    """Return the curves of shapes s [N], of exponents β = exp(tanh s) in (1/e, e)."""
+    exponents = jnp.exp(LARGEST_LOG_EXPONENT * jnp.tanh(shapes))
     starts = jnp.exp(exponents * np.log(OFFSET))
     return Curve(exponents, 1 / (jnp.exp(exponents * np.log(2 + OFFSET)) - starts), starts)
 
@@ -389,13 +364,10 @@ class Bands(Part):
                 f"{gaussians.sh_degree}, the degree of the Gaussians, has"
             )
 
-    def color_sums(self, gaussians: Gaussians, center: Array, degree: Any) -> Array:
+    def color_sums(self, gaussians: Gaussians, center: Array, degree: Integer) -> Array:
         """Return the sums [N, 3] that the bands add to Σ Y_l·sh_l, before 0.5 is added and negatives are cut off.
 
-        Args:
-          gaussians: N Gaussians, of which degree and means are read.
-          center: [3] camera centre in the world.
-          degree: highest degree used; may be traced.
+        The camera's centre is [3]; the highest degree may be traced.
         """
         table, base, means = self.coefficients, gaussians.sh_degree, gaussians.means
         assert table is not None
@@ -422,11 +394,7 @@ def floats_of_band(degree: int) -> int:
 
 
 def sizes_of_degrees(degrees: np.ndarray, base_degree: int) -> np.ndarray:
-    """Return the sizes [N, 1] of the blocks of Gaussians of the given degrees.
-
-    Raises:
-      ValueError: if a degree is out of range.
-    """
+    """Return the sizes [N, 1] of the blocks of Gaussians of the given degrees. ValueError: a degree is out of range."""
     if degrees.size and not base_degree <= degrees.min() <= degrees.max() <= MAX_DEGREE:
         raise ValueError(f"degrees must be in {base_degree}..3; got {degrees.min()}..{degrees.max()}")
     sizes: np.ndarray = np.asarray(NUM_BASES)[degrees] - NUM_BASES[base_degree]

@@ -3,13 +3,13 @@
 import decimal
 import math
 import re
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from a2tg_jax.core.gaussians import floats_per_gaussian
+from a2tg_jax.core.numerics import Integer
 from a2tg_jax.host.text import shortened
 
 BYTES_PER_FLOAT = 4
@@ -57,18 +57,10 @@ def bytes_per_gaussian(sh_degree: int, floats: float = 0) -> float:
     return BYTES_PER_FLOAT * (floats_per_gaussian(sh_degree) + floats)
 
 
-def number_to_reach(num: Array, cap: int, num_left: Any) -> Array:
-    """Return the number of Gaussians after an event, such that the last of `num_left` events reaches `cap`.
+def number_to_reach(num: Array, cap: int, num_left: Integer) -> Array:
+    """Return the number of Gaussians after an event, such that the last of r = `num_left` events reaches `cap`; int32.
 
-    ⌈n·(cap/n)^(1/r)⌉: every event grows by the same factor. Traceable.
-
-    Args:
-      num: n int32, present number, at most the cap.
-      cap: number after the last event.
-      num_left: r int32, events left with this one, at least 1.
-
-    Returns:
-      int32.
+    ⌈n·(cap/n)^(1/r)⌉: every event grows the present number n, at most the cap, by the same factor. Traceable.
     """
     now = num.astype(jnp.result_type(float))
     exponent = 1 / jnp.maximum(jnp.asarray(num_left, jnp.int32), 1).astype(now.dtype)
@@ -80,16 +72,8 @@ def number_to_reach(num: Array, cap: int, num_left: Any) -> Array:
 def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray, budget_bytes: float) -> np.ndarray:
     """Return a mask [N] of the candidates chosen in descending order of statistic per byte while they fit.
 
-    The unspent rest is less than the cheapest candidate that was not chosen.
-
-    Args:
-      statistic: [N] gain, at least 0.
-      can_grow: [N] mask of the candidates.
-      cost: [N] bytes, positive for candidates.
-      budget_bytes: bytes to spend.
-
-    Raises:
-      ValueError: if the budget is negative.
+    The unspent rest is less than the cheapest candidate that was not chosen. Statistics [N] are at least 0, costs [N]
+    are bytes, positive for candidates. ValueError: the budget is negative.
     """
     if not budget_bytes >= 0:
         raise ValueError(f"budget_bytes must be at least 0; got {budget_bytes}")
@@ -113,13 +97,10 @@ def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray,
 
 
 def event_budget(total_bytes: float, current_bytes: float, event_index: int, num_events: int) -> int:
-    """Return the bytes that event j of m may add: 1/(m - j + 1) of the unspent memory budget, rounded down.
+    """Return the bytes that event j = `event_index` of m may add: 1/(m - j + 1) of the unspent memory budget, rounded
+    down.
 
-    Args:
-      total_bytes: largest reported memory (`measure.metrics.parameter_bytes`).
-      current_bytes: reported memory now.
-      event_index: j, from 1.
-      num_events: m.
+    Both numbers of bytes are those that reports give (`measure.metrics.parameter_bytes`).
 
     Raises:
       ValueError: if the budget is already exceeded or the event does not exist.

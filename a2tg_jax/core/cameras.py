@@ -87,78 +87,52 @@ def check_camera(camera: Camera, name: str = "camera") -> None:
         if not isinstance(value, int) or value < 1:
             kind = "" if isinstance(value, int) else ", a Python int"
             raise ValueError(f"{name}.{side} must be a positive number of pixels{kind}; got {value!r}")
-    _check_rigid(camera.viewmat, f"{name}.viewmat")
-    _check_projection(camera.K, f"{name}.K")
+    # Both may drift as gradient steps make them; a pose with NaN passes.
+    if not isinstance(camera.viewmat, jax.core.Tracer):
+        viewmat = np.asarray(camera.viewmat, np.float64)
+        rotation = viewmat[:3, :3]
+        skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        wanted = f"{name}.viewmat must be a rigid motion, world to camera, OpenCV axes (x right, y down, z forward)"
+        if skew > MAX_DRIFT:
+            raise ValueError(f"{wanted}; its rotation R has entries of R·Rᵀ − I up to {skew:.2g}")
+        if np.linalg.det(rotation) < 0:
+            raise ValueError(f"{wanted}; its rotation mirrors, with a determinant of −1")
+        if np.abs(viewmat[3] - [0, 0, 0, 1]).max() > MAX_DRIFT:
+            raise ValueError(f"{wanted}; its last row must be 0, 0, 0, 1, and is {_numbers(viewmat[3])}")
+    if not isinstance(camera.K, jax.core.Tracer):
+        K = np.asarray(camera.K, np.float64)
+        focal = K[[0, 1], [0, 1]]
+        is_upper = abs(K[1, 0]) <= MAX_DRIFT * focal[1] and np.abs(K[2] - [0, 0, 1]).max() <= MAX_DRIFT
+        if not (np.isfinite(K).all() and (focal > 0).all() and is_upper):
+            wanted = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels, finite, with positive focal lengths fx and fy"
+            raise ValueError(f"{name}.K must be {wanted}; got {_numbers(K)}")
 
 
 def check_is_camera(camera: Camera, name: str = "camera") -> None:
     """Raise ValueError unless a value is a camera, whatever is in it."""
-    check_kind(name, camera, Camera, _hint(camera))
-
-
-def _hint(value: object) -> str:
-    return "use view.camera" if hasattr(value, "camera") else ""
+    check_kind(name, camera, Camera, "use view.camera" if hasattr(camera, "camera") else "")
 
 
 def checked_cameras(cameras: Any, name: str = "cameras") -> list[Camera]:
-    """Return one camera, or several, as a list.
-
-    Raises:
-      ValueError: if it is neither, or as `check_camera` does.
-    """
+    """Return one camera, or several, as a list. ValueError: it is neither, or as `check_camera` raises."""
     if isinstance(cameras, Camera):
         check_camera(cameras, name)
         return [cameras]
     try:
         several: list[Camera] = list(cameras)
     except TypeError:  # Sequences that only have __getitem__ are no Iterable, but can be listed.
-        check_kind(name, cameras, (Camera, Iterable), _hint(cameras))
+        check_kind(name, cameras, (Camera, Iterable), "use view.camera" if hasattr(cameras, "camera") else "")
         raise
     for index, camera in enumerate(several):
         check_camera(camera, f"{name}[{index}]")
     return several
 
 
-def _check_projection(K: Array, name: str) -> None:
-    """Raise ValueError unless a matrix with values has positive focal lengths and the form of intrinsics, up to drift
-    such as gradient steps leave."""
-    if isinstance(K, jax.core.Tracer):
-        return
-    values = np.asarray(K, np.float64)
-    focal = values[[0, 1], [0, 1]]
-    is_upper = abs(values[1, 0]) <= MAX_DRIFT * focal[1] and np.abs(values[2] - [0, 0, 1]).max() <= MAX_DRIFT
-    if not (np.isfinite(values).all() and (focal > 0).all() and is_upper):
-        wanted = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels, finite, with positive focal lengths fx and fy"
-        raise ValueError(f"{name} must be {wanted}; got {_numbers(values)}")
-
-
-def _check_rigid(viewmat: Array, name: str) -> None:
-    """Raise ValueError unless a matrix with values is a rigid motion, up to drift; one with NaN passes."""
-    if isinstance(viewmat, jax.core.Tracer):
-        return
-    values = np.asarray(viewmat, np.float64)
-    rotation = values[:3, :3]
-    skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    wanted = f"{name} must be a rigid motion, world to camera, OpenCV axes (x right, y down, z forward)"
-    if skew > MAX_DRIFT:
-        raise ValueError(f"{wanted}; its rotation R has entries of R·Rᵀ − I up to {skew:.2g}")
-    if np.linalg.det(rotation) < 0:
-        raise ValueError(f"{wanted}; its rotation mirrors, with a determinant of −1")
-    if np.abs(values[3] - [0, 0, 0, 1]).max() > MAX_DRIFT:
-        raise ValueError(f"{wanted}; its last row must be 0, 0, 0, 1, and is {_numbers(values[3])}")
-
-
 def check_calibration(viewmat: np.ndarray, K: np.ndarray, width: int, height: int, what: str) -> None:
     """Check the numbers of a camera that was read from a file (host).
 
-    Args:
-      viewmat: [4, 4].
-      K: [3, 3] in pixels.
-      width, height: of the image.
-      what: name of the camera in the error.
-
     Raises:
-      ValueError: if a number is NaN, infinite, or outside the limits at the top of this module.
+      ValueError: naming the camera, if a number is NaN, infinite, or outside the limits at the top of this module.
     """
     check_intrinsics(K, width, height, what)
     rotation = viewmat[:3, :3]
@@ -219,34 +193,21 @@ def _resampled(values: Array, num: int, axis: int) -> Array:
 
 
 def crop_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the same view at another image size and aspect: scaled to cover it, and cropped around its centre.
-
-    The view is that of a pinhole camera: rays of a lens are left out.
-
-    Raises:
-      ValueError: unless it is a camera, and both sides are positive ints.
-    """
+    """Return the view of a pinhole camera at another image size and aspect: scaled to cover it, and cropped around its
+    centre. Rays of a lens are left out."""
     check_is_camera(camera)
     check_int("width", width, 1)
     check_int("height", height, 1)
     camera = dataclasses.replace(camera, rays=None)
     factor = max(width / camera.width, height / camera.height)
     scaled = resize_camera(camera, round(factor * camera.width), round(factor * camera.height))
-    shift = (
-        jnp.zeros((3, 3), camera.K.dtype)
-        .at[:2, 2]
-        .set(jnp.asarray([(width - scaled.width) / 2, (height - scaled.height) / 2], camera.K.dtype))
-    )
-    return Camera(camera.viewmat, scaled.K + shift, width, height)
+    shift = jnp.asarray([(width - scaled.width) / 2, (height - scaled.height) / 2], camera.K.dtype)
+    return Camera(camera.viewmat, scaled.K.at[:2, 2].add(shift), width, height)
 
 
 def intrinsics(width: int, height: int, field_of_view: float) -> np.ndarray:
-    """Return K [3, 3] of square pixels with the principal point in the middle.
-
-    Args:
-      width, height: size of the image in pixels.
-      field_of_view: in radians, across the longer side.
-    """
+    """Return K [3, 3] of square pixels with the principal point in the middle. The field of view is in radians, across
+    the longer side."""
     focal = max(width, height) / (2 * np.tan(field_of_view / 2))
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
 

@@ -88,7 +88,12 @@ def turntable(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     elevation = np.clip(
         np.arcsin(np.clip(offsets @ up / distances, -1, 1)).mean(), -LARGEST_ELEVATION, LARGEST_ELEVATION
     )
-    side = _across(offsets[0], up)
+    # The unit direction of the first offset perpendicular to the vertical; any such one if the offset is vertical.
+    for vector in (offsets[0], *np.eye(3)):
+        across = vector - (vector @ up) * up
+        if np.linalg.norm(across) > 1e-3 * np.linalg.norm(vector):
+            break
+    side = across / np.linalg.norm(across)
     first, place = cameras[0], distances.mean()
     frames = []
     for angle in np.arange(num_frames) * (2 * np.pi / num_frames):
@@ -97,13 +102,3 @@ def turntable(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
         viewmat = looking(subject + place * outward, -outward, -up)
         frames.append(Camera(jnp.asarray(viewmat, first.viewmat.dtype), first.K, first.width, first.height))
     return frames
-
-
-def _across(offset: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return the unit direction of an offset perpendicular to the vertical; any such one if the offset is vertical."""
-    for vector in (offset, *np.eye(3)):
-        across = vector - (vector @ up) * up
-        length = np.linalg.norm(across)
-        if length > 1e-3 * np.linalg.norm(vector):
-            break
-    return np.asarray(across / length)

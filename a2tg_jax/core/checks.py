@@ -42,8 +42,11 @@ def check_kind(name: str, value: Any, kind: type | tuple[type, ...], hint: str =
         return
     if not hint and isinstance(value, type) and issubclass(value, kind):
         hint = f"say {value.__name__}(…)"
-    kinds = kind if isinstance(kind, tuple) else (kind,)
-    raise ValueError(f"{name} must be {' or '.join(map(_noun, kinds))}; got {kind_of(value)}{hint and f': {hint}'}")
+    nouns = []
+    for own in (each.__name__ for each in (kind if isinstance(kind, tuple) else (kind,))):
+        article = "" if own.endswith("s") else "an " if own[0] in "AEIOUaeiou" else "a "  # Gaussians have none.
+        nouns.append(f"{article}{own}")
+    raise ValueError(f"{name} must be {' or '.join(nouns)}; got {kind_of(value)}{hint and f': {hint}'}")
 
 
 def check_literal(name: str, value: object, literal: object) -> None:
@@ -80,7 +83,10 @@ def check_number(
         raise ValueError(f"{name} must be {f'a number {wanted}'.rstrip()}; got {found}")
     if isinstance(value, jax.core.Tracer):
         return
-    if not _is_within(float(value), least, above, most, below):
+    number = float(value)
+    is_low_enough = (most is None or number <= most) and (below is None or number < below)
+    is_high_enough = (least is None or number >= least) and (above is None or number > above)
+    if not (is_low_enough and is_high_enough and number == number):
         raise ValueError(f"{name} must be {wanted or 'a number'}; got {value!r}")
 
 
@@ -97,14 +103,6 @@ def _is_numeric(value: object) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
-def _is_within(
-    number: float, least: float | None, above: float | None, most: float | None, below: float | None
-) -> bool:
-    is_low_enough = (most is None or number <= most) and (below is None or number < below)
-    is_high_enough = (least is None or number >= least) and (above is None or number > above)
-    return is_low_enough and is_high_enough and number == number
-
-
 def check_array(name: str, x: object, hint: str = "") -> None:
     """Raise ValueError, with an optional hint, unless a value is an array or a tracer."""
     if not (hasattr(x, "shape") and hasattr(x, "dtype")):
@@ -115,10 +113,8 @@ def check_array(name: str, x: object, hint: str = "") -> None:
 def plain_array(name: str, value: Any, dtype: DTypeLike | None = None) -> Any:
     """Return nested lists of numbers, and NumPy's special arrays, as arrays that JAX takes; other values unchanged.
 
-    Args:
-      name: name of the argument in the error.
-      value: a list, a masked array without masked entries, an array in foreign byte order, or anything else.
-      dtype: dtype of an array that is made of a list; None: JAX's default float.
+    Special arrays are masked ones without masked entries, and those in foreign byte order. The dtype is that of an
+    array that is made of a list; None: JAX's default float.
 
     Raises:
       ValueError: if an entry is masked, or the rows of a list differ in length.
@@ -126,7 +122,11 @@ def plain_array(name: str, value: Any, dtype: DTypeLike | None = None) -> Any:
     check_unmasked(name, value)
     if isinstance(value, np.ma.MaskedArray):
         value = np.ma.getdata(value)
-    if type(value) in (list, tuple) and _holds_numbers(value):
+    first = value
+    while isinstance(first, list | tuple) and first:
+        first = first[0]
+    # JAX puts no nested sequences of numbers into a pytree, but other things in the place of an array.
+    if type(value) in (list, tuple) and isinstance(first, numbers.Number) and not isinstance(first, bool):
         try:
             value = np.asarray(value, jnp.result_type(float) if dtype is None else dtype)
         except ValueError:
@@ -156,19 +156,6 @@ def make_plain(instance: object, name: str, *fields: str, dtype: DTypeLike | Non
             object.__setattr__(instance, field, changed)
 
 
-def _holds_numbers(values: object) -> bool:
-    """Return whether the first entry of nested sequences is a number; JAX puts no such sequence into a pytree."""
-    while isinstance(values, list | tuple) and values:
-        values = values[0]
-    return isinstance(values, numbers.Number) and not isinstance(values, bool)
-
-
-def _noun(kind: type) -> str:
-    """Return the name of a class with its article; a plural, such as Gaussians, has none."""
-    article = "" if kind.__name__.endswith("s") else "an " if kind.__name__[0] in "AEIOUaeiou" else "a "
-    return f"{article}{kind.__name__}"
-
-
 def kind_of(value: object) -> str:
     """Return the class of a value in errors; a class itself by its name."""
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
@@ -177,10 +164,7 @@ def kind_of(value: object) -> str:
 def check_shape(name: str, x: Any, wanted: Wanted) -> None:
     """Raise ValueError unless x has the wanted shape; a letter that occurs twice stands for one size.
 
-    Args:
-      name: name of the argument in the error.
-      x: an array, a tracer, or nested sequences of numbers.
-      wanted: sizes of its axes.
+    x is an array, a tracer, or nested sequences of numbers.
     """
     shape = np.shape(x)
     if len(shape) != len(wanted) or not _fits(shape, wanted):

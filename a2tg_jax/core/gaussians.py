@@ -4,7 +4,6 @@ N is the number of Gaussians; quaternions are wxyz and need not be unit.
 """
 
 import dataclasses
-import functools
 import math
 import os
 from typing import Any
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax._src import xla_bridge
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike, DTypeLike
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.checks import (
@@ -32,31 +31,28 @@ from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import NUM_BASES
 
-_is_child = _has_devices = False
+_forked_from: set[int] = set()
+"""Identifiers of processes that were forked after JAX had started their devices."""
+
+
+def _note_devices() -> None:
+    # The function is not public; without it, nothing is checked.
+    if getattr(xla_bridge, "backends_are_initialized", bool)():
+        _forked_from.add(os.getpid())
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_note_devices)
 
 
 def check_process() -> None:
     """Raise RuntimeError, rather than hang, if this process was forked after JAX had started its devices."""
-    if _is_child:
+    if _forked_from - {os.getpid()}:
         raise RuntimeError(
             "this process was forked from one in which JAX had started, and waits for its threads forever: start "
             'processes by spawn, as in multiprocessing.get_context("spawn").Pool(), with functions of a module, not of '
             "a notebook"
         )
-
-
-def _look() -> None:
-    global _has_devices
-    _has_devices = getattr(xla_bridge, "backends_are_initialized", bool)()  # not public; without it, nothing is checked
-
-
-def _mark() -> None:
-    global _is_child
-    _is_child = _is_child or _has_devices
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_look, after_in_child=_mark)
 
 
 INITIAL_OPACITY = 0.1
@@ -177,15 +173,6 @@ def logit(p: Array) -> Array:
     return jnp.log(p) - jnp.log1p(-p)
 
 
-def check_unit_colors(name: str, colors: ArrayLike) -> None:
-    """Raise ValueError if colours are an array of integers, such as bytes, or outside [0, 1]; NaN passes."""
-    values = np.asarray(colors)
-    if hasattr(colors, "dtype") and not np.issubdtype(values.dtype, np.floating):
-        raise ValueError(f"{name} must be floats in [0, 1]; got {values.dtype}: divide bytes by 255")
-    if (outside := values[(values < -COLOR_SLACK) | (values > 1 + COLOR_SLACK)]).size:
-        raise ValueError(f"{name} must lie in [0, 1]; got {outside.flat[0]:g}: divide bytes by 255")
-
-
 def init_from_points(
     points: ArrayLike,
     colors: ArrayLike,
@@ -219,7 +206,11 @@ def init_from_points(
     check_int("sh_degree", sh_degree, 0, len(NUM_BASES) - 1)
     check_number("opacity", opacity, above=0, below=1)
     points, colors = plain_array("points", points), plain_array("colors", colors)
-    check_unit_colors("colors", colors)
+    found = np.asarray(colors)
+    if hasattr(colors, "dtype") and not np.issubdtype(found.dtype, np.floating):
+        raise ValueError(f"colors must be floats in [0, 1]; got {found.dtype}: divide bytes by 255")
+    if (outside := found[(found < -COLOR_SLACK) | (found > 1 + COLOR_SLACK)]).size:  # NaN is refused below.
+        raise ValueError(f"colors must lie in [0, 1]; got {outside.flat[0]:g}: divide bytes by 255")
     points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
         raise ValueError(f"points and colors must both be [P, 3]; got {points.shape} and {colors.shape}")
@@ -236,14 +227,14 @@ def init_from_points(
     scales = np.sqrt(np.maximum(np.mean(distances**2, axis=1), 1e-7))
     count = len(points)
     quats = rng.normal(size=(count, 4))
-    as_float = functools.partial(jnp.asarray, dtype=jnp.float32)
-    return Gaussians(
-        means=as_float(points),
-        quats=as_float(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
-        log_scales=as_float(np.repeat(np.log(scales)[:, None], 2, axis=1)),
-        logit_opacities=as_float(np.full(count, np.log(opacity / (1 - opacity)))),
-        sh=as_float(sh_of_colors(colors, sh_degree)),
+    arrays = (
+        points,
+        quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        np.repeat(np.log(scales)[:, None], 2, axis=1),
+        np.full(count, np.log(opacity / (1 - opacity))),
+        sh_of_colors(colors, sh_degree),
     )
+    return Gaussians(*(jnp.asarray(array, jnp.float32) for array in arrays))
 
 
 def sh_of_colors(colors: np.ndarray, sh_degree: int) -> np.ndarray:
@@ -253,7 +244,7 @@ def sh_of_colors(colors: np.ndarray, sh_degree: int) -> np.ndarray:
     return sh
 
 
-def no_rows(num: int, num_coefficients: int, dtype: Any = jnp.float32) -> Gaussians:
+def no_rows(num: int, num_coefficients: int, dtype: DTypeLike = jnp.float32) -> Gaussians:
     """Return rows that do not exist yet."""
     return Gaussians(
         means=jnp.zeros((num, 3), dtype),
@@ -275,18 +266,10 @@ QUADRATURE_STEPS = 32
 
 
 def share(logit_opacities: Array, log_scales: Array, num_shares: Array) -> tuple[Array, Array]:
-    """Return opacity and size of `num_shares` coincident copies that replace one Gaussian (3DGS-MCMC, relocation).
+    """Return opacity [N] and size [N, 2] of `num_shares` coincident copies that replace one Gaussian.
 
-    o' = 1 - (1 - o)^(1/N), clamped to [0.005, 1 - 2⁻²³], keeps the opacity at the centre; the scales, multiplied by
-    o / S(o', N), keep the integral of the opacity along a line through it.
-
-    Args:
-      logit_opacities: [N] logits of the originals.
-      log_scales: [N, 2] log-scales of the originals.
-      num_shares: [N] integers of at least 1; 1 leaves a row unchanged.
-
-    Returns:
-      logit_opacities [N] and log_scales [N, 2] of each copy.
+    o' = 1 - (1 - o)^(1/n), clamped to [0.005, 1 - 2⁻²³], keeps the opacity at the centre; the scales, multiplied by o /
+    S(o', n), keep the integral of the opacity along a line through it. Rows with n = 1 stay unchanged.
     """
     dtype = logit_opacities.dtype
     opacities = shared_opacities(logit_opacities, num_shares.astype(dtype))
@@ -299,29 +282,19 @@ def share(logit_opacities: Array, log_scales: Array, num_shares: Array) -> tuple
 
 
 def shared_opacities(logit_opacities: Array, num_shares: Array) -> Array:
-    """Return 1 - (1 - o)^(1/n) [N], clamped to [0.005, 1 - 2⁻²³]: the opacity of n layers as opaque as one of o.
-
-    Args:
-      logit_opacities: [N] logits of the originals.
-      num_shares: [N] floats n of at least 1.
-    """
+    """Return 1 - (1 - o)^(1/n) [N], clamped to [0.005, 1 - 2⁻²³]: the opacity of n layers as opaque as one of o. The
+    numbers n are floats of at least 1."""
     # log(1 - o) straight from the logit: 1 - o itself has no digits left when o is close to 1.
     log_transparency = jax.nn.log_sigmoid(-logit_opacities)
     return jnp.clip(-jnp.expm1(log_transparency / num_shares), DEAD_OPACITY, LARGEST_OPACITY)
 
 
 def stacked_integral(opacities: Array, num_shares: Array) -> Array:
-    """Return S = π^(-1/2)·∫ [1 - (1 - o·e^(-x²))^N] dx: the opacity of N coincident Gaussians, integrated along a line.
+    """Return S = π^(-1/2)·∫ [1 - (1 - o·e^(-x²))^n] dx: the opacity of n coincident Gaussians, integrated along a line.
 
-    Equal to the binomial double sum of 3DGS-MCMC, without its cancellation. The integrand is even and entire, so the
-    trapezoidal rule converges exponentially: 32 steps on [0, 5] are off by less than 1e-10 for N up to 51.
-
-    Args:
-      opacities: [N] in (0, 1).
-      num_shares: [N] integers, 1 to 51.
-
-    Returns:
-      Positive integrals [N]; `opacities` itself if `num_shares` is 1.
+    Equal to the binomial double sum of 3DGS-MCMC, without its cancellation; o itself if n is 1. The integrand is even
+    and entire, so the trapezoidal rule converges exponentially: 32 steps on [0, 5] are off by less than 1e-10 for n up
+    to 51.
     """
     count = num_shares.astype(opacities.dtype)
     spacing = QUADRATURE_END / QUADRATURE_STEPS

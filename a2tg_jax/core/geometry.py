@@ -22,13 +22,7 @@ NEAR_PLANE = 0.2
 
 
 def pixel_sizes(means: Any, scales: Any, viewmat: Any, K: Any) -> Any:
-    """Return the smaller standard deviation of Gaussians in pixels [N]; 0 before the near plane.
-
-    Args:
-      means: [N, 3], NumPy or JAX.
-      scales: [N, 2] standard deviations.
-      viewmat, K: [4, 4] and [3, 3] of a camera.
-    """
+    """Return the smaller standard deviation of Gaussians in pixels [N], of NumPy or JAX; 0 before the near plane."""
     depths = means @ viewmat[2, :3] + viewmat[2, 3]
     focal = (K[0, 0] * K[1, 1]) ** 0.5
     return (depths > NEAR_PLANE).astype(depths.dtype) * scales.min(axis=1) * focal / depths.clip(NEAR_PLANE)
@@ -96,10 +90,8 @@ class ScreenBounds(NamedTuple):
 def screen_bounds(M: Array, cutoff: Array, near_plane: float) -> ScreenBounds:
     """Return the bounds on the screen of the discs u² + v² <= cutoff, joined with the low-pass filter's reach.
 
-    Args:
-      M: [N, 3, 3] homographies.
-      cutoff: [N] r² = 2·ln(255·o·max T_A); a splat with r² <= 0 is invisible.
-      near_plane: least depth of a hit.
+    The cutoff [N] is r² = 2·ln(255·o·max T_A); a splat with r² <= 0 is invisible. Hits have depths from `near_plane`
+    on.
     """
     rows = tuple(tuple(M[:, i, k] for k in range(3)) for i in range(3))
     bounds = unclipped_bounds(rows, cutoff, near_plane)

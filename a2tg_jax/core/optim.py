@@ -36,14 +36,8 @@ class AdamState:
 
 
 def adam_init(params: Any) -> AdamState:
-    """Return the state before the first update: zero moments.
-
-    Args:
-      params: any pytree of float arrays.
-
-    Raises:
-      ValueError: if a leaf holds no floats, naming it.
-    """
+    """Return the state before the first update of a pytree of float arrays: zero moments. ValueError: a leaf holds no
+    floats, naming it."""
     _check_floats(params)
     zeros = jax.tree.map(jnp.zeros_like, params)
     return AdamState(mu=zeros, nu=jax.tree.map(jnp.zeros_like, params), count=jnp.zeros((), jnp.int32))
@@ -77,7 +71,12 @@ def adam_update(
     check_number("eps", eps, least=0)
     _check_floats(params)
     for name, tree in (("grads", grads), ("state.mu", state.mu), ("state.nu", state.nu)):
-        _check_like(name, tree, params)
+        found, wanted = str(jax.tree.structure(tree)), str(jax.tree.structure(params))
+        if found != wanted:
+            raise ValueError(f"{name} must have the structure of params, {wanted}; got {found}")
+        leaves = jax.tree_util.tree_leaves_with_path(tree)
+        for (path, leaf), param in zip(leaves, jax.tree.leaves(params), strict=True):
+            check_shape(f"{name}{jax.tree_util.keystr(path)}", leaf, jnp.shape(param))
     count = state.count + 1
     mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
     nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
@@ -139,16 +138,6 @@ def _check_floats(params: object) -> None:
         name = f"params{jax.tree_util.keystr(path)}"
         check_array(name, leaf)
         check_floats(name, leaf, leaf.shape)
-
-
-def _check_like(name: str, tree: object, params: object) -> None:
-    """Raise ValueError, naming the leaf, unless the pytree has the structure and the shapes of the parameters."""
-    found, wanted = str(jax.tree.structure(tree)), str(jax.tree.structure(params))
-    if found != wanted:
-        raise ValueError(f"{name} must have the structure of params, {wanted}; got {found}")
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    for (path, leaf), param in zip(leaves, jax.tree.leaves(params), strict=True):
-        check_shape(f"{name}{jax.tree_util.keystr(path)}", leaf, jnp.shape(param))
 
 
 def _bias_correction(decay: float, count: Array, dtype: DTypeLike) -> Array:

@@ -4,10 +4,9 @@ With an origin, a model can be rendered, flown past and moved without the photog
 """
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -76,20 +75,11 @@ class Origin:
             corrections={},
         )
 
-    # Arrays have no hash of their own, and jit asks for one of everything that is static.
-
-    @functools.cached_property
-    def _content(self) -> tuple[Any, ...]:
-        arrays = (self.viewmats, self.Ks, self.sizes, self.is_test, self.transform.rotation, self.transform.translation)
-        texts = tuple(np.ascontiguousarray(array).tobytes() for array in arrays)
-        learned = tuple((name, rows.shape, rows.tobytes()) for name, rows in sorted(self.corrections.items()))
-        return texts, self.names, float(self.transform.scale), learned
-
     def __eq__(self, other: object) -> bool:
-        return self is other or (isinstance(other, Origin) and self._content == other._content)
-
-    def __hash__(self) -> int:
-        return hash(self._content)
+        if not isinstance(other, Origin):
+            return NotImplemented
+        (own, structure), (others, other_structure) = (jax.tree.flatten(dataclasses.asdict(x)) for x in (self, other))
+        return structure == other_structure and all(map(np.array_equal, own, others))  # type: ignore[operator]
 
     def __repr__(self) -> str:
         return f"Origin({len(self.names)} cameras, {int(np.sum(self.is_test))} of them for testing)"

@@ -9,7 +9,15 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from a2tg_jax.core.cameras import Camera, check_camera, intrinsics, looking, resize_camera, viewmat_of_axes
+from a2tg_jax.core.cameras import (
+    Camera,
+    check_camera,
+    checked_cameras,
+    intrinsics,
+    looking,
+    resize_camera,
+    viewmat_of_axes,
+)
 from a2tg_jax.core.checks import check_int
 from a2tg_jax.core.similarity import camera_centers
 
@@ -71,7 +79,7 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
       ValueError: if there are fewer than two cameras or no frames.
     """
     check_int("num_frames", num_frames, 1)
-    _check_cameras("cameras", cameras)
+    cameras = checked_cameras(cameras)
     if len(cameras) < 2:
         raise ValueError(f"a path needs two cameras; got {len(cameras)}")
     viewmats = np.stack([np.asarray(camera.viewmat, np.float64) for camera in cameras])
@@ -100,7 +108,7 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
       ValueError: if there are no views or no frames.
     """
     check_int("num_frames", num_frames, 1)
-    _check_cameras("views", views)
+    views = checked_cameras(views, "views")
     if not views:
         raise ValueError("a path needs a view; got none")
     first = views[0]
@@ -124,15 +132,6 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
         Camera(jnp.asarray(viewmat_of_axes(R, c), dtype), jnp.asarray(K, dtype), *size)
         for R, c, K in zip(turned, places, lenses, strict=True)
     ]
-
-
-def _check_cameras(name: str, cameras: Sequence[Camera]) -> None:
-    """Raise ValueError unless all items of a sequence are cameras."""
-    if not isinstance(cameras, Sequence):
-        found = type(cameras).__name__
-        raise ValueError(f"{name} must be a list of cameras, such as model.origin.cameras; got {found}")
-    for index, camera in enumerate(cameras):
-        check_camera(camera, f"{name}[{index}]")
 
 
 def _short_tour(centers: np.ndarray, forwards: np.ndarray) -> list[int]:

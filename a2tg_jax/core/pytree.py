@@ -34,14 +34,11 @@ def pytree(*, kw_only: bool = False, repr: bool = True) -> Callable[[type[T]], t
 
 
 def pytree(cls: Any = None, /, **options: Any) -> Any:
-    """Decorate a class: make it a frozen dataclass and a pytree of its fields, but for static ones.
+    """Decorate a class: make it a frozen dataclass, with options of `dataclasses.dataclass`, and a pytree of its
+    fields, but for static ones. Its bases may be decorated, too.
 
     Transformations of JAX build instances without calling `__init__` and `__post_init__`, so that these may check and
     convert what a caller gives.
-
-    Args:
-      cls: the class; its bases may be decorated, too.
-      **options: options of `dataclasses.dataclass`, as in `@pytree(kw_only=True)`.
     """
     if cls is None:
         return lambda own: pytree(own, **options)

@@ -40,22 +40,14 @@ def sh_basis(directions: Array) -> Array:
     )
 
 
-def degree_mask(degree: ArrayLike) -> Array:
-    """Return a mask [16] of the bases up to `degree`, which may be traced."""
-    degrees = jnp.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3], jnp.int32)
-    return degrees <= jnp.asarray(degree, jnp.int32)
-
-
 def sh_sum(sh: Array, means: Array, center: Array, degree: ArrayLike) -> Array:
     """Return the view-dependent sums [N, 3], Σ Y_l·sh_l; colours are max(sum + 0.5, 0).
 
-    Args:
-      sh: [N, K, 3] coefficients, K being 1, 4, 9 or 16.
-      means: [N, 3] positions in the world.
-      center: [3] camera centre in the world.
-      degree: highest degree used, 0 to 3, an int or a traced integer.
+    Coefficients are [N, K, 3], K being 1, 4, 9 or 16, the camera's centre [3]. The highest degree used may be traced.
     """
     directions = normalize(means - center[None, :])
-    basis = jnp.where(degree_mask(degree)[None, :], sh_basis(directions), 0.0)[:, : sh.shape[1]]
+    degrees = jnp.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3], jnp.int32)
+    is_used = degrees <= jnp.asarray(degree, jnp.int32)
+    basis = jnp.where(is_used[None, :], sh_basis(directions), 0.0)[:, : sh.shape[1]]
     # A sum, which CPUs do several times faster than many small matrix products.
     return jnp.sum(basis[:, :, None] * sh, axis=1)

@@ -83,14 +83,8 @@ SH_DEGREES = (slice(0, 1), slice(1, 4), slice(4, 9), slice(9, 16))
 def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
     """Return the same Gaussians in the world that `similarity` leads to (host).
 
-    A camera carried along sees the same image: means and scales follow the similarity, quaternions and SH its rotation.
-
-    Args:
-      gaussians: N Gaussians.
-      similarity: map from their world to the new one.
-
-    Returns:
-      N Gaussians of the same dtype; the quaternions are unit.
+    A camera carried along sees the same image: means and scales follow the similarity, quaternions, unit in the result,
+    and SH its rotation.
 
     Raises:
       ValueError: if a field of the Gaussians has another shape than it must have, or the similarity is none.
@@ -116,26 +110,18 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
 def sh_rotation(rotation: np.ndarray) -> np.ndarray:
     """Return the matrix D [16, 16] with Σ_k Y_k(R d)·(D c)_k = Σ_k Y_k(d)·c_k for every direction d and coefficients c.
 
-    Args:
-      rotation: R, [3, 3].
-
-    Returns:
-      float64, block diagonal with one orthogonal block per degree.
+    It is float64, block diagonal with one orthogonal block per degree.
     """
-    directions = _fixed_directions()
+    # A Fibonacci lattice: directions spread evenly over the sphere.
+    index = np.arange(NUM_DIRECTIONS) + 0.5
+    z, angle = 1 - 2 * index / NUM_DIRECTIONS, np.pi * (1 + 5**0.5) * index
+    radius = np.sqrt(1 - z * z)
+    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
     before, after = _basis(directions), _basis(directions @ rotation.T)
     matrix = np.zeros((16, 16))
     for degree in SH_DEGREES:
         matrix[degree, degree] = np.linalg.lstsq(after[:, degree], before[:, degree], rcond=None)[0]
     return matrix
-
-
-def _fixed_directions() -> np.ndarray:
-    """Return unit vectors [NUM_DIRECTIONS, 3] spread evenly over the sphere (a Fibonacci lattice)."""
-    index = np.arange(NUM_DIRECTIONS) + 0.5
-    z, angle = 1 - 2 * index / NUM_DIRECTIONS, np.pi * (1 + 5**0.5) * index
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
 
 
 def _basis(directions: np.ndarray) -> np.ndarray:

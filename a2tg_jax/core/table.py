@@ -7,6 +7,7 @@ only a change of these, on the host, compiles a step again.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -76,13 +77,8 @@ class Table:
 
     @classmethod
     def allocate(cls, sizes: ArrayLike, values: Sequence[float], dtype: DTypeLike = jnp.float32) -> Self:
-        """Return blocks that hold the C `values` everywhere (host).
-
-        Args:
-          sizes: [N, D] integers, the D sides of each block, all 0 for an empty one, which takes no bytes.
-          values: C numbers.
-          dtype: dtype of the blocks.
-        """
+        """Return blocks of the given sizes [N, D] that hold the C `values` everywhere (host); one of sides 0 takes no
+        bytes."""
         places, capacities = plan_places(np.asarray(sizes))
         value = jnp.asarray(values, dtype)
         shapes = zip(capacities, places.bucket_sizes, strict=True)
@@ -154,28 +150,15 @@ class Table:
 
     @classmethod
     def of_flat(cls, sizes: np.ndarray, elements: np.ndarray) -> Self:
-        """Return the table of sizes [N, D] and of what `flat` returned (host).
-
-        Raises:
-          ValueError: if they disagree.
-        """
-        areas = sizes.prod(axis=1)
-        if elements.shape != (int(areas.sum()), len(cls.padding)):
-            wanted = [int(areas.sum()), len(cls.padding)]
-            raise ValueError(f"sizes {[*sizes.shape]} need elements {wanted}; got {[*elements.shape]}")
-        pieces = np.split(elements, np.cumsum(areas)[:-1]) if len(sizes) else []
-        channels = elements.shape[1]
-        blocks = [piece.reshape(*size, channels) for piece, size in zip(pieces, sizes, strict=True)]
-        return cls.of_blocks(blocks)
+        """Return the table of sizes [N, D] and of what `flat` returned, which fits them (host)."""
+        pieces = np.split(elements, np.cumsum(sizes.prod(axis=1))[:-1]) if len(sizes) else []
+        return cls.of_blocks([piece.reshape(*size, piece.shape[1]) for piece, size in zip(pieces, sizes, strict=True)])
 
     # Rows
 
-    def gather(self, rows: Any) -> Self:
-        """Return blocks, or moments of them, whose Gaussian i is the former rows[i] of N; traceable.
-
-        Raises:
-          ValueError: if there are blocks of several sizes.
-        """
+    def gather(self, rows: Array | np.ndarray) -> Self:
+        """Return blocks, or moments of them, whose Gaussian i is the former rows[i] of N; traceable. ValueError: there
+        are blocks of several sizes."""
         if len(self.buckets) != 1:
             name, num = type(self).__name__.lower(), len(self.buckets)
             raise ValueError(f"{name} of {num} sizes cannot change rows: densify and prune before they grow")
@@ -194,22 +177,13 @@ class Table:
         return dataclasses.replace(self, buckets=tuple(cleared))
 
     def take(self, rows: np.ndarray, padding: Sequence[float] | None = None) -> Self:
-        """Return the blocks of the Gaussians `rows`, which may repeat, in buckets as small as they need (host).
-
-        Args:
-          rows: [M] indices.
-          padding: C numbers of padding, such as zeros for moments; None: those of the class.
-        """
+        """Return the blocks of the Gaussians `rows` [M], which may repeat, in buckets as small as they need (host).
+        Padding is that of the class, or C given numbers, such as zeros for moments."""
         places, capacities = plan_places(self.sizes[rows])
-        old_row = on_host(self.row)[rows]
-        new_bucket, new_row = np.asarray(places.bucket), np.asarray(places.row)
-        filled = []
-        for index, (capacity, size) in enumerate(zip(capacities, places.bucket_sizes, strict=True)):
-            target, is_own = self._padded(capacity, size, self.buckets[0].dtype, padding), new_bucket == index
-            if is_own.any():
-                target[new_row[is_own]] = on_host(self.buckets[self.bucket_sizes.index(size)])[old_row[is_own]]
-            filled.append(target)
-        return self.placed(filled, places)
+        old = on_host(self.bucket)[rows], on_host(self.row)[rows]
+        moves = _moves_between(old, (np.asarray(places.bucket), np.asarray(places.row)))
+        padding = self.padding if padding is None else padding
+        return self.placed(_moved(type(self), self.buckets, moves, places.bucket_sizes, capacities, padding), places)
 
     @classmethod
     def joined(cls, tables: Sequence[Self]) -> Self:
@@ -229,7 +203,7 @@ class Table:
         return short_repr(self)
 
 
-def is_table(leaf: Any) -> bool:
+def is_table(leaf: object) -> bool:
     """Return whether a node of a pytree is a table, for `is_leaf` of `jax.tree`."""
     return isinstance(leaf, Table)
 
@@ -262,14 +236,11 @@ def bucket_capacity(count: int) -> int:
 def plan_places(
     sizes: np.ndarray, known: Sequence[Shape] = (), like: Array | None = None, room: Shape | None = None
 ) -> tuple[Places, tuple[int, ...]]:
-    """Return the places of blocks of the given sizes, and the capacity of each bucket (host).
+    """Return the places of blocks of the given sizes [N, D], from 0 to 63, and the capacity of each bucket (host).
 
-    Args:
-      sizes: [N, D] integers from 0 to 63.
-      known: shapes with compiled programs. One is taken if the blocks fit and it has at most `KNOWN_SLACK` times the
-        elements.
-      like: array over whose devices the places are spread; None: they lie on one.
-      room: shape that is taken if the blocks fit, however large it is.
+    A shape with room for the blocks is taken: `room`, however large it is, or a known one, with a compiled program, of
+    at most `KNOWN_SLACK` times the elements. The places are spread over the devices of an array `like`; None: they are
+    on one.
     """
     for shape in known:
         check_kind("known", shape, Shape)
@@ -286,25 +257,22 @@ def plan_places(
         tuple(int(code // weight % 64) for weight in weights): int(n) for code, n in zip(codes, counts, strict=True)
     }
     # Without Gaussians, one bucket of no blocks keeps the number of sides and the dtype.
-    shape = _choose_shape(needed, known, room) if needed else Shape(((0,) * sizes.shape[1],), (0,))
-    place = np.asarray([shape.sizes.index(size) for size in needed], np.int32)
-    buckets = (place[bucket] if len(place) else bucket).astype(np.int32)
-    return Places(placed_like(buckets, like), placed_like(row, like), shape.sizes), shape.capacities
-
-
-def _choose_shape(needed: dict[Size, int], known: Sequence[Shape], wanted: Shape | None) -> Shape:
-    """Return the wanted shape if it has room for the needed blocks of each size, else the smallest known one that has,
-    or a new one."""
     new = Shape(tuple(needed), tuple(map(bucket_capacity, needed.values())))
 
     def has_room(shape: Shape) -> bool:
-        room = dict(zip(*shape, strict=True))
-        return all(room.get(size, 0) >= count for size, count in needed.items())
+        own = dict(zip(*shape, strict=True))
+        return all(own.get(size, 0) >= count for size, count in needed.items())
 
-    if wanted is not None and has_room(wanted):
-        return wanted
-    fitting = [shape for shape in known if has_room(shape) and shape.num_elements <= KNOWN_SLACK * new.num_elements]
-    return min(fitting, key=lambda shape: shape.num_elements, default=new)
+    if not needed:
+        shape = Shape(((0,) * sizes.shape[1],), (0,))
+    elif room is not None and has_room(room):
+        shape = room
+    else:
+        fitting = [own for own in known if has_room(own) and own.num_elements <= KNOWN_SLACK * new.num_elements]
+        shape = min(fitting, key=lambda own: own.num_elements, default=new)
+    place = np.asarray([shape.sizes.index(size) for size in needed], np.int32)
+    buckets = (place[bucket] if len(place) else bucket).astype(np.int32)
+    return Places(placed_like(buckets, like), placed_like(row, like), shape.sizes), shape.capacities
 
 
 class Resized(NamedTuple):
@@ -335,23 +303,15 @@ def resize(
       kept: [N] bool, whose moments are kept, the others' being 0; None: all.
     """
     places, capacities = plan_places(sizes, known, like=table.bucket, room=room)
-    moves = kept_moves = _plan_moves(table, places)
+    ends = (on_host(table.bucket), on_host(table.row)), (on_host(places.bucket), on_host(places.row))
+    moves = kept_moves = _moves_between(*ends)
     if kept is not None:
         check_mask("kept", kept, (table.num,))
-        kept_moves = _plan_moves(table, places, kept)
-    shapes = list(zip(capacities, places.bucket_sizes, strict=True))
+        kept_moves = _moves_between(*((bucket[kept], row[kept]) for bucket, row in ends))
     own = type(table)
 
     def rebuilt(old: Table, moves: list[_Move], padding: Sequence[float]) -> Table:
-        dtype = old.buckets[0].dtype if old.buckets else np.float32
-        targets = [own._padded(capacity, size, dtype, padding) for capacity, size in shapes]
-        # Each old bucket is read once, one after the other.
-        for index, bucket in enumerate(old.buckets):
-            mine = [move for move in moves if move.old_bucket == index]
-            source = on_host(bucket) if mine and bucket.size else np.zeros(0)
-            for move in mine if source.size else ():
-                blocks = own.resized(source[move.old_rows], places.bucket_sizes[move.new_bucket])
-                targets[move.new_bucket][move.new_rows] = blocks
+        targets = _moved(own, old.buckets, moves, places.bucket_sizes, capacities, padding)
         whole = own.placed([placed_like(target, table.bucket) for target in targets], places)
         return partition(whole)[0] if old.bucket is None else whole  # Moments are floats only.
 
@@ -368,28 +328,37 @@ def resize(
     return Resized(rebuilt(table, moves, own.padding), moments)
 
 
-class _Move(NamedTuple):
-    """Blocks that go from one bucket to another."""
-
-    old_bucket: int
-    new_bucket: int
-    old_rows: np.ndarray
-    new_rows: np.ndarray
+_Move = tuple[int, int, np.ndarray, np.ndarray]
+"""Old bucket and new bucket, old rows and new rows of the blocks that go from one to the other."""
 
 
-def _plan_moves(old: Table, new: Places, is_moved: np.ndarray | None = None) -> list[_Move]:
-    """Return one move for each pair of buckets that some Gaussian, among the marked ones [N] if given, connects."""
-    chosen = slice(None) if is_moved is None else is_moved
-    num_new = len(new.bucket_sizes)
-    pairs = on_host(old.bucket)[chosen].astype(np.int64) * num_new + on_host(new.bucket)[chosen]
+def _moves_between(old: tuple[np.ndarray, np.ndarray], new: tuple[np.ndarray, np.ndarray]) -> list[_Move]:
+    """Return the moves between (bucket, row) of blocks before and after, one for each pair of buckets; old ones
+    ascend."""
+    (old_bucket, old_row), (new_bucket, new_row) = old, new
+    base = int(new_bucket.max(initial=0)) + 1
+    pairs = old_bucket.astype(np.int64) * base + new_bucket
     order = np.argsort(pairs, kind="stable")
     codes, starts = np.unique(pairs[order], return_index=True)
-    old_rows, new_rows = on_host(old.row)[chosen][order], on_host(new.row)[chosen][order]
-    stops = [*starts[1:], len(order)][: len(starts)]
-    return [
-        _Move(int(code) // num_new, int(code) % num_new, old_rows[start:stop], new_rows[start:stop])
-        for code, start, stop in zip(codes, starts, stops, strict=True)
-    ]
+    groups = np.split(order, starts[1:]) if len(codes) else []
+    found = zip(codes.tolist(), groups, strict=True)
+    return [(code // base, code % base, old_row[group], new_row[group]) for code, group in found]
+
+
+def _moved(
+    kind: type[Table], buckets: Sequence[Any], moves: list[_Move], sizes: Sequence[Size], capacities: Sequence[int],
+    padding: Sequence[float],
+) -> list[np.ndarray]:  # fmt: skip
+    """Return new buckets of given sizes and capacities, with the blocks that moves bring from the old ones."""
+    dtype = buckets[0].dtype if buckets else np.float32
+    targets = [kind._padded(capacity, size, dtype, padding) for capacity, size in zip(capacities, sizes, strict=True)]
+    # Each old bucket is read once, one after the other.
+    for old_bucket, own in itertools.groupby(moves, key=lambda move: move[0]):
+        if buckets[old_bucket].size:
+            source = on_host(buckets[old_bucket])
+            for _, new_bucket, old_rows, new_rows in own:
+                targets[new_bucket][new_rows] = kind.resized(source[old_rows], sizes[new_bucket])
+    return targets
 
 
 # Checks
@@ -417,23 +386,18 @@ def check_table(table: Table, num: int | None = None, name: str = "textures") ->
             raise ValueError(f"{name}.{field} must be integers; got {getattr(table, field).dtype}")
     if table.num and not any(len(bucket) for bucket in table.buckets):
         raise ValueError(f"{name} must have a row for each of {table.num} Gaussians; all buckets are empty")
-    if table.num and not any(isinstance(leaf, jax.core.Tracer) for leaf in (table.bucket, table.row)):
-        _check_ranges(table, name)
-
-
-def _check_ranges(table: Table, name: str) -> None:
-    """Raise ValueError unless each bucket exists and each row is within its bucket (host)."""
-    bucket, row = on_host(table.bucket), on_host(table.row)
-    last = len(table.buckets) - 1
-    if bucket.min() < 0 or bucket.max() > last:
-        raise ValueError(f"{name}.bucket must be 0 to {last}; got {bucket.min()} to {bucket.max()}")
-    capacities = np.asarray([len(blocks) for blocks in table.buckets])[bucket]
-    outside = np.flatnonzero((row < 0) | (row >= capacities))
+    if not table.num or any(isinstance(leaf, jax.core.Tracer) for leaf in (table.bucket, table.row)):
+        return
+    places, last = on_host(table.bucket), len(table.buckets) - 1
+    if places.min() < 0 or places.max() > last:
+        raise ValueError(f"{name}.bucket must be 0 to {last}; got {places.min()} to {places.max()}")
+    rows, capacities = on_host(table.row), np.asarray([len(blocks) for blocks in table.buckets])[places]
+    outside = np.flatnonzero((rows < 0) | (rows >= capacities))
     if outside.size:
         first = outside[0]
         raise ValueError(
             f"{name}.row must be below the number of blocks in the bucket, {capacities[first]} in bucket "
-            f"{bucket[first]}; got {row[first]} for Gaussian {first} (of {outside.size} rows out of range)"
+            f"{places[first]}; got {rows[first]} for Gaussian {first} (of {outside.size} rows out of range)"
         )
 
 

@@ -15,12 +15,12 @@ from jax import Array
 from a2tg_jax.core.budget import number_to_reach
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.gaussians import Gaussians, rotation_matrices
-from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.events import (
     Change,
     EventInfo,
+    GradientStatistics,
     Now,
     Seen,
     Statistic,
@@ -104,11 +104,7 @@ class CloneSplitPrune(StepEvent):
         return Change(model, moments, self.init(model), EventInfo(jnp.any(edit.is_kept), num_refused))
 
     def plan(self, now: Now, model: Model, gradients: Array) -> tuple[Edit, Array]:
-        """Return the edit of each row, and the number of Gaussians without room.
-
-        Args:
-          gradients: [N] averages.
-        """
+        """Return the edit of each row, given its average gradient, and the number of Gaussians without room."""
         is_kept = is_live(model) & ~self._is_pruned(now, model)
         # A copy of what is pruned would be pruned as well.
         is_wanted = is_kept & (gradients >= self.threshold)
@@ -122,11 +118,11 @@ class CloneSplitPrune(StepEvent):
         between = reset_interval(now.num_iterations)
         is_late, since_reset = now.iteration > between, now.iteration % between
         is_faint = (opacities < self.least_opacity) & ~(is_late & (since_reset < RECOVERY))
-        return is_faint | (is_late & (_sizes(model) > self.largest_share * now.scene_scale))
+        return is_faint | (is_late & (jnp.max(model.gaussians.scales, axis=1) > self.largest_share * now.scene_scale))
 
     def _edit(self, now: Now, model: Model, is_kept: Array, is_doubled: Array) -> Edit:
         """Split large doubled rows and clone small ones."""
-        is_large = _sizes(model) > self.dense_share * now.scene_scale
+        is_large = jnp.max(model.gaussians.scales, axis=1) > self.dense_share * now.scene_scale
         return Edit(is_kept, is_doubled & ~is_large, is_doubled & is_large)
 
 
@@ -166,11 +162,6 @@ class FillingDensity(CloneSplitPrune):
 def is_live(model: Model) -> Array:
     """Return a mask [N] of the rows that exist."""
     return jnp.arange(model.gaussians.num, dtype=jnp.int32) < model.live_count
-
-
-def _sizes(model: Model) -> Array:
-    """Return [N] the larger standard deviations."""
-    return jnp.max(model.gaussians.scales, axis=1)
 
 
 def _ranks(values: Array, is_ranked: Array) -> Array:
@@ -240,12 +231,10 @@ class OpacityReset(StepEvent):
         limited = dataclasses.replace(model, gaussians=gaussians, appearance=appearance)
         (before, _), (after, _) = partition(model), partition(limited)
 
-        def cleared(moment: Model) -> Model:
-            # Adam forgets whatever was changed.
-            kept: Model = jax.tree.map(
-                lambda x, old, new: x if new is old else jnp.zeros_like(x), moment, before, after
-            )
-            return kept
-
-        moments = dataclasses.replace(moments, mu=cleared(moments.mu), nu=cleared(moments.nu))
+        # Adam forgets whatever was changed.
+        mu, nu = (
+            jax.tree.map(lambda x, old, new: x if new is old else jnp.zeros_like(x), moment, before, after)
+            for moment in (moments.mu, moments.nu)
+        )
+        moments = dataclasses.replace(moments, mu=mu, nu=nu)
         return Change(limited, moments, state)

@@ -94,26 +94,33 @@ class Contributions(NamedTuple):
 
 
 def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contributions:
-    """Return how much each Gaussian shows, and in how many views it shows as much as `least` pixels (host).
+    """Return how much each of N Gaussians shows, and in how many views it shows as much as `least` pixels (host).
 
-    The devices over which the model's rows are spread draw each view together. If they are of several processes, all
-    of these call it, and get the numbers of the first one, since GPUs may round sums differently each time.
-
-    Args:
-      model: N rows; spare rows have weight 0.
-      views: at least one; only their cameras and masks are used.
-      least: Σ α·T from which a Gaussian counts as shown in a view.
-
-    Raises:
-      ValueError: if there is no view.
+    Spare rows show nothing. Of the views, at least one, only cameras and masks are used. The devices over which the
+    model's rows are spread draw each view together. If they are of several processes, all of these call it, and get the
+    numbers of the first one, since GPUs may round sums differently each time.
     """
     if not views:
         raise ValueError("views must hold at least one view; got none")
     total, num_views = np.zeros(model.gaussians.num), np.zeros(model.gaussians.num, np.int64)
     if not len(total):
         return Contributions(total, num_views)
-    settings, dtype = _planned(model, [view.camera for view in views]), model.gaussians.means.dtype
-    mesh = mesh_of(model.gaussians.means)
+    mesh, dtype = mesh_of(model.gaussians.means), model.gaussians.means.dtype
+    settings, appearance = RenderSettings(exchange=exchange_of(model.gaussians.means)), model.appearance
+    all_cameras = [view.camera for view in views]
+
+    def rounded_up(number: int) -> int:
+        return 1 << number.bit_length()  # Programs are compiled for a room: for few of them.
+
+    if settings.exchange is None:
+        capacity = plan_render(model, all_cameras, settings=settings).capacity
+        settings = dataclasses.replace(settings, capacity=rounded_up(capacity or 1))
+    else:
+        rooms = [room_of_view(model.gaussians, one, appearance, settings, model.num_live) for one in all_cameras]
+        capacity = rounded_up(max(room.pairs for room in rooms))
+        rows_per_pair = rounded_up(max(room.rows for room in rooms)) / capacity
+        exchange = dataclasses.replace(settings.exchange, rows_per_pair=rows_per_pair)
+        settings = dataclasses.replace(settings, capacity=capacity, exchange=exchange)
     for own in views_by_kind(views):
         rays = own[0].camera.rays
         rays = None if rays is None else jnp.asarray(rays, dtype)
@@ -125,25 +132,6 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contrib
         total += on_host(weights).astype(np.float64)
         num_views += on_host(num)
     return Contributions(*of_first(mesh, (total, num_views)))
-
-
-def _planned(model: Model, cameras: Sequence[Camera]) -> RenderSettings:
-    """Return settings with room for all cameras, rounded up, because programs are compiled for a room: for few of
-    them."""
-    settings, appearance = RenderSettings(exchange=exchange_of(model.gaussians.means)), model.appearance
-    if settings.exchange is None:
-        capacity = plan_render(model, cameras, settings=settings).capacity
-        return dataclasses.replace(settings, capacity=_rounded_up(capacity or 1))
-    rooms = [room_of_view(model.gaussians, camera, appearance, settings, model.num_live) for camera in cameras]
-    capacity = _rounded_up(max(room.pairs for room in rooms))
-    rows_per_pair = _rounded_up(max(room.rows for room in rooms)) / capacity
-    exchange = dataclasses.replace(settings.exchange, rows_per_pair=rows_per_pair)
-    return dataclasses.replace(settings, capacity=capacity, exchange=exchange)
-
-
-def _rounded_up(number: int) -> int:
-    """Return the next power of two above a number."""
-    return 1 << number.bit_length()
 
 
 @functools.cache
@@ -237,14 +225,9 @@ class PruneFloaters(HostEvent):
 
 
 def are_near(means: np.ndarray, views: Sequence[View], near: float) -> np.ndarray:
-    """Return [N] whether a point lies within the picture of a view, at a smaller depth than `near`.
+    """Return [N] whether a point [3] is within the picture of a view, at a smaller depth than `near`.
 
     The picture of a lens that is no pinhole is the smallest rectangle in the image plane that holds all its rays.
-
-    Args:
-      means: [N, 3] points.
-      views: V views.
-      near: limit of the depth.
     """
     found = np.zeros(len(means), bool)
     for camera in (view.camera for view in views):

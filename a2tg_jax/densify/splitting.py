@@ -14,7 +14,6 @@ times that of others: with replacement it would be the host of nearly all new Ga
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +21,10 @@ from jax import Array
 
 from a2tg_jax.core.gaussians import logit, shared_opacities
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
-from a2tg_jax.core.gradient_statistics import GradientStatistics
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.densify.clone_split import SPLIT_SHRINK, split_in_half
-from a2tg_jax.events import Change, EventInfo, Now, Seen, Statistic, clear_moments, gather_rows
+from a2tg_jax.events import Change, EventInfo, GradientStatistics, Now, Seen, Statistic, clear_moments, gather_rows
 from a2tg_jax.mcmc import FillingMcmc, Moves, plan_growth, plan_relocation
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.rows import zeros_beside
@@ -65,21 +63,17 @@ class SplitByGradient(FillingMcmc):
         gradients = state.gradients.observe_views(seen.gradients, seen.is_visible)
         return SplitStatistics(gradients, jnp.maximum(state.pixels, jnp.max(sizes, axis=0)))
 
-    def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
+    def apply(self, now: Now, model: Model, moments: AdamState, state: SplitStatistics) -> Change:
         to_move, to_add, to_split = jax.random.split(now.keys[0], 3)
         num_live = model.live_count
         draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
-        moves = plan_relocation(to_move, self._opacities(model), num_live, draw)
+        moves = plan_relocation(to_move, model.appearance.opacities(model.gaussians), num_live, draw)
         model, moments, state = split_rows(to_split, moves, model, moments, state)
         cap, least = min(self.cap, model.gaussians.num), self.least(now, num_live)
         draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
-        moves = plan_growth(to_add, self._opacities(model), num_live, cap, least, draw)
+        moves = plan_growth(to_add, model.appearance.opacities(model.gaussians), num_live, cap, least, draw)
         model, moments, state = split_rows(now.keys[1], moves, model, moments, state)
         return Change(model, moments, state, EventInfo(is_possible=moves.info.has_hosts))
-
-    @staticmethod
-    def _opacities(model: Model) -> Array:
-        return model.appearance.opacities(model.gaussians)
 
 
 def draw_weights(model: Model, state: SplitStatistics) -> Array:
@@ -88,18 +82,10 @@ def draw_weights(model: Model, state: SplitStatistics) -> Array:
 
 
 def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: Array) -> Array:
-    """Draw a host for every target with probability ∝ weight, none twice before each was drawn once.
+    """Draw a host [N] int32 for every target with probability ∝ weight, none twice before each was drawn once.
 
-    The order of log-weights plus Gumbel noise is that of successive draws without replacement (Yellott, 1977).
-
-    Args:
-      weights: [N], positive.
-      key: a random key.
-      is_host: [N], the rows that may be drawn.
-      is_target: [N], the rows that need a host.
-
-    Returns:
-      [N] int32 rows of hosts, if there are any. Only entries of targets have a meaning.
+    The order of log-weights plus Gumbel noise is that of successive draws without replacement (Yellott, 1977). Only the
+    entries of targets have a meaning, if there are any hosts.
     """
     noisy = jnp.log(weights) + jax.random.gumbel(key, weights.shape, weights.dtype)
     order = jnp.argsort(jnp.where(is_host, -noisy, jnp.inf)).astype(jnp.int32)
@@ -128,14 +114,11 @@ def split_rows(
 
 
 def logits_of_halves(logit_opacities: Array, pixels: Array) -> Array:
-    """Return the logits of the opacities [N] of the halves of splats.
+    """Return the logits of the opacities [N] of the halves of splats, given theirs before.
 
-    The filter draws a splat over an area of max(s², filter²). Without it, halves would have 1/1.6² of that area. Where
-    the filter makes them k times larger, k in 1..1.6², their opacity is 1 − (1 − o)^(1/k), at least that of the dead.
-
-    Args:
-      logit_opacities: [N] of the splats before.
-      pixels: [N] their standard deviations s in pixels; 0 for those that no view has shown, which keep theirs.
+    The filter draws a splat over an area of max(s², filter²), where s [N] is its standard deviation in pixels. Without
+    it, halves would have 1/1.6² of that area. Where the filter makes them k times larger, k in 1..1.6², their opacity
+    is 1 − (1 − o)^(1/k), at least that of the dead. Splats of 0 pixels, which no view has shown, keep theirs.
     """
     before = jnp.maximum(pixels * pixels, FILTER_VARIANCE)
     after = jnp.maximum((pixels / SPLIT_SHRINK) ** 2, FILTER_VARIANCE)

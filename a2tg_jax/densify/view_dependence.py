@@ -6,12 +6,12 @@ over views of ∂L/∂colour · Y(direction). Residuals that many views share ad
 
 import dataclasses
 import itertools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 
 from a2tg_jax.appearance import in_words
 from a2tg_jax.appearance.parts import MAX_DEGREE, Coefficients, degrees_of_sizes, floats_of_band, sizes_of_degrees
@@ -37,18 +37,12 @@ class ViewDependence:
     """[] int32, views so far."""
 
     @staticmethod
-    def init(num: int, dtype: Any = jnp.float32, like: Array | None = None) -> "ViewDependence":
+    def init(num: int, dtype: DTypeLike = jnp.float32, like: Array | None = None) -> "ViewDependence":
         """Return empty sums for `num` Gaussians, spread like the rows of an array; None: on one device."""
         return ViewDependence(zeros_beside(like, (num, 16, 3), dtype), zeros_beside(like, (), jnp.int32))
 
     def observe(self, means: Array, centers: Array, colors: Array) -> "ViewDependence":
-        """Add V views.
-
-        Args:
-          means: [N, 3] of the Gaussians.
-          centers: [V, 3] of the cameras.
-          colors: [V, N, 3] gradients by the colour of each Gaussian.
-        """
+        """Add V views: cameras at centers [V, 3], and gradients [V, N, 3] by the colour of each Gaussian."""
         total = self.total
         for center, color in zip(centers, colors, strict=True):
             basis = sh_basis(normalize(means - center[None, :]))
@@ -135,15 +129,8 @@ class AdaptDegrees(HostEvent):
 
 
 def most_blocks(num_bytes: float, base_degree: int, highest: int, num: int, table: Coefficients) -> Shape:
-    """Return a shape with room for all blocks that `num` Gaussians can have within some bytes (host).
-
-    Args:
-      num_bytes: of all blocks, at most.
-      base_degree: degree of all Gaussians.
-      highest: highest degree that is reached.
-      num: number of Gaussians that exist.
-      table: present blocks, of as many rows as are allocated.
-    """
+    """Return a shape with room for all blocks, of degrees up to the highest, that `num` Gaussians can have within some
+    bytes (host)."""
     counts = {(0,): bucket_capacity(table.num)}
     for degree in range(base_degree + 1, highest + 1):
         size = NUM_BASES[degree] - NUM_BASES[base_degree]
@@ -174,11 +161,7 @@ def without_idle(table: Coefficients, base_degree: int, idle: float) -> np.ndarr
 def raised_degrees(degrees: np.ndarray, strengths: np.ndarray, budget: float, highest: int = MAX_DEGREE) -> np.ndarray:
     """Return [N] degrees, raised by one in descending order of gradient per added byte within a budget (host).
 
-    Args:
-      degrees: [N] 0 to 3.
-      strengths: [N, 3] of the bands of degree 1, 2 and 3.
-      budget: bytes.
-      highest: largest degree.
+    Strengths [N, 3] are those of the bands of degree 1, 2 and 3; the budget is in bytes.
     """
     following = np.minimum(degrees, MAX_DEGREE - 1)
     cost = BYTES_PER_FLOAT * np.asarray([floats_of_band(degree) for degree in (1, 2, 3)])[following]

@@ -13,7 +13,7 @@ The received rows keep the order of the model, so that a band is composited as i
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -92,25 +92,24 @@ class ImageBands(NamedTuple):
         """Return the number of pairs in each row of tiles, [rows] int32."""
         end = boxes.y0 + boxes.counts // jnp.maximum(boxes.columns, 1)
         columns = jnp.where(boxes.counts > 0, boxes.columns, 0)
+        # Each box adds its columns at its first row and takes them away after its last: the running sum is the count.
         ends = jnp.zeros(self.whole.rows + 1, jnp.int32).at[boxes.y0].add(columns).at[end].add(-columns)
         return jnp.cumsum(ends)[:-1]
 
     def borders(self, pairs: Array) -> Array:
-        """Return the first row of tiles of each band, and the end of the last one: [B + 1] int32, ascending.
-
-        Args:
-          pairs: number of pairs in each row of tiles, [rows] int32.
-        """
+        """Return the first row of tiles of each band, and the end of the last one: [B + 1] int32, ascending, given the
+        number of pairs in each row of tiles [rows]."""
         rows = self.whole.rows
         if self.num == 1:
             return jnp.asarray([0, rows], jnp.int32)
+        # Integers only, so that all devices find the same. Counts are shifted so that their sum has COST_BITS bits.
         pairs = jnp.maximum(pairs, 0)
         bits = 32 - jax.lax.clz(jnp.max(pairs)) + rows.bit_length()
         pairs = pairs >> jnp.maximum(bits - COST_BITS, 0)
         cost = pairs + jnp.sum(pairs) // (rows * EMPTY_TILES) + 1
         ends = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(cost)])
         number = jnp.arange(self.num + 1, dtype=jnp.int32)
-        wanted = ends[-1] // self.num * number + ends[-1] % self.num * number // self.num
+        wanted = ends[-1] // self.num * number + ends[-1] % self.num * number // self.num  # Without overflow.
         after = jnp.searchsorted(ends, wanted, method="compare_all").astype(jnp.int32)
         before = jnp.maximum(after - 1, 0)
         return jnp.where(wanted - ends[before] < ends[after] - wanted, before, after)
@@ -156,12 +155,8 @@ class ImageBands(NamedTuple):
     def to_even(self, image: Array, borders: Array, device: Array, num_views: int, axis: str) -> Array:
         """Return the pixels [C, `even_height`, W] of this device in an even cut, from the bands of all devices.
 
-        Args:
-          image: pixels [C, `own.height`, W] from the first row of this device's band.
-          borders: of its view.
-          device: its index along the axis.
-          num_views: number of views, of `num` devices each, one after the other.
-          axis: of the mesh, inside `shard_map`.
+        The image [C, `own.height`, W] begins with the first row of this device's band, of which the borders are those
+        of its view. Devices of several views follow each other along the axis, inside `shard_map`.
         """
         band, height = device % self.num, self.even_height
         first, end = self.pixels_of(borders, band)
@@ -222,7 +217,7 @@ def exchange_of(x: Any) -> Exchange | None:
     return None if mesh is None else Exchange(mesh)
 
 
-def exchange_among(devices: Any) -> Exchange:
+def exchange_among(devices: Sequence[jax.Device]) -> Exchange:
     """Return the exchange among devices, at least one."""
     mesh = jax.make_mesh((len(devices),), (AXIS,), axis_types=(jax.sharding.AxisType.Auto,), devices=devices)
     return Exchange(mesh)
@@ -232,16 +227,11 @@ def composite_on_devices(
     settings: CompositingSettings, exchange: Exchange, capacity: int, splats: Splats, texels: Array,
     regions: TextureRegion | None, cutoff: Array, jacobian: Array, probe: Array, rays: Array | None,
 ) -> Composited:  # fmt: skip
-    """Composite a view as `compositor.composite` does on one device: each device a band.
+    """Composite a view as `compositor.composite` does on one device, with its arguments: each device a band.
 
-    The number of pairs is the capacity that has room for the fullest band and for all that is sent to it.
-
-    Args:
-      settings, splats, texels, regions, cutoff, jacobian, probe: as for `composite`.
-      exchange: the D devices. If they draw several views at once, this is called for each of them under
-        `value_and_grad_of_views`.
-      capacity: number of pairs of a whole image.
-      rays: [H, W, 2] of the lens (`Camera.rays`); None of a pinhole.
+    `capacity` is the number of pairs of a whole image; the result's number of pairs is the capacity that has room for
+    the fullest band and for all that is sent to it. If the devices draw several views at once, this is called for each
+    of them under `value_and_grad_of_views`. The rays [H, W, 2] are those of the lens (`Camera.rays`).
     """
     draw = functools.partial(_composite_views, settings, exchange, capacity, texels, regions, rays)
     arrays = splats, cutoff, jacobian, probe
@@ -294,7 +284,14 @@ def _composite_band(
     pairs_share, (num_views, num) = share_of_a_band(bands.num), cutoff.shape
     most_pairs = math.ceil(capacity * pairs_share)
     most_sent = min(num, max(1, math.ceil(capacity * exchange.rows_per_pair)))
-    borders, reached = _cut(settings, bands, jax.lax.stop_gradient(splats.M), cutoff, pixels)
+    # Borders of bands [G, D/G + 1], the same on all devices, and which bands are reached by each of its n splats.
+    boxes = jax.vmap(
+        lambda M, cutoff: tile_rectangles(screen_bounds(M, cutoff, settings.kernel.near_plane), settings.grid, pixels)
+    )(jax.lax.stop_gradient(splats.M), cutoff)
+    most = jnp.int32((2**31 - 1) // exchange.num)  # No sum over devices overflows.
+    pairs = jax.lax.psum(jnp.clip(jax.vmap(bands.pairs_of_rows)(boxes), 0, most), AXIS)
+    borders = jax.vmap(bands.borders)(pairs)
+    reached = jax.vmap(bands.reached)(boxes, borders)
     num_sent = jnp.max(jnp.sum(reached, axis=2, dtype=jnp.int32))
     # The rows that reach each of D bands, [D, most_sent], among [n] and among [G·n] rows; n and G·n stand for none.
     rows_of = functools.partial(jnp.nonzero, size=most_sent, fill_value=num)
@@ -335,27 +332,6 @@ def _composite_band(
     return channels, transmittance, jax.lax.pmax(needed.astype(jnp.float32), AXIS), overflow
 
 
-def _cut(
-    settings: CompositingSettings, bands: ImageBands, M: Array, cutoff: Array, pixels: TilePixels | None
-) -> tuple[Array, Array]:
-    """Return the borders [G, D/G + 1] of the bands, the same on all devices, and [G, D/G, n] which bands are reached by
-    each of this device's n splats.
-
-    Args:
-      settings, bands: static.
-      M, cutoff: [G, n, ...] of this device's splats, as for `core.geometry.screen_bounds`.
-      pixels: of all tiles, if they have rays of their own.
-    """
-    boxes = jax.vmap(
-        lambda M, cutoff: tile_rectangles(screen_bounds(M, cutoff, settings.kernel.near_plane), settings.grid, pixels)
-    )(M, cutoff)  # fmt: skip
-    num_devices = bands.num * cutoff.shape[0]
-    most = jnp.int32((2**31 - 1) // num_devices)
-    pairs = jax.lax.psum(jnp.clip(jax.vmap(bands.pairs_of_rows)(boxes), 0, most), AXIS)
-    borders = jax.vmap(bands.borders)(pairs)
-    return borders, jax.vmap(bands.reached)(boxes, borders)
-
-
 def _send(chosen: Array, x: Array, fill: float = 0.0) -> Array:
     """Send the chosen rows [D, C] of an array [n, ...] to each device; return the rows received [D·C, ...]."""
     rows = jnp.take(x, chosen.reshape(-1), axis=0, mode="fill", fill_value=fill)
@@ -381,13 +357,9 @@ VIEWS_AXIS = "views_at_once"
 def value_and_grad_of_views(loss: Callable[..., tuple[Array, Any]], num_views: int, axes: Any) -> Callable[..., Any]:
     """Return what `jax.value_and_grad(loss, (0, 1, 2, 3), has_aux=True)` is for one view, for G views at once.
 
-    Results have a leading axis [G, ...], but for the gradient in `appearance`, a mean over the views.
-
-    Args:
-      loss: of (gaussians, appearance, rows, probe, view), which returns a scalar and any auxiliary value. `rows` and
-        `view` are those of the views [G, ...]; the others are shared.
-      num_views: G.
-      axes: of the view, for `jax.vmap`.
+    Results have a leading axis [G, ...], but for the gradient in `appearance`, a mean over the views. The loss is a
+    function of (gaussians, appearance, rows, probe, view), which returns a scalar and any auxiliary value. `rows` and
+    `view`, mapped along `axes`, are of each view; the others are shared.
     """
 
     def of_views(gaussians: Any, appearance: Any, rows: Any, probe: Any, views: Any) -> tuple[Array, Any]:
@@ -407,18 +379,10 @@ def value_and_grad_of_views(loss: Callable[..., tuple[Array, Any]], num_views: i
 
 
 def map_views(function: Callable[[Any], tuple[Any, Any]], views: Any, num_at_once: int) -> tuple[Any, Any]:
-    """Return what `jax.lax.map` does, of a function of G views [G, ...] at a time.
+    """Return what `jax.lax.map` does, of a function of G views [G, ...] at a time, where G divides V.
 
-    Each of the G groups of devices draws V/G views in a row, whose photographs alone it needs
-    (`pictures.sharding_of_batch`).
-
-    Args:
-      function: returns results of the views [G, ...], and results that they share.
-      views: [V, ...].
-      num_at_once: G, which divides V.
-
-    Returns:
-      The results of the views [V, ...], and the shared ones [V/G, ...].
+    Each of the G groups of devices draws V/G views in a row, whose photographs alone it needs (`sharding_of_batch`).
+    The function returns results of the views, which come back as [V, ...], and results that they share, [V/G, ...].
     """
     rounds = jax.tree.map(lambda x: x.reshape(num_at_once, -1, *x.shape[1:]).swapaxes(0, 1), views)
     of_views, shared = jax.lax.map(function, rounds)
@@ -450,8 +414,8 @@ def _all(size: int, is_batched: Any, views: Any, index: Array) -> tuple[Any, Any
 # Photographs of the training views on the devices that draw them (host)
 
 
-VIEW_AXIS = "views"
-"""Axis of a mesh of the same devices along which the views are that are drawn at once."""
+GROUP_AXIS = "views"
+"""Axis of a mesh of the same devices along which their groups are."""
 PICTURES = ("images", "alphas", "masks", "depths")
 """Fields of a batch [V, H, ...] of which each device needs those that it draws. It has the others whole."""
 
@@ -466,8 +430,8 @@ def sharding_of_batch(exchange: Exchange, num_views: int, height: int) -> NamedS
     if num_groups == 1:
         return sharding_of_rows(exchange.mesh, (num_views, height), axis=1)
     devices = exchange.mesh.devices.reshape(num_groups, -1)
-    mesh = Mesh(devices, (VIEW_AXIS, AXIS), axis_types=(jax.sharding.AxisType.Auto,) * 2)
-    return NamedSharding(mesh, P(VIEW_AXIS, None if height % devices.shape[1] else AXIS))
+    mesh = Mesh(devices, (GROUP_AXIS, AXIS), axis_types=(jax.sharding.AxisType.Auto,) * 2)
+    return NamedSharding(mesh, P(GROUP_AXIS, None if height % devices.shape[1] else AXIS))
 
 
 def are_drawn_here(exchange: Exchange | None, num_views: int, height: int) -> list[bool]:
@@ -481,13 +445,11 @@ def are_drawn_here(exchange: Exchange | None, num_views: int, height: int) -> li
 
 
 def on_devices(exchange: Exchange, photographs: Any, *, is_batch: bool) -> Any:
-    """Return `training.batches.Photographs` with their pictures spread over the devices, the rest on every device.
+    """Return `training.batches.Photographs` of V views with their pictures spread over the devices, the rest on every
+    device; the rays of their lens stay where they are.
 
-    Args:
-      exchange: the D devices.
-      photographs: V views. The rays of their lens stay where they are.
-      is_batch: whether they are a batch, of which other processes' devices may draw a part (`are_drawn_here`).
-        Otherwise all devices share each picture's rows of pixels, if D divides them.
+    Other processes' devices may draw a part of a batch (`are_drawn_here`). Otherwise all devices share each picture's
+    rows of pixels, if D divides them.
     """
     placed_fields = {}
     for name, field in photographs._asdict().items():

@@ -195,8 +195,14 @@ class Team:
     def watch(self, coordinator: str) -> None:
         """Connect the processes, which watch each other from now on."""
         own = listen() if self.is_first else None
-        host = own_address(coordinator).encode() if own else b""
-        told = broadcast(b"".join([own[1].to_bytes(4, "big"), own[2], host]) if own else b"")
+        host = coordinator.rpartition(":")[0].strip("[]")
+        if coordinator == AUTO:
+            host = socket.gethostname()
+            with contextlib.suppress(OSError):
+                address = socket.gethostbyname(host)
+                host = host if address.startswith("127.") else address
+            host = host[:LONGEST_HOST]
+        told = broadcast(b"".join([own[1].to_bytes(4, "big"), own[2], host.encode()]) if own else b"")
         others = accept(own[0], own[2], self.count) if own else connect(
             told[36:].decode(), int.from_bytes(told[:4], "big"), told[4:36], self.index
         )  # fmt: skip
@@ -258,11 +264,38 @@ def joined(place: ProcessPlace | None) -> Iterator[Team | None]:
     if place is None:
         yield None
         return
-    late = threading.Timer(JOIN_SECONDS, _give_up, (place.coordinator,))
+
+    def give_up() -> NoReturn:
+        told = f"a2tg: error: not all processes have joined --coordinator {place.coordinator} within {JOIN_SECONDS} s"
+        print(f"{told}: start as many as --num-processes says, each with a --process-id of its own", file=sys.stderr)
+        sys.stderr.flush()
+        os._exit(LOST)
+
+    late = threading.Timer(JOIN_SECONDS, give_up)
     late.daemon = True
     late.start()
     try:
-        _initialize(place)
+        if not os.environ.get("A2TG_DEBUG"):
+            own_output_only()
+        wait_in_abort()
+        is_auto = place.coordinator == AUTO
+        # JAX's handler of SIGTERM would take the place of `signals`.
+        jax.config.update("jax_enable_preemption_service", False)
+        try:
+            # Its own times are a net beneath this module's.
+            jax.distributed.initialize(
+                None if is_auto else place.coordinator,
+                place.num_processes,
+                place.process_id,
+                cluster_detection_method=None if is_auto else "deactivate",
+                initialization_timeout=2 * JOIN_SECONDS,
+                heartbeat_timeout_seconds=round(2 * place.seconds) + 60,
+                shutdown_timeout_seconds=LEAVE_SECONDS,
+            )
+        except (ValueError, TypeError, RuntimeError) as error:
+            is_alone = is_auto and "coordinator_address" in str(error)
+            reason = "no Slurm, Open MPI or Kubernetes was found: give HOST:PORT" if is_alone else error
+            raise ValueError(f"--coordinator {place.coordinator}: {reason}") from error
         _team = Team(place.seconds)
         if _team.count > 1:
             _team.watch(place.coordinator)
@@ -276,42 +309,6 @@ def joined(place: ProcessPlace | None) -> Iterator[Team | None]:
         raise
     finally:
         _team = None
-
-
-def _initialize(place: ProcessPlace) -> None:
-    """Call `jax.distributed.initialize`."""
-    if not os.environ.get("A2TG_DEBUG"):
-        own_output_only()
-    wait_in_abort()
-    is_auto = place.coordinator == AUTO
-    # JAX's handler of SIGTERM would take the place of `signals`.
-    jax.config.update("jax_enable_preemption_service", False)
-    try:
-        # Its own times are a net beneath this module's.
-        jax.distributed.initialize(
-            None if is_auto else place.coordinator,
-            place.num_processes,
-            place.process_id,
-            cluster_detection_method=None if is_auto else "deactivate",
-            initialization_timeout=2 * JOIN_SECONDS,
-            heartbeat_timeout_seconds=round(2 * place.seconds) + 60,
-            shutdown_timeout_seconds=LEAVE_SECONDS,
-        )
-    except (ValueError, TypeError, RuntimeError) as error:
-        is_alone = is_auto and "coordinator_address" in str(error)
-        reason = "no Slurm, Open MPI or Kubernetes was found: give HOST:PORT" if is_alone else error
-        raise ValueError(f"--coordinator {place.coordinator}: {reason}") from error
-
-
-def _give_up(coordinator: str) -> NoReturn:
-    """End the process with one line, since the others do not come."""
-    print(
-        f"a2tg: error: not all processes have joined --coordinator {coordinator} within {JOIN_SECONDS} s: start as "
-        "many as --num-processes says, each with a --process-id of its own",
-        file=sys.stderr,
-        flush=True,
-    )
-    os._exit(LOST)
 
 
 def broadcast(data: bytes) -> bytes:
@@ -336,14 +333,3 @@ def is_of_collectives(error: BaseException) -> bool:
     if "RESOURCE_EXHAUSTED" in str(error):
         return False
     return isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error) or "NCCL" in str(error)
-
-
-def own_address(coordinator: str) -> str:
-    """Return the host name or address by which other processes reach the first one, which calls this."""
-    if coordinator != AUTO:
-        return coordinator.rpartition(":")[0].strip("[]")
-    name = socket.gethostname()
-    with contextlib.suppress(OSError):
-        address = socket.gethostbyname(name)
-        return name if address.startswith("127.") else address
-    return name[:LONGEST_HOST]

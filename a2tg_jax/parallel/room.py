@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from a2tg_jax.appearance import Appearance
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.geometry import screen_bounds
+from a2tg_jax.core.numerics import Integer
 from a2tg_jax.parallel.exchange import BorderRoom, Exchange, ImageBands, share_of_a_band
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.splats import drawn_splats
@@ -37,7 +38,11 @@ class RoomOfView(NamedTuple):
 
 
 def room_of_view(
-    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: Any = None
+    gaussians: Gaussians,
+    camera: Camera,
+    appearance: Appearance,
+    settings: RenderSettings,
+    num_live: Integer | None = None,
 ) -> RoomOfView:
     """Return the room that the devices of `settings.exchange` need in a view (host)."""
     assert settings.exchange is not None
@@ -53,7 +58,7 @@ def _jitted_needs() -> jax.stages.Wrapped:
 
 
 def _needs(
-    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: Any
+    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: Integer | None
 ) -> tuple[Array, Array, Array, Array]:
     """Return the largest number of rows that a device sends to another one, the rows of pixels by which borders move
     up and down, and the largest number of pairs of a band; int32."""
@@ -75,15 +80,9 @@ def exchange_with_room(
     exchange: Exchange, rooms: Sequence[RoomOfView], growth: float, *, num: int, num_live: int, capacity: int,
     tile_size: int,
 ) -> Exchange:  # fmt: skip
-    """Return the exchange with room for views once all rows exist (host).
+    """Return the exchange with room for views once all `num` rows, of which `num_live` exist, are there (host).
 
-    Args:
-      exchange: the D devices.
-      rooms: of some views, at present.
-      growth: room as a multiple of that.
-      num: number N of rows, of which `num_live` exist.
-      capacity: number of pairs of an image.
-      tile_size: in pixels.
+    The room is a multiple of the present rooms of some views; the capacity is the number of pairs of an image.
     """
     rows = -(-num // exchange.num)
     share = min(1.0, growth * max(1, *(own.rows for own in rooms)) / max(1, min(num_live, rows)))

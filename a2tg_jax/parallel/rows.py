@@ -54,7 +54,12 @@ def spread(mesh: Mesh | None, tree: Any, axis: int = 0) -> Any:
         return tree
     own = [x for x in jax.tree.leaves(tree) if not isinstance(x, jax.core.Tracer) and _is_own(x)]
     if own and num_processes(mesh) > 1:
-        _check_same(own)
+        digest = 0
+        for x in map(np.asarray, own):
+            values: Any = np.ascontiguousarray(x).view(np.uint8)
+            digest = zlib.crc32(values, zlib.crc32(repr(x.shape).encode(), digest))
+        if len(np.unique(multihost_utils.process_allgather(np.asarray(digest, np.uint32)))) > 1:
+            raise ValueError("the processes differ after a change of the model: train on machines that are alike")
 
     def of_leaf(x: Any) -> Any:
         sharding = sharding_of_rows(mesh, jnp.shape(x), axis)
@@ -112,10 +117,7 @@ def _is_own(x: Any) -> bool:
 
 def placed_like(new: Any, old: Any) -> Array:
     """Return values of the host, their rows spread over the devices of another array, whose shape may differ.
-
-    Raises:
-      ValueError: if several processes have different values.
-    """
+    ValueError: several processes have different values."""
     mesh = mesh_of(old)
     if mesh is None:
         return jnp.asarray(new)
@@ -130,7 +132,7 @@ def zeros_beside(old: Any, shape: Sequence[int], dtype: DTypeLike) -> Array:
     return jnp.zeros(shape, dtype, device=None if mesh is None else sharding_of_rows(mesh, tuple(shape)))
 
 
-def rows_moved(x: Array, rows: Any) -> Array:
+def rows_moved(x: Array, rows: Array | np.ndarray) -> Array:
     """Return the array whose row i is the former row rows[i].
 
     It is traceable. Outside jit, rows that are spread over devices move on the host.
@@ -180,16 +182,6 @@ def of_first(mesh: Mesh | None, tree: Any) -> Any:
         return same
 
     return jax.tree.map(of_leaf, tree)
-
-
-def _check_same(arrays: Sequence[Any]) -> None:
-    """Raise ValueError unless all processes have the same arrays."""
-    digest = 0
-    for x in map(np.asarray, arrays):
-        values: Any = np.ascontiguousarray(x).view(np.uint8)
-        digest = zlib.crc32(values, zlib.crc32(repr(x.shape).encode(), digest))
-    if len(np.unique(multihost_utils.process_allgather(np.asarray(digest, np.uint32)))) > 1:
-        raise ValueError("the processes differ after a change of the model: train on machines that are alike")
 
 
 # Inside shard_map: results of foreign functions, of which JAX assumes that they are the same on all devices

@@ -48,7 +48,14 @@ class A2tg(TwoStages):
     name: ClassVar[str] = "a2tg"
 
     def stages(self) -> tuple[Stage, ...]:
-        texture = self._texture()
+        texture = self.texture
+        if self.memory_budget is not None:
+            if texture.budget_mb is not None:
+                raise ValueError(
+                    "memory_budget and texture.budget_mb both say how much memory there is: give one of them"
+                )
+            budget = megabytes_of(self.memory_budget)
+            texture = dataclasses.replace(texture, select="budget", threshold=None, budget_mb=budget)
         # Up to half of the largest texture, if there is a time to grow.
         texels = min(BUDGET_TEXELS, (1 + texture.cap**2) / 2) if texture.iterations(self.stage2_iterations) else 1
         growth = grown_by_mcmc(self.densify, self.budget_cap(FLOATS_PER_TEXEL * texels))
@@ -58,15 +65,6 @@ class A2tg(TwoStages):
         rates = {"texture": TexelRates(self.texel_rate, single)}
         textured = Appearance(texture=Texture(None, (1, 1), self.lookup))
         return first, self.later_stage("textures", textured, events, rates)
-
-    def _texture(self) -> Upscale:
-        """Return the textures' growth, within the memory budget if there is one."""
-        if self.memory_budget is None:
-            return self.texture
-        if self.texture.budget_mb is not None:
-            raise ValueError("memory_budget and texture.budget_mb both say how much memory there is: give one of them")
-        megabytes = megabytes_of(self.memory_budget)
-        return dataclasses.replace(self.texture, select="budget", threshold=None, budget_mb=megabytes)
 
     @classmethod
     def presets(cls) -> dict[str, Self]:

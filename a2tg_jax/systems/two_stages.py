@@ -28,8 +28,6 @@ SMOKE_CAP = 1_000
 FLOATS_PER_TEXEL = 4
 PRUNING = Prune(at=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8))
 NO_PRUNING = dataclasses.replace(PRUNING, share=0.0)
-LONG_STAGE = 30_000
-"""Iterations of a stage in which the times of growth are given as fractions."""
 LAST_PRUNING = 0.8
 """Latest fraction of the first stage at which Gaussians are pruned; MCMC's growth ends at 5/6."""
 
@@ -100,12 +98,8 @@ class TwoStages(System):
 
 
 def grown_by_mcmc(densify: Mcmc, budget_cap: int | None) -> tuple[Event, ...]:
-    """Return noise after every iteration, and relocation and growth at their times.
-
-    Args:
-      densify: the system's option `densify`.
-      budget_cap: number of Gaussians that fill the memory budget; None without one.
-    """
+    """Return noise after every iteration, and relocation and growth at their times, up to the number of Gaussians that
+    fill the memory budget; None without one."""
     if not densify.cap:
         if budget_cap is not None:
             raise ValueError("densify.cap is 0, so that no Gaussians can fill a memory_budget")
@@ -124,10 +118,7 @@ def grown_by_density(densify: CloneSplitPrune, budget_cap: int | None) -> CloneS
 def pruned(prune: Prune, num_iterations: int, growth: Callable[[int], Times]) -> tuple[Event, ...]:
     """Return the event that prunes while others grow; none if its share is 0.
 
-    Args:
-      prune: the system's option `prune`.
-      num_iterations: length of the stage.
-      growth: times of growth in a stage by its length.
+    `growth` returns the times of growth in a stage by its length.
 
     Raises:
       ValueError: if no fraction is left, though others grow.
@@ -138,11 +129,6 @@ def pruned(prune: Prune, num_iterations: int, growth: Callable[[int], Times]) ->
         raise ValueError(
             f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little grows in the place of "
             f"what is pruned; got {shortened(prune.at)}: lower the last, or set prune.share to 0"
-        )
-    if not during_growth(prune.at, LONG_STAGE, growth(LONG_STAGE)):
-        ends = growth(LONG_STAGE).last_time / LONG_STAGE
-        raise ValueError(
-            f"prune.at must begin before the last growth, at {ends:.2g} of the stage; got {shortened(prune.at)}"
         )
     times = growth(num_iterations)
     at = during_growth(prune.at, num_iterations, times)

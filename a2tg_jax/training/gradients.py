@@ -12,9 +12,9 @@ from a2tg_jax.appearance import Appearance, check_is_appearance
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_kind, check_literal, short_tuple_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.core.pytree import combine, partition
+from a2tg_jax.events import read_probe
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.parallel.exchange import value_and_grad_of_views
 from a2tg_jax.rasterize.capacity import with_capacity

@@ -17,11 +17,10 @@ from jax.typing import DTypeLike
 from a2tg_jax.appearance import Appearance, projected
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
-from a2tg_jax.core.gradient_statistics import read_probe
 from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import combine, partition, pytree
-from a2tg_jax.events import EventInfo, Now, Seen, StepEvent
+from a2tg_jax.events import EventInfo, Now, Seen, StepEvent, read_probe
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.exchange import map_views
 from a2tg_jax.parallel.rows import spread
