@@ -298,6 +298,7 @@ class Mcmc(StepEvent):
         return num
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
+        # Dead Gaussians move first: their new places can be hosts of what is added.
         moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))
         least, cap = self.least(now, model.live_count), min(self.cap, model.gaussians.num)
         plan = functools.partial(plan_growth, now.keys[1], cap=cap, least=least)

@@ -178,6 +178,7 @@ class Texture(Part):
         An empty texture has a region of no texels and changes nothing.
         """
         textures = self.shown()
+        # Buckets lie one after the other; a texture begins at its bucket's start plus its row times the area.
         areas = [height * width for height, width in textures.bucket_sizes]
         capacities = [bucket.shape[0] for bucket in textures.buckets]
         starts = np.cumsum([0] + [capacity * area for capacity, area in zip(capacities, areas, strict=True)])[:-1]

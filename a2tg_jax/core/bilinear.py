@@ -78,6 +78,7 @@ def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
     right, bottom = jnp.minimum(left + 1, right_most), jnp.minimum(top + 1, bottom_most)
     above, below = region.first + top * region.width, region.first + bottom * region.width
     exists = (region.width > 0).astype(x.dtype)
+    # Without a texture all four weights are 0, and nothing is read into the sum.
     fx, fy = exists * (x - left.astype(x.dtype)), exists * (y - top.astype(y.dtype))
     gx, gy = exists - fx, exists - fy
     return (
@@ -110,6 +111,7 @@ def or_empty(sample: Sample, region: TextureRegion, empty: tuple[float, ...]) ->
 
 def follow(sample: Sample, x: Array, y: Array) -> tuple[Array, ...]:
     """Return the sample's values, differentiable in (x, y)."""
+    # Both are 0, and carry the derivative: texels are read once, and JAX need not differentiate the lookup itself.
     dx, dy = x - jax.lax.stop_gradient(x), y - jax.lax.stop_gradient(y)
     columns = zip(*sample, strict=True)
     return tuple(value + slope_x * dx + slope_y * dy for value, slope_x, slope_y in columns)

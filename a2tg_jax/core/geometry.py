@@ -116,6 +116,8 @@ def unclipped_bounds(M: Sequence[Sequence[Array]], cutoff: Array, near_plane: fl
     spread2 = r2 * (last_u * last_u + last_v * last_v)
     is_clipped = is_visible & (depth - jnp.sqrt(spread2) < near_plane)
 
+    # The dual conic of the disc is C = M·diag(r², r², −1)·Mᵀ. After division by C₃₃ = spread2 − depth², its last column
+    # is the centre e, relative to the projected mean, and S = e·eᵀ minus its upper block.
     scale = jnp.where(is_clipped, 0.0, r2 / jnp.where(is_clipped, 1.0, depth * depth - spread2))
     shift_x, shift_y = -scale * (x_u * last_u + x_v * last_v), -scale * (y_u * last_u + y_v * last_v)
     ellipse_x, ellipse_y = mean_x + shift_x, mean_y + shift_y

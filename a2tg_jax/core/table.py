@@ -171,6 +171,7 @@ class Table:
         """Return moments of blocks with those of the marked Gaussians [N] at zero; traceable."""
         cleared = []
         for index, bucket in enumerate(self.buckets):
+            # Gaussians of other buckets point beyond the end, where they are dropped.
             rows = jnp.where(self.bucket == index, self.row, bucket.shape[0])
             marks = jnp.zeros(bucket.shape[0], bool).at[rows].set(is_cleared, mode="drop")
             cleared.append(jnp.where(marks.reshape(-1, *[1] * (bucket.ndim - 1)), jnp.zeros_like(bucket), bucket))

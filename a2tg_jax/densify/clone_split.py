@@ -181,6 +181,7 @@ def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tupl
     index = jnp.arange(num, dtype=jnp.int32)
     is_doubled = edit.is_cloned | edit.is_split
     num_kept, num_copies = (jnp.sum(mask, dtype=jnp.int32) for mask in (edit.is_kept, is_doubled))
+    # Sorting masks stably puts marked rows first, in their order, at fixed shapes.
     kept_first = jnp.argsort(~edit.is_kept, stable=True).astype(jnp.int32)
     doubled_first = jnp.argsort(~is_doubled, stable=True).astype(jnp.int32)
     is_copy = (index >= num_kept) & (index < num_kept + num_copies)

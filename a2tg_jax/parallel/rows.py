@@ -94,6 +94,7 @@ def on_host(x: Any) -> np.ndarray:
     if mesh is None or not x.sharding.is_equivalent_to(sharding_of_rows(mesh, x.shape), x.ndim):
         whole = x if x.is_fully_addressable else multihost_utils.process_allgather(x, tiled=True)
         return np.asarray(whole)
+    # Every process reads its own parts, one piece at a time, and all exchange them: no device ever holds the whole.
     starts: dict[int, list[int]] = {}  # Of each process, the first rows of the parts on its devices.
     for device, index in x.sharding.devices_indices_map(x.shape).items():
         starts.setdefault(device.process_index, []).append(index[0].start or 0)
