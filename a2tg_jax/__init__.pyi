@@ -11,11 +11,11 @@ from .appearance import (
     allocate_appearance as allocate_appearance,
 )
 from .core.bilinear import TextureRegion as TextureRegion
+from .core.camera_paths import look_at as look_at, path_through as path_through, smooth_path as smooth_path
 from .core.cameras import Camera as Camera, resize_camera as resize_camera
 from .core.gaussians import Gaussians as Gaussians, init_from_points as init_from_points
 from .core.optim import adam_init as adam_init, adam_update as adam_update, exponential_decay as exponential_decay
 from .core.origin import Origin as Origin
-from .core.paths import look_at as look_at, path_through as path_through, smooth_path as smooth_path
 from .core.pytree import combine as combine, partition as partition, pytree as pytree, static as static
 from .core.similarity import Similarity as Similarity, transform_gaussians as transform_gaussians
 from .data import (

@@ -19,7 +19,7 @@ from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
 from a2tg_jax.events import Change, Due, GradientStatistics, HostEvent, Seen, Statistic, iterations_at
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.rows import on_host
+from a2tg_jax.parallel.sharded_rows import on_host
 from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures, checked_sizes
 
 Axes = Literal["paper", "authors"]

@@ -26,7 +26,7 @@ from a2tg_jax.core.table import Shape, Table, is_table
 from a2tg_jax.data import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.rows import on_host, placed_like, rows_moved, zeros_beside
+from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved, zeros_beside
 from a2tg_jax.rasterize.pixel import Statistic as Statistic
 
 LEAST_LEFT = 2
@@ -139,7 +139,7 @@ class Event:
 
     Where several devices train together, arrays come as they are, with their rows spread over the devices; whatever
     `init`, `gather` and an event on the host return is spread again. On the host, read arrays by `on_host`, and place
-    new ones by `placed_like`, which never puts all rows on one device (`parallel.rows`).
+    new ones by `placed_like`, which never puts all rows on one device (`parallel.sharded_rows`).
     """
 
     prunes_large: ClassVar[bool] = False
@@ -169,7 +169,7 @@ class Event:
 
         It does not follow rows that another event moves inside the step: what gathers per row wants a stage in which
         none does. `gather` follows those that move on the host. If several devices train together, they share the rows
-        of these arrays; those made by `parallel.rows.zeros_beside` are never on one device.
+        of these arrays; those made by `parallel.sharded_rows.zeros_beside` are never on one device.
         """
         return ()
 

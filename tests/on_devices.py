@@ -22,9 +22,9 @@ from a2tg_jax.appearance.base import cutoff_of
 from a2tg_jax.core.geometry import homographies, screen_bounds
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Change, Due, HostEvent, StepEvent
-from a2tg_jax.parallel import exchange as exchanges, rows
+from a2tg_jax.parallel import exchange as exchanges, sharded_rows as rows
 from a2tg_jax.parallel.exchange import AXIS, ROOM_OF_A_BAND, BorderRoom, ImageBands, exchange_among
-from a2tg_jax.parallel.rows import on_host, placed_like, readable, rows_moved, sharding_of_rows, spread
+from a2tg_jax.parallel.sharded_rows import on_host, placed_like, readable, rows_moved, sharding_of_rows, spread
 from a2tg_jax.rasterize.capacity import pairs_of_view
 from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles
 from a2tg_jax.rasterize.views import render_traced
@@ -439,7 +439,7 @@ HAPPENED = ["Prune", "PruneFloaters", "Prune", "AdaptDegrees", "AdaptDegrees", "
 def no_whole_rows(num):
     """Fail if a new array of so many rows or more lies on one device, or on each, while others are read and placed.
 
-    It sees the arrays that live whenever a function of `parallel.rows` returns.
+    It sees the arrays that live whenever a function of `parallel.sharded_rows` returns.
     """
     known, found = jax.live_arrays(), set()
     ids = set(map(id, known))

@@ -29,7 +29,7 @@ from test_pictures import write_scene
 import a2tg_jax as a2tg
 from a2tg_jax.data import decoding, photo_reading, photo_store
 from a2tg_jax.parallel.processes import LOST, ProcessPlace, joined
-from a2tg_jax.parallel.rows import placed_like, spread
+from a2tg_jax.parallel.sharded_rows import placed_like, spread
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import BatchOrder, PhotoStore

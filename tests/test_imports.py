@@ -29,7 +29,7 @@ LAYERS = (
     {"cli"},
 )
 """Lowest first. A module may import from lower layers, and, within one subpackage, from itself."""
-DRAWING = {"parallel.exchange", "parallel.room"}
+DRAWING = {"parallel.exchange", "parallel.exchange_room"}
 """Modules of `parallel` that belong to the layer of rasterize: how splats reach pixels. The others are arrays only."""
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

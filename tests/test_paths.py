@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.core.camera_paths import look_at, path_through
 from a2tg_jax.core.cameras import Camera, looking
 from a2tg_jax.core.capture_geometry import central_camera, turntable, vertical_of
-from a2tg_jax.core.paths import look_at, path_through
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.io.path_file import load_views
 

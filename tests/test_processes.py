@@ -21,7 +21,7 @@ from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.parallel import processes, rows
+from a2tg_jax.parallel import processes, sharded_rows
 from a2tg_jax.parallel.processes import LOST, Liveness, accept, connect, is_of_collectives, listen
 from a2tg_jax.results import several_processes
 from a2tg_jax.results.folder import RunFolder, resuming_command
@@ -227,11 +227,11 @@ def test_a_process_that_follows_may_have_the_scene_elsewhere(tmp_path):
 
 def test_numbers_of_the_first_process_keep_their_bits(monkeypatch):
     own = (np.array([1 / 3, 2.0]), np.arange(4)[::2], np.ones((2, 2), np.float32))
-    assert rows.of_first(None, own) is own
+    assert sharded_rows.of_first(None, own) is own
     told = []
-    monkeypatch.setattr(rows.multihost_utils, "broadcast_one_to_all", lambda x: told.append(x.dtype) or x + 0)
+    monkeypatch.setattr(sharded_rows.multihost_utils, "broadcast_one_to_all", lambda x: told.append(x.dtype) or x + 0)
     devices = np.array([SimpleNamespace(process_index=index) for index in range(2)])
-    found = rows.of_first(SimpleNamespace(devices=devices), own)
+    found = sharded_rows.of_first(SimpleNamespace(devices=devices), own)
     jax.tree.map(np.testing.assert_array_equal, found, own)
     assert [x.dtype for x in found] == [x.dtype for x in own] and set(told) == {np.dtype(np.uint8)}
 

@@ -15,9 +15,9 @@ from run_folders import create_run
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli import main as cli
+from a2tg_jax.core.camera_paths import smooth_path
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.core.paths import smooth_path
 from a2tg_jax.data import View, synthetic_scene, view_image
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.io.model_file import save_model

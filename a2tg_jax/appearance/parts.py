@@ -22,7 +22,7 @@ from a2tg_jax.core.numerics import Integer, normalize, within
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, sh_basis
 from a2tg_jax.core.table import Places, Size, Table, check_places, check_table
-from a2tg_jax.parallel.rows import on_host, placed_like
+from a2tg_jax.parallel.sharded_rows import on_host, placed_like
 from a2tg_jax.texture import NEUTRAL_TEXEL, Textures, allocate_textures, check_textures
 
 

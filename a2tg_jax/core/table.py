@@ -19,7 +19,7 @@ from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_mask, check_shape, plain_array, short_repr
 from a2tg_jax.core.pytree import partition, pytree, static
-from a2tg_jax.parallel.rows import on_host, placed_like, rows_moved
+from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved
 
 Size = tuple[int, ...]
 KNOWN_SLACK = 1.25

@@ -26,8 +26,8 @@ from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, iteration
 from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.exchange import exchange_of
-from a2tg_jax.parallel.room import room_of_view
-from a2tg_jax.parallel.rows import everywhere, mesh_of, of_first, on_host, spread
+from a2tg_jax.parallel.exchange_room import room_of_view
+from a2tg_jax.parallel.sharded_rows import everywhere, mesh_of, of_first, on_host, spread
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render

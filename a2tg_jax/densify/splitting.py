@@ -27,7 +27,7 @@ from a2tg_jax.densify.clone_split import SPLIT_SHRINK, split_in_half
 from a2tg_jax.events import Change, EventInfo, GradientStatistics, Now, Seen, Statistic, clear_moments, gather_rows
 from a2tg_jax.mcmc import FillingMcmc, Moves, plan_growth, plan_relocation
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.rows import zeros_beside
+from a2tg_jax.parallel.sharded_rows import zeros_beside
 
 LEAST_WEIGHT = 1e-12
 """Weight of a host that no view has seen."""

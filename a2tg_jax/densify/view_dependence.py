@@ -24,7 +24,7 @@ from a2tg_jax.core.sh import NUM_BASES, sh_basis
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
 from a2tg_jax.events import Change, Due, HostEvent, Seen, iterations_at
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.rows import on_host, zeros_beside
+from a2tg_jax.parallel.sharded_rows import on_host, zeros_beside
 
 
 @pytree

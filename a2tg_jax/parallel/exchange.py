@@ -23,7 +23,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec as P
 
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import screen_bounds
-from a2tg_jax.parallel.rows import everywhere, mesh_of, placed, sharding_of_rows
+from a2tg_jax.parallel.sharded_rows import everywhere, mesh_of, placed, sharding_of_rows
 from a2tg_jax.rasterize.compositor import Composited, composite, list_tiles
 from a2tg_jax.rasterize.kernels.packing import pack_splats, unpack_splats
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats

@@ -13,7 +13,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.geometry import screen_bounds
-from a2tg_jax.parallel.room import room_of_view
+from a2tg_jax.parallel.exchange_room import room_of_view
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.splats import drawn_splats
 from a2tg_jax.rasterize.supersampling import finer

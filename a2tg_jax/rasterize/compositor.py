@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.bilinear import TextureRegion, within_texels
-from a2tg_jax.parallel.rows import cotangent_of
+from a2tg_jax.parallel.sharded_rows import cotangent_of
 from a2tg_jax.rasterize import tiles
 from a2tg_jax.rasterize.kernels import autodiff, xla
 from a2tg_jax.rasterize.kernels.by_platform import by_platform

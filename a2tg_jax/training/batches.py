@@ -15,7 +15,7 @@ from a2tg_jax.data.observations import ObservedPoints, stacked_points
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.machine import num_threads
 from a2tg_jax.parallel.exchange import Exchange, are_drawn_here, on_devices
-from a2tg_jax.parallel.rows import asked_by_any, everywhere
+from a2tg_jax.parallel.sharded_rows import asked_by_any, everywhere
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25

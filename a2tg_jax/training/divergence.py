@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from a2tg_jax.parallel.rows import readable, spread
+from a2tg_jax.parallel.sharded_rows import readable, spread
 from a2tg_jax.training.checkpoint import Checkpoint, History
 from a2tg_jax.training.step import Attempt, StepSettings, attempt
 

@@ -20,8 +20,8 @@ from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Change, Due, HostEvent, StepEvent
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.exchange import Exchange
-from a2tg_jax.parallel.room import exchange_with_room, room_of_view, with_wider_borders
-from a2tg_jax.parallel.rows import (
+from a2tg_jax.parallel.exchange_room import exchange_with_room, room_of_view, with_wider_borders
+from a2tg_jax.parallel.sharded_rows import (
     asked_by_any,
     everywhere,
     num_processes,

@@ -21,7 +21,7 @@ from a2tg_jax.data.scene import View, view_image
 from a2tg_jax.events import Change, Event, HostEvent, StepEvent
 from a2tg_jax.host.progress_bars import has_terminal, is_line_due
 from a2tg_jax.host.text import counted, in_bytes
-from a2tg_jax.parallel.rows import on_host
+from a2tg_jax.parallel.sharded_rows import on_host
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Background, Stage

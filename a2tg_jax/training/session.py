@@ -7,7 +7,7 @@ import jax
 from a2tg_jax.core.table import Shape
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.parallel.exchange import exchange_among
-from a2tg_jax.parallel.rows import num_processes
+from a2tg_jax.parallel.sharded_rows import num_processes
 
 
 def _nothing() -> None:

@@ -23,7 +23,7 @@ from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.events import EventInfo, Now, Seen, StepEvent, read_probe
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.exchange import map_views
-from a2tg_jax.parallel.rows import spread
+from a2tg_jax.parallel.sharded_rows import spread
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs
 from a2tg_jax.training.corrections import (

@@ -17,7 +17,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from a2tg_jax.parallel.rows import vary_with
+from a2tg_jax.parallel.sharded_rows import vary_with
 
 CodeOf = Callable[..., Callable[..., Any]]
 """Function of a platform ("cpu", "cuda" or "other") and of static arguments that returns a function of arrays."""
