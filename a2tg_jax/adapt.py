@@ -286,7 +286,7 @@ def select(
     * fraction: the round(fraction·N) largest statistics, halves rounded up, out of the Gaussians that can still grow
       and have a statistic above 0.
     * budget_bytes: in descending order of statistic per added byte, each Gaussian whose added texels still fit in
-      what is left of the budget; one that does not fit is skipped and the search goes on. What stays unspent is less
+      what is left of the budget; one that does not fit is skipped and the search continues. What stays unspent is less
       than the cheapest upscale not chosen. Gaussians with a statistic of 0 come last.
 
     Equal values are taken in the order of the Gaussians. A Gaussian that cannot grow is never selected.

@@ -1,7 +1,7 @@
 """Events: what changes a model between steps, such as densification, noise, or textures that grow.
 
 An event is a frozen dataclass registered as a pytree. Its numbers (thresholds, weights) are leaves and reach the step
-as traced arguments, so that other values compile nothing anew; what chooses shapes or code is static
+as traced arguments, so that other values recompile nothing; what chooses shapes or code is static
 (`metadata={"static": True}`). An event either happens inside the step, at fixed shapes (`StepEvent`), or between steps
 on the host, where shapes may change (`HostEvent`). Either may gather a statistic of the gradients until it is past.
 """
@@ -70,7 +70,7 @@ class Seen(NamedTuple):
     cameras: Camera
     """V cameras, stacked."""
     gradients: Array
-    """[V, N, 3] the statistic that the event asked for (`render.render_traced`), on the screen in units of half an
+    """[V, N, 3] the statistic that the event wants (`render.render_traced`), on the screen in units of half an
     image; 0 where a Gaussian was not seen."""
     is_visible: Array
     """[V, N] whether the Gaussian was composited at one pixel at least."""
@@ -128,7 +128,7 @@ class Change(NamedTuple):
     info: EventInfo = EventInfo()
     rows: np.ndarray | None = None
     """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved.
-    Model, moments and state are those of the new order; what other events have gathered then follows."""
+    Model, moments and state are in the new order; what other events have gathered then follows."""
     unused: str | None = None
     """Sentence that begins with a field of an event on the host and says that it made no difference this time; None:
     all did. If it made none in the whole stage, a warning says so."""
@@ -246,7 +246,7 @@ class HostEvent(Event):
         """Return model and moments with padding that the event will fill, so that its changes keep all shapes and no
         step is compiled again (host). The default adds none.
 
-        It is called before the stage, or when it goes on; the model has about `num_bytes` when the event first happens.
+        It is called when the stage begins or resumes; the model has about `num_bytes` when the event first happens.
         """
         return model, moments
 

@@ -136,7 +136,7 @@ class Model:
 
     @property
     def sh(self) -> np.ndarray:
-        """[N, K, 3] all spherical harmonics, with zeros above the degree of a Gaussian; K is that of the highest degree
+        """[N, K, 3] all spherical harmonics, with zeros above the degree of a Gaussian; K belongs to the highest degree
         (host)."""
         own, coefficients = np.asarray(self.gaussians.sh), self.appearance.coefficients
         if coefficients is None:
@@ -183,7 +183,7 @@ class Model:
 
         View dependence turns with the world; everything else of the appearance stays.
 
-        Lengths of the settings are in units of the world: `near_plane` is 0.2 of the new units too. Scale it along for
+        Lengths of the settings are in units of the world: `near_plane` is 0.2 of the new units. Scale it along for
         the same image, which else may lack or show splats close to the camera:
 
             moved = model.transform(similarity)
@@ -208,7 +208,7 @@ class Model:
         return html_table("Model", self._facts())
 
     def _facts(self) -> list[tuple[str, str]]:
-        """Return what a reader asks about a model, by name (host)."""
+        """Return what a reader wants about a model, by name (host)."""
         degree = self.gaussians.sh_degree
         has_bands = self.appearance.bands is not None
         facts = [
@@ -252,7 +252,7 @@ def concatenate(models: Sequence[Model]) -> Model:
       models: at least one, of the same appearance with the same options.
 
     Returns:
-      The model of all Gaussians that exist; its origin is that of the first model.
+      The model of all Gaussians that exist; its origin is the first one.
 
     Raises:
       ValueError: if there are no models, or they differ in their appearance or dtype.

@@ -8,7 +8,7 @@ and the K numbers it computes a colour residual and an alpha factor (`shade`):
     α = min(max_alpha, peak opacity · falloff(numbers, ρ) · factor),  colour = SH colour + residual
 
 `Appearance()` is plain 2DGS. Its optional parts are a texture, exponents of the kernels, and bands of spherical
-harmonics. A subclass adds arrays of its own and overrides what differs; the parts work with it too.
+harmonics. A subclass adds arrays of its own and overrides what differs; the parts work with it as well.
 
 An appearance whose arrays are None is a template, such as the one of a stage: it has the options only, and
 `allocate_appearance` makes the arrays for some Gaussians. A plain array of a subclass has a row for each Gaussian.
@@ -59,9 +59,9 @@ class Appearance:
     bands: Bands | None = None
     """Spherical harmonics with a degree per Gaussian, beyond those of the Gaussians; None: none."""
     given_colors: Array | None = None
-    """[N, 3] colours in place of those of spherical harmonics, for rendering; None otherwise."""
+    """[N, 3] colours instead of spherical harmonics, for rendering; None otherwise."""
     features: Array | None = None
-    """[N, D] numbers to show in place of all colour, residuals of textures included, D >= 1, of either sign; None
+    """[N, D] numbers to show instead of all colour, residuals of textures included, D >= 1, of either sign; None
     otherwise."""
     max_alpha: float | None = static(default=None)
     """Upper limit of alpha, in (0, 1); None: the one of the texture's options, or 0.99."""
@@ -151,7 +151,7 @@ class Appearance:
         return self
 
     def rates(self, rate: Any) -> Any:
-        """Return Adam's learning rates, a prefix of the tree of floats, from those of a stage.
+        """Return Adam's learning rates, a prefix of the tree of floats, from the rates of a stage.
 
         A number holds for all floats. A mapping has rates by field, 0 for those it lacks.
         """
@@ -187,7 +187,7 @@ class Appearance:
         """Raise ValueError unless arrays of the subclass, with a row for each Gaussian, fit its options (host)."""
 
     def num_published_floats(self, num: int) -> int:
-        """Return the floats of `num` Gaussians, beside their own, as the method's authors count them (host)."""
+        """Return the floats of `num` Gaussians besides their own, as the method's authors count them (host)."""
         return count_floats(self, num)
 
     # Facts
@@ -373,7 +373,7 @@ def projected(appearance: A) -> A:
 
 
 def count_floats(appearance: Appearance, num: int) -> int:
-    """Return the trained floats of the first `num` Gaussians beside their own, without padding (host).
+    """Return the trained floats of the first `num` Gaussians besides their own, without padding (host).
 
     An opacity that is not trained counts as -1.
     """

@@ -114,7 +114,7 @@ class _LeftOut:
             raise AttributeError(name)
         self._refuse()
 
-    # A property: JAX asks whether there is such a method, and its own error would name neither field nor appearance.
+    # A property: JAX checks whether there is such a method, and its own error would name neither field nor appearance.
     __jax_array__ = property(_refuse)
     __array__ = __getitem__ = __iter__ = __len__ = __bool__ = __float__ = __int__ = _refuse
     __add__ = __sub__ = __mul__ = __truediv__ = __pow__ = __neg__ = __abs__ = __matmul__ = _refuse

@@ -5,7 +5,7 @@ per splat. With the weights w_i = exp(−k_i·|(u, v) − (x_i, y_i)|²) + 10⁻
 
     α = mean_i(o_i·w_i)·exp(−ρ/2),   colour = SH colour + mean_i(c_i·w_i)
 
-The Gaussian's own opacity takes no part. (u, v) are always those of the hit; the authors' program takes offsets in
+The Gaussian's own opacity takes no part. (u, v) always belong to the hit; the authors' program takes offsets in
 pixels instead where the low-pass filter decides.
 """
 
@@ -98,7 +98,7 @@ class MovableKernels(Appearance):
         return PUBLISHED_FLOATS * num
 
     def opacities(self, gaussians: Gaussians) -> Array:
-        """Return the mean opacity [N] of the kernels, which bounds that of the splat to 10⁻⁴ of it."""
+        """Return the mean opacity [N] of the kernels, which bounds the opacity of the splat to 10⁻⁴ of it."""
         return jnp.mean(self.kernel_opacities, axis=1)
 
     def share(self, gaussians: Gaussians, num_shares: Array) -> tuple[Gaussians, "MovableKernels"]:

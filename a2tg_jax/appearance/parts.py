@@ -122,7 +122,7 @@ class Texture(Part):
         check_places(self.texels)
 
     def rates(self, rate: Any) -> Any:
-        """Return one rate for all texels, or those of `TexelRates`."""
+        """Return one rate for all texels, or `TexelRates`."""
         if not isinstance(rate, TexelRates):
             return rate
         assert self.texels is not None

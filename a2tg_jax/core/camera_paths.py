@@ -36,7 +36,7 @@ def look_at(
     fov: float = 60.0,
     up: ArrayLike = (0.0, 0.0, 1.0),
 ) -> Camera:
-    """Return a pinhole camera that sees `target` in the middle of its image, with a level horizon (host).
+    """Return a pinhole camera with `target` in the middle of its image, with a level horizon (host).
 
     Args:
       position: [3] position of the camera in the world.
@@ -46,7 +46,7 @@ def look_at(
       up: [3] vertical of the world; the cameras of a scene have it near +z.
 
     Raises:
-      ValueError: if the camera is asked to look nowhere, or along the vertical, or with another angle of view.
+      ValueError: if the target is at the position or along the vertical, or the angle of view is out of range.
     """
     vectors = {name: np.asarray(v, np.float64) for name, v in (("position", position), ("target", target), ("up", up))}
     for name, vector in vectors.items():
@@ -55,8 +55,8 @@ def look_at(
     center, seen, up = vectors.values()
     forward = seen - center
     if np.linalg.norm(np.cross(forward, up)) <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(up):
-        told = f"target must lie in a direction that is not along up; it lies at {forward} from the camera"
-        raise ValueError(f"{told}, and up is {up}: say another up=")
+        wanted = f"target must lie in a direction that is not along up; it lies at {forward} from the camera"
+        raise ValueError(f"{wanted}, and up is {up}: say another up=")
     if not 0 < fov < 180:
         raise ValueError(f"fov must lie between 0 and 180 degrees; got {fov}")
     viewmat, K = looking(center, forward, -up), intrinsics(width, height, np.radians(fov))

@@ -51,7 +51,7 @@ class Camera:
     """Image height in pixels."""
     rays: Array | None = None
     """[H, W, 2] where the ray of each pixel meets the image plane of K, in its pixels, for a lens that is no pinhole:
-    pixel (i, j) looks along K⁻¹·(x, y, 1). A pixel whose numbers are not finite sees the background. A constant, which
+    pixel (i, j) looks along K⁻¹·(x, y, 1). A pixel whose numbers are not finite shows the background. A constant, which
     is not differentiated; None is a pinhole camera."""
 
     def __post_init__(self) -> None:
@@ -181,7 +181,7 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def _resampled(values: Array, num: int, axis: int) -> Array:
-    """Return values at the centres of `num` pixels along an axis, linear between and beyond those of the old ones."""
+    """Return values at the centres of `num` pixels along an axis, linear between and beyond the old centres."""
     old = values.shape[axis]
     if old == 1 or num == old:
         return values if num == old else jnp.repeat(values, num, axis=axis)

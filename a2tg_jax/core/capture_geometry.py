@@ -17,7 +17,7 @@ LEAST_FACING = 0.5
 """Smallest median cosine between optical axes and the directions to the subject."""
 LARGEST_ELEVATION = np.radians(80)
 FEWEST = 4
-"""Smallest number of cameras whose right axes tell more than their mean up."""
+"""Smallest number of cameras whose right axes say more than their mean up."""
 LEAST_SPREAD = 0.025
 """Smallest second eigenvalue of the right axes' moments: headings that spread by 9°."""
 LARGEST_RATIO = 0.25
@@ -37,7 +37,7 @@ def nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 
 def vertical_of(viewmats: np.ndarray) -> np.ndarray:
-    """Return the vertical [3] that cameras [V, 4, 4] tell, as the viewer estimates it (web/src/vertical.ts).
+    """Return the vertical [3] of cameras [V, 4, 4], as the viewer estimates it (web/src/vertical.ts).
 
     It is the axis closest to perpendicular to all right axes in least squares, or the cameras' mean up if the right
     axes do not determine it.

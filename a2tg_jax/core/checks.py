@@ -36,7 +36,7 @@ def fields_of(path: str) -> Iterator[None]:
 def check_kind(name: str, value: Any, kind: type | tuple[type, ...], hint: str = "") -> None:
     """Raise ValueError, with an optional hint, unless a value is an instance of a class, or of one of several.
 
-    Without a hint, a class in place of its instance is told so.
+    Without a hint, the error of a class instead of its instance says so.
     """
     if isinstance(value, kind):
         return
@@ -50,7 +50,7 @@ def check_kind(name: str, value: Any, kind: type | tuple[type, ...], hint: str =
 
 
 def check_literal(name: str, value: object, literal: object) -> None:
-    """Raise ValueError unless a value is one of those of a `Literal`."""
+    """Raise ValueError unless a value is one of a `Literal`."""
     if value not in get_args(literal):
         raise ValueError(f"{name} must be one of {', '.join(get_args(literal))}; got {value!r}")
 

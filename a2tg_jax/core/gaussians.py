@@ -306,7 +306,7 @@ def stacked_integral(opacities: Array, num_shares: Array) -> Array:
         # Without jit, JAX hands Python's integers to the body of a loop.
         return total + integrand(jnp.asarray(node, opacities.dtype) * spacing)
 
-    # A loop over nodes, not an axis of nodes: the memory stays that of one value per row.
+    # A loop over nodes, not an axis of nodes: the memory stays one value per row.
     half = jax.lax.fori_loop(1, QUADRATURE_STEPS + 1, add_node, 0.5 * integrand(0.0))
     whole: Array = half * (2 * spacing / math.sqrt(math.pi))
     return whole

@@ -119,8 +119,8 @@ def _one_each(rates: Any, params: Any) -> Any:
     try:
         found = jax.tree.broadcast(rates, params)
     except ValueError as error:
-        told = shortened(str(jax.tree.structure(rates)))
-        raise ValueError(f"rates must be one for all, or have the fields of params; got {told}") from error
+        found_fields = shortened(str(jax.tree.structure(rates)))
+        raise ValueError(f"rates must be one for all, or have the fields of params; got {found_fields}") from error
     for (path, param), rate in zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(found), strict=True):
         shape = jnp.shape(rate)
         fits = len(shape) == param.ndim and all(

@@ -33,7 +33,7 @@ class Origin:
     is_test: np.ndarray
     """[V] whether the photograph was held out for testing."""
     transform: Similarity
-    """Transform from the original world to that of the cameras."""
+    """Transform from the original world to the world of the cameras."""
     corrections: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """[V, ...] learned values of each photograph (`training.corrections`), by the correction's name, in the world of
     the training. `viewmats` are corrected already."""

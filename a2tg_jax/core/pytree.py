@@ -2,7 +2,7 @@
 
 `jax.tree_util.register_dataclass` is not used: JAX 0.10 to 0.12 considers the structures of two such classes equal if
 only the classes differ, so that `jax.jit` may run the program of a class for its subclass. Classes registered with
-their own functions are told apart.
+their own functions are distinct.
 """
 
 import dataclasses
@@ -99,7 +99,7 @@ def num_compiled(jitted: Any) -> int:
 
 
 def partition(tree: T) -> tuple[T, T]:
-    """Return a pytree with its float arrays only, None in place of all other leaves, and one with the others only."""
+    """Return a pytree with its float arrays only, None for all other leaves, and one with the others only."""
 
     def is_float(leaf: Any) -> bool:
         dtype = getattr(leaf, "dtype", None)

@@ -23,7 +23,7 @@ from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved
 
 Size = tuple[int, ...]
 KNOWN_SLACK = 1.25
-"""Largest number of elements of a known shape, as a multiple of those of a new one, for which it is taken."""
+"""Largest number of elements of a known shape, as a multiple of a new one's, for which it is taken."""
 
 
 class Shape(NamedTuple):
@@ -179,7 +179,7 @@ class Table:
 
     def take(self, rows: np.ndarray, padding: Sequence[float] | None = None) -> Self:
         """Return the blocks of the Gaussians `rows` [M], which may repeat, in buckets as small as they need (host).
-        Padding is that of the class, or C given numbers, such as zeros for moments."""
+        Padding is `padding` of the class, or C given numbers, such as zeros for moments."""
         places, capacities = plan_places(self.sizes[rows])
         old = on_host(self.bucket)[rows], on_host(self.row)[rows]
         moves = _moves_between(old, (np.asarray(places.bucket), np.asarray(places.row)))

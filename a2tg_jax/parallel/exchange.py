@@ -38,7 +38,7 @@ COST_BITS = 29
 
 
 class BorderRoom(NamedTuple):
-    """Rows of pixels by which a border between two bands may lie off that of an even cut; static."""
+    """Rows of pixels by which a border between two bands may differ from the border of an even cut; static."""
 
     above: int
     below: int
@@ -231,7 +231,7 @@ def composite_on_devices(
 
     `capacity` is the number of pairs of a whole image; the result's number of pairs is the capacity that has room for
     the fullest band and for all that is sent to it. If the devices draw several views at once, this is called for each
-    of them under `value_and_grad_of_views`. The rays [H, W, 2] are those of the lens (`Camera.rays`).
+    of them under `value_and_grad_of_views`. The rays [H, W, 2] of the lens are `Camera.rays`.
     """
     draw = functools.partial(_composite_views, settings, exchange, capacity, texels, regions, rays)
     arrays = splats, cutoff, jacobian, probe
@@ -372,8 +372,8 @@ def value_and_grad_of_views(loss: Callable[..., tuple[Array, Any]], num_views: i
         copy = lambda x: jnp.broadcast_to(x, (num_views, *x.shape))  # noqa: E731
         gaussians, probe = jax.tree.map(copy, (gaussians, probe))
         with_gradients = jax.value_and_grad(of_views, argnums=(0, 1, 2, 3), has_aux=True)
-        (_, told), (of_gaussians, sums, *others) = with_gradients(gaussians, appearance, rows, probe, views)
-        return told, (of_gaussians, jax.tree.map(lambda x: x / num_views, sums), *others)
+        (_, found), (of_gaussians, sums, *others) = with_gradients(gaussians, appearance, rows, probe, views)
+        return found, (of_gaussians, jax.tree.map(lambda x: x / num_views, sums), *others)
 
     return differentiated
 

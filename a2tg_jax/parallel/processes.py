@@ -27,7 +27,7 @@ from a2tg_jax.host.text import shortened
 BEATS = 5
 """Number of signs of life within the time after which a silent process is lost."""
 GRACE = 2.0
-"""Seconds in which a process that fails with the others can tell its own error."""
+"""Seconds in which a process that fails with the others can report its own error."""
 INTERRUPTED_GRACE = 300.0
 """Seconds in which a process that is interrupted with the others can write its last checkpoint."""
 LOOK_SECONDS = 0.1
@@ -44,8 +44,8 @@ class Liveness:
         others: connections by the number of the process.
         count: number of all processes.
         seconds: time after which a silent process is lost.
-        on_end: called in a thread with the reason once another process is lost, or with "" if the first one asks to
-          end quietly. It ends the process.
+        on_end: called in a thread with the reason once another process is lost, or with "" if the first one wants
+          the others to end quietly. It ends the process.
         """
         self._others, self._count, self._seconds, self._on_end = dict(others), count, seconds, on_end
         self._ending, self._sending = threading.Lock(), threading.Lock()
@@ -57,7 +57,7 @@ class Liveness:
     def end(self, kind: bytes, reason: str = "") -> None:
         """Report the end of this process to the others.
 
-        BYE: it needs them no more, and they not it. INTERRUPTED: it was asked to end, as they should be. FAILED: it
+        BYE: it needs them no more, and they not it. INTERRUPTED: it was interrupted, as they should be. FAILED: it
         ends by an error of its own, the reason. QUIT: they are to end quietly.
         """
         if kind != FAILED:
@@ -158,7 +158,7 @@ LEAVE_SECONDS = 60
 """Time in which all processes must have finished training."""
 AUTO = "auto"
 LOST = 75
-"""Exit code after another process was lost: training can go on from its last checkpoint."""
+"""Exit code after another process was lost: training can resume from its last checkpoint."""
 LONGEST_HOST = 255
 MOST_TOLD = 300
 """Largest number of characters of another process's error."""
@@ -182,7 +182,7 @@ class Team:
     def __init__(self, seconds: float):
         self.index, self.count, self._seconds = jax.process_index(), jax.process_count(), seconds
         self.advice: Callable[[], str] = str
-        """Function that tells how to go on after a process is lost."""
+        """Function that returns how to resume after a process is lost."""
         self.has_met = False
         """Whether all are training, so that an interruption of one stops all after the same iteration."""
         self._liveness: Liveness | None = None
@@ -202,22 +202,22 @@ class Team:
                 address = socket.gethostbyname(host)
                 host = host if address.startswith("127.") else address
             host = host[:LONGEST_HOST]
-        told = broadcast(b"".join([own[1].to_bytes(4, "big"), own[2], host.encode()]) if own else b"")
+        sent = broadcast(b"".join([own[1].to_bytes(4, "big"), own[2], host.encode()]) if own else b"")
         others = accept(own[0], own[2], self.count) if own else connect(
-            told[36:].decode(), int.from_bytes(told[:4], "big"), told[4:36], self.index
+            sent[36:].decode(), int.from_bytes(sent[:4], "big"), sent[4:36], self.index
         )  # fmt: skip
         self._liveness = Liveness(others, self.count, self._seconds, self._end)
 
     def leave(self) -> None:
-        """End the common work; this process goes on alone."""
+        """End the common work; this process continues alone."""
         if self._liveness is not None:
             multihost_utils.sync_global_devices("leave")
             self._liveness.end(BYE)
             self._liveness = None
             jax.distributed.shutdown()
 
-    def told(self, error: BaseException) -> None:
-        """Tell the others of an error; if it comes of a lost process, wait for what is known of that one."""
+    def report(self, error: BaseException) -> None:
+        """Report an error to the others; if it comes of a lost process, wait for what is known of that one."""
         liveness, self._liveness = self._liveness, None
         if liveness is None:
             return
@@ -233,7 +233,7 @@ class Team:
             time.sleep(self._seconds)
 
     def _end(self, reason: str) -> NoReturn:
-        """End this process, which waits inside XLA, with one line; without a reason the first one ends, too."""
+        """End this process, which waits inside XLA, with one line; without a reason the first one ends as well."""
         if not reason:
             with contextlib.suppress(Exception):
                 jax.distributed.shutdown()  # The first process waits for it at its end.
@@ -266,8 +266,9 @@ def joined(place: ProcessPlace | None) -> Iterator[Team | None]:
         return
 
     def give_up() -> NoReturn:
-        told = f"a2tg: error: not all processes have joined --coordinator {place.coordinator} within {JOIN_SECONDS} s"
-        print(f"{told}: start as many as --num-processes says, each with a --process-id of its own", file=sys.stderr)
+        missing = f"not all processes have joined --coordinator {place.coordinator} within {JOIN_SECONDS} s"
+        advice = "start as many as --num-processes says, each with a --process-id of its own"
+        print(f"a2tg: error: {missing}: {advice}", file=sys.stderr)
         sys.stderr.flush()
         os._exit(LOST)
 
@@ -279,7 +280,7 @@ def joined(place: ProcessPlace | None) -> Iterator[Team | None]:
             own_output_only()
         wait_in_abort()
         is_auto = place.coordinator == AUTO
-        # JAX's handler of SIGTERM would take the place of `signals`.
+        # JAX's handler of SIGTERM would replace `signals`.
         jax.config.update("jax_enable_preemption_service", False)
         try:
             # Its own times are a net beneath this module's.
@@ -305,7 +306,7 @@ def joined(place: ProcessPlace | None) -> Iterator[Team | None]:
         yield _team
         _team.leave()
     except BaseException as error:
-        _team.told(error)
+        _team.report(error)
         raise
     finally:
         _team = None

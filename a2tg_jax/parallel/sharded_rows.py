@@ -1,6 +1,6 @@
 """Who holds which rows: arrays whose rows are spread over the devices of a mesh, and those that every device has.
 
-JAX's shardings say it all: an array knows its mesh. A `Mesh | None` says where new arrays go; None is one device, where
+JAX's shardings say it all: an array has its mesh. A `Mesh | None` says where new arrays go; None is one device, where
 every function here leaves arrays as they are. On the host an array is read by `on_host` and written by `placed_like`,
 one at a time, so that a change takes a share of the memory of each device. If the devices belong to several processes,
 all of them make the same calls.
@@ -165,7 +165,7 @@ def warn_of_uneven_rows(num: int, num_devices: int) -> None:
 
 
 def asked_by_any(mesh: Mesh | None, is_asked: bool) -> bool:
-    """Return whether any of the processes asks for something (host)."""
+    """Return whether any of the processes wants something (host)."""
     if num_processes(mesh) == 1:
         return is_asked
     return bool(np.any(multihost_utils.process_allgather(np.asarray(is_asked))))
@@ -178,8 +178,8 @@ def of_first(mesh: Mesh | None, tree: Any) -> Any:
 
     def of_leaf(x: Any) -> np.ndarray:
         x = np.ascontiguousarray(x)
-        told = multihost_utils.broadcast_one_to_all(x.reshape(-1).view(np.uint8))  # As bytes: JAX may round numbers.
-        same: np.ndarray = np.asarray(told, np.uint8).view(x.dtype).reshape(x.shape)
+        sent = multihost_utils.broadcast_one_to_all(x.reshape(-1).view(np.uint8))  # As bytes: JAX may round numbers.
+        same: np.ndarray = np.asarray(sent, np.uint8).view(x.dtype).reshape(x.shape)
         return same
 
     return jax.tree.map(of_leaf, tree)

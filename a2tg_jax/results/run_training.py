@@ -165,7 +165,7 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
         if text is None:
             raise
         if others is not None:
-            others.told(error)
+            others.report(error)
         raise ValueError(f"{text}; {advice()}") from error
 
 

@@ -1,1 +1,1 @@
-"""The methods that the paper compares; `training.registry` knows them by name."""
+"""The methods that the paper compares; `training.registry` has their names."""

@@ -79,7 +79,7 @@ class TwoStages(System):
         return first, self.later_stage("continued", first.appearance, appearance_rate=first.appearance_rate)
 
     def _floaters_pruned(self, others: tuple[Event, ...]) -> tuple[Event, ...]:
-        """Return the event that prunes floaters before the last growth by other events; none if none is asked for."""
+        """Return the event that prunes floaters before the last growth by other events; none if it is off."""
         floaters, length = self.floaters, self.stage1_iterations
         if not (floaters.min_views or floaters.near):
             return ()
