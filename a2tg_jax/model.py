@@ -237,9 +237,9 @@ def _indices(rows: Any, num: int) -> np.ndarray:
         raise ValueError(f"rows must choose among {num} Gaussians: {error}") from None
 
 
-def check_is_model(model: Any, name: str = "model") -> None:
+def check_is_model(model: Any) -> None:
     """Raise ValueError unless a value is a model."""
-    check_kind(name, model, Model, "say Model(gaussians)" if isinstance(model, Gaussians) else "")
+    check_kind("model", model, Model, "say Model(gaussians)" if isinstance(model, Gaussians) else "")
 
 
 def concatenate(models: Sequence[Model]) -> Model:

@@ -44,11 +44,11 @@ class Textures(Table):
         return self.count_elements(self.num)
 
 
-def check_textures(textures: Textures, num: int | None = None, name: str = "textures") -> None:
+def check_textures(textures: Textures, num: int | None = None) -> None:
     """Raise ValueError, naming the field, unless a value is `Textures` that fit `num` Gaussians, if given."""
     if not isinstance(textures, Textures):
-        raise ValueError(f"{name} must be Textures; got {type(textures).__name__}")
-    check_table(textures, num, name)
+        raise ValueError(f"textures must be Textures; got {type(textures).__name__}")
+    check_table(textures, num)
 
 
 def checked_sizes(sizes: ArrayLike, name: str = "sizes") -> np.ndarray:

@@ -260,11 +260,10 @@ def appearance_for(
     has_textures: bool,
     has_degrees: bool = False,
     has_shapes: bool = False,
-    start: tuple[int, int] = (1, 1),
 ) -> Appearance:
     """Return the template of plain Gaussians with some parts; without textures, only `options.max_alpha` counts."""
     return Appearance(
-        texture=Texture(None, start, options) if has_textures else None,
+        texture=Texture(None, (1, 1), options) if has_textures else None,
         exponents=Exponents() if has_shapes else None,
         bands=Bands() if has_degrees else None,
         max_alpha=None if has_textures else options.max_alpha,

@@ -144,14 +144,14 @@ def check_unmasked(name: str, value: object) -> None:
         raise ValueError(f"{name} has masked entries: replace them, as in array.filled(0), or drop their rows")
 
 
-def make_plain(instance: object, name: str, *fields: str, dtype: DTypeLike | None = None) -> None:
+def make_plain(instance: object, name: str, *fields: str) -> None:
     """Replace fields of a frozen dataclass by `plain_array` of them; lists get the dtype of the first array."""
     values = {field: getattr(instance, field) for field in fields}
-    dtypes = [value.dtype for value in values.values() if hasattr(value, "dtype")]
+    dtype = next((value.dtype for value in values.values() if hasattr(value, "dtype")), None)
     for field, value in values.items():
         if type(value) is tuple:  # Trees of shapes have tuples where arrays were.
             continue
-        changed = plain_array(f"{name}.{field}", value, dtype or next(iter(dtypes), None))
+        changed = plain_array(f"{name}.{field}", value, dtype)
         if changed is not value:
             object.__setattr__(instance, field, changed)
 

@@ -51,7 +51,21 @@ class TwoStages(System):
         name: str = "gaussians",
     ) -> Stage:
         """Return a first stage, in which the degree of spherical harmonics rises and floaters are pruned."""
-        return self._stage(0, name, appearance, (*events, *self._floaters_pruned(events)), appearance_rate)
+        floaters, length = self.floaters, self.stage1_iterations
+        if floaters.min_views or floaters.near:
+            growing = (each for each in events if isinstance(each, StepEvent) and each.most_gaussians is not None)
+            times = [found for each in growing if (found := each.times(length)).num_times]
+            if times:
+                last = max(times, key=lambda found: found.last_time)
+                floaters = dataclasses.replace(floaters, at=during_growth(floaters.at, length, last))
+                if not floaters.at:
+                    raise ValueError(
+                        "floaters.at must hold a fraction before the last growth, which is at iteration "
+                        f"{last.last_time:,} of {length:,}, for others grow in the place of what is pruned; got "
+                        f"{shortened(self.floaters.at)}"
+                    )
+            events = (*events, floaters)
+        return self._stage(0, name, appearance, events, appearance_rate)
 
     def later_stage(
         self, name: str, appearance: Appearance, events: tuple[Event, ...] = (), appearance_rate: Any = None
@@ -77,24 +91,6 @@ class TwoStages(System):
         if not self.stage2_iterations:
             return (first,)
         return first, self.later_stage("continued", first.appearance, appearance_rate=first.appearance_rate)
-
-    def _floaters_pruned(self, others: tuple[Event, ...]) -> tuple[Event, ...]:
-        """Return the event that prunes floaters before the last growth by other events; none if it is off."""
-        floaters, length = self.floaters, self.stage1_iterations
-        if not (floaters.min_views or floaters.near):
-            return ()
-        growing = (each for each in others if isinstance(each, StepEvent) and each.most_gaussians is not None)
-        times = [found for each in growing if (found := each.times(length)).num_times]
-        if not times:
-            return (floaters,)
-        last = max(times, key=lambda found: found.last_time)
-        at = during_growth(floaters.at, length, last)
-        if not at:
-            raise ValueError(
-                f"floaters.at must hold a fraction before the last growth, which is at iteration {last.last_time:,} of "
-                f"{length:,}, for others grow in the place of what is pruned; got {shortened(floaters.at)}"
-            )
-        return (dataclasses.replace(floaters, at=at),)
 
 
 def grown_by_mcmc(densify: Mcmc, budget_cap: int | None) -> tuple[Event, ...]:
