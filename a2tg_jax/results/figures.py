@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
+from a2tg_jax.core.camera_paths import smooth_path
 from a2tg_jax.core.cameras import Camera, resize_camera
 from a2tg_jax.core.gaussians import SH_C0
-from a2tg_jax.core.camera_paths import smooth_path
 from a2tg_jax.data.colmap import read_cameras_and_points
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.model import Model
