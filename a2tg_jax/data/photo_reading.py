@@ -52,7 +52,7 @@ class Photo(NamedTuple):
     """Factor by which the file's pixels are downscaled."""
     lens_of: Callable[[tuple[int, int]], Lens]
     """Function from the file's (width, height) to the lens."""
-    told: str
+    what: str
     """Name of the photograph in errors of its lens."""
     mask: tuple[Path, int] | None
     """File of the mask, and the factor by which it is downscaled."""
@@ -174,7 +174,7 @@ def _named(photo: Photo) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise ValueError(f"{photo.told}: its camera model {error}") from None
+        raise ValueError(f"{photo.what}: its camera model {error}") from None
 
 
 def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) -> None:
