@@ -8,7 +8,7 @@ from typing import Any
 
 import lazy_loader
 
-_import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_import_name, _, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
@@ -20,3 +20,7 @@ def __getattr__(name: str) -> Any:
     value = _import_name(name)
     importlib.import_module(f"{__name__}.host.field_docs").list_fields()
     return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -90,8 +90,8 @@ def test_a_budget_is_one_value_however_it_comes(name, tmp_path):
     wanted = kind(memory_budget=1.5)
     assert wanted == kind(memory_budget="1500kB") and wanted.budget_bytes == 1_500_000
     run = ["--system", name, "--out", str(tmp_path)]
-    assert cli._parse("train", ["synthetic", *run, "--memory-budget", "1.5MB"]).options == wanted
-    assert cli._parse("train", ["synthetic", *run, "--memory-budget", "1.5"]).options == wanted
+    assert cli.parsed("train", ["synthetic", *run, "--memory-budget", "1.5MB"]).record.options == wanted
+    assert cli.parsed("train", ["synthetic", *run, "--memory-budget", "1.5"]).record.options == wanted
     for number in ('"1.5MB"', "1.5", '"1500 kB"'):
         table = tomllib.loads(f"memory_budget = {number}")
         assert with_changes(kind(), table, "file") == wanted

@@ -77,4 +77,4 @@ def test_commands_are_understood(command, monkeypatch):
     if {"--resume", "--config"} & set(arguments) or any(":" in word for word in arguments):
         pytest.skip("reads a file")
     with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
-        assert cli._parse(name, arguments)
+        assert cli.parsed(name, arguments)

@@ -105,7 +105,7 @@ def test_a_scene_in_a_circle_of_links_is_read_as_it_stands(tmp_path):
     (tmp_path / "a").symlink_to(tmp_path / "b")
     (tmp_path / "b").symlink_to(tmp_path / "a")
     (tmp_path / "run.toml").write_text('scene = "a"')
-    assert read_run_file(tmp_path / "run.toml").scene.startswith(str(tmp_path))
+    assert read_run_file(tmp_path / "run.toml").scene.path.startswith(str(tmp_path))
 
 
 @pytest.mark.parametrize("line", [b"x" * 5000, b"../outside", b"/etc/hostname", b"\xff\xfe", b"a\0b", b".", b"loop"])

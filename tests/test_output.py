@@ -12,7 +12,7 @@ from run_folders import create_run
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import MovableKernels, allocate_appearance
-from a2tg_jax.cli import main as cli, mesh
+from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.results.checks import check_export, check_new, check_output
@@ -170,8 +170,8 @@ def test_exports_into_a_run_are_replaced_by_default_or_if_asked(tmp_path, name, 
 def test_the_mesh_of_a_run_is_replaced_unasked_once_it_was_written_so(tmp_path, monkeypatch, capsys):
     write_record(create_run(tmp_path), RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg()))
     out = tmp_path / "mesh.glb"
-    monkeypatch.setattr(mesh, "open_source", lambda *_: None)
-    monkeypatch.setattr(mesh, "write_mesh", lambda source, out, options: out.write_text("mesh"))
+    monkeypatch.setattr(runs, "open_source", lambda *_: None)
+    monkeypatch.setattr(runs, "write_mesh", lambda source, out, options: out.write_text("mesh"))
     out.write_text("mine")
     assert cli.main(["mesh", str(tmp_path)]) == 2 and out.read_text() == "mine"
     assert "mesh.glb exists; add --overwrite" in capsys.readouterr().err

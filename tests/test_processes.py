@@ -39,7 +39,7 @@ def test_two_processes_train_as_one(tmp_path):
     assert ended(trainings(run.path, SHORT, (), ()))[1] == ""
     record = read_record(run)
     first, _ = record.plan.main
-    alone = fit_stage(record.scene.load(), record.system, 0, progress=False)
+    alone = fit_stage(record.scene.load(), record.options, 0, progress=False)
     np.testing.assert_allclose(read_history(run.history(first)).loss, alone.history.loss, rtol=1e-3)
     assert load_model(run.model(first)).num_bytes == alone.model.num_bytes
 
@@ -210,7 +210,7 @@ def test_digests_differ_where_training_would():
     assert all(found[:2] == digests()[:2] and found[2] != digests()[2] for found in scenes)
     mesh = SimpleNamespace(devices=np.array([SimpleNamespace(process_index=0, id=index) for index in range(2)]))
     on_two = digests(session=SimpleNamespace(mesh=mesh))
-    other_seed = digests(dataclasses.replace(record, system=dataclasses.replace(system, seed=1)))
+    other_seed = digests(dataclasses.replace(record, options=dataclasses.replace(system, seed=1)))
     differing = [[a != b for a, b in zip(found, digests(), strict=True)] for found in (other_seed, on_two)]
     assert differing == [[True, False, False], [False, True, False]]
 
@@ -219,10 +219,11 @@ def test_a_process_that_follows_may_have_the_scene_elsewhere(tmp_path):
     run = create_run(tmp_path / "run")
     write_record(run, RunRecord(SceneSource("/there"), "gaussians-2d-mcmc", a2tg.Gaussians2dMcmc()))
     train = train_defaults(["--resume", "--out", str(run.path), "--coordinator", "h:1"])
-    train = dataclasses.replace(train, scene=str(tmp_path), out=run.path)
-    assert train._resumed(run, is_written=False).scene.path == str(tmp_path)
-    with pytest.raises(ValueError, match="was trained on /there, not on"):
-        train._resumed(run)
+    record = dataclasses.replace(train.record, scene=SceneSource(str(tmp_path)))
+    train = dataclasses.replace(train, record=record, out=run.path)
+    assert train.resumed(run, is_first=False).scene.path == str(tmp_path)
+    with pytest.raises(ValueError, match=r"leave out .*, as it was trained on /there"):
+        train.resumed(run)
 
 
 def test_numbers_of_the_first_process_keep_their_bits(monkeypatch):
@@ -247,8 +248,8 @@ def test_a_lack_of_memory_is_no_lost_connection():
 @pytest.mark.parametrize(
     ("flags", "told"),
     [
-        ("--num-processes 2", "--num-processes wants --coordinator HOST:PORT"),
-        ("--coordinator h:1 --process-id 0", "--coordinator HOST:PORT also wants --num-processes"),
+        ("--num-processes 2", "--num-processes needs --coordinator HOST:PORT"),
+        ("--coordinator h:1 --process-id 0", "--coordinator HOST:PORT also needs --num-processes"),
         (
             "--coordinator h --num-processes 2 --process-id 0",
             "must be HOST:PORT, [IPv6]:PORT or auto; got 'h'",
@@ -258,7 +259,7 @@ def test_a_lack_of_memory_is_no_lost_connection():
         ("--coordinator auto --heartbeat-timeout-seconds 0", "--heartbeat-timeout-seconds must be positive and finite"),
         ("--coordinator auto --heartbeat-timeout-seconds nan", "must be positive and finite; got nan"),
         ("--coordinator auto --heartbeat-timeout-seconds inf", "must be positive and finite; got inf"),
-        ("--heartbeat-timeout-seconds 9", "--heartbeat-timeout-seconds wants --coordinator HOST:PORT"),
+        ("--heartbeat-timeout-seconds 9", "--heartbeat-timeout-seconds needs --coordinator HOST:PORT"),
         ("--coordinator auto --num-processes -3", "--num-processes must be at least 1; got -3"),
         ("--coordinator auto --process-id -1", "--process-id must be at least 0; got -1"),
         ("--coordinator ::1:7700 --num-processes 2 --process-id 0", "[IPv6]:PORT or auto; got '::1:7700'"),

@@ -1,187 +1,117 @@
-"""Command-line arguments parsed into a dataclass by tyro, with every error on one line."""
+"""Command-line arguments parsed into a dataclass by tyro, which prints help and errors and ends in SystemExit."""
 
-import contextlib
 import dataclasses
-import difflib
-import io
+import inspect
 import itertools
-import os
-import re
-import shlex
 import types
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import typing
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
 from docstring_parser import parse_from_object
-from tyro.conf import arg
+from tyro.conf import Positional, arg
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from a2tg_jax.cli.errors import UNRECOGNIZED, plain, told_unknown, unknown_words
-from a2tg_jax.cli.values import registry
 from a2tg_jax.host.remote_files import is_url, without_secrets
 
 Parsed = TypeVar("Parsed")
-
-WIDE = "1000"
-"""Terminal width at which no error message is wrapped."""
-LEAST_LIKENESS = 0.75
-"""Smallest similarity, of 1, of an unknown flag and one that is suggested instead."""
-NEARLY_AS_LIKE = 0.05
-"""Difference in similarity from the likest flag up to which others are suggested as well."""
-MOST_SUGGESTED = 3
+NONE = "None"
 
 
 def defaulting_to(text: str, metavar: str | None = None) -> Any:
-    """Return the annotation of an option whose help tells its default in words, in place of None."""
+    """Return the annotation of an option whose help describes its default in words, instead of None."""
     return arg(help_behavior_hint=f"(default: {text})", metavar=metavar)
 
 
-LastModel = Annotated[str | None, defaulting_to("the last model of the main system", "NAME")]
-"""Name of a model of a run; None: the last one of its main system."""
+LastModel = Annotated[
+    str | None,
+    arg(help="Name of a run's model, as a2tg info prints it."),
+    defaulting_to("the last model of the main system", "NAME"),
+]
+RunFolderPath = Annotated[Positional[Path], arg(metavar="RUN", help="Run folder.")]
+RunOrFile = Annotated[
+    Positional[Path],
+    arg(
+        metavar="RUN_OR_FILE",
+        help="Run folder, model (*.npz), compact scene (*.a2tgz), or splats of other programs (*.ply, *.spz, ...).",
+    ),
+]
+LpipsWeights = Annotated[
+    Path | None,
+    arg(metavar="FILE", help="Weights (.npz) for LPIPS with AlexNet or SqueezeNet; without them, LPIPS is left out."),
+]
 
 
-def flag_of(name: str) -> str:
-    """Return the flag of an option."""
-    return "--" + name.replace("_", "-")
+def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: Parsed | None = None) -> Parsed:
+    """Parse arguments into an instance of a dataclass.
 
+    Args:
+      kind: the dataclass.
+      program: name of the command in the help.
+      arguments: arguments without the command's name.
+      default: values of the options that are not given; None: the dataclass's own.
 
-def flag_with_value(name: str, value: object) -> str:
-    """Return the flag of an option with its value, as it is typed."""
-    if isinstance(value, bool):
-        group, dot, own = name.rpartition(".")
-        return flag_of(name if value else f"{group}{dot}no_{own}")
-    words = value if isinstance(value, list | tuple) else [value]
-    return shlex.join([flag_of(name), *map(str, words)])
+    Raises:
+      SystemExit: after help (code 0) or an error (code 2), which tyro has printed.
+      ValueError: if a URL is given where only paths on this machine work.
+    """
+    for one in _nested(default or kind):
+        _fill_help(one)
+    rules = ConstructorRegistry()
+    rules.primitive_rule(_optional_rule)
+    about = inspect.getdoc(kind) or ""
+    given: dict[str, Any] = {} if default is None else {"default": default}
+    about = about if default is None else about.split("\n")[0]  # The other lines are the short help.
+    command: Parsed = tyro.cli(kind, prog=program, args=arguments, description=about, registry=rules, **given)
+    scene = getattr(getattr(getattr(command, "record", None), "scene", None), "path", None)
+    for word in arguments:
+        text = word.partition("=")[2] if word.startswith("--") else word
+        if text != scene:
+            check_path(text)
+    return command
 
 
 def check_path(text: str) -> None:
     """Raise ValueError if a path is a URL, which would name a folder of this machine."""
     if is_url(text):
-        told = without_secrets(text)
-        raise ValueError(f"{told}: only SCENE of a2tg train may be a URL; copy it here, or mount the bucket")
+        url = without_secrets(text)
+        raise ValueError(f"{url}: only SCENE of a2tg train may be a URL; copy it here, or mount the bucket")
 
 
-def typed_paths(arguments: Sequence[str]) -> set[str]:
-    """Return the paths of the options that were typed as flags."""
-    flags = (word.partition("=")[0] for word in arguments if word.startswith("--"))
-    return {flag[2:].replace("-", "_") for flag in flags}
+def _nested(value: Any) -> Iterator[type]:
+    """Yield the class of a dataclass, and the classes of dataclasses in its fields."""
+    yield value if isinstance(value, type) else type(value)
+    for field in dataclasses.fields(value):
+        inner = getattr(value, field.name, None)
+        if dataclasses.is_dataclass(inner) and not isinstance(inner, type):
+            yield from _nested(inner)
 
 
-def in_flags(message: str, paths: Iterable[str]) -> str:
-    """Return a message with flags in place of the paths of options.
-
-    A path of one word is replaced at the beginning only, for it may be a word of the message.
-    """
-    for path in sorted(paths, key=len, reverse=True):
-        before = r"(?<![\w./-])" if re.search(r"[._]", path) else "^"
-        message = re.sub(rf"{before}{re.escape(path)}(?!\w|\.\w)", flag_of(path), message)
-    return message
-
-
-def parse(
-    kind: type[Parsed],
-    program: str,
-    arguments: Sequence[str],
-    *,
-    hint: Callable[[str], str] = lambda flag: "",
-    **options: Any,
-) -> Parsed:
-    """Parse arguments into an instance of `kind`. Help is printed and ends in SystemExit.
-
-    Args:
-      kind: a dataclass.
-      program: name of the command in the help.
-      arguments: without the command's name.
-      hint: gives what to say of an unknown flag, or an empty text if it knows nothing of it.
-      options: further arguments of `tyro.cli`.
-
-    Raises:
-      ValueError: if an argument is missing, unknown or of another type.
-    """
-    errors, is_help = io.StringIO(), bool({"-h", "--help"} & set(arguments))
-    if is_help:
-        _tell_in_paragraphs(kind, options.get("default"))
-    width = contextlib.nullcontext() if is_help else _columns(WIDE)
-    try:
-        with registry(), width, contextlib.redirect_stderr(errors):
-            parsed: Parsed = tyro.cli(kind, prog=program, args=arguments, **options)
-            return parsed
-    except SystemExit as end:
-        if not end.code:
-            raise
-        told = plain(one_line(errors.getvalue()))
-    if told.startswith(UNRECOGNIZED):
-        told = told_unknown(unknown_words(told), lambda flag: hint(flag) or _suggested(flag, kind, options))
-    raise ValueError(f"{told} (see {program} --help)")
-
-
-def _tell_in_paragraphs(kind: type, default: object) -> None:
-    """Have the help of a dataclass, and of those in its default, fill its lines; tyro breaks them where the docstrings
-    in the source do."""
+def _fill_help(kind: type) -> None:
+    """Have the help of a dataclass fill its lines; tyro breaks them where the docstrings in the source do."""
     params = itertools.chain.from_iterable(parse_from_object(one).params for one in kind.__mro__[-2::-1])
-    told = {param.arg_name: " ".join(param.description.split()) for param in params if param.description}
+    texts = {param.arg_name: " ".join(param.description.split()) for param in params if param.description}
     for field in dataclasses.fields(kind):
-        if field.name in told:
-            field.metadata = types.MappingProxyType({**field.metadata, "help": told[field.name]})
-        value = getattr(default, field.name, None)
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            _tell_in_paragraphs(type(value), value)
+        if field.name in texts:
+            field.metadata = types.MappingProxyType({**field.metadata, "help": texts[field.name]})
 
 
-def one_line(box: str) -> str:
-    """Return the first message of a tyro error, without title, frame and colours."""
-    lines = [re.sub(r"\x1b\[[0-9;]*m", "", line).strip("│╭╰╮╯ ") for line in box.splitlines()]
-    parts: list[list[str]] = [[]]
-    for line in [line for line in lines if line][1:]:
-        if line.strip("─-"):
-            parts[-1].append(line)
-        else:
-            parts.append([])
-    said, *_ = [part for part in parts if part] or [[box]]
-    return " ".join(" ".join(said).split()).rstrip(".")
-
-
-def nearest(flag: str, known: Iterable[str]) -> list[str]:
-    """Return the known flags most like an unknown one, as a whole or by their last words, the likest first."""
-    likeness = {name: max(_likeness(flag, tail) for tail in _tails(name)) for name in known}
-    least = max(LEAST_LIKENESS, max(likeness.values(), default=0.0) - NEARLY_AS_LIKE)
-    near = sorted((name for name in likeness if likeness[name] >= least), key=lambda name: -likeness[name])
-    return near[:MOST_SUGGESTED]
-
-
-def _likeness(flag: str, tail: str) -> float:
-    return difflib.SequenceMatcher(None, flag.removeprefix("--"), tail).ratio()
-
-
-def _tails(name: str) -> list[str]:
-    """Return a flag without its dashes, and what follows each of its dots and dashes."""
-    words = name.removeprefix("--")
-    return [words, *(words[match.end() :] for match in re.finditer(r"[.-]", words))]
-
-
-def _suggested(flag: str, kind: type, options: dict[str, Any]) -> str:
-    """Return "; did you mean FLAG?" for an unrecognised flag; empty if none is near."""
-    near = nearest(flag, _flags(kind, options))
-    return f"; did you mean {' or '.join(near)}?" if near else ""
-
-
-def _flags(kind: type, options: dict[str, Any]) -> list[str]:
-    """Return every flag of a command, as its help lists them."""
-    text = io.StringIO()
-    with registry(), contextlib.suppress(SystemExit), contextlib.redirect_stdout(text):
-        tyro.cli(kind, args=["--help"], **options)
-    return re.findall(r"^[│ ]*(--[\w.-]+)", text.getvalue(), flags=re.MULTILINE)
-
-
-@contextlib.contextmanager
-def _columns(width: str) -> Iterator[None]:
-    """Set the terminal width in the environment for the duration of the block."""
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = width
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["COLUMNS"]
-        else:
-            os.environ["COLUMNS"] = before
+def _optional_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Return the rule for a value that may be None, named in the help as without None."""
+    kinds = typing.get_args(info.type)
+    if typing.get_origin(info.type) not in (typing.Union, types.UnionType) or types.NoneType not in kinds:
+        return None
+    rest: Any = typing.Union.__getitem__(tuple(kind for kind in kinds if kind is not types.NoneType))
+    plain = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(rest, info.markers))
+    if not isinstance(plain, PrimitiveConstructorSpec):
+        return None
+    return dataclasses.replace(
+        plain,
+        metavar="SIZE" if {float, str} <= set(kinds) else plain.metavar,
+        instance_from_str=lambda words: None if words == [NONE] else plain.instance_from_str(words),
+        is_instance=lambda value: value is None or plain.is_instance(value),
+        str_from_instance=lambda value: [NONE] if value is None else plain.str_from_instance(value),
+        choices=None if plain.choices is None else (*plain.choices, NONE),
+    )

@@ -35,47 +35,45 @@ class Doctor:
     """
 
     def run(self) -> None:
-        machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
-        _tell("a2tg-jax", f"{version('a2tg-jax')}, {machine}")
-        _tell("packages", ", ".join(f"{name} {_version(name)}" for name in PACKAGES))
-        _tell("devices", ", ".join(map(_described, jax.devices())))
-        cuda = cuda_of_driver()
-        _tell("driver", f"NVIDIA's, for CUDA {cuda[0]}.{cuda[1]}" if cuda else "no NVIDIA driver is found")
-        asked = os.environ.get(VARIABLE)
-        _tell("threads", f"{num_threads()} ({VARIABLE}{f'={asked}' if asked else ' is not set'})")
-        _tell("memory", f"{memory_limit() / 1e9:.1f} GB may be used")
-        _tell("XLA_FLAGS", os.environ.get("XLA_FLAGS") or "not set")
-        _tell("cache", str(compilation_cache_folder()))
-        device = jax.devices()[0]
+        device, cuda, wanted = jax.devices()[0], cuda_of_driver(), os.environ.get(VARIABLE)
         # As JAX names it when it compiles; a device calls both CUDA and ROCm "gpu".
-        platform_of_jax = "cuda" if "cuda" in device.client.platform_version.lower() else device.platform
-        _tell("compositor", f"{choice.choose('auto', platform_of_jax)} is the choice of 'auto'")
-        available = [name for name in choice.PLATFORMS if choice.is_available(name, platform_of_jax)]
+        of_jax = "cuda" if "cuda" in device.client.platform_version.lower() else device.platform
+        kinds = ["the CPU" if one.platform == "cpu" else f"{one.platform} ({one.device_kind})" for one in jax.devices()]
+        machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+        lines = {
+            "a2tg-jax": f"{version('a2tg-jax')}, {machine}",
+            "packages": ", ".join(f"{name} {_version(name)}" for name in PACKAGES),
+            "devices": ", ".join(kinds),
+            "driver": f"NVIDIA's, for CUDA {cuda[0]}.{cuda[1]}" if cuda else "no NVIDIA driver is found",
+            "threads": f"{num_threads()} ({VARIABLE}{f'={wanted}' if wanted else ' is not set'})",
+            "memory": f"{memory_limit() / 1e9:.1f} GB may be used",
+            "XLA_FLAGS": os.environ.get("XLA_FLAGS") or "not set",
+            "cache": str(compilation_cache_folder()),
+            "compositor": f"{choice.choose('auto', of_jax)} is the choice of 'auto'",
+        }
+        for name, text in lines.items():
+            _print(name, text)
+        available = [name for name in choice.PLATFORMS if choice.is_available(name, of_jax)]
         for name, remedy in choice.REMEDIES.items():
             if name not in available:
-                _tell("", f"{name} is not available: it needs {remedy}")
+                _print("", f"{name} is not available: it needs {remedy}")
         largest = _compare(available)
         if not largest <= MOST_DIFFERENCE:
             raise ValueError(f"the compositors differ by {largest:.2g}; please report this with the lines above")
-        _tell("verdict", _verdict(platform_of_jax, available, has_driver=cuda is not None))
-
-
-def _described(device: jax.Device) -> str:
-    """Return a device in words: the CPU, or platform and model of an accelerator."""
-    return "the CPU" if device.platform == "cpu" else f"{device.platform} ({device.device_kind})"
+        _print("verdict", _verdict(of_jax, available, has_driver=cuda is not None))
 
 
 def _verdict(platform: str, available: Sequence[Compositor], *, has_driver: bool) -> str:
     """Return whether everything works on a machine whose compositors agree."""
     if platform == "cpu" and has_driver:
-        return "everything works, but on the CPU: JAX does not see the NVIDIA GPU; pip install 'a2tg-jax[cuda13]'"
+        return "everything works, but on the CPU: JAX does not find the NVIDIA GPU; pip install 'a2tg-jax[cuda13]'"
     for name, remedy in choice.REMEDIES.items():
         if choice.PLATFORMS[name] == platform and name not in available:
             return f"everything works, but slowly: {name} is not available, which needs {remedy}"
     return "everything works on this machine"
 
 
-def _tell(name: str, text: str) -> None:
+def _print(name: str, text: str) -> None:
     print(f"{name:12}{text}", flush=True)
 
 
@@ -97,9 +95,9 @@ def _compare(available: Sequence[Compositor]) -> float:
         start = time.perf_counter()
         output = render_image(gaussians, Camera(viewmat, K, WIDTH, HEIGHT), settings=RenderSettings(compositor=name))
         colors[name] = np.asarray(output.color)
-        told = f"{name}: {time.perf_counter() - start:.2f} s with compiling"
+        text = f"{name}: {time.perf_counter() - start:.2f} s with compiling"
         if name != "xla":
             difference = float(np.nan_to_num(abs(colors[name] - colors["xla"]), nan=np.inf).max())
-            told, largest = f"{told}, at most {difference:.1g} from XLA's image", max(largest, difference)
-        _tell("render", told)
+            text, largest = f"{text}, at most {difference:.1g} from XLA's image", max(largest, difference)
+        _print("render", text)
     return largest

@@ -62,7 +62,7 @@ def num_threads() -> int:
 def control_groups(root: Path, controller: str) -> list[Path]:
     """Return the folders of Linux's control groups (containers, jobs, services) of this process, innermost first.
 
-    A group's limit holds for all groups in it. In a container the path of the group may be that of the machine outside,
+    A group's limit holds for all groups in it. In a container, the group may have its path on the machine outside,
     whose folders do not exist. Then the limit is at the top.
 
     Args:

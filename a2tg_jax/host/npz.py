@@ -85,14 +85,14 @@ def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype, bool, tuple[int,
     """Return the dtype of one array, whether it is in Fortran order, and its shape."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
-        raise ValueError(f"{name} is of the version {version} of .npy, which is not known here")
+        raise ValueError(f"{name} is of the version {version} of .npy, which is not supported")
     length = int.from_bytes(file.read(2 if version == (1, 0) else 4), "little")
     if length > LONGEST_HEADER:
         raise ValueError(f"{name} has a header of {length} bytes")
-    told: Any = ast.literal_eval(file.read(length).decode())
-    dtype, shape = np.dtype(told["descr"]), told["shape"]
+    header: Any = ast.literal_eval(file.read(length).decode())
+    dtype, shape = np.dtype(header["descr"]), header["shape"]
     if dtype.kind not in "biuf" or dtype.itemsize > 8 or dtype.shape:
         raise ValueError(f"{name} must be of plain numbers; got {dtype}")
     if type(shape) is not tuple or not all(type(side) is int and side >= 0 for side in shape) or len(shape) > 32:
         raise ValueError(f"{name} has no shape")
-    return dtype, told["fortran_order"] is True, shape
+    return dtype, header["fortran_order"] is True, shape

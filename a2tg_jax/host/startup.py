@@ -59,11 +59,11 @@ def silence_xla() -> None:
     hints are missing from the processor's features. It does not crash (openxla/xla#44565). If you ask for XLA's log by
     jax_logging_level or TF_CPP_MIN_LOG_LEVEL=0, you get all of it.
     """
-    asked = jax.config.values["jax_logging_level"]
-    if asked in (None, "NOTSET") and os.environ.get("TF_CPP_MIN_LOG_LEVEL") != "0":
+    chosen = jax.config.values["jax_logging_level"]
+    if chosen in (None, "NOTSET") and os.environ.get("TF_CPP_MIN_LOG_LEVEL") != "0":
         # The first sets the level of XLA and of JAX, the second takes back only that of JAX.
         jax.config.update("jax_logging_level", "CRITICAL")
-        jax.config.update("jax_logging_level", asked)
+        jax.config.update("jax_logging_level", chosen)
 
 
 def add_xla_flags(flags: tuple[str, ...]) -> None:

@@ -19,7 +19,7 @@ def shortened(value: object, most: int = 80) -> str:
 
 
 def as_argument(path: Path) -> str:
-    """Return a path as a shell takes it, relative to the current folder if it lies there."""
+    """Return a path as a shell takes it, relative to the current folder if it is inside."""
     here = Path.cwd()
     return shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path))
 
@@ -42,10 +42,10 @@ def first_names(names: Sequence[str], most: int = 5) -> str:
 
 def in_bytes(num: float) -> str:
     """Return a number of bytes with three digits in a unit that suits it: bytes, kB, MB or GB (10^9 bytes)."""
-    size, told = float(num), counted(round(num), "byte")
+    size, text = float(num), counted(round(num), "byte")
     for unit in ("kB", "MB", "GB"):
         if size < 999.5:
             break
         size /= 1e3
-        told = f"{size:,.{2 if size < 9.995 else 1 if size < 99.95 else 0}f} {unit}"
-    return told
+        text = f"{size:,.{2 if size < 9.995 else 1 if size < 99.95 else 0}f} {unit}"
+    return text

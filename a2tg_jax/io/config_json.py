@@ -1,5 +1,6 @@
 """Configuration dataclasses as JSON-able dictionaries, and back."""
 
+import contextlib
 import dataclasses
 import types
 import typing
@@ -22,55 +23,52 @@ def config_to_dict(config: Any) -> dict[str, Any]:
 
 
 def config_from_dict(
-    kind: type[ConfigT],
-    data: Mapping[str, Any],
-    where: str = "config",
-    *,
-    given: Mapping[str, Any] | None = None,
-    is_written: bool = True,
+    kind: type[ConfigT], data: Mapping[str, Any], where: str = "config", *, given: Mapping[str, Any] | None = None
 ) -> ConfigT:
     """Return the dataclass `kind` that `config_to_dict` was given.
 
     Args:
       kind: the dataclass.
-      data: an entry per field. A field that has a default may be missing, as those are that an older version lacked.
-      where: what the errors call this place, such as the name of the file.
+      data: an entry per field. A field that has a default may be missing.
+      where: name of this place in errors, such as the name of the file.
       given: values of fields that are not among the data.
-      is_written: whether this program wrote the data, so that a missing field means another version.
 
     Raises:
       ValueError: if a field is missing or unknown, or has a value of another type; the field is named.
     """
     if not isinstance(data, Mapping):
         raise ValueError(f"{where} must hold the fields of {kind.__name__}; got {shortened(repr(data))}")
-    hints = typing.get_type_hints(kind)
-    given = given or {}
-    names = [field.name for field in dataclasses.fields(kind) if field.name not in given]  # type: ignore[arg-type]
+    hints, values = typing.get_type_hints(kind), dict(given or {})
+    fields = {field.name: field for field in dataclasses.fields(kind) if field.name not in values}  # type: ignore[arg-type]
+    within = f"{where} " if where.endswith(":") else f"{where}."
     for name in data:
-        if name not in names:
-            raise ValueError(f"{_within(where, shortened(name))} is an unknown key{_instead(name, names)}")
-    optional = {field.name for field in dataclasses.fields(kind) if has_default(field)}  # type: ignore[arg-type]
-    for name in names:
-        if name not in data and name not in optional:
-            raise ValueError(f"{_within(where, name)} is missing{'; another version wrote it' if is_written else ''}")
-    values = {name: _from_json(hints[name], data[name], _within(where, name)) for name in names if name in data}
-    return kind(**values, **given)
+        if name not in fields:
+            group, _, option = name.partition(".")
+            instead = did_you_mean(name, fields) or f"; it has {', '.join(fields)}"
+            instead = f"; say {group}={{{option!r}: …}}" if option and group in fields else instead
+            raise ValueError(f"{within}{shortened(name)} is an unknown key{instead}")
+    for name, field in fields.items():
+        if name in data:
+            values[name] = _from_json(hints[name], data[name], f"{within}{name}")
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise ValueError(f"{within}{name} is missing")
+    return kind(**values)
 
 
 def changed_config(config: ConfigT, changes: Mapping[str, Any], where: str) -> ConfigT:
-    """Return a dataclass with some fields changed, those of nested dataclasses by nested dictionaries.
+    """Return a dataclass with some fields changed, fields of nested dataclasses by nested dictionaries.
 
     Raises:
       ValueError: naming the field, if it is unknown or of another type.
     """
-    return config_from_dict(type(config), merged(config_to_dict(config), _plain(changes)), where)
+    return config_from_dict(type(config), merged(config_to_dict(config), _to_json(changes)), where)
 
 
 def check_config(config: Any, prefix: str = "") -> None:
     """Raise ValueError, naming the field, if a group, number, text or choice of a dataclass is of another type.
 
-    Fields of other types are not looked at, nor dataclasses whose annotations cannot be resolved, such as those of a
-    class within a function.
+    Fields of other types are not checked, nor dataclasses whose annotations cannot be resolved, such as classes within
+    a function.
     """
     try:
         hints = typing.get_type_hints(type(config))
@@ -86,19 +84,6 @@ def check_config(config: Any, prefix: str = "") -> None:
             _from_json(hint, _to_json(value), name)
 
 
-def _is_plain(hint: object) -> bool:
-    """Return whether a type is one of numbers, texts and choices, None, or a union or tuple of them."""
-    if typing.get_origin(hint) is typing.Literal or hint is ...:
-        return True
-    parts = typing.get_args(hint)
-    return all(map(_is_plain, parts)) if parts else hint in (int, float, bool, str, type(None))
-
-
-def _plain(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return changes with the values in nested dictionaries as JSON has them."""
-    return {name: _plain(value) if isinstance(value, Mapping) else _to_json(value) for name, value in changes.items()}
-
-
 def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested options with some of them changed."""
     result = dict(values)
@@ -106,23 +91,6 @@ def merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
         is_group = isinstance(change, Mapping) and isinstance(values.get(name), Mapping)
         result[name] = merged(values[name], change) if is_group else change
     return result
-
-
-def has_default(field: dataclasses.Field[Any]) -> bool:
-    """Return whether a field of a dataclass need not be given."""
-    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
-
-
-def _within(where: str, name: str) -> str:
-    """Return the name of a field in errors: where.name, or "FILE: name" if the place is "FILE:"."""
-    return f"{where} {name}" if where.endswith(":") else f"{where}.{name}"
-
-
-def _instead(name: str, names: list[str]) -> str:
-    group, _, option = name.partition(".")
-    if option and group in names:
-        return f"; say {group}={{{option!r}: …}}"
-    return did_you_mean(name, names) or f"; it has {', '.join(names)}"
 
 
 def flatten_config(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -135,29 +103,68 @@ def flatten_config(config: Any, prefix: str = "") -> dict[str, Any]:
     return leaves
 
 
+def _is_plain(hint: object) -> bool:
+    """Return whether a type is one of numbers, texts and choices, None, or a union or tuple of them."""
+    if typing.get_origin(hint) is typing.Literal or hint is ...:
+        return True
+    parts = typing.get_args(hint)
+    return all(map(_is_plain, parts)) if parts else hint in (int, float, bool, str, type(None))
+
+
 def _to_json(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return config_to_dict(value)
+    if isinstance(value, Mapping):
+        return {name: _to_json(item) for name, item in value.items()}
     if isinstance(value, tuple):
         return [_to_json(item) for item in value]
     return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _from_json(hint: Any, value: Any, where: str) -> Any:
-    """Return `value` as the type that the annotation asks for; what a dict holds is not looked at."""
+    """Return `value` as the type of the annotation; the contents of a dict are not checked."""
     if dataclasses.is_dataclass(hint):
         return config_from_dict(typing.cast(type, hint), value, where)
-    is_union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
-    alternatives = typing.get_args(hint) if is_union else (hint,)
+    alternatives = typing.get_args(hint)
     if value == NONE and type(None) in alternatives and str not in alternatives:
         return None
-    for alternative in alternatives:
-        if _fits(alternative, value):
-            return _converted(alternative, value)
-    raise ValueError(f"{where} must be {_told(hint)}; got {shortened(repr(value))}")
+    try:
+        return _as(hint, value)
+    except TypeError:
+        raise ValueError(f"{where} must be {_type_name(hint)}; got {shortened(repr(value))}") from None
 
 
-def _told(hint: Any) -> str:
+def _as(hint: Any, value: Any) -> Any:
+    """Return a JSON value as a plain type; an integer is a good float, a truth value is not a number.
+
+    Raises:
+      TypeError: if it is of another type.
+    """
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        for alternative in inner:
+            with contextlib.suppress(TypeError):
+                return _as(alternative, value)
+    elif origin is typing.Literal:
+        if value in inner:
+            return value
+    elif origin is tuple and isinstance(value, list):
+        hints = inner[:1] * len(value) if inner[-1] is ... else inner
+        if len(hints) == len(value):
+            return tuple(map(_as, hints, value))
+    elif isinstance(value, bool):
+        if hint is bool:
+            return value
+    elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+        pass  # It would overflow as a float.
+    elif hint is float and isinstance(value, int | float):
+        return float(value)
+    elif isinstance(value, dict if origin is Mapping else origin or hint):
+        return value
+    raise TypeError
+
+
+def _type_name(hint: Any) -> str:
     """Return a type as a user reads it; a tuple is a list, as files have it."""
     origin, inner = typing.get_origin(hint), [item for item in typing.get_args(hint) if item is not ...]
     if origin is typing.Literal:
@@ -166,38 +173,9 @@ def _told(hint: Any) -> str:
         return "dict"
     if origin is tuple:
         same = len(set(inner)) == 1 and len(inner) > 1
-        return f"list of {len(inner)} {_told(inner[0])}" if same else f"list of {', '.join(map(_told, inner))}"
+        return (
+            f"list of {len(inner)} {_type_name(inner[0])}" if same else f"list of {', '.join(map(_type_name, inner))}"
+        )
     if inner:
-        return " | ".join(map(_told, inner))
+        return " | ".join(map(_type_name, inner))
     return "None" if hint is type(None) else hint.__name__
-
-
-def _fits(hint: Any, value: Any) -> bool:
-    """Return whether a JSON value is of a plain type; an integer is a good float, a truth value is not a number."""
-    origin = typing.get_origin(hint)
-    if origin is typing.Literal:
-        return value in typing.get_args(hint)
-    if origin in (dict, Mapping):
-        return isinstance(value, dict)
-    if origin is tuple:
-        return isinstance(value, list) and all(map(_fits, _item_hints(hint, value), value))
-    if isinstance(value, bool):
-        return hint is bool
-    if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-        return False
-    return isinstance(value, (int, float) if hint is float else hint)
-
-
-def _converted(hint: Any, value: Any) -> Any:
-    """Return a value that fits, as the type itself."""
-    if typing.get_origin(hint) is tuple:
-        return tuple(map(_converted, _item_hints(hint, value), value))
-    return float(value) if hint is float else value
-
-
-def _item_hints(hint: Any, value: list[Any]) -> tuple[Any, ...]:
-    """Return the types of the items of a tuple; too few or too many match no list of that length."""
-    first, *rest = typing.get_args(hint)
-    if rest == [...]:
-        return (first,) * len(value)
-    return (first, *rest) if len(value) == 1 + len(rest) else (type(None),) * len(value)

@@ -208,7 +208,7 @@ def print_forecast(
     if out is not None:
         found.check_disk(out)
         side = max(max(view.camera.width, view.camera.height) for view in scene.train)
-        if QUICK in type(record.system).presets() and (record.preset != QUICK or side > QUICK_SIDE):
+        if QUICK in type(record.options).presets() and (record.preset != QUICK or side > QUICK_SIDE):
             found = dataclasses.replace(found, quicker=quick_flags(side, record.scene.downscale))
     print(found.text(limit), flush=True)
 

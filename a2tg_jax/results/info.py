@@ -55,7 +55,7 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
         "path": str(run.path),
         "scene": record.scene.path,
         "downscale": record.scene.downscale,
-        "system": record.name,
+        "system": record.system,
         "compare": list(record.compare),
         "is_finished": all(is_regular(run.model(name)) for name in names),
         "stages": [{"name": name, **_stage_facts(run, name), "psnr": measured.get(name)} for name in names],

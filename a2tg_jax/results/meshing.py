@@ -4,9 +4,10 @@ import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from tyro.conf import arg
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.core.origin import Origin
@@ -40,28 +41,33 @@ SMALL_PARTS = "raise --resolution or lower --voxel, or train longer or from more
 TextureSource = Literal["none", "renders", "photographs"]
 
 
+def _defaulting_to(default: str, metavar: str) -> Any:
+    return arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
+
+
 @dataclasses.dataclass(frozen=True)
 class MeshOptions:
     """Options of a mesh; lengths are in units of the original world."""
 
-    resolution: int | None = None
-    """Voxels along the radius; None: as in `extract_mesh`."""
-    voxel: float | None = None
-    """Side of a voxel, instead of the resolution."""
-    radius: float | None = None
-    """Radius of the space; None: as in `extract_mesh`."""
+    resolution: Annotated[int | None, _defaulting_to("512, unless --voxel is given", "N")] = None
+    """Voxels along the radius."""
+    voxel: Annotated[float | None, _defaulting_to("radius / resolution", "LENGTH")] = None
+    """Side of a voxel in units of the original world."""
+    radius: Annotated[float | None, _defaulting_to("twice the cameras' median distance from it", "LENGTH")] = None
+    """Radius around the point that the cameras look at, in units of the original world."""
     unbounded: bool = False
-    """Whether the space goes on beyond the radius."""
+    """Continue beyond the radius, with voxels that grow with the distance."""
     clusters: int = MOST_CLUSTERS
-    """Largest number of connected parts."""
-    faces: int | None = None
-    """Largest number of faces; None is no limit, or `TEXTURED_FACES` with a texture."""
+    """Largest number of connected parts to keep; smaller ones are floaters."""
+    faces: Annotated[int | None, _defaulting_to(f"all, or {TEXTURED_FACES:,} with a texture", "N")] = None
+    """Largest number of faces. Needs pip install 'a2tg-jax[mesh]'."""
     texture: TextureSource = "none"
-    """Pictures that fill a texture atlas."""
+    """Fill a texture atlas from renders or photographs of the training views (GLB and OBJ). Needs xatlas (pip install
+    'a2tg-jax[mesh]')."""
     texture_size: int = 2048
     """Side of the atlas in texels."""
-    max_memory: str | float | None = None
-    """Memory budget of the voxels; None is half of the free memory."""
+    max_memory: Annotated[str | None, _defaulting_to("half of the free memory", "SIZE")] = None
+    """Memory budget of the voxels, such as 4GB."""
 
     @property
     def most_faces(self) -> int | None:

@@ -1,8 +1,8 @@
 """Record of a run: the scene, a system with all its options, systems to compare. Kept as run.toml.
 
-A configuration file says the same or less; what it leaves out has the value that the command line gives it:
+A configuration file has the same keys; what it leaves out has the value that the command line gives it:
 
-    scene = "../scenes/fox"              # seen from the file's folder; or s3://bucket/fox, or "synthetic"
+    scene = "../scenes/fox"              # relative to the file's folder; or s3://bucket/fox, or "synthetic"
     downscale = 2
     system = "a2tg"                      # or package.module:NAME
     preset = "quick"
@@ -11,19 +11,21 @@ A configuration file says the same or less; what it leaves out has the value tha
     [options.texture]                    # options of the system, as nested tables
     cap = 8
 
-    [compare_options.gaussians-2d-mcmc]  # options of a compared system, in place of the main one's
+    [compare_options.gaussians-2d-mcmc]  # options of a compared system, instead of the main one's
     sh_degree = 0
 """
 
 import dataclasses
+import math
 import os
 import shlex
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tomli_w
+from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
 from a2tg_jax.data import Scene, load_scene, synthetic_scene
 from a2tg_jax.data.assembly import with_validation_views
@@ -35,11 +37,11 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.remote_files import checked_url, is_url, path_here
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config, merged
-from a2tg_jax.results.finish_options import read_finish
-from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.folder import RunFolder, read_json
 from a2tg_jax.results.plan import RunPlan, plan_run
+from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import System, find_system, like
 from a2tg_jax.training.options import own_options
 from a2tg_jax.training.registry import differences, with_changes
@@ -58,18 +60,19 @@ HeldOut = Literal["test", "validation"]
 class SceneSource:
     """Source of a scene, from which it can be loaded again."""
 
-    path: str
-    """Folder with photographs and poses, its URL in object storage, or "synthetic" for the built-in scene."""
+    path: Annotated[Positional[str], arg(metavar="SCENE")] = ""
+    """Scene folder with photographs and cameras, its URL such as s3://bucket/scene, or "synthetic"; not needed with
+    --config or --resume."""
     downscale: int = 1
     """Factor k by which images are downscaled."""
     test_every: int = 8
-    """Interval k of test views: every k-th view is held out."""
+    """Hold out every k-th image for testing."""
     alpha: AlphaMeaning = "transparency"
-    """Meaning of the alpha channel: transparency before a background, or a mask."""
+    """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
     lens: LensUse = "undistort"
-    """Whether photographs of distorted cameras are undistorted, or kept."""
+    """Photographs of distorted cameras, such as fisheyes: undistort them to pinholes, or keep them as they are."""
     validation: bool = False
-    """Whether every eighth training view is held out for choosing options, in place of the test views."""
+    """Hold out every eighth training image instead of the test images, to choose options without using these."""
 
     @property
     def held_out(self) -> HeldOut:
@@ -111,22 +114,26 @@ class SceneSource:
 
 @dataclasses.dataclass(frozen=True)
 class RunRecord:
-    """Record of a run."""
+    """Scene, system and options of a run: what `a2tg train` parses, and what run.toml keeps."""
 
-    scene: SceneSource
-    name: str
-    """Name of the system, as `find_system` takes it."""
-    system: System
-    """System with all its options."""
-    compare: tuple[str, ...] = ()
-    """Names of the systems to compare. They take the main system's options of the same names."""
-    preset: str | None = None
-    """Preset of the other options of these systems."""
+    scene: Annotated[SceneSource, arg(name="")]
+    system: Annotated[str, arg(metavar="NAME")] = DEFAULT_SYSTEM
+    """System to train: a name listed by a2tg --help, or your own as package.module:NAME. Its options follow below."""
+    options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
+    compare: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = ()
+    """System to train for comparison; may be repeated. It takes every option above and below that it has."""
+    preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: paper)")] = None
+    """Preset of the options below: paper, quick (minutes on two cores) or smoke (half a minute); a2tg also has official
+    (the conventions of the authors' program), gaussians-2d also has surfaces (for a2tg mesh)."""
     on_nan: OnNan = "stop"
-    """Action if a loss or gradient is not finite, or a loss explodes."""
-    init: str | None = None
-    """File of splats in place of the main system's first stage."""
-    compare_options: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict, compare=False)
+    """Action if training diverges (a loss or gradient is not finite, or the loss explodes): stop, or restore the newest
+    checkpoint and continue with the views in another order."""
+    init: Annotated[str | None, arg(metavar="FILE")] = None
+    """File of splats (PLY, SPZ, SOG, a checkpoint of gsplat, ...) instead of the first stage, in the world of the
+    scene folder."""
+    compare_options: Annotated[Mapping[str, Mapping[str, Any]], Fixed, Suppress] = dataclasses.field(
+        default_factory=dict, compare=False
+    )
     """Options of the compared systems, nested, by name. Those that are left out have the main system's values, or the
     preset's if it lacks them. A record that is written and read again has all that the main system lacks."""
 
@@ -135,14 +142,14 @@ class RunRecord:
         """Main system and then those compared with it, by label.
 
         Raises:
-          ValueError: if a system is not found, or two have one label.
+          ValueError: if a system is not found, or two have one label, or an option of a compared one is wrong.
         """
-        found = {label_of(self.name): self.system}
+        found = {label_of(self.system): self.options}
         for name in self.compare:
             if label_of(name) in found:
                 raise ValueError(f"compare: two systems of the run would be called {shortened(label_of(name))!r}")
-            beside, given = compared_system(name, self.system, self.preset), self.compare_options.get(name, {})
-            found[label_of(name)] = with_changes(beside, given, f"compare_options.{name}")
+            other, given = compared_system(name, self.options, self.preset), self.compare_options.get(name, {})
+            found[label_of(name)] = with_changes(other, given, f"compare_options.{name}")
         return found
 
     @property
@@ -158,81 +165,48 @@ class RunRecord:
         """
         for name in self.compare_options:
             if name not in self.compare:
-                told = f"compare_options.{shortened(name)}: the run does not compare this system"
-                raise ValueError(f"{told}: add it to compare, or remove the table")
+                reason = f"compare_options.{shortened(name)}: the run does not compare this system"
+                raise ValueError(f"{reason}: add it to compare, or remove the table")
         for label, system in self.systems.items():
             try:
                 system.check()
             except ValueError as error:
-                if system is self.system:
+                if system is self.options:
                     raise
-                raise ValueError(f"compare {label}, with the options of {self.name}: {error}") from error
+                raise ValueError(f"compare {label}, with the options of {self.system}: {error}") from error
         plan = plan_run(self.systems)
         if self.init is not None and len(plan.main) < 2:
-            raise ValueError(f"init takes the place of a first stage, and {self.name} has no second one")
-        if self.init is not None and self.system.sky_gaussians:
-            raise ValueError("init takes the place of a first stage, and sky_gaussians start in one: leave one out")
+            raise ValueError(f"init replaces a first stage, and {self.system} has no second one")
+        if self.init is not None and self.options.sky_gaussians:
+            raise ValueError("init replaces a first stage, and sky_gaussians start in one: leave one out")
 
-    def leaves(self) -> dict[str, Any]:
-        """Return every option by the name of its flag, without the dashes."""
-        scene = {name: value for name, value in flatten_config(self.scene).items() if name != "path"}
-        init = {} if self.init is None else {"init": self.init}
-        return {"system": self.name, **scene, **init, **flatten_config(self.system)}
-
-
-@dataclasses.dataclass(frozen=True)
-class RunFile:
-    """Content of a configuration file."""
-
-    scene: str | None = None
-    downscale: int = 1
-    test_every: int = 8
-    alpha: AlphaMeaning = "transparency"
-    lens: LensUse = "undistort"
-    validation: bool = False
-    system: str = DEFAULT_SYSTEM
-    preset: str | None = None
-    compare: tuple[str, ...] = ()
-    on_nan: OnNan = "stop"
-    init: str | None = None
-    version: str | None = None
-    """Version of a2tg-jax that wrote the file."""
-    options: dict[str, Any] = dataclasses.field(default_factory=dict)
-    compare_options: dict[str, Any] = dataclasses.field(default_factory=dict)
-
-    def chosen(self, where: str) -> System:
-        """Return the system with the file's preset and options.
-
-        Raises:
-          ValueError: if there is no such system or preset, or an option is unknown or of another type.
-        """
-        system = chosen_system(self.system, self.preset)
-        return with_changes(system, self.options, f"{where}: options")
-
-    def compared(self, main: System, where: str) -> dict[str, Mapping[str, Any]]:
-        """Return the options of compared systems, as `RunRecord.compare_options` has them.
+    def placed(self, folder: Path = Path()) -> "RunRecord":
+        """Return the record with full paths.
 
         Args:
-          main: the system that `chosen` returns.
-          where: path of the file, for errors.
+          folder: folder that relative paths start from.
 
         Raises:
-          ValueError: naming the option, if it is unknown or of another type.
+          ValueError: as `scene_place` does.
         """
-        found = dict[str, Mapping[str, Any]]()
-        for name in dict.fromkeys((*self.compare, *self.compare_options)):
-            label, given = f"{where}: compare_options.{name}", self.compare_options.get(name, {})
-            try:
-                beside = compared_system(name, main, self.preset)
-            except ValueError as error:
-                if name in self.compare:
-                    raise
-                raise ValueError(f"{label}: {error}") from error
-            if not isinstance(given, Mapping):
-                raise ValueError(f"{label} must be a table of options; got {shortened(given)}")
-            with_changes(beside, given, label)
-            found[name] = given
-        return found
+        path = self.scene.path
+        path = path if path in ("", SYNTHETIC) else scene_place(path, folder)
+        init = None if self.init is None else os.path.realpath(folder / self.init)
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, path=path), init=init)
+
+    def with_system(self, name: str, preset: str | None) -> "RunRecord":
+        """Return the record of another system, or another preset, with its options.
+
+        Raises:
+          ValueError: if there is no such system or preset.
+        """
+        options = chosen_system(name, preset)
+        return dataclasses.replace(self, system=name, preset=preset, options=options, compare_options={})
+
+
+SCENE_KEYS = {"scene": "path"} | {field.name: field.name for field in dataclasses.fields(SceneSource)[1:]}
+"""Names of the fields of a scene's source by their keys in run.toml."""
+KEYS = (*SCENE_KEYS, *(field.name for field in dataclasses.fields(RunRecord)[1:]), "version")
 
 
 def label_of(name: str) -> str:
@@ -268,28 +242,6 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
     return with_changes(like(start, other), differences(found), name)
 
 
-def read_run_file(path: Path) -> RunFile:
-    """Read a configuration file. Relative paths in it start from its folder.
-
-    Raises:
-      FileNotFoundError: if there is none.
-      ValueError: if it is no TOML, or a key is unknown or of another type; key and file are named.
-    """
-    if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such configuration file")
-    data = read_regular(path, MOST_TOML_BYTES)
-    try:
-        table = parse_toml(data)
-    except ValueError as error:
-        raise ValueError(f"{path}: is not valid TOML: {shortened(str(error), 200)}") from error
-    file = config_from_dict(RunFile, {**config_to_dict(RunFile()), **table}, f"{path}:")
-    if file.init is not None:
-        file = dataclasses.replace(file, init=os.path.realpath(path.parent / file.init))
-    if file.scene is None or file.scene == SYNTHETIC:
-        return file
-    return dataclasses.replace(file, scene=scene_place(file.scene, path.parent))
-
-
 def scene_place(scene: str, folder: Path = Path()) -> str:
     """Return the place of a scene as run.toml keeps it: a URL, or a full path without links.
 
@@ -304,85 +256,102 @@ def scene_place(scene: str, folder: Path = Path()) -> str:
     return checked_url(scene) if here is None else os.path.realpath(folder / here)  # Also of links in a circle.
 
 
+def read_run_file(path: Path) -> RunRecord:
+    """Read a configuration file, in which the scene may be missing. Relative paths in it start from its folder.
+
+    Raises:
+      FileNotFoundError: if there is none.
+      ValueError: if it is no TOML, or a key is unknown or of another type; key and file are named.
+    """
+    if not is_regular(path):
+        raise FileNotFoundError(f"{path}: no such configuration file")
+    data, where = read_regular(path, MOST_TOML_BYTES), f"{path}:"
+    try:
+        table = parse_toml(data)
+    except ValueError as error:
+        raise ValueError(f"{path}: is not valid TOML: {shortened(str(error), 200)}") from error
+    for key in table:
+        if key not in KEYS:
+            raise ValueError(f"{where} {shortened(key)} is an unknown key{did_you_mean(key, KEYS)}")
+    if not isinstance(table.get("scene", ""), str):
+        raise ValueError(f"{where} scene must be str; got {shortened(table['scene'])}")
+    table.pop("version", None)
+    source = {name: table.pop(key) for key, name in SCENE_KEYS.items() if key in table}
+    scene = config_from_dict(SceneSource, source, where)
+    options = table.pop("options", {})
+    record = config_from_dict(RunRecord, table, where, given={"scene": scene, "options": A2tg()})
+    tables = {"options": options, **{f"compare_options.{key}": value for key, value in record.compare_options.items()}}
+    for key, value in tables.items():
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{where} {shortened(key)} must be a table of options; got {shortened(value)}")
+    system = with_changes(chosen_system(record.system, record.preset), options, f"{path}: options")
+    return dataclasses.replace(record, options=system).placed(path.parent)
+
+
 def write_record(run: RunFolder, record: RunRecord) -> None:
     """Write run.toml with every option, so that later versions with other defaults repeat the same run."""
-    start = config_to_dict(chosen_system(record.name, record.preset))
+    preset, scene, compared = chosen_system(record.system, record.preset), config_to_dict(record.scene), {}
+    for name in record.compare:  # All that they do not take from the main system, and what was given.
+        start = compared_system(name, record.options, record.preset)
+        own = own_options(record.systems[label_of(name)], record.options)
+        compared[name] = _without_none(merged(own, record.compare_options.get(name, {})), config_to_dict(start))
     table = {
-        "scene": record.scene.path,
-        "downscale": record.scene.downscale,
-        "test_every": record.scene.test_every,
-        "alpha": record.scene.alpha,
-        **({} if record.scene.lens == "undistort" else {"lens": record.scene.lens}),
-        **({"validation": True} if record.scene.validation else {}),
-        "system": record.name,
+        **{key: scene[name] for key, name in SCENE_KEYS.items()},
+        "system": record.system,
         **({} if record.preset is None else {"preset": record.preset}),
         "compare": list(record.compare),
         "on_nan": record.on_nan,
         **({} if record.init is None else {"init": record.init}),
         "version": version("a2tg-jax"),
-        "options": _without_none(config_to_dict(record.system), start),
-        **({"compare_options": _options_beside(record)} if record.compare else {}),
+        "options": _without_none(config_to_dict(record.options), config_to_dict(preset)),
+        **({"compare_options": compared} if compared else {}),
     }
-    text = f"# Repeats the run: {repeating_command(run)}\n{_budget_note(record.system)}{tomli_w.dumps(table)}"
+    text = f"# Repeats the run: {repeating_command(run)}\n"
+    if record.options.memory_budget is not None and (caps := record.options.caps()):
+        text += f"# options.memory_budget decides instead of {', '.join(f'options.{name}' for name in caps)}\n"
     with replacing(run.own(run.record)) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text + tomli_w.dumps(table), encoding="utf-8")
 
 
-def _options_beside(record: RunRecord) -> dict[str, Any]:
-    """Return the options of the compared systems by name: all that they do not take from the main one, and those that
-    were given."""
-    found, systems = {}, record.systems
-    for name in record.compare:
-        beside = compared_system(name, record.system, record.preset)
-        own = own_options(systems[label_of(name)], record.system)
-        found[name] = _without_none(merged(own, record.compare_options.get(name, {})), config_to_dict(beside))
-    return found
-
-
-def _budget_note(system: System) -> str:
-    """Return a comment that names the options without effect beside a memory budget; empty if there are none."""
-    if system.memory_budget is None or not (caps := system.caps()):
-        return ""
-    return f"# options.memory_budget decides in place of {', '.join(f'options.{name}' for name in caps)}\n"
+def _without_none(table: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:
+    """Leave out None, which TOML lacks, or write "None", as on the command line, if `start` has another value."""
+    kept: dict[str, Any] = {}
+    for name, value in table.items():
+        if isinstance(value, dict):
+            kept[name] = _without_none(value, start[name])
+        elif value is not None or start[name] is not None:
+            kept[name] = "None" if value is None else value
+    return kept
 
 
 def read_record(run: RunFolder) -> RunRecord:
-    """Read run.toml. If the system is a user's own, its module is imported.
+    """Read run.toml. If the system is a custom one, its module is imported.
 
     Raises:
-      ValueError: if it is damaged, its system is not found, or an option is unknown, of another type or out of range;
-        it is named, and the version that began the run if it is another one.
+      ValueError: if it is damaged or of another version, its system is not found, or an option is unknown, of another
+        type or out of range.
     """
     try:
-        return _checked_record(run)
+        record = read_run_file(run.record)
+        if not record.scene.path:
+            raise ValueError(f"{run.record}: scene is missing")
+        record.check()
+        return record
     except ValueError as error:
-        told = str(error) if str(run.record) in str(error) else f"{run.record}: {error}"
-        raise ValueError(f"{shortened(told, LONGEST_REASON)}{_of_another_version(run)}") from error
+        reason = str(error) if str(run.record) in str(error) else f"{run.record}: {error}"
+        other = f" (if another version than a2tg-jax {version('a2tg-jax')} began the run, use that version)"
+        raise ValueError(f"{shortened(reason, LONGEST_REASON)}{other}") from error
 
 
-def _checked_record(run: RunFolder) -> RunRecord:
-    file = read_run_file(run.record)
-    if file.scene is None:
-        raise ValueError(f"{run.record}: scene is missing")
-    source = SceneSource(file.scene, file.downscale, file.test_every, file.alpha, file.lens, file.validation)
-    system = file.chosen(str(run.record))
-    compared = file.compared(system, str(run.record))
-    record = RunRecord(source, file.system, system, file.compare, file.preset, file.on_nan, file.init, compared)
-    record.check()
-    return record
-
-
-def _of_another_version(run: RunFolder) -> str:
-    """Return what to do if another version may have begun a run that this one refuses; empty if this one did."""
-    try:
-        before = parse_toml(read_regular(run.record, MOST_TOML_BYTES)).get("version")
-    except ValueError:
-        return ""
-    now = version("a2tg-jax")
-    if before is None:
-        return f"; if an earlier version than a2tg-jax {now} began the run, go on with that version"
-    told = f"; a2tg-jax {shortened(before)} began the run, and this is {now}: go on with that version"
-    return told if before != now else ""
+def contradictions(asked: RunRecord, kept: RunRecord) -> list[str]:
+    """Return the options, named as in run.toml, in which a record differs from the one of the run to resume: all but
+    the path of the scene, the systems to compare and `on_nan`."""
+    before, now = (
+        {"system": one.system, "preset": one.preset, "init": one.init, **flatten_config(one.scene)}
+        | flatten_config(one.options)
+        for one in (kept, asked)
+    )
+    return [name for name, value in now.items() if name != "path" and (name not in before or before[name] != value)]
 
 
 def repeating_command(run: RunFolder) -> str:
@@ -394,29 +363,36 @@ def repeating_command(run: RunFolder) -> str:
     if not is_regular(run.finish):
         return training(f"{run.path}-again")
     trained = f"{run.path}-trained"
-    finishing = ["a2tg", "finish", trained, "--out", f"{run.path}-again", *read_finish(run).flags]
-    return f"{training(trained)} && {shlex.join(finishing)}"
+    options = config_to_dict(read_finish(run))
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
+    return f"{training(trained)} && {shlex.join(['a2tg', 'finish', trained, '--out', f'{run.path}-again', *flags])}"
 
 
-def changed_numbers(asked: RunRecord, kept: RunRecord) -> list[str]:
-    """Return the names of the options in which two records of the same scene differ."""
-    before = kept.leaves()
-    return [name for name, value in asked.leaves().items() if name not in before or value != before[name]]
+@dataclasses.dataclass(frozen=True)
+class FinishOptions:
+    """Options of `a2tg finish`, as finish.json of a finished run keeps them."""
+
+    max_loss: float = 0.02
+    """Largest loss of PSNR in dB by smaller textures, on training views; 0 leaves textures as they are."""
+    polish_steps: int = 5
+    """Steps of least squares, each of which draws every training view; many fit these views too closely, and 0 leaves
+    colours as they are."""
+
+    def check(self) -> None:
+        """Raise ValueError if a number is out of range."""
+        if not 0 <= self.max_loss < math.inf:
+            raise ValueError(f"max_loss must be at least 0 dB; got {self.max_loss}")
+        if self.polish_steps < 0:
+            raise ValueError(f"polish_steps must be at least 0; got {self.polish_steps}")
 
 
-def changed_compared(asked: RunRecord, kept: RunRecord) -> list[str]:
-    """Return the tables `compare_options` of a record that differ from the systems compared by another record."""
-    names = [name for name in asked.compare_options if name in kept.compare]
-    before, now = kept.systems, dataclasses.replace(asked, compare=kept.compare).systems
-    return [f"compare_options.{name}" for name in names if before[label_of(name)] != now[label_of(name)]]
+def read_finish(run: RunFolder) -> FinishOptions:
+    """Return the options with which a run was finished.
 
-
-def _without_none(table: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:
-    """Leave out None, which TOML lacks, or write "None", as on the command line, if `start` has another value."""
-    told: dict[str, Any] = {}
-    for name, value in table.items():
-        if isinstance(value, dict):
-            told[name] = _without_none(value, start[name])
-        elif value is not None or start[name] is not None:
-            told[name] = "None" if value is None else value
-    return told
+    Raises:
+      ValueError: if finish.json is damaged or of another version.
+    """
+    data = read_json(run.finish)
+    names = [field.name for field in dataclasses.fields(FinishOptions)]
+    own = {name: data[name] for name in names if name in data} if isinstance(data, dict) else data
+    return config_from_dict(FinishOptions, own, f"{run.finish}:")

@@ -331,12 +331,12 @@ def write_report(
     rows = [[row[at] for at in order] for row in rows]
     best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
-    leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.system)
+    leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.options)
     page = pages.get_template("report.html").render(
         **inlined,
         policy=Markup(policy),
         title=f"{next(iter(result.plan.chains))} on {result.scene}",
-        about=(inspect.getdoc(type(result.record.system)) or "").split("\n", 1)[0],
+        about=(inspect.getdoc(type(result.record.options)) or "").split("\n", 1)[0],
         result=result,
         main=main,
         held_out=held_out,

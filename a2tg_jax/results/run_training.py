@@ -52,7 +52,7 @@ from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.start import check_loss_data, check_start
 
 LESS_MEMORY = (
-    "close other programs, or start another run with a larger --downscale, or a smaller memory_budget or batch_size"
+    "close other programs, or start another run with a larger --downscale, or a smaller --memory-budget or --batch-size"
 )
 """Advice of the command line for trainings that have run out of memory."""
 MOST_RESTORED = 5
@@ -102,15 +102,15 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     if record.scene.path != SYNTHETIC and not is_url(record.scene.path):
         check_apart(out, Path(record.scene.path))
     check_free(out, overwrite=options.overwrite)
-    given = None if record.init is None else check_init(Path(record.init), out, record.system)
+    given = None if record.init is None else check_init(Path(record.init), out, record.options)
     check_output(out)
     scene = record.scene.load(room_for_photographs(options.max_memory), is_divided=True)
     num_given = None if given is None else given.num
     for system in record.systems.values():
         check_loss_data(scene.train, system.stages())
-        check_start(scene, system, num_given if system is record.system else None)
-    if record.system.small_budget:
-        warnings.warn(f"{record.system.small_budget}; it is in bytes of the model, such as 20MB", stacklevel=2)
+        check_start(scene, system, num_given if system is record.options else None)
+    if record.options.small_budget:
+        warnings.warn(f"{record.options.small_budget}; it is in bytes of the model, such as 20MB", stacklevel=2)
     print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given, out)
     run = RunFolder(out)
     with claimed(run):

@@ -14,15 +14,15 @@ from a2tg_jax.training import SYSTEMS
 PAGE = Path(__file__).resolve().parents[1] / "options.md"
 OPENING = """# Options
 
-Every option of every command, with its default, as `a2tg COMMAND --help` prints them. This page is
+Every option of every command, with its default, as `a2tg COMMAND --help-all` prints them. This page is
 written by `python docs/scripts/options.py`. [The command line](command-line.md) explains what they
 are for. Options that are on or off have a second form, `--no-…`.
 """
 OF_SYSTEMS = """
 ## Options of systems
 
-`a2tg train --system NAME --help` lists them with the defaults of the preset `paper`, as here;
-`--preset NAME` sets others. Options that all systems share stand above, with `a2tg train`.
+`a2tg train --system NAME --help-all` lists them with the defaults of the preset `paper`, as here;
+`--preset NAME` sets others. Options that all systems share are listed above, with `a2tg train`.
 """
 WIDTH = "110"
 """Columns of a terminal in which the help has one column of boxes."""
@@ -43,8 +43,8 @@ def help_of(*words: str) -> str:
     told, before = io.TextIOWrapper(io.BytesIO(), encoding="utf-8"), os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = WIDTH
     try:
-        with contextlib.redirect_stdout(told), contextlib.suppress(SystemExit):
-            command_line._parse(words[0], [*words[1:], "--help"]).run()
+        with contextlib.redirect_stdout(told):
+            command_line.main([*words, "--help-all"])
     finally:
         os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
     return re.sub(r"\x1b\[[0-9;]*m", "", _text(told))

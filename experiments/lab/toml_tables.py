@@ -39,4 +39,4 @@ def table_as(kind: type[TableT], table: Any, where: str, **given: Any) -> TableT
     """
     if not isinstance(table, Mapping):
         raise ValueError(f"{where} must be a table; got {shortened(table)}")
-    return config_from_dict(kind, table, where, given=given, is_written=False)
+    return config_from_dict(kind, table, where, given=given)

@@ -1,4 +1,4 @@
-"""The command `a2tg sfm`."""
+"""The commands that make scene folders: `a2tg sfm` finds cameras, `a2tg download` fetches benchmark data sets."""
 
 import dataclasses
 import functools
@@ -9,12 +9,14 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import defaulting_to
-from a2tg_jax.data import SfmSummary, run_sfm
+from a2tg_jax.data import run_sfm
+from a2tg_jax.data.download import BENCHMARK_SETS, fetch
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.photo_folder import CAMERA_PICTURE, holds_photos, is_video
 from a2tg_jax.data.sfm import CameraModel, Matching
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
+from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.results.checks import check_apart, check_output
 from a2tg_jax.results.figures import save_camera_picture
 from a2tg_jax.results.forecast import quick_flags
@@ -25,8 +27,8 @@ class Sfm:
     """Find camera poses and sparse points for photographs, videos and panoramas.
 
     COLMAP extracts features, matches them and maps the scene. Of a video (pip install 'a2tg-jax[video]') it takes the
-    sharpest frames along the camera's way. Panoramas of 360° are cut into views. Photographs are turned as EXIF says.
-    The scene folder gets images, sparse points and cameras.png, which shows where the cameras stand.
+    sharpest frames along the camera path. Panoramas of 360° are cut into views. Photographs are turned as EXIF says.
+    The scene folder gets images, sparse points and cameras.png, which shows where the cameras are.
 
     Examples:
       a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox --preset quick --downscale 4
@@ -56,7 +58,7 @@ class Sfm:
         for source in sources:
             check_apart(out, source)
             if is_scene(source):
-                _print(f"{source} has cameras already, which a2tg train reads; finding them anew")
+                print(f"{source} has cameras already, which a2tg train reads; COLMAP finds them again", flush=True)
         check_output(out)
         found = run_sfm(
             sources,
@@ -65,10 +67,13 @@ class Sfm:
             matching=self.matching,
             frames=self.frames,
             panorama=self.panorama,
-            on_note=_print,
+            on_note=functools.partial(print, flush=True),
         )
         save_camera_picture(out, out / CAMERA_PICTURE)
-        print(_told(found))
+        print(
+            f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points, "
+            f"mean reprojection error {found.mean_error:.2f} pixels"
+        )
         run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
         command = f"{shlex.join(run)} {quick_flags(found.longest_side)}"
         print(f"cameras: {out / CAMERA_PICTURE}\nscene: {out}; continue with: {command}")
@@ -88,11 +93,38 @@ class Sfm:
         return sources, out
 
 
-def _told(found: SfmSummary) -> str:
-    return (
-        f"{found.num_registered} of {found.num_photos} photographs registered, {found.num_points:,} points, "
-        f"mean reprojection error {found.mean_error:.2f} pixels"
-    )
+@dataclasses.dataclass(frozen=True)
+class Download:
+    """Download benchmark data sets and unpack them.
 
+    An interrupted download continues when the command is given again. What is there is left alone. The experiments find
+    the scenes where they are unpacked.
 
-_print = functools.partial(print, flush=True)
+    Examples:
+      a2tg download --list
+      a2tg download mipnerf360 tandt-db --out scenes
+    """
+
+    names: Annotated[Positional[tuple[str, ...]], arg(metavar="NAME")] = ()
+    """Data sets, as --list names them."""
+    out: Annotated[Path, arg(metavar="SCENES")] = Path("scenes")
+    """Folder for all scenes."""
+    list: bool = False
+    """Print names, sizes and contents of the data sets."""
+
+    def run(self) -> None:
+        if self.list or not self.names:
+            for name, known in BENCHMARK_SETS.items():
+                size = known.num_bytes
+                print(f"{name:<17} {'      ?' if size is None else f'{size / 1e9:4.1f} GB'}  {known.content}")
+            print("The server reports sizes with ? before the download.")
+            return
+        for name in self.names:
+            if name not in BENCHMARK_SETS:
+                near = did_you_mean(name, BENCHMARK_SETS)
+                raise ValueError(f"there is no data set {name!r}{near or ';'} they are {', '.join(BENCHMARK_SETS)}")
+        for name in self.names:
+            archive = BENCHMARK_SETS[name]
+            print(f"{name}: {archive.url}", flush=True)
+            is_new = fetch(archive, self.out)
+            print(f"{name}: {'unpacked' if is_new else 'is there already'} in {self.out / archive.folder}")

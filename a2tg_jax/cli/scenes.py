@@ -1,4 +1,4 @@
-"""The commands that show scenes in a browser: `a2tg view`, `a2tg export`, and the view of a training."""
+"""The commands that show scenes in a browser, or write them for other programs: `a2tg view`, `export`, `convert`."""
 
 import dataclasses
 import webbrowser
@@ -8,11 +8,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import LastModel
+from a2tg_jax.cli.arguments import LastModel, RunOrFile
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.results.checks import check_apart, check_new, check_not_source, check_output
-from a2tg_jax.results.conversion import check_ply, export_ply
+from a2tg_jax.results.conversion import BakeOptions, check_ply, convert, export_ply
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.viewing import check_page, export_web, routes_of, shown_live
 from a2tg_jax.training.loop import Watch
@@ -32,10 +32,8 @@ class ViewCommand:
       a2tg view runs/fox --host 0.0.0.0
     """
 
-    source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
-    """Run folder, model (*.npz), compact scene (*.a2tgz), or splats of other programs (*.ply, *.spz, *.sog, ...)."""
+    source: RunOrFile
     model: LastModel = None
-    """Name of a run's model, as a2tg info prints it."""
     host: str = LOOPBACK
     """Address to listen on. 0.0.0.0 opens the page to the network, for a phone on the same Wi-Fi. Anyone who has the
     printed address, which contains a random token, can see the scene; the connection is not encrypted."""
@@ -67,8 +65,7 @@ class Export:
       a2tg export runs/fox --ply fox.ply
     """
 
-    source: Annotated[Positional[Path], arg(metavar="RUN_OR_FILE")]
-    """Run folder, model (*.npz), compact scene (*.a2tgz), or splats of other programs (*.ply, *.spz, *.sog, ...)."""
+    source: RunOrFile
     web: Path | None = None
     """Output folder of the page; a name that ends in .html is one HTML file that needs no other."""
     ply: Annotated[Path | None, arg(metavar="FILE")] = None
@@ -78,9 +75,8 @@ class Export:
     single_file: bool = False
     """Write one HTML file, whatever its name."""
     photographs: bool = False
-    """Put the photographs of the run's cameras beside the page."""
+    """Add the photographs of the run's cameras to the page."""
     model: LastModel = None
-    """Name of a run's model, as a2tg info prints it."""
     overwrite: bool = False
     """Replace what --web and --ply name."""
 
@@ -134,3 +130,48 @@ def _open(address: str) -> None:
     """Open a browser if there is a display."""
     if has_display():
         webbrowser.open(address)
+
+
+@dataclasses.dataclass(frozen=True)
+class Convert:
+    """Convert splats between formats, chosen by the suffixes of the files.
+
+    Reads and writes *.npz, *.a2tgz, *.ply, *.compressed.ply, *.spz, *.sog, *.splat, *.ksplat, *.glb, *.gltf, *.usda,
+    *.usdc and *.usdz. Reads checkpoints of gsplat, Nerfstudio, 3DGS and 2DGS (*.pt, *.pth, *.ckpt), too. Gaussians of
+    3DGS are flattened along their thinnest axis. Files of other programs hold the original world.
+
+    Other programs support no textures, and no kernels but Gaussians. --bake turns a textured splat into plain ones, as
+    many as its texels or fewer, and trains them on pictures of the model from its training cameras. The photographs
+    are not needed.
+
+    Examples:
+      a2tg convert runs/fox fox.sog --bake
+      a2tg convert scene.spz scene.npz
+    """
+
+    source: RunOrFile
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Output file."""
+    model: LastModel = None
+
+    bake: bool = False
+    """Turn splats with textures, or with kernels of other shapes, into plain ones."""
+    bake_growth: float = BakeOptions.growth
+    """Largest ratio of bytes of the numbers after --bake to those before."""
+    bake_iterations: int = BakeOptions.iterations
+    """Iterations of training in --bake; each draws one view. 0 leaves training out."""
+
+    float64: bool = False
+    """Write the positions of a PLY as float64, so that map coordinates stay whole."""
+
+    overwrite: bool = False
+    """Replace the output file."""
+
+    def run(self) -> None:
+        options = BakeOptions(self.bake_growth, self.bake_iterations)
+        if not self.bake and options != BakeOptions():
+            raise ValueError("--bake-growth and --bake-iterations have no effect without --bake: add it")
+        baking = options if self.bake else None
+        baking = options if self.bake else None
+        text = convert(self.source, self.out, self.model, baking=baking, float64=self.float64, overwrite=self.overwrite)
+        print(text)

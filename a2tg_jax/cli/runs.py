@@ -1,0 +1,242 @@
+"""The commands for a finished run: `a2tg eval`, `finish`, `render`, `mesh`, `compress` and `info`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from a2tg_jax.cli.arguments import LastModel, LpipsWeights, RunFolderPath, defaulting_to
+from a2tg_jax.cli.train import tell_result
+from a2tg_jax.host.text import counted
+from a2tg_jax.mesh.files import mesh_files
+from a2tg_jax.results.checks import check_apart, check_export, check_not_source, check_output, check_weights
+from a2tg_jax.results.compression import compress
+from a2tg_jax.results.finishing import finish_run
+from a2tg_jax.results.folder import RunFolder, json_text, open_run, opened
+from a2tg_jax.results.frames import (
+    FRAMES_PER_SECOND,
+    FrameFolder,
+    Route,
+    check_rate,
+    parse_size,
+    render_frames,
+    video_name,
+    write_video,
+)
+from a2tg_jax.results.info import describe_run, run_facts
+from a2tg_jax.results.meshing import MeshOptions, write_mesh
+from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.record import FinishOptions
+from a2tg_jax.results.report import metrics_json
+from a2tg_jax.results.run_training import measure
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Evaluate the finished stages of a run again.
+
+    Rewrites metrics, pictures and report.
+
+    Example:
+      a2tg eval runs/fox --lpips-weights lpips_alex.npz
+    """
+
+    folder: RunFolderPath
+    lpips_weights: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Weights file (.npz) for LPIPS with AlexNet or SqueezeNet. Without it, the LPIPS in metrics.json is kept if the
+    models are the same."""
+    json: bool = False
+    """Print metrics.json, for programs, instead of a table."""
+
+    def run(self) -> None:
+        check_weights(self.lpips_weights)
+        with opened(self.folder) as run:
+            result = measure(run, lpips_weights=self.lpips_weights)
+            if self.json:
+                print(json_text(metrics_json(result)))
+            else:
+                tell_result(result, self.folder)
+
+
+@dataclasses.dataclass(frozen=True)
+class Finish:
+    """Shrink and polish the model of a finished run, in a new run folder.
+
+    Textures become smaller where that loses next to nothing on the training views. Then colours and texels move to the
+    least squared error on them. The new run is evaluated; the old one stays as it is.
+
+    Example:
+      a2tg finish runs/fox --out runs/fox-finished
+    """
+
+    folder: RunFolderPath
+    out: Path
+    """New run folder."""
+    options: Annotated[FinishOptions, arg(name="")] = FinishOptions()
+    lpips_weights: LpipsWeights = None
+
+    def run(self) -> None:
+        check_weights(self.lpips_weights)
+        check_apart(self.out, self.folder)
+        check_output(self.out)
+        print(finish_run(open_run(self.folder), self.out, self.options, lpips_weights=self.lpips_weights))
+        print(f"report: {RunFolder(self.out).report}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Render frames of a finished run as PNG files.
+
+    A flight also becomes a video: MP4 if ffmpeg is installed, and otherwise an animated WebP. The photographs are not
+    needed.
+
+    Examples:
+      a2tg render runs/fox --frames 240 --fps 60
+      a2tg render runs/fox --size 1280x720
+      a2tg render runs/fox --path orbit --frames 240 --out fox-orbit
+      a2tg render runs/fox --path test --out fox-test
+      a2tg render runs/fox --path path.json --out fox-flight
+    """
+
+    folder: RunFolderPath
+    path: Route | Path = "smooth"
+    """Camera path: smooth (a flight past the cameras), orbit (a turntable around the subject), test (the test views),
+    or a file (*.json) saved in a2tg view."""
+    frames: int = 120
+    """Number of frames of the flight."""
+    fps: float = FRAMES_PER_SECOND
+    """Frames per second of the video."""
+    size: Annotated[str | None, arg(metavar="WxH"), defaulting_to("size of the cameras' images")] = None
+    """Width and height of the frames in pixels, such as 1280x720. Views of another aspect are cropped."""
+    supersample: int = 1
+    """Factor k by which frames are drawn larger and averaged: without aliasing where frames are smaller than the
+    photographs, at k² times the cost."""
+    out: Annotated[Path | None, defaulting_to("RUN/frames")] = None
+    """Output folder."""
+    model: LastModel = None
+    overwrite: bool = False
+    """Replace files that exist. What earlier renders wrote is always replaced, and frames of a longer flight are
+    deleted."""
+
+    def run(self) -> None:
+        run = open_run(self.folder)
+        out = self.out or run.path / "frames"
+        check_rate(self.fps)
+        if self.path == "test" and (self.frames, self.fps) != (Render.frames, Render.fps):
+            raise ValueError("--frames and --fps are of a flight and have no effect on --path test: leave them out")
+        size = None if self.size is None else parse_size(self.size)
+        if self.supersample < 1:
+            raise ValueError(f"--supersample must be at least 1; got {self.supersample}")
+        check_output(out)
+        if self.path != "test":
+            FrameFolder(out).check([video_name()], overwrite=self.overwrite)
+        paths = render_frames(
+            run,
+            out,
+            route=self.path,
+            num_frames=self.frames,
+            name=self.model,
+            size=size,
+            supersample=self.supersample,
+            overwrite=self.overwrite,
+        )
+        print(f"wrote {counted(len(paths), 'frame')} to {out}/")
+        if self.path != "test":
+            video = write_video(paths, frames_per_second=self.fps)
+            if video.suffix == ".mp4":
+                print(f"video: {video}")
+                return
+            print("no video: ffmpeg is not installed; install it for MP4 (apt install ffmpeg, brew install ffmpeg)")
+            print(f"animation: {video}")
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshCommand:
+    """Write the surface of a trained scene as triangles, by fusion of rendered depths.
+
+    GLB files are upright, with the lengths of the original world; PLY and OBJ are in the original world. Only textures
+    need the photographs. Surfaces are best if the scene was trained with --system gaussians-2d --preset surfaces.
+
+    Examples:
+      a2tg mesh runs/fox
+      a2tg mesh runs/fox --out fox.ply --resolution 1024
+      a2tg mesh runs/fox --texture photographs
+      a2tg mesh runs/street --unbounded
+    """
+
+    source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
+    """Run folder, or model with cameras (*.npz or *.a2tgz)."""
+    out: Annotated[Path | None, defaulting_to("RUN/mesh.glb, or NAME-mesh.glb next to the model", "FILE")] = None
+    """Output file, *.glb, *.ply or *.obj."""
+    options: Annotated[MeshOptions, arg(name="")] = MeshOptions()
+    model: LastModel = None
+    overwrite: bool = False
+    """Replace files that exist. The default of a run is always replaced once a2tg mesh has written it."""
+
+    def run(self) -> None:
+        is_run = self.source.is_dir()
+        default = self.source / "mesh.glb" if is_run else self.source.with_name(f"{self.source.stem}-mesh.glb")
+        out = self.out or default
+        self.options.check(out)
+        files = mesh_files(out, has_texture=self.options.texture != "none")
+        check_not_source(files, self.source, "--out")
+        source = open_source(self.source, self.model)
+        check_output(out)
+        for file in files:
+            check_export(file, default, "--out", overwrite=self.overwrite)
+        print(write_mesh(source, out, self.options))
+        if is_run and out.resolve() == default.resolve():
+            RunFolder(self.source).own(default)
+
+
+@dataclasses.dataclass(frozen=True)
+class Compress:
+    """Write the smallest file of a model within a given loss of PSNR.
+
+    The loss is measured on at most 16 training views. If the photographs are missing, it is estimated from renders, for
+    a model of 30 dB. A table lists the loss and the bytes of each choice of bits. This takes minutes on a CPU. With
+    --tune-iterations the model is trained further while its numbers are rounded, so that fewer bits suffice.
+
+    Examples:
+      a2tg compress runs/fox
+      a2tg compress runs/fox --tune-iterations 1000
+      a2tg compress scene.npz --out scene.a2tgz --max-loss 0.02
+    """
+
+    source: Annotated[Positional[Path], arg(metavar="RUN_OR_MODEL")]
+    """Model file (*.npz), or run folder, whose last model is taken."""
+    out: Annotated[Path | None, defaulting_to("NAME.a2tgz next to the model", "FILE")] = None
+    """Output file, *.a2tgz."""
+    max_loss: float = 0.05
+    """Largest loss of PSNR in dB."""
+    tune_iterations: int = 0
+    """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. It happens up to 4
+    times, for other bits each time: first those that lose 0.5 dB, or twice --max-loss if that is more. 0: numbers are
+    only rounded."""
+    overwrite: bool = False
+    """Replace the output file. The default of a run is always replaced once a2tg compress has written it."""
+
+    def run(self) -> None:
+        iterations = self.tune_iterations
+        table = compress(
+            self.source, self.out, max_loss=self.max_loss, tune_iterations=iterations, overwrite=self.overwrite
+        )
+        print(table)
+
+
+@dataclasses.dataclass(frozen=True)
+class Info:
+    """Print the scene, the progress of each stage, the models and the metrics of a run.
+
+    Example:
+      a2tg info runs/fox --json
+    """
+
+    folder: RunFolderPath
+    json: bool = False
+    """Print JSON, for programs."""
+
+    def run(self) -> None:
+        run = open_run(self.folder)
+        print(json_text(run_facts(run)) if self.json else describe_run(run))
