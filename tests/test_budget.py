@@ -386,7 +386,7 @@ def test_the_command_line_tells_budgets(tmp_path, capsys, monkeypatch):
     ]
     assert cli.main(["train", "synthetic", *flags, "--memory-budget", "300MB"]) == 2
     told = capsys.readouterr().err
-    assert "--memory-budget has room for" in told and "raise --stage1-iterations" in told
+    assert "--memory-budget has room for" in told and "raise stage1_iterations" in told
     assert not (tmp_path / "run").exists()
     assert cli.main(["train", "synthetic", *flags, "--memory-budget", "lots"]) == 2
     assert "--memory-budget must be a number of MB" in capsys.readouterr().err

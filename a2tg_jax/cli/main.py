@@ -89,10 +89,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             warnings.showwarning = _show_warning
             configure_cpu()
             _add_current_folder()
-            parsed(name, arguments).run()
+            try:
+                command = parsed(name, arguments)
+            except SystemExit as end:  # tyro has printed help, or an error.
+                return int(end.code or 0)
+            command.run()
             sys.stdout.flush()
-    except SystemExit as end:  # tyro has printed help, or an error.
-        return int(end.code or 0)
     except KeyboardInterrupt as stop:
         stopped = signals.Stopped.of(stop)
         print(f"a2tg: interrupted{stopped.advice and '; ' + stopped.advice}", file=sys.stderr)
