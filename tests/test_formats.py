@@ -273,7 +273,7 @@ def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsy
     np.testing.assert_allclose(first.gaussians.means, some_gaussians(40).means, atol=1e-5)
     np.testing.assert_allclose(first.gaussians.sh, some_gaussians(40).sh[:, :4], atol=1e-5)
     with pytest.raises(ValueError, match="has no second one"):
-        dataclasses.replace(record, name="gaussians-2d", system=Gaussians2d()).check()
+        dataclasses.replace(record, system="gaussians-2d", options=Gaussians2d()).check()
     command = ["train", "synthetic", "--out", str(tmp_path / "new"), "--init", str(tmp_path / "no.ply")]
     assert main(command) == 2 and "there is no file" in capsys.readouterr().err
 
