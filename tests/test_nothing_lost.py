@@ -448,7 +448,7 @@ def trapped_run(scene, folder, on_nan, always=False) -> RunFolder:
     x = float(np.asarray(view.camera.viewmat)[0, 0])
     system = Trapped(stage1_iterations=20, x=x, always=always, **SIZES)
     run = create_run(folder)
-    write_record(run, dataclasses.replace(RECORD, name=f"{__name__}:Trapped", system=system, on_nan=on_nan))
+    write_record(run, dataclasses.replace(RECORD, system=f"{__name__}:Trapped", options=system, on_nan=on_nan))
     return run
 
 
