@@ -23,9 +23,8 @@ from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain_array
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
-from a2tg_jax.rasterize.capacity import with_capacity
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.rasterize.views import render_traced, with_capacity
 from a2tg_jax.texture import Textures, check_textures
 
 

@@ -13,8 +13,8 @@ from a2tg_jax.core.checks import check_kind, check_number
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.capacity import HEAD_ROOM, capacity_for, pairs_of_view, pairs_to_draw
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
+from a2tg_jax.rasterize.views import HEAD_ROOM, capacity_for, pairs_of_view, pairs_to_draw
 from a2tg_jax.render import appearance_of, check_background, jitted_render
 from a2tg_jax.texture import Textures
 

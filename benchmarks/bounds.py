@@ -22,12 +22,12 @@ import numpy as np
 import a2tg_jax
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.gaussians import floats_per_gaussian
-from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view
 from a2tg_jax.rasterize.compositor import composite
+from a2tg_jax.rasterize.kernels.jaxprs import PixelFunctions
 from a2tg_jax.rasterize.kernels.native import composite as native
-from a2tg_jax.rasterize.kernels.traced import Functions
-from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats, kernel_of, project_gaussians
+from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats, project_gaussians, settings_of_pass
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
+from a2tg_jax.rasterize.views import capacity_for, pairs_of_view
 from a2tg_jax.render import appearance_of
 from benchmarks.workload import random_scene, random_textures
 
@@ -109,19 +109,19 @@ def count(num: int, kind: str, width: int, height: int) -> tuple[Work, KernelSpe
     boxes = pairs_of_view(gaussians, camera, appearance, settings)
     splats, cutoff = jax.jit(lambda g: project_gaussians(g, camera, appearance, settings.near_plane, 3))(gaussians)
     lists = native.tile_lists(splats.M, cutoff, settings.near_plane, grid, capacity_for(boxes))
-    spec, texels, regions = kernel_of(
-        appearance, splats, tile_size=TILE_SIZE, near_plane=settings.near_plane, has_geometry=False
+    compositing, texels, regions = settings_of_pass(
+        appearance, splats, grid, settings.near_plane, has_geometry=False, compositor="native", tile_batch=1
     )
-    counting = dataclasses.replace(spec, statistic="position")
+    counting = compositing._replace(kernel=dataclasses.replace(compositing.kernel, statistic="position"))
     jacobian = camera.K @ camera.viewmat[:3, :3]
-    view = View(CompositingSettings(counting, grid, "native", 1), splats, texels, regions, cutoff, jacobian)
+    view = View(counting, splats, texels, regions, cutoff, jacobian)
     counts = np.asarray(view.counts(lists))
     areas = np.zeros(num, int) if textures is None else textures.sizes.prod(axis=1)
     work = Work(
         num, width * height, float(boxes), float(lists.starts[-1]), float(view.taken(lists).sum()), float(counts.sum()),
         float(counts[areas > 1].sum()), int(areas.sum()),
     )  # fmt: skip
-    return work, spec
+    return work, compositing.kernel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,7 +180,7 @@ def stages(work: Work, spec: KernelSpec) -> list[Stage]:
     """Return the least work of each stage of a step."""
     num, row, size = work.num, FLOAT * spec.num_floats, FLOAT * floats_per_gaussian(3)
     texels, image = FLOAT * spec.num_columns * work.num_texels, FLOAT * 3 * work.num_pixels
-    functions, evaluated = Functions(spec), work.taken * TILE_SIZE**2
+    functions, evaluated = PixelFunctions(spec), work.taken * TILE_SIZE**2
     prepare, reach, blend = (operations(jaxpr) for jaxpr in (functions.prepare, functions.reach, functions.forward))
     back, prepare_back = operations(functions.backward), operations(functions.prepare_vjp)
     project, project_back = projection_flops()

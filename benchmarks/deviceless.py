@@ -152,10 +152,10 @@ def compile_for(target: pathlib.Path, function, inputs, **options):
 @functools.cache
 def assembled(spec, ptxas: str) -> dict[str, str]:
     """Return registers and spills of the kernels of a spec, by name."""
-    from a2tg_jax.rasterize.kernels.cuda import launch, nvrtc
+    from a2tg_jax.rasterize.kernels.cuda import composite, nvrtc
     from a2tg_jax.rasterize.kernels.cuda.source import source
 
-    capability = launch.DEFAULT_CAPABILITY
+    capability = composite.DEFAULT_CAPABILITY
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "tiles.ptx"
         path.write_text(nvrtc.ptx(source(spec, "cuda"), capability), encoding="utf-8")

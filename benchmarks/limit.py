@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels.native import lanes, llvm_modules
-from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
-from a2tg_jax.rasterize.kernels.tracing import trace
+from a2tg_jax.rasterize.kernels.jaxprs import trace
+from a2tg_jax.rasterize.kernels.native import lanes, llvm_code
+from a2tg_jax.rasterize.kernels.native.llvm_code import LONG, Writer
 from benchmarks.timing import timed
 
 
 def measure_limit(case: dict) -> dict:
     """Return the time of a number of multiply-adds and one exp per pixel and splat, and nothing else."""
-    module, width = ir.Module("limit"), llvm_modules.vector_bytes() // 4
+    module, width = ir.Module("limit"), llvm_code.num_lanes("float32")
     writer = Writer(module, "limit", ("data",), ("num",), "float32")
     at = lanes.Lanes(writer.b, width)
     reals = at.vector(writer.real)
@@ -38,7 +38,7 @@ def measure_limit(case: dict) -> dict:
         writer.b.store(writer.b.fadd(result, writer.b.load(total, typ=reals)), total)
     writer.store(writer.b.load(total, typ=reals), writer.arguments["data"], 0)
     writer.b.ret_void()
-    run = llvm_modules.as_function(llvm_modules.compile_module(module)["limit"], 1, 1)
+    (run,) = llvm_code.compiled(module, {"limit": (1, 1)})
     threads = len(os.sched_getaffinity(0))
     pool = concurrent.futures.ThreadPoolExecutor(threads)
     vectors = int(case["pairs"] / width / threads)

@@ -35,8 +35,7 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.geometry import NEAR_PLANE, screen_bounds
 from a2tg_jax.parallel.exchange import BorderRoom, ImageBands
-from a2tg_jax.rasterize.kernels.packing import num_numbers
-from a2tg_jax.rasterize.splats import drawn_splats
+from a2tg_jax.rasterize.splats import drawn_splats, num_numbers
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training.registry import with_changes

@@ -9,7 +9,7 @@ import a2tg_jax
 from a2tg_jax.core.optim import adam_init, adam_update
 from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.native import composite as native
-from a2tg_jax.rasterize.splats import CompositingSettings, kernel_of, project_gaussians
+from a2tg_jax.rasterize.splats import project_gaussians, settings_of_pass
 from a2tg_jax.rasterize.tiles import TileGrid
 from a2tg_jax.render import appearance_of
 from benchmarks import timing
@@ -30,10 +30,9 @@ def measure_stages(case: dict) -> dict:
     splats, cutoff = project(gaussians)
     find_lists = jax.jit(lambda M, cutoff: native.tile_lists(M, cutoff, settings.near_plane, grid, capacity))
     lists = find_lists(splats.M, cutoff)
-    spec, texels, regions = kernel_of(
-        appearance, splats, tile_size=settings.tile_size, near_plane=settings.near_plane, has_geometry=False
+    compositing, texels, regions = settings_of_pass(
+        appearance, splats, grid, settings.near_plane, has_geometry=False, compositor="native", tile_batch=1
     )
-    compositing = CompositingSettings(spec, grid, "native", 1)
     jacobian, probe = camera.K @ camera.viewmat[:3, :3], jnp.zeros((num, 4))
 
     def colors(splats, texels):

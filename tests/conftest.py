@@ -80,11 +80,11 @@ def gpu_kernels(monkeypatch):
     """Runs the GPU kernels on the CPU, as OpenCL."""
     import opencl
 
-    from a2tg_jax.rasterize.kernels import choice
+    from a2tg_jax.rasterize.kernels import platforms
     from a2tg_jax.rasterize.kernels.cuda import composite, nvrtc
 
     opencl.queue()
-    monkeypatch.setitem(choice.PLATFORMS, "cuda", "cpu")
+    monkeypatch.setitem(platforms.PLATFORMS, "cuda", "cpu")
     monkeypatch.setattr(nvrtc, "find", lambda: True)
     monkeypatch.setattr(composite, "launch", opencl.launch)
 

@@ -4,10 +4,10 @@ import jax
 import numpy as np
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels.native import llvm_modules
-from a2tg_jax.rasterize.kernels.native.lanes import BOOL, Lanes, scalar_type
-from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
-from a2tg_jax.rasterize.kernels.tracing import trace
+from a2tg_jax.rasterize.kernels.jaxprs import trace
+from a2tg_jax.rasterize.kernels.native import llvm_code
+from a2tg_jax.rasterize.kernels.native.lanes import Lanes
+from a2tg_jax.rasterize.kernels.native.llvm_code import BOOL, LONG, Writer, scalar_type
 
 
 class _Loop(Writer):
@@ -37,11 +37,9 @@ def _stored(dtype) -> ir.Type:
 def run_native(function, arrays, width: int) -> list[np.ndarray]:
     """The flat results of a function of scalars for every entry of arrays, whose length `width` divides."""
     closed, _ = trace(function, *(jax.ShapeDtypeStruct((), array.dtype) for array in arrays))
-    name, module = llvm_modules.unique("looped"), ir.Module("test")
+    name, module = llvm_code.unique("looped"), ir.Module("test")
     _Loop(module, name, closed, width)
-    run = llvm_modules.as_function(
-        llvm_modules.compile_module(module)[name], len(closed.in_avals) + len(closed.out_avals), 1
-    )
+    (run,) = llvm_code.compiled(module, {name: (len(closed.in_avals) + len(closed.out_avals), 1)})
     results = [np.empty(len(arrays[0]), aval.dtype) for aval in closed.out_avals]
     run(*(array.ctypes.data for array in (*arrays, *results)), len(arrays[0]) // width)
     return results

@@ -25,9 +25,8 @@ from a2tg_jax.events import Change, Due, HostEvent, StepEvent
 from a2tg_jax.parallel import exchange as exchanges, sharded_rows as rows
 from a2tg_jax.parallel.exchange import AXIS, ROOM_OF_A_BAND, BorderRoom, ImageBands, exchange_among
 from a2tg_jax.parallel.sharded_rows import on_host, placed_like, readable, rows_moved, sharding_of_rows, spread
-from a2tg_jax.rasterize.capacity import pairs_of_view
 from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles
-from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.rasterize.views import pairs_of_view, render_traced
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import PhotoStore

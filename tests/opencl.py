@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from a2tg_jax.rasterize.kernels import cuda
-from a2tg_jax.rasterize.kernels.cuda.primitives import C_TYPES
-from a2tg_jax.rasterize.kernels.cuda.printing import Argument, c_function
+from a2tg_jax.rasterize.kernels.cuda.printing import C_TYPES, Argument, c_function
 from a2tg_jax.rasterize.kernels.cuda.source import block_threads, num_parts, source
 
 cl = pytest.importorskip("pyopencl", reason="the GPU kernels run on CPUs as OpenCL: pip install 'pyopencl[pocl]'")
@@ -59,7 +58,7 @@ def run(spec, name, num_tiles, inputs, results, totals):
 
 
 def launch(spec, name, num_tiles, inputs, results, totals=()):
-    """Run a kernel on the CPU, with the arguments and results of `kernels.cuda.launch.launch`."""
+    """Run a kernel on the CPU, with the arguments and results of `kernels.cuda.composite.launch`."""
     _kernel(spec, name)  # Here, for the callback's thread is not in 64-bit mode, and would trace for float32.
     given, wanted = _kinds([*inputs, *totals]), _kinds([*results, *totals])
 

@@ -9,7 +9,7 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 import a2tg_jax
 from a2tg_jax import render_image
 from a2tg_jax.host import machine
-from a2tg_jax.rasterize.kernels.native import composite as native, threads
+from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 
 CGROUPS = {
     "version 2, in a container": ("0::/", {"cpu.max": "150000 100000"}, 1.5),
@@ -89,9 +89,9 @@ def test_a_wrong_environment_is_named(monkeypatch, wrong):
 @pytest.mark.parametrize("num", [1, 2, 3])
 def test_as_many_threads_render_as_are_set(monkeypatch, num):
     parts = []
-    run_spans = threads.run_spans
+    run_spans = ffi.run_spans
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 1)
-    monkeypatch.setattr(threads, "run_spans", lambda work, spans: (parts.append(len(spans)), run_spans(work, spans)))
+    monkeypatch.setattr(ffi, "run_spans", lambda work, spans: (parts.append(len(spans)), run_spans(work, spans)))
     scene = draw_scene(3, num=60)
     a2tg_jax.set_num_threads(num)
     render_image(as_gaussians(scene, "float32"), as_camera(scene, "float32")).color.block_until_ready()

@@ -13,7 +13,7 @@ from a2tg_jax.rasterize.kernels.native import ffi
 SCRIPT = """
 import os, signal, sys, threading, time
 import jax, jax.numpy as jnp
-from a2tg_jax.rasterize.kernels.native import ffi, threads
+from a2tg_jax.rasterize.kernels.native import ffi
 
 # A program that a shell runs in the background ignores Ctrl-C, and so do those that it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -24,7 +24,7 @@ def part(first, last, index):
 def handler(arguments, results):
     results[0][...] = 7
     if arguments[0][0] > 0:
-        threads.run_spans(part, [(0, 1), (1, 2)])
+        ffi.run_spans(part, [(0, 1), (1, 2)])
 
 def refuse(*_):
     raise RuntimeError("refused to print")

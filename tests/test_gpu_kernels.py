@@ -14,17 +14,15 @@ from scenes_random import as_camera, as_gaussians, as_settings, as_textures, dra
 
 from a2tg_jax import RenderSettings, render_image
 from a2tg_jax.appearance import Appearance, StaticShading, Texture
-from a2tg_jax.rasterize.kernels.cuda import launch, nvrtc
-from a2tg_jax.rasterize.kernels.cuda.primitives import PRIMITIVES
-from a2tg_jax.rasterize.kernels.cuda.printing import Argument, c_function
+from a2tg_jax.rasterize.kernels.cuda import composite, nvrtc
+from a2tg_jax.rasterize.kernels.cuda.printing import PRIMITIVES, Argument, c_function
 from a2tg_jax.rasterize.kernels.cuda.source import source
-from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
-from a2tg_jax.rasterize.kernels.native import primitives as of_native
-from a2tg_jax.rasterize.kernels.tracing import example, trace
+from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable, example, trace
+from a2tg_jax.rasterize.kernels.native import lanes as of_native
 from a2tg_jax.rasterize.splats import KernelSpec
 
-NOT_PRINTED = {"clz", "population_count"}
-"""Primitives of native loops that GPU kernels lack; their names differ between CUDA and OpenCL."""
+NOT_PRINTED = {"bitcast_convert_type", "shift_left", "shift_right_arithmetic"}
+"""Primitives of the formulas of native loops, which GPU kernels have no use for."""
 
 
 def spec_of(has_textures=True, dtype="float32", tile_size=16, has_geometry=True, statistic="position"):
@@ -81,7 +79,7 @@ def test_xla_takes_them():
         return jnp.sum(render_image(gaussians, camera, settings=settings).color)
 
     lowered = jax.jit(jax.grad(loss)).trace(gaussians).lower(lowering_platforms=("cuda",)).as_text()
-    calls = re.findall(rf"custom_call @{re.escape(launch.TARGET)}.*", lowered.replace('"', ""))
+    calls = re.findall(rf"custom_call @{re.escape(composite.TARGET)}.*", lowered.replace('"', ""))
     assert len(calls) == 2
     for name, call in zip(("forward", "backward"), calls, strict=True):
         assert f"name = {name}" in call and "block_x = 256" in call and "grid_x = 6 " in call
@@ -114,18 +112,22 @@ def test_every_primitive_of_native_loops_is_printed():
 
 
 def program(x, y):
-    """Branches, loops, arrays, integers and bits."""
-    steps = lax.while_loop(lambda c: c[0] < 30, lambda c: (c[0] * 2 + 1, c[1] + 1), (abs(x) + 0.5, 0))[1]
-    branch = lax.switch(steps % 3, [lambda: x, lambda: y * 2, lambda: jnp.tanh(x)])
-    total = lax.fori_loop(0, 5, lambda k, t: t * y + k, x)
-    array = jnp.stack([x, y, branch])
-    bits = lax.bitcast_convert_type(x, jnp.int32 if x.dtype == jnp.float32 else jnp.int64)
-    scanned, rows = lax.scan(lambda c, row: (c + row, c * row), x, array)
+    """All that is printed."""
+    whole = x.astype(jnp.int32)
     return (
-        *(branch, total, jnp.sum(array), jnp.max(array), jnp.prod(array[::-1][:2]), scanned, jnp.sum(rows)),
-        *(jnp.clip(x, -1, y), lax.rem(x, y), jnp.sign(x), jnp.round(x * 8), x.astype(jnp.int32) // 3, bits >> 4),
-        *((bits << 3) ^ steps.astype(bits.dtype), jnp.isfinite(x / y), ~(x < y), lax.integer_pow(y, -3), x**2.5),
-        *(jnp.minimum(x, y), jnp.logical_xor(x > 0, y > 0), jnp.exp(x), jax.nn.sigmoid(y), lax.rsqrt(abs(x))),
+        *(x + y, x - y, x * y, x / y, -x, jnp.sqrt(abs(x)), lax.square(x), lax.integer_pow(y, -3), abs(x) ** 2.5),
+        *(jnp.clip(x, -1, y), jnp.minimum(x, y), jnp.maximum(x, y), jnp.sign(x), jnp.floor(x), jnp.ceil(y)),
+        *(x == y, x != y, x < y, x <= y, x > y, x >= y, ~(x < y), (x > 0) & (y > 0), (x > 0) | (y > 0)),
+        *(
+            lax.div(whole, jnp.int32(3)),
+            whole.astype(x.dtype),
+            jnp.sign(whole),
+            abs(whole),
+            ~whole | (whole & 6),
+            whole.astype(bool),
+        ),
+        *(jnp.where(x > 0, x, y), lax.select_n(jnp.clip(whole, 0, 2), x, y, x + 1), lax.stop_gradient(x)),
+        *(jnp.exp(x), jnp.log(abs(y)), jnp.sin(x), jnp.cos(y), jax.nn.sigmoid(y)),
     )
 
 

@@ -17,7 +17,7 @@ from a2tg_jax.appearance import Billboards, Texture
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.native import composite as native
-from a2tg_jax.rasterize.splats import CompositingSettings, kernel_of, project_gaussians
+from a2tg_jax.rasterize.splats import project_gaussians, settings_of_pass
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists
 
 NUM = 50
@@ -112,10 +112,8 @@ def view_of(compositor):
     camera, appearance = as_camera(SCENE, "float32"), a2tg.Appearance(texture=Texture(TEXTURES))
     grid = TileGrid(camera.width, camera.height, 16)
     splats, cutoff = project_gaussians(as_gaussians(SCENE, "float32"), camera, appearance, 0.2, 3)
-    kernel, *places = kernel_of(
-        appearance, splats, tile_size=16, near_plane=0.2, has_geometry=False, statistic="position"
-    )
-    settings = CompositingSettings(kernel, grid, compositor, tile_batch=1)
+    options = {"has_geometry": False, "statistic": "position", "compositor": compositor, "tile_batch": 1}
+    settings, *places = settings_of_pass(appearance, splats, grid, 0.2, **options)
     return settings, splats, *places, cutoff, tile_lists(splats.M, cutoff, 0.2, grid, 1024)
 
 

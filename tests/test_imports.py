@@ -122,7 +122,7 @@ def test_mathematics_knows_nothing_of_the_host():
     known = {name: hosts - {"host.text"} for name, hosts in found.items()}
     assert {name: hosts for name, hosts in known.items() if hosts} == {
         "rasterize.kernels.cuda.check": {"host.atomic", "host.operating_system", "host.startup"},
-        "rasterize.kernels.native.threads": {"host.machine"},
+        "rasterize.kernels.native.ffi": {"host.machine"},
     }
 
 
@@ -141,7 +141,7 @@ def test_one_module_tells_systems_apart():
     """The C library's mathematics has another name on Windows, and a report names the system."""
     asking = re.compile(r"sys\.platform|os\.name\b|import (fcntl|msvcrt|resource)\b|sched_getaffinity")
     found = {dotted(path) for path in MODULES if asking.search(path.read_text(encoding="utf-8"))}
-    assert found == {"host.operating_system", "rasterize.kernels.native.libm", "results.report"}
+    assert found == {"host.operating_system", "rasterize.kernels.native.llvm_code", "results.report"}
 
 
 def test_import_leaves_jax_alone():

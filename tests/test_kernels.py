@@ -13,11 +13,11 @@ import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
-from a2tg_jax.appearance import Appearance, Texture, TextureOptions, gaussian_cutoff
+from a2tg_jax.appearance import Appearance, Exponents, StaticShading, Texture, TextureOptions, gaussian_cutoff
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import homographies
 from a2tg_jax.core.pytree import combine, partition, pytree, static
-from a2tg_jax.rasterize.kernels.native import composite as native, threads
+from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.texture import textures_from_arrays
@@ -29,7 +29,7 @@ from a2tg_jax.texture import textures_from_arrays
 def test_lists_are_those_of_xla(monkeypatch, tile_size, dtype):
     monkeypatch.setattr(native, "SPLATS_PER_THREAD", 100)
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 100)
-    monkeypatch.setattr(threads, "num_threads", lambda: 3)
+    monkeypatch.setattr(ffi, "num_threads", lambda: 3)
     scene = draw_scene(4, num=300)
     gaussians, camera = as_gaussians(scene, dtype), as_camera(scene, dtype)
     M, _ = homographies(gaussians, camera)
@@ -60,9 +60,9 @@ def test_threads_share_the_work_and_nothing_else(monkeypatch, num_threads):
         return jnp.sum(output.color**2) + jnp.sum(output.depth), output
 
     differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
-    monkeypatch.setattr(threads, "num_threads", lambda: 1)
+    monkeypatch.setattr(ffi, "num_threads", lambda: 1)
     (_, one), expected = differentiate(gaussians, textures.buckets)
-    monkeypatch.setattr(threads, "num_threads", lambda: num_threads)
+    monkeypatch.setattr(ffi, "num_threads", lambda: num_threads)
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 10)
     (_, many), found = differentiate(gaussians, textures.buckets)
     np.testing.assert_array_equal(many.color, one.color)
@@ -228,6 +228,12 @@ def test_mixed_precisions_are_composited_in_the_larger():
     for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
         assert a.dtype == b.dtype == jnp.float32
         np.testing.assert_allclose(b, a, rtol=0, atol=2e-2 * float(jnp.abs(a).max()))
+
+
+def test_kernels_have_the_same_name_in_every_process():
+    """XLA's compilation cache finds them by the name, which contains no address of an object."""
+    textures = as_textures(draw_scene(4, num=8), "float32")
+    assert " at 0x" not in repr(StaticShading.of(Appearance(texture=Texture(textures), exponents=Exponents())))
 
 
 def test_a_class_defined_again_is_compiled_again():

@@ -9,8 +9,9 @@ from skimage.metrics import structural_similarity
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.rasterize.kernels import choice, scores, windows
-from a2tg_jax.rasterize.kernels.native import ssim as kernel, threads
+from a2tg_jax.rasterize.kernels import platforms, window_scores
+from a2tg_jax.rasterize.kernels.native import ffi, ssim as kernel
+from a2tg_jax.rasterize.kernels.window_scores import Score
 from a2tg_jax.training.losses import (
     depth_normals,
     mean_opacity,
@@ -73,7 +74,7 @@ def test_gradient_equals_central_differences_at_every_pixel(x64, weight):
 @pytest.mark.parametrize("is_native", [True, False])
 def test_first_and_second_derivatives_in_both_modes(monkeypatch, x64, is_native):
     """Forward mode is the gradient along a direction; second derivatives are differences of gradients."""
-    monkeypatch.setattr(choice, "has_native", lambda: is_native)
+    monkeypatch.setattr(platforms, "has_native", lambda: is_native)
     image, target = map(jnp.asarray, random_pair(11, 18, 0.1))
     direction, eps = jnp.sin(jnp.arange(image.size, dtype=image.dtype)).reshape(image.shape), 1e-6
     gradient = jax.grad(lambda image: photometric_loss(image, target))
@@ -92,7 +93,7 @@ def test_first_and_second_derivatives_in_both_modes(monkeypatch, x64, is_native)
 
 @pytest.mark.parametrize("is_native", [True, False])
 def test_ssim_of_a_batch_under_vmap_and_jit(monkeypatch, is_native):
-    monkeypatch.setattr(choice, "has_native", lambda: is_native)
+    monkeypatch.setattr(platforms, "has_native", lambda: is_native)
     pairs = [random_pair(14, 31, 0.1, np.float32, seed) for seed in range(3)]
     images, targets = (jnp.stack([jnp.asarray(x) for x in side]) for side in zip(*pairs, strict=True))
     batched = jax.jit(jax.vmap(jax.value_and_grad(mean_ssim)))(images, targets)
@@ -187,11 +188,11 @@ def test_regularisers_see_live_rows_only():
 def test_ssim_and_its_gradients_are_the_same_without_native_loops(monkeypatch, x64, shape, dtype, rtol):
     """In float32 the variances, differences of means of about 0.3, keep four digits where they are about 0.01."""
     monkeypatch.setattr(kernel, "LEAST_PIXELS", 500)
-    monkeypatch.setattr(threads, "num_threads", lambda: 2)
+    monkeypatch.setattr(ffi, "num_threads", lambda: 2)
     image, target = map(jnp.asarray, random_pair(*shape, 0.1, dtype))
     value, gradients = jax.value_and_grad(mean_ssim, argnums=(0, 1))(image, target)
     jax.clear_caches()
-    monkeypatch.setattr(choice, "has_native", lambda: False)
+    monkeypatch.setattr(platforms, "has_native", lambda: False)
     exact, wanted = jax.value_and_grad(mean_ssim, argnums=(0, 1))(image.astype(np.float64), target.astype(np.float64))
     np.testing.assert_allclose(value, exact, rtol=rtol / 100)
     for a, b in zip(gradients, wanted, strict=True):
@@ -202,7 +203,7 @@ def test_ssim_and_its_gradients_are_the_same_without_native_loops(monkeypatch, x
 def test_another_score_of_the_same_name_is_another():
     image, target = (jnp.asarray(x.transpose(2, 0, 1)) for x in random_pair(14, 40, 0.1, np.float32))
     found = [
-        scores.mean_score(windows.Score(lambda x, y, squares, product, k=k: k * x, (0.5, 0.5)), image, target)
+        window_scores.mean_score(Score(lambda x, y, squares, product, k=k: k * x, (0.5, 0.5)), image, target)
         for k in (1.0, 3.0)
     ]
     np.testing.assert_allclose(found[1], 3 * found[0], rtol=1e-6)

@@ -13,13 +13,13 @@ import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
 
 from a2tg_jax import RenderSettings, render_image
-from a2tg_jax.rasterize.kernels import choice
-from a2tg_jax.rasterize.kernels.by_platform import by_platform
-from a2tg_jax.rasterize.kernels.cuda import check, composite, launch, nvrtc
+from a2tg_jax.rasterize.kernels import platforms
+from a2tg_jax.rasterize.kernels.cuda import check, composite, nvrtc
+from a2tg_jax.rasterize.kernels.platforms import by_platform
 from a2tg_jax.training.losses import mean_ssim
 
 NATIVE = r"custom_call @a2tg_"
-CUDA = rf"custom_call @{re.escape(launch.TARGET)}"
+CUDA = rf"custom_call @{re.escape(composite.TARGET)}"
 
 
 def loss(gaussians, textures=None, layout=None, **settings):
@@ -42,11 +42,11 @@ def fake_nvrtc(monkeypatch):
     """Programs for CUDA are lowered, but their kernels are empty."""
     monkeypatch.setattr(nvrtc, "find", lambda: True)
     monkeypatch.setattr(nvrtc, "ptx", lambda source, capability: "none")
-    choice.has_cuda.cache_clear()
+    platforms.has_cuda.cache_clear()
     lowered.cache_clear()
     jax.clear_caches()
     yield
-    choice.has_cuda.cache_clear()
+    platforms.has_cuda.cache_clear()
 
 
 @pytest.mark.usefixtures("fake_nvrtc")
@@ -130,13 +130,13 @@ def test_each_of_several_devices_draws_the_same(monkeypatch):
 def a_gpu(monkeypatch, tmp_path, gpu_kernels):
     """The CPU passes for an NVIDIA GPU, on which "auto" takes the CUDA kernels, run as OpenCL. Returns the cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setitem(choice.PLATFORMS, "native", "none")
+    monkeypatch.setitem(platforms.PLATFORMS, "native", "none")
     (device,) = jax.local_devices()
     monkeypatch.setattr(jax, "local_devices", lambda backend: [device])
-    choice.has_cuda.cache_clear()
+    platforms.has_cuda.cache_clear()
     jax.clear_caches()
     yield tmp_path / "a2tg-jax"
-    choice.has_cuda.cache_clear()
+    platforms.has_cuda.cache_clear()
     jax.clear_caches()
 
 
@@ -163,8 +163,8 @@ def test_kernels_that_agree_with_xla_are_used_and_checked_once(a_gpu, monkeypatc
     assert checked[0] < check.MOST_DIFFERENCE / 100
     (file,) = a_gpu.iterdir()
     assert file.read_text() == ""
-    choice.has_cuda.cache_clear()
-    assert choice.choose("auto", "cpu") == "cuda" and len(checked) == 1
+    platforms.has_cuda.cache_clear()
+    assert platforms.choose("auto", "cpu") == "cuda" and len(checked) == 1
 
 
 def fails(*_):
@@ -191,14 +191,14 @@ def test_xla_takes_over_from_kernels_that_are_wrong(a_gpu, monkeypatch, broken, 
     assert_drawn_like_xla(found)
     (file,) = a_gpu.iterdir()
     assert str(file) in str(told[0].message) and file.read_text() in str(told[0].message)
-    choice.has_cuda.cache_clear()
+    platforms.has_cuda.cache_clear()
     monkeypatch.setattr(check, "largest_difference", None)
     with pytest.warns(UserWarning, match="CUDA kernels"):
-        assert choice.choose("auto", "cpu") == "xla"
-    assert choice.choose("cuda", "cpu") == "cuda"
+        assert platforms.choose("auto", "cpu") == "xla"
+    assert platforms.choose("cuda", "cpu") == "cuda"
 
 
 def test_a_cache_folder_that_cannot_be_written_is_done_without(a_gpu, monkeypatch):
     a_gpu.write_text("a file where the folder would be")
     monkeypatch.setattr(check, "largest_difference", lambda device: 0.0)
-    assert choice.choose("auto", "cpu") == "cuda"
+    assert platforms.choose("auto", "cpu") == "cuda"

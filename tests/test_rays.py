@@ -18,7 +18,7 @@ from a2tg_jax.core.cameras import Camera, looking, resize_camera
 from a2tg_jax.data.scene import kinds_of, ray_bytes
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.model import Model
-from a2tg_jax.rasterize.capacity import pairs_of_view
+from a2tg_jax.rasterize.views import pairs_of_view
 from a2tg_jax.training import batches
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.cost import fed_bytes

@@ -12,7 +12,7 @@ from a2tg_jax.adapt import Upscale
 from a2tg_jax.densify.clone_split import CloneSplitPrune
 from a2tg_jax.host.machine import Machine, this_machine
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.rasterize.kernels import choice
+from a2tg_jax.rasterize.kernels import platforms
 from a2tg_jax.systems.baselines import Gaussians2d
 
 FIRST = A2tg(
@@ -49,9 +49,9 @@ def test_what_ran_before_in_the_process_changes_nothing():
     ],
 )
 def test_kernels_with_atomic_sums_are_not_chosen_where_xla_is_to_be_deterministic(monkeypatch, flags, wanted):
-    monkeypatch.setattr(choice, "has_cuda", lambda: True)
+    monkeypatch.setattr(platforms, "has_cuda", lambda: True)
     monkeypatch.setenv("XLA_FLAGS", flags)
-    assert choice.choose("auto", "cuda") == wanted
+    assert platforms.choose("auto", "cuda") == wanted
 
 
 def test_what_may_change_bits_is_told():

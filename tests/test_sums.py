@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from a2tg_jax.rasterize.kernels.native.sums import SumsOfParts, _overlap
+from a2tg_jax.rasterize.kernels.native.composite import SumsOfParts, _overlap
 
 NUM, NUM_TILES, COLUMNS = 300, 40, 4
 

@@ -103,6 +103,10 @@ class _LeftOut:
     def __hash__(self) -> int:
         return hash(self._name)
 
+    def __repr__(self) -> str:
+        # Without an address: compiled kernels have the same name in every process, for XLA's compilation cache.
+        return f"<array {self._name}>"
+
     def _refuse(self, *_: Any) -> NoReturn:
         raise ValueError(
             f"{self._name} is an array, and texel_position, shade and falloff see only the static fields of an "

@@ -16,7 +16,7 @@ from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.host.machine import VARIABLE, memory_limit, num_threads
 from a2tg_jax.host.operating_system import cuda_of_driver
 from a2tg_jax.host.startup import compilation_cache_folder
-from a2tg_jax.rasterize.kernels import choice
+from a2tg_jax.rasterize.kernels import platforms
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.splats import Compositor
 from a2tg_jax.render import render_image
@@ -49,12 +49,12 @@ class Doctor:
             "memory": f"{memory_limit() / 1e9:.1f} GB may be used",
             "XLA_FLAGS": os.environ.get("XLA_FLAGS") or "not set",
             "cache": str(compilation_cache_folder()),
-            "compositor": f"{choice.choose('auto', of_jax)} is the choice of 'auto'",
+            "compositor": f"{platforms.choose('auto', of_jax)} is the choice of 'auto'",
         }
         for name, text in lines.items():
             _print(name, text)
-        available = [name for name in choice.PLATFORMS if choice.is_available(name, of_jax)]
-        for name, remedy in choice.REMEDIES.items():
+        available = [name for name in platforms.PLATFORMS if platforms.is_available(name, of_jax)]
+        for name, remedy in platforms.REMEDIES.items():
             if name not in available:
                 _print("", f"{name} is not available: it needs {remedy}")
         largest = _compare(available)
@@ -67,8 +67,8 @@ def _verdict(platform: str, available: Sequence[Compositor], *, has_driver: bool
     """Return whether everything works on a machine whose compositors agree."""
     if platform == "cpu" and has_driver:
         return "everything works, but on the CPU: JAX does not find the NVIDIA GPU; pip install 'a2tg-jax[cuda13]'"
-    for name, remedy in choice.REMEDIES.items():
-        if choice.PLATFORMS[name] == platform and name not in available:
+    for name, remedy in platforms.REMEDIES.items():
+        if platforms.PLATFORMS[name] == platform and name not in available:
             return f"everything works, but slowly: {name} is not available, which needs {remedy}"
     return "everything works on this machine"
 

@@ -1,7 +1,7 @@
 """Bilinear interpolation in a splat's texture: the texels around a position, and their weights.
 
 This is the arithmetic of a texture lookup. The appearance (`appearance.base`) gives the position; `texture` stores
-textures of many sizes; `rasterize.kernels.native.texels` does the same lookup for vectors of pixels.
+textures of many sizes; `rasterize.kernels.native.texture_lookups` does the same lookup for vectors of pixels.
 
 The textures of all splats lie in one array of texels [T, C], each a `TextureRegion` of it, row by row. Every function
 is element-wise: it takes scalars, or arrays that broadcast. (x, y) counts texels from the centre of the first one and

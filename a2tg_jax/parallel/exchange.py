@@ -25,8 +25,7 @@ from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import screen_bounds
 from a2tg_jax.parallel.sharded_rows import everywhere, mesh_of, placed, sharding_of_rows
 from a2tg_jax.rasterize.compositor import Composited, composite, list_tiles
-from a2tg_jax.rasterize.kernels.packing import pack_splats, unpack_splats
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats
+from a2tg_jax.rasterize.splats import CompositingSettings, Splats, pack_splats, unpack_splats
 from a2tg_jax.rasterize.tile_pixels import TilePixels, band_pixels, tile_pixels
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
 

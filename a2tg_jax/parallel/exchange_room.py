@@ -22,7 +22,6 @@ from a2tg_jax.core.numerics import Integer
 from a2tg_jax.parallel.exchange import BorderRoom, Exchange, ImageBands, share_of_a_band
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.splats import drawn_splats
-from a2tg_jax.rasterize.supersampling import finer
 from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles
 
 
@@ -46,7 +45,7 @@ def room_of_view(
 ) -> RoomOfView:
     """Return the room that the devices of `settings.exchange` need in a view (host)."""
     assert settings.exchange is not None
-    camera = finer(camera, settings.supersample)
+    camera = settings.finer(camera)
     rows, above, below, pairs = map(int, _jitted_needs()(gaussians, camera, appearance, settings, num_live))
     share = share_of_a_band(settings.exchange.num // settings.exchange.views_at_once)
     return RoomOfView(rows, BorderRoom(above, below), math.ceil(pairs / share))

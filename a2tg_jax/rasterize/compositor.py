@@ -2,32 +2,41 @@
 
 `pixel` defines one pixel. A module of `kernels` computes all: `native` on CPUs, `cuda` on NVIDIA GPUs, or `xla`. Each
 has a `forward` and a `backward` with the same arguments and results, and JAX chooses among them when it compiles for a
-platform (`kernels.by_platform`). `autodiff` has no gradient of its own.
+platform (`kernels.platforms`). The compositor "autodiff" has no gradient of its own.
 
 The backward pass walks front to back too (`rasterize.pixel.absorb_vjp`), so that nothing is stored per pixel and splat.
+
+Native loops, CUDA kernels and the loops of XLA are differentiated once, in reverse mode. JAX's own errors in other
+modes name neither the renderer nor a remedy; those here do. (Under `vmap` of tangents, as in `jax.jacfwd`, JAX's error
+comes first.)
 """
 
 import functools
-from typing import Any, Literal, NamedTuple
+import importlib
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
 from a2tg_jax.core.bilinear import TextureRegion, within_texels
 from a2tg_jax.parallel.sharded_rows import cotangent_of
 from a2tg_jax.rasterize import tiles
-from a2tg_jax.rasterize.kernels import autodiff, xla
-from a2tg_jax.rasterize.kernels.by_platform import by_platform
-from a2tg_jax.rasterize.kernels.choice import choose, instead_of
-from a2tg_jax.rasterize.kernels.native import composite as native
-from a2tg_jax.rasterize.reverse_only import ADVICE, reverse_only
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats, Wanted
+from a2tg_jax.rasterize.kernels import xla
+from a2tg_jax.rasterize.kernels.platforms import by_platform, choose, instead_of
+from a2tg_jax.rasterize.splats import CompositingSettings, PassInputs, Splats, Wanted
 from a2tg_jax.rasterize.tile_pixels import TilePixels
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
 TILES_ON_ACCELERATORS = 4096
 """Number of tiles that XLA composites at once if the settings do not say it; 1 on CPUs."""
+ADVICE = (
+    "compositor={compositor!r} is differentiated once, in reverse mode (jax.grad, jax.vjp, jax.jacrev). "
+    "For forward mode (jax.jvp, jax.jacfwd, jax.linearize) and second derivatives, use "
+    "RenderSettings(compositor='autodiff')"
+)
 
 
 class Composited(NamedTuple):
@@ -60,13 +69,22 @@ def composite(
       probe: [N, 4] zeros. Its gradient is not of the image: columns 0 to 2 are the statistic, Σ_pixels of
         `rasterize.pixel.positional_gradient`, column 3 the number of pixels in which the splat was composited.
     """
+    # Kernels follow regions without checking them.
     regions = None if regions is None else within_texels(regions, texels.shape[0])
     if settings.compositor == "autodiff":
         if settings.kernel.statistic:
             raise ValueError("the statistic of densification needs another compositor than 'autodiff'")
-        channels, transmittance = _autodiff(settings, splats, texels, regions, lists)
+        inputs = PassInputs(splats, texels, regions, cutoff, lists)
+
+        def on(platform: str) -> Any:
+            return functools.partial(xla.composite_in_any_mode, _batched_on(platform, settings))
+
+        # JAX differentiates the code itself, which it must therefore trace for all platforms.
+        per_platform = {"cpu": on("cpu")} if settings.tile_batch is None else {}
+        channels, transmittance = jax.lax.platform_dependent(inputs, default=on("other"), **per_platform)
     else:
-        splats, texels, probe = reverse_only(settings.compositor, (splats, texels, probe))
+        mark = functools.partial(_reverse_only, settings.compositor)
+        splats, texels, probe = jax.tree.map(mark, (splats, texels, probe))
         arrays = splats, texels, regions, cutoff, lists, jacobian, probe
         channels, transmittance = _composite_tiles(settings, *arrays)
     return _assemble(channels, settings.grid), _assemble(transmittance, settings.grid)
@@ -92,47 +110,35 @@ def list_tiles(
 
 def _lists_on(platform: str, compositor: Wanted, near_plane: float, grid: TileGrid, capacity: int) -> Any:
     def lists(M: Array, cutoff: Array, height: Array | None) -> tuple[Array, ...]:
-        is_native = choose(compositor, platform) == "native"
-        tile_lists: Any = native.tile_lists if is_native else tiles.tile_lists
+        chosen = _kernels(compositor, platform)
+        # CUDA kernels have no lists of their own.
+        tile_lists = getattr(chosen, "tile_lists", tiles.tile_lists)
         return tuple(tile_lists(M, cutoff, near_plane, grid, capacity, height=height)[:4])
 
     return lists
 
 
-def _autodiff(settings: CompositingSettings, *arrays: Any) -> tuple[Array, Array]:
-    def on(platform: str) -> Any:
-        return functools.partial(autodiff.composite_tiles, _batched_on(platform, settings))
+def _forward(settings: CompositingSettings, *arrays: Any) -> tuple[Array, Array]:
+    """Return channels [tiles, D, P] and transmittance [tiles, P], P pixels a tile.
 
-    # JAX differentiates the code itself, which it must therefore trace for all platforms.
-    per_platform = {"cpu": on("cpu")} if settings.tile_batch is None else {}
-    shown: tuple[Array, Array] = jax.lax.platform_dependent(*arrays, default=on("other"), **per_platform)
+    Args:
+      settings: static options.
+      arrays: fields of `PassInputs`, jacobian and probe.
+    """
+    inputs = PassInputs(*arrays[:5])
+    tiles, pixels = settings.grid.num, settings.grid.tile_size**2
+    shapes = (tiles, settings.kernel.num_channels, pixels), (tiles, pixels)
+    results = tuple(jax.ShapeDtypeStruct(shape, inputs.splats.M.dtype) for shape in shapes)
+    shown: tuple[Array, Array] = _by_platform("forward", settings, results, inputs)
     return shown
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _composite_tiles(
-    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
-    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Return channels [tiles, D, P] and transmittance [tiles, P], P pixels a tile."""
-    return _forward(settings, splats, texels, regions, cutoff, lists)
+_composite_tiles = jax.custom_vjp(_forward, nondiff_argnums=(0,))
 
 
-def _forward(settings: CompositingSettings, *arrays: Any) -> tuple[Array, Array]:
-    splats: Splats = arrays[0]
-    tiles, pixels = settings.grid.num, settings.grid.tile_size**2
-    shapes = (tiles, settings.kernel.num_channels, pixels), (tiles, pixels)
-    results = [jax.ShapeDtypeStruct(shape, splats.M.dtype) for shape in shapes]
-    channels, transmittance = _by_platform("forward", settings, results, *arrays)
-    return channels, transmittance
-
-
-def _composite_tiles_fwd(
-    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
-    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array,
-) -> tuple[tuple[Array, Array], tuple[Any, ...]]:  # fmt: skip
-    shown = _forward(settings, splats, texels, regions, cutoff, lists)
-    return shown, (splats, texels, regions, cutoff, lists, jacobian, probe, *shown)
+def _composite_tiles_fwd(settings: CompositingSettings, *arrays: Any) -> tuple[tuple[Array, Array], tuple[Any, ...]]:
+    shown = _forward(settings, *arrays)
+    return shown, (*arrays, *shown)
 
 
 def _composite_tiles_bwd(
@@ -140,10 +146,12 @@ def _composite_tiles_bwd(
 ) -> tuple[Splats, Array, None, None, None, None, Array]:
     *arrays, channels, transmittance = residuals
     g, g_transmittance = cotangents
+    # B of the whole list: Σ g·c·α·T over the splats is g·channels, and what is behind them has weight T.
     suffix_sum = jnp.sum(g * channels, axis=1) + g_transmittance * transmittance
-    differentiated = arrays[0], arrays[1], arrays[-1]
+    inputs, jacobian, probe = PassInputs(*arrays[:5]), *arrays[5:]
+    differentiated = inputs.splats, inputs.texels, probe
     results = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), differentiated)
-    found = _by_platform("backward", settings, results, *arrays, g, suffix_sum)
+    found = _by_platform("backward", settings, results, inputs, jacobian, probe, g, suffix_sum)
     d_splats, d_texels, d_probe = cotangent_of(differentiated, found)
     return d_splats, d_texels, None, None, None, None, d_probe
 
@@ -151,31 +159,27 @@ def _composite_tiles_bwd(
 _composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
 
 
-def _by_platform(
-    which: Literal["forward", "backward"],
-    settings: CompositingSettings,
-    results: Any,
-    *arrays: Any,
-) -> Any:
+def _by_platform(which: str, settings: CompositingSettings, results: Any, *arrays: Any) -> Any:
+    """Call `forward` or `backward` of the kernels of the platform that JAX compiles for."""
     advice = ADVICE.format(compositor=settings.compositor)
     return by_platform(_pass_on, (which, settings), results, *arrays, advice=advice)
 
 
 def _pass_on(platform: str, which: str, settings: CompositingSettings) -> Any:
-    def run(splats: Splats, texels: Array, regions: TextureRegion | None, *arrays: Any) -> Any:
-        compositor = choose(settings.compositor, platform)
-        kernels: Any = native if compositor == "native" else xla
-        if compositor == "cuda":  # Not imported by programs on CPUs.
-            from a2tg_jax.rasterize.kernels.cuda import composite as cuda
+    kernels, spec = _kernels(settings.compositor, platform), settings.kernel
+    if kernels is not xla and (reason := kernels.refusal(spec)):
+        instead_of(settings.compositor, type(spec.static.appearance), reason)
+        kernels = xla
+    return functools.partial(getattr(kernels, which), _batched_on(platform, settings))
 
-            kernels = cuda
-        spec = settings.kernel
-        if kernels is not xla and (reason := kernels.refusal(spec)):
-            instead_of(settings.compositor, type(spec.static.appearance), reason)
-            kernels = xla
-        return getattr(kernels, which)(_batched_on(platform, settings), splats, texels, regions, *arrays)
 
-    return run
+def _kernels(wanted: Wanted, platform: str) -> Any:
+    """Return the module of kernels for a platform; imported here, where it is used, as not all packages are installed.
+
+    `native` needs llvmlite, and programs on CPUs have no use for `cuda`.
+    """
+    chosen = choose(wanted, platform)
+    return xla if chosen in ("xla", "autodiff") else importlib.import_module(f"{xla.__package__}.{chosen}.composite")
 
 
 def _batched_on(platform: str, settings: CompositingSettings) -> CompositingSettings:
@@ -189,7 +193,32 @@ def _batched_on(platform: str, settings: CompositingSettings) -> CompositingSett
 def _assemble(tiles: Array, grid: TileGrid) -> Array:
     """Assemble tiles [tiles, ..., P] into one image [..., H, W]."""
     inner = tiles.shape[1:-1]
+    # [rows, columns, ..., y, x] to [..., rows, y, columns, x]; the last tiles may reach beyond the image.
     blocks = tiles.reshape(grid.rows, grid.columns, *inner, grid.tile_size, grid.tile_size)
     image = jnp.moveaxis(blocks, (0, 1), (-4, -2))
     size = grid.tile_size
     return image.reshape(*inner, grid.rows * size, grid.columns * size)[..., : grid.height, : grid.width]
+
+
+def _refuse(compositor: str) -> NoReturn:
+    raise ValueError(ADVICE.format(compositor=compositor))
+
+
+# The identity, in the linear map of tangents. Reverse mode transposes it away; only forward mode runs it.
+_tangent_p = Primitive("a2tg_reverse_only")
+_tangent_p.def_impl(lambda tangent, *, compositor: _refuse(compositor))
+_tangent_p.def_abstract_eval(lambda tangent, *, compositor: tangent)
+ad.deflinear2(_tangent_p, lambda cotangent, _, *, compositor: [cotangent])
+batching.defvectorized(_tangent_p)
+mlir.register_lowering(_tangent_p, lambda _, tangent, *, compositor: _refuse(compositor))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _reverse_only(compositor: str, x: Any) -> Any:
+    """Return an input of the compositor unchanged; derivatives in forward mode raise ValueError."""
+    return x
+
+
+@_reverse_only.defjvp
+def _reverse_only_jvp(compositor: str, primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+    return primals[0], _tangent_p.bind(tangents[0], compositor=compositor)

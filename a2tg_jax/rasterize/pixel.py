@@ -103,6 +103,7 @@ def _in_frame(tile: TileNumbers, along_x: Array, along_y: Array) -> tuple[Array,
     if len(tile) == 2:
         return along_x, along_y
     _, _, xx, xy, yx, yy = tile
+    # ∂L/∂place = Fᵀ·∂L/∂pixel for pixel = F·place: this solves for ∂L/∂pixel.
     inverse = 1 / (xx * yy - xy * yx)
     return (yy * along_x - yx * along_y) * inverse, (xx * along_y - xy * along_x) * inverse
 
@@ -124,6 +125,7 @@ def planes_of(M: Rows, tile: TileNumbers) -> Planes:
     if frame:
         xx, xy, yx, yy = frame
         first, second = _mixed(xx, first, xy, second), _mixed(yx, first, yy, second)
+    # (x·M₂ − M₀) × (y·M₂ − M₁) is bilinear: x and y multiply the cross products with the last row.
     a, b, c = _cross(second, last), _cross(last, first), _cross(first, second)
     return Planes(
         p0=(a[0], b[0], c[0]),
@@ -316,6 +318,7 @@ def positional_gradient(
         hit = intersect(planes_of(rows, tile), x, y, near_plane, has_low_pass)
         return hit.rho, hit.is_ray
 
+    # Only the third column of M moves with the mean, by the jacobian.
     _, pull_back, is_ray = jax.vjp(rho, mean, has_aux=True)
     (d_mean,) = pull_back(d_rho)
     if statistic == "position":

@@ -6,13 +6,14 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import TextureOptions
+from a2tg_jax.core.cameras import Camera, resize_camera
 from a2tg_jax.core.checks import check_int, check_kind, check_number, short_repr
 from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.notebook_display import as_bytes, enlarged, png
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.parallel.exchange import Exchange
-from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
+from a2tg_jax.rasterize.kernels.platforms import MAX_TILE_SIZE
 from a2tg_jax.rasterize.splats import Wanted
 
 
@@ -61,6 +62,11 @@ class RenderSettings:
             value = getattr(self, field.name)
             if isinstance(value, np.integer):
                 object.__setattr__(self, field.name, int(value))
+
+    def finer(self, camera: Camera) -> Camera:
+        """Return the view at the size at which it is drawn: `supersample` times its own."""
+        factor = self.supersample
+        return camera if factor == 1 else resize_camera(camera, factor * camera.width, factor * camera.height)
 
     def transform(self, similarity: Similarity) -> "RenderSettings":
         """Return settings that show a model in the world of `similarity` as these show it in its own."""

@@ -1,10 +1,11 @@
 """Input of the compositors: the splats of a view, projected from Gaussians, and the static options of a pass.
 
-`compositor` and all kernels share these two types.
+`compositor` and all kernels share these two types. Kernels take splats and texture regions packed in plain arrays.
 """
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -20,7 +21,7 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.geometry import homographies
 from a2tg_jax.core.numerics import Integer
 from a2tg_jax.rasterize.pixel import Statistic
-from a2tg_jax.rasterize.tiles import TileGrid
+from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
 Compositor = Literal["cuda", "native", "xla", "autodiff"]
 """CUDA kernels (NVIDIA GPUs), native loops (CPUs), XLA (everywhere), or XLA without a gradient of its own."""
@@ -88,13 +89,29 @@ class KernelSpec:
         """Number S of floats per splat: its numbers, and the squared distance beyond which it is invisible."""
         return num_numbers(self.has_geometry, self.num_colors) + self.num_own_numbers + 1
 
-    def gradient_shapes(self, splats: Splats, texels: Array, probe: Array) -> tuple[tuple[int, ...], ...]:
+    def gradient_shapes(self, inputs: "PassInputs") -> tuple[tuple[int, ...], ...]:
         """Return the shapes of a kernel's gradients of packed splats, texels and probe; without a statistic [1, 4]."""
-        return (len(splats.M), self.num_floats), texels.shape, probe.shape if self.statistic else (1, 4)
+        num = len(inputs.cutoff)
+        return (num, self.num_floats), inputs.texels.shape, (num if self.statistic else 1, 4)
+
+
+class PassInputs(NamedTuple):
+    """Arrays of a compositing pass."""
+
+    splats: Splats
+    """N splats."""
+    texels: Array
+    """[T, C] texels of the appearance."""
+    regions: TextureRegion | None
+    """[N] places of the splats' textures among them; None without textures."""
+    cutoff: Array
+    """[N] squared distance beyond which each splat is invisible; XLA has no use for it."""
+    lists: TileLists
+    """Splats of each tile."""
 
 
 class CompositingSettings(NamedTuple):
-    """Static options of a compositing pass."""
+    """Static options of a compositing pass: a kernel, and what may change without compiling another one."""
 
     kernel: KernelSpec
     """What is computed at each pixel."""
@@ -153,7 +170,9 @@ def project_gaussians(
     is_drawn = ~(M[:, 2, 2] < near_plane)
     if num_live is not None:
         is_drawn &= jnp.arange(gaussians.num, dtype=jnp.int32) < num_live
+    # A bound, not part of the image: what lies beyond is invisible anyway.
     cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(cutoff_of(appearance, opacities)), -1.0)
+    # Not finite and not invisible: NaN marks it, which `views.render_traced` carries into the image.
     is_broken = ~(cutoff <= 0) & ~_are_finite(M, colors, numbers)
     cutoff = jnp.where(is_broken, jnp.nan, cutoff)
     is_shown = (cutoff > 0)[:, None]
@@ -187,19 +206,14 @@ def _check_given(appearance: Appearance, opacities: Array, numbers: Array, color
         raise ValueError(f"an appearance gives own_colors {wanted}; {name} gave {colors.shape}")
 
 
-def kernel_of(
-    appearance: Appearance,
-    splats: Splats,
-    *,
-    tile_size: int,
-    near_plane: float,
-    has_geometry: bool,
-    statistic: Statistic | None = None,
-    has_rays: bool = False,
-) -> tuple[KernelSpec, Array, TextureRegion | None]:
-    """Return what is computed at each pixel, and the texels [T, C] and texture regions [N] of N splats.
+def settings_of_pass(
+    appearance: Appearance, splats: Splats, grid: TileGrid, near_plane: float, *, has_geometry: bool,
+    statistic: Statistic | None = None, has_rays: bool = False, compositor: Wanted = "auto",
+    tile_batch: int | None = None,
+) -> tuple[CompositingSettings, Array, TextureRegion | None]:  # fmt: skip
+    """Return the static options of a pass, and the texels [T, C] and texture regions [N] of N splats.
 
-    Keyword arguments are fields of `KernelSpec`.
+    Further arguments are fields of `CompositingSettings` and of `KernelSpec`.
 
     Raises:
       ValueError: if the appearance gives texture regions of another number of splats or a `max_alpha` outside (0, 1),
@@ -218,7 +232,7 @@ def kernel_of(
         num_own_numbers=splats.numbers.shape[1],
         num_columns=0 if regions is None else texels.shape[1],
         dtype=np.dtype(splats.M.dtype).name,
-        tile_size=tile_size,
+        tile_size=grid.tile_size,
         near_plane=near_plane,
         has_geometry=has_geometry,
         statistic=statistic,
@@ -226,10 +240,69 @@ def kernel_of(
         has_rays=has_rays,
     )
     check_shading(kernel.static, kernel.arguments)
-    return kernel, texels, regions
+    return CompositingSettings(kernel, grid, compositor, tile_batch), texels, regions
 
 
 def _are_finite(M: Array, colors: Array, numbers: Array) -> Array:
     """Return whether all numbers of each splat are finite [N]."""
     columns = [*(M[:, i, k] for i in range(3) for k in range(3)), *colors.T, *numbers.T]
     return functools.reduce(jnp.logical_and, map(jnp.isfinite, columns))
+
+
+def pack_inputs(settings: CompositingSettings, inputs: PassInputs) -> tuple[Array, ...]:
+    """Pack what kernels read: ids, starts, splats with the cutoff, regions, texels, and (columns, width, height).
+
+    Kernels follow these indices without checking them. Ids and starts are clamped here, and regions by the compositor
+    (`bilinear.within_texels`), so that no list and no region, whatever it holds, makes them read or write elsewhere.
+    Rays of pixels are packed apart (`native.composite`).
+    """
+    splats, texels, regions, cutoff, lists = inputs
+    num, capacity = splats.M.shape[0], lists.ids.shape[0]
+    packed = pack_splats(splats, settings.kernel.has_geometry, cutoff).astype(splats.M.dtype)
+    size = jnp.asarray([settings.grid.columns, settings.grid.width, lists.height_in(settings.grid)], jnp.int32)
+    # Threads divide the tiles by their starts, which must ascend. Without splats no id is valid: all lists are empty.
+    starts = jax.lax.cummax(jnp.clip(lists.starts, 0, capacity if num else 0))
+    ids = jnp.clip(lists.ids, 0, max(num - 1, 0))
+    return ids, starts, packed, pack_regions(regions), texels.astype(splats.M.dtype), size
+
+
+def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
+    """Pack splats as [N, S], one per row in the order of `rasterize.pixel.Splat`, followed by further columns [N]."""
+    columns = [splats.M.reshape(-1, 9), splats.opacities[:, None], splats.colors]
+    columns += [splats.normals] if has_geometry else []
+    return jnp.concatenate([*columns, splats.numbers, *(column[:, None] for column in more)], axis=1)
+
+
+def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
+    """Unpack cotangents [N, S] as those of splats."""
+    num_colors = like.colors.shape[1]
+    normal, first = 10 + num_colors, num_numbers(has_geometry, num_colors)
+    return Splats(
+        M=packed[:, :9].reshape(-1, 3, 3).astype(like.M.dtype),
+        opacities=packed[:, 9].astype(like.opacities.dtype),
+        colors=packed[:, 10:normal].astype(like.colors.dtype),
+        normals=packed[:, normal:first].astype(like.normals.dtype) if has_geometry else jnp.zeros_like(like.normals),
+        numbers=packed[:, first : first + like.numbers.shape[1]].astype(like.numbers.dtype),
+    )
+
+
+def split_image(image: Array) -> tuple[Array, Array]:
+    """Split a kernel's image [tiles, D + 1, P] into channels [tiles, D, P] and transmittance [tiles, P]."""
+    return image[:, :-1], image[:, -1]
+
+
+def unpack_gradients(
+    settings: CompositingSettings, found: Sequence[Array], inputs: PassInputs, probe: Array
+) -> tuple[Splats, Array, Array]:
+    """Unpack a kernel's gradients, of `KernelSpec.gradient_shapes`, as those of splats, texels and probe."""
+    packed, d_texels, d_probe = found
+    d_splats = unpack_splats(packed, inputs.splats, settings.kernel.has_geometry)
+    d_probe = d_probe.astype(probe.dtype) if settings.kernel.statistic else jnp.zeros_like(probe)
+    return d_splats, d_texels.astype(inputs.texels.dtype), d_probe
+
+
+def pack_regions(regions: TextureRegion | None) -> Array:
+    """Pack the `TextureRegion` of every splat as int32 [N, 3]; without textures [1, 0]."""
+    if regions is None:
+        return jnp.zeros((1, 0), jnp.int32)
+    return jnp.stack(regions, axis=1).astype(jnp.int32)

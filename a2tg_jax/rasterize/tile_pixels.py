@@ -77,6 +77,7 @@ def tile_pixels(rays: Array, tile_size: int, num_rows: int | None = None) -> Til
         offsets=jnp.einsum("tij,tjp->tip", frames, offsets, precision="highest"),
         is_seen=is_seen,
         boxes=boxes,
+        # The Frobenius norm bounds the length of the image of a unit vector.
         magnifications=jnp.sqrt(jnp.sum(jacobians**2, axis=(1, 2))),
     )
 
@@ -109,6 +110,8 @@ def _fitted(places: Array, is_seen: Array, tile_size: int) -> tuple[Array, Array
         mean = jnp.sum(values, axis=2) / num[:, None]
         return mean, (values - mean[:, :, None]) * weights[:, None]
 
+    # Least squares, place ≈ centre + J·pixel: J = Σ place·pixelᵀ (Σ pixel·pixelᵀ)⁻¹, both about their means. The prior
+    # adds a multiple of the unit matrix to both sums, which leads to J = 1 where pixels do not determine it.
     (_, pixels), (centers, places) = about_mean(pixels), about_mean(places)
     prior = PRIOR * num[:, None, None] * jnp.eye(2, dtype=places.dtype)[None]
     covariance, spread = (
@@ -130,6 +133,8 @@ def spans_of(pixels: TilePixels, num_columns: int, reach: Array) -> tuple[Spans,
     low, high = (edge.reshape(-1, num_columns, 2) for edge in (low, high))
     spans = []
     for axis in range(2):  # Over the rows for the columns, over the columns for the rows.
+        # Lenses bend rows and columns, so that spans overlap and need not be in order. The largest end so far and the
+        # least begin from here on are, and contain them: `covered` can search them by halves.
         begun, reached = jnp.min(low[..., axis], axis=axis), jnp.max(high[..., axis], axis=axis)
         spans.append(Spans(jax.lax.cummax(reached), jax.lax.cummin(begun, reverse=True)))
     return spans[0], spans[1]

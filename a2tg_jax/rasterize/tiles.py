@@ -75,6 +75,7 @@ def tile_rectangles(bounds: ScreenBounds, grid: TileGrid, pixels: TilePixels | N
         spans_x, spans_y = spans_of(pixels, grid.columns, jnp.max(bounds.outline.radius, initial=0.0))
         x0, columns = covered(spans_x, bounds.left, bounds.right)
         y0, rows = covered(spans_y, bounds.top, bounds.bottom)
+    # Without rows there are no columns either: counts may be divided by them.
     columns = jnp.where(rows > 0, columns, jnp.int32(0))
     return Rectangles(x0, y0, columns, columns * rows)
 
@@ -86,6 +87,7 @@ def _tile_span(low: Array, high: Array, size: int, tile_size: int) -> tuple[Arra
         return jnp.clip(x, -1.0, 1e6).astype(jnp.int32)
 
     nothing, last_pixel, side = jnp.int32(0), jnp.int32(size - 1), jnp.int32(tile_size)
+    # Pixel k has its centre at k + ½.
     first = jnp.maximum(as_pixels(jnp.ceil(low - 0.5)), nothing)
     last = jnp.minimum(as_pixels(jnp.floor(high - 0.5)), last_pixel)
     # Not //, which is slower for the sake of negative numbers; only `last` can be one, -1, less than `first`.
@@ -143,6 +145,7 @@ def _touches(outline: Outline, distance_to_box: Callable[[Array, Array], tuple[A
     def squared_distance(x: Array, y: Array) -> Array:
         return yy * x * x - 2 * xy * x * y + xx * y * y
 
+    # In the ellipse's metric, points at distance 1 have yy·x² − 2·xy·x·y + xx·y² = xx·yy − xy².
     nearest = jnp.minimum(squared_distance(x_side, y_on_side), squared_distance(x_on_side, y_side))
     is_in_ellipse = nearest <= (xx * yy - xy * xy)
     left, right, top, bottom = distance_to_box(outline.mean_x, outline.mean_y)
@@ -169,9 +172,12 @@ def tile_lists(
     rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, shown, pixels))
     total = total_pairs(rectangles.counts)
     overflow = exceeds(total, capacity)
+    # Empty lists instead of some that lack splats: an image that is plainly wrong, at no cost.
     counts = jnp.where(overflow, 0, rectangles.counts)
     ends = jnp.cumsum(counts)
     num = depths.shape[0]
+    # One place for each pair: splat `rank` in depth order has the places from ends − counts on, and pair number `local`
+    # of its rectangle lies in its column local mod columns. Places that are left, up to the capacity, are not kept.
     rank = jnp.repeat(jnp.arange(num, dtype=jnp.int32), counts, total_repeat_length=capacity)
     position = jnp.arange(capacity, dtype=jnp.int32)
     local = position - (ends - counts)[rank]
@@ -185,8 +191,10 @@ def tile_lists(
         tile_x, tile_y = (x * grid.tile_size).astype(dtype), (y * grid.tile_size).astype(dtype)
         is_touched = outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
     else:
+        # Places that are left may lie in no tile.
         own = jnp.minimum(y * grid.columns + x, grid.num - 1)
         is_touched = outline_touches_rays(per_pair, pixels.boxes[own], pixels.magnifications[own])
+    # Pairs that are not kept sort behind all tiles.
     is_kept = (position < ends[-1]) & is_touched
     tile = jnp.where(is_kept, y * grid.columns + x, grid.num)
     ids, starts = _sort_by_tile(tile, rank, order, grid.num)

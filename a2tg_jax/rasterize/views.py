@@ -1,25 +1,30 @@
-"""Render of a view as training differentiates it: project, list the tiles, composite."""
+"""Renders of views: the room that a view needs, counted on the host, and the render that training differentiates."""
 
 import dataclasses
+import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance
+from a2tg_jax.appearance import Appearance, check_is_appearance
 from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.geometry import screen_bounds
 from a2tg_jax.core.numerics import Integer
 from a2tg_jax.parallel.exchange import composite_on_devices
+from a2tg_jax.parallel.exchange_room import room_of_view
 from a2tg_jax.rasterize.compositor import Composited, composite, list_tiles
-from a2tg_jax.rasterize.kernels.choice import check_compositor
+from a2tg_jax.rasterize.kernels.platforms import check_compositor
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import Geometry, RenderOutput, RenderSettings
-from a2tg_jax.rasterize.splats import CompositingSettings, kernel_of, num_channels, project_gaussians
-from a2tg_jax.rasterize.supersampling import box_mean, finer
+from a2tg_jax.rasterize.splats import drawn_splats, num_channels, project_gaussians, settings_of_pass
 from a2tg_jax.rasterize.tile_pixels import pixels_of
-from a2tg_jax.rasterize.tiles import TileGrid
+from a2tg_jax.rasterize.tiles import TileGrid, count_pairs
 
 
 def render_traced(
@@ -53,36 +58,38 @@ def render_traced(
     if settings.supersample > 1:
         if probe is not None:
             raise ValueError("supersample must be 1 where statistics of gradients are gathered")
-        factor, settings = settings.supersample, dataclasses.replace(settings, supersample=1)
+        finer, factor = settings.finer(camera), settings.supersample
+        settings = dataclasses.replace(settings, supersample=1)
         output, num_pairs = render_traced(
-            gaussians, finer(camera, factor), appearance, background, settings,
+            gaussians, finer, appearance, background, settings,
             has_geometry=has_geometry, sh_degree=sh_degree, num_live=num_live,
         )  # fmt: skip
-        color, alpha, geometry = jax.tree.map(
-            lambda image: box_mean(image, factor), (output.color, output.alpha, output.geometry)
-        )
+
+        def box_mean(image: Array) -> Array:
+            rows = image.reshape(camera.height, factor, camera.width, factor, *image.shape[2:])
+            return rows.mean(axis=(1, 3))
+
+        color, alpha, geometry = jax.tree.map(box_mean, (output.color, output.alpha, output.geometry))
         return RenderOutput(color, alpha, output.overflow, geometry), num_pairs
+    # Before anything is traced, so that the error does not come from deep within JAX.
     check_compositor(settings.compositor)
     num = gaussians.means.shape[0]
     if num == 0:
         return _empty_view(camera, num_colors_of(appearance), has_geometry, background), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, cutoff = project_gaussians(gaussians, camera, appearance, settings.near_plane, degree, num_live)
-    kernel, texels, regions = kernel_of(
-        appearance,
-        splats,
-        tile_size=settings.tile_size,
-        near_plane=settings.near_plane,
-        has_geometry=has_geometry,
-        statistic=None if probe is None else statistic,
-        has_rays=camera.rays is not None,
-    )
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    compositing = CompositingSettings(kernel, grid, settings.compositor, settings.tile_batch)
+    compositing, texels, regions = settings_of_pass(
+        appearance, splats, grid, settings.near_plane, has_geometry=has_geometry,
+        statistic=None if probe is None else statistic, has_rays=camera.rays is not None,
+        compositor=settings.compositor, tile_batch=settings.tile_batch,
+    )  # fmt: skip
+    # Cameras get no gradient through the statistic.
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     probe = jnp.zeros((num, 4), splats.M.dtype) if probe is None else probe
     capacity = settings.capacity or 0
     if settings.exchange is None:
+        # Which tiles a splat touches is piecewise constant.
         M, pixels = jax.lax.stop_gradient(splats.M), pixels_of(camera, settings.tile_size)
         lists = list_tiles(compositing, M, cutoff, capacity, pixels)
         image = composite(compositing, splats, texels, regions, cutoff, lists, jacobian, probe)
@@ -91,9 +98,10 @@ def render_traced(
         shown = composite_on_devices(
             compositing, settings.exchange, capacity, splats, texels, regions, cutoff, jacobian, probe, camera.rays
         )
+    # A splat with a number that is not finite spoils the whole image: a sum would hide it behind the splats in front.
     taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(shown.channels.dtype)
     channels, transmittance = shown.channels + taint, shown.transmittance + taint
-    output = _output(channels, transmittance, kernel.num_colors, has_geometry, background, shown.overflow)
+    output = _output(channels, transmittance, splats.colors.shape[1], has_geometry, background, shown.overflow)
     return output, shown.num_pairs
 
 
@@ -112,6 +120,88 @@ def _output(
     alpha = 1 - transmittance
     if not has_geometry:
         return RenderOutput(color, alpha, overflow)
+    # Σ_ij w_i w_j (z_i − z_j)² / 2 = Σ w · Σ w z² − (Σ w z)², without a double sum; alpha is Σ w.
     depth, squared = channels[num_colors], channels[num_colors + 1]
     normal = jnp.moveaxis(channels[num_colors + 2 :], 0, -1)
     return RenderOutput(color, alpha, overflow, Geometry(depth, normal, alpha * squared - depth * depth))
+
+
+HEAD_ROOM = 1.25
+
+
+def capacity_for(pairs: int, head_room: float = HEAD_ROOM) -> int:
+    """Return a capacity with head room for a number of pairs, rounded up so that few shapes occur."""
+    return max(1024, -(-int(pairs * head_room) // 1024) * 1024)
+
+
+def with_capacity(
+    settings: RenderSettings, gaussians: Gaussians, camera: Camera, appearance: Appearance, num_live: Any = None
+) -> RenderSettings:
+    """Return the settings; if they lack a capacity, with one for this view, which an eager call can find.
+
+    Raises:
+      ValueError: under jit or vmap without a capacity.
+    """
+    check_kind("settings", settings, RenderSettings)
+    check_is_appearance(appearance)
+    if settings.capacity is not None:
+        return settings
+    gaussians, camera, appearance, num_live = jax.tree.map(_primal_value, (gaussians, camera, appearance, num_live))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((gaussians, camera, appearance, num_live))):
+        raise ValueError(
+            "settings.capacity is needed under jit and vmap, where shapes are fixed: "
+            "settings = plan_render(model, cameras) outside, then pass settings=settings"
+        )
+    pairs = pairs_to_draw(gaussians, camera, appearance, settings, num_live)
+    return dataclasses.replace(settings, capacity=capacity_for(pairs))
+
+
+def _primal_value(x: Any) -> Any:
+    """Return the concrete array behind the tracers of `jax.grad`, or the tracer if jit or vmap hides the value."""
+    while isinstance(x, jax.core.Tracer):
+        try:
+            return np.asarray(jax.lax.stop_gradient(x))
+        except jax.errors.TracerArrayConversionError:
+            inner = getattr(x, "primal", None)
+            if inner is None:
+                return x
+            x = inner
+    return x
+
+
+def pairs_of_view(
+    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: Any = None
+) -> int:
+    """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
+    check_is_appearance(appearance)
+    if not gaussians.num:
+        return 0
+    camera = settings.finer(camera)
+    try:
+        return int(_jitted_count()(gaussians, camera, appearance, settings.tile_size, settings.near_plane, num_live))
+    except jax.errors.ConcretizationTypeError as error:
+        raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
+
+
+def pairs_to_draw(
+    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: Any = None
+) -> int:
+    """Return the least capacity for a view (host): its pairs or, on several devices, what the fullest band needs."""
+    pairs = pairs_of_view(gaussians, camera, appearance, settings, num_live)
+    if settings.exchange is None or not pairs:
+        return pairs
+    return max(pairs, room_of_view(gaussians, camera, appearance, settings, num_live).pairs)
+
+
+@functools.cache
+def _jitted_count() -> jax.stages.Wrapped:
+    return jax.jit(_count_pairs, static_argnums=(3, 4))
+
+
+def _count_pairs(
+    gaussians: Gaussians, camera: Camera, appearance: Appearance, tile_size: int, near_plane: float, num_live: Any
+) -> Array:
+    M, cutoff = drawn_splats(gaussians, camera, appearance, num_live)
+    pixels = pixels_of(camera, tile_size)
+    bounds = screen_bounds(M, cutoff, near_plane)
+    return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size), pixels)

@@ -17,10 +17,9 @@ from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.events import read_probe
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.parallel.exchange import value_and_grad_of_views
-from a2tg_jax.rasterize.capacity import with_capacity
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.rasterize.views import render_traced, with_capacity
 from a2tg_jax.render import check_background
 from a2tg_jax.training.corrections import Correction, corrected_camera
 

@@ -30,8 +30,8 @@ from a2tg_jax.parallel.sharded_rows import (
     spread,
     warn_of_uneven_rows,
 )
-from a2tg_jax.rasterize.capacity import capacity_for, pairs_of_view
 from a2tg_jax.rasterize.render_types import RenderSettings
+from a2tg_jax.rasterize.views import capacity_for, pairs_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Interrupted
 from a2tg_jax.training.corrections import check_corrections

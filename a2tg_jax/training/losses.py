@@ -13,7 +13,7 @@ from a2tg_jax.core.cameras import Camera, check_is_camera
 from a2tg_jax.core.checks import check_array, check_floats, check_number, check_shape, plain_array
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import normalize, safe_divide
-from a2tg_jax.rasterize.kernels import scores, windows
+from a2tg_jax.rasterize.kernels import window_scores
 
 SSIM_SIGMA = 1.5
 SSIM_RADIUS = 5
@@ -74,8 +74,8 @@ def mean_ssim(image: Array, target: Array) -> Array:
             f"{image.shape[0]}: use larger images or ssim_weight=0"
         )
     x, y = jnp.moveaxis(image, -1, 0), jnp.moveaxis(target, -1, 0)
-    score = windows.Score(_similarity, SSIM_TAPS)
-    return scores.mean_score(score, x, y)
+    score = window_scores.Score(_similarity, SSIM_TAPS)
+    return window_scores.mean_score(score, x, y)
 
 
 def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product: Array) -> Array:

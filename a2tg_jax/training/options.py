@@ -11,7 +11,7 @@ from a2tg_jax.core.checks import check_int, check_number, fields_of
 from a2tg_jax.events import Event
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, check_config, config_to_dict, flatten_config
-from a2tg_jax.rasterize.kernels.choice import MAX_TILE_SIZE
+from a2tg_jax.rasterize.kernels.platforms import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import BilateralGrid, Correction, Exposure, PoseRefinement
 from a2tg_jax.training.stage import LearningRates, LossTerm, Stage
 from a2tg_jax.training.terms import (

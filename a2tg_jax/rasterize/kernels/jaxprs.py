@@ -1,40 +1,33 @@
-"""Evaluation of jaxprs of scalars, an equation at a time: the part that all kinds of kernels share.
+"""The scalar functions that kernels apply, as jaxprs: traced once, then evaluated equation by equation.
 
-A value stands for a number in the code that is being made. A small array is a numpy array of values, one per entry;
-every entry becomes code of its own.
+`native` and `cuda` make code of the same jaxprs. A value stands for a number in the code that is being made.
 """
 
-import abc
-import functools
-import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Generic, Protocol, TypeAlias, TypeVar, cast
+import concurrent.futures
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.extend import core
 from jax.typing import ArrayLike, DTypeLike
 
-MOST_ENTRIES = 256
-"""Largest number of entries of an array, and of steps of a scan over arrays, for which code is unrolled."""
+from a2tg_jax.core.bilinear import Lookup, Sample, TextureRegion
+from a2tg_jax.rasterize import pixel
+from a2tg_jax.rasterize.splats import KernelSpec
+
 Equation = core.JaxprEqn
-Params = dict[str, Any]
-"""Parameters of an equation."""
 V = TypeVar("V")
 """What stands for a number in the code that is being made."""
-Value: TypeAlias = V | np.ndarray
-"""A number, or a small array of them."""
-Values: TypeAlias = list[Value[V]]
-Step: TypeAlias = Callable[[Values[V]], Values[V]]
-CALLS = (
+CALLS = {
     *("jit", "pjit", "closed_call", "core_call", "call", "remat", "remat2", "checkpoint"),
     *("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"),
-)
-"""Primitives that run their jaxpr once, by their names in all versions of JAX from 0.10 on."""
-REDUCTIONS = {
-    **{"reduce_and": "and", "reduce_max": "max", "reduce_min": "min"},
-    **{"reduce_or": "or", "reduce_prod": "mul", "reduce_sum": "add"},
 }
-"""Element-wise primitives by the name of the reduction."""
+"""Primitives that run their jaxpr once, by their names in all versions of JAX from 0.10 on."""
+CUTOFF_SLACK = 1e-3
+"""Added to the squared distance within which a pixel is looked at; what it shows is decided exactly."""
 
 
 class Untranslatable(ValueError):
@@ -43,226 +36,191 @@ class Untranslatable(ValueError):
     primitive: str | None = None
     """Name of the primitive that has no translation, if it is one."""
 
-    @staticmethod
-    def of(primitive: str, target: str) -> "Untranslatable":
-        """Return the error of a primitive without a translation to a kind of kernels."""
-        error = Untranslatable(f"{target} have no translation for the primitive '{primitive}'")
-        error.primitive = primitive
-        return error
+
+def example(dtype: DTypeLike) -> Any:
+    """Return an abstract scalar as an example for `trace`."""
+    return jax.ShapeDtypeStruct((), dtype)
 
 
-class ArrayAval(Protocol):
-    """Abstract value of an array."""
+def trace(function: Callable[..., Any], *examples: Any) -> tuple[core.ClosedJaxpr, Any]:
+    """Return the jaxpr of a function of scalars, and the tree structure of its result.
 
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
+    The jaxpr does not depend on what is being traced around it, such as the axes of a `shard_map` or a mesh.
+
+    Args:
+      function: function to trace.
+      examples: pytrees of `example`, one per argument.
+    """
+    closed, shape = in_clean_context(lambda: jax.make_jaxpr(function, return_shape=True)(*examples))
+    return closed, jax.tree.structure(shape)
 
 
-class Evaluator(abc.ABC, Generic[V]):
-    """Base class of what makes code of jaxprs; a subclass knows numbers, element-wise primitives and loops."""
+def in_clean_context(work: Callable[[], Any]) -> Any:
+    """Return work(), run on a thread of its own, because JAX's tracing is per thread, with the caller's dtype rules."""
+    config: Any = jax.config
+    is_x64, promotion = config.jax_enable_x64, config.jax_numpy_dtype_promotion
 
-    target: str
-    """Kind of kernels, as error messages name them."""
+    def with_rules() -> Any:
+        with jax.enable_x64(is_x64), jax.numpy_dtype_promotion(promotion):
+            return work()
 
-    @abc.abstractmethod
-    def literal(self, number: ArrayLike, dtype: DTypeLike) -> V:
-        """Return the value of a number."""
+    # The caller waits: nothing runs at the same time.
+    with concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="a2tg-trace") as pool:
+        return pool.submit(with_rules).result()
 
-    @abc.abstractmethod
-    def check_dtype(self, dtype: DTypeLike) -> None:
-        """Raise Untranslatable unless there are values of this dtype."""
 
-    @abc.abstractmethod
-    def primitive(self, name: str) -> Callable[[list[V], Equation], V] | None:
-        """Return the function from values to the value of an element-wise primitive, if there is one."""
+def make_code(
+    jaxpr: Any, arguments: Sequence[V], literal: Callable[[ArrayLike, DTypeLike], V],
+    primitives: Mapping[str, Callable[[list[V], Equation], V]], target: str,
+) -> list[V]:  # fmt: skip
+    """Make code of a jaxpr of scalars; return the values of its results.
 
-    @abc.abstractmethod
-    def branches(
-        self, index: Value[V], branches: Sequence[core.ClosedJaxpr], operands: Values[V], equation: Equation
-    ) -> Values[V]:
-        """Emit `cond` or `switch`."""
+    Args:
+      jaxpr: the jaxpr, closed or without constants.
+      arguments: values of its arguments.
+      literal: function of a number and its dtype that returns the number's value.
+      primitives: by the name of a primitive, the function of operands and equation that returns the result's value.
+      target: kind of kernels, for errors.
 
-    @abc.abstractmethod
-    def loop(self, carry: Values[V], test: Callable[[Values[V]], Value[V]], step: Step[V]) -> Values[V]:
-        """Emit a loop that replaces `carry` by `step` of it as long as `test` of it holds."""
+    Raises:
+      Untranslatable: if a primitive has no translation, or a number is an array.
+    """
+    inner: core.Jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
+    values: dict[core.Var, V] = dict(zip(inner.invars, arguments, strict=True))
+    constants = dict(zip(inner.constvars, getattr(jaxpr, "consts", ()), strict=True))
 
-    @abc.abstractmethod
-    def counted(self, length: int, carry: Values[V], step: Step[V]) -> Values[V]:
-        """Emit a loop of a fixed number of steps."""
+    def read(atom: Any) -> V:
+        if not isinstance(atom, core.Literal) and atom not in constants:
+            return values[atom]
+        number: Any = atom.val if isinstance(atom, core.Literal) else constants[atom]
+        if np.shape(number):
+            # Such as a table: kernels keep numbers in registers, which cannot be indexed.
+            raise Untranslatable(f"{target} take functions of scalars; a constant has shape {np.shape(number)}")
+        return literal(number, atom.aval.dtype)
 
-    def run(self, jaxpr: core.ClosedJaxpr | core.Jaxpr, arguments: Sequence[Value[V]]) -> Values[V]:
-        """Emit a jaxpr, closed or without constants, and return its values."""
-        consts = getattr(jaxpr, "consts", ())
-        jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
-        values: dict[core.Var, Value[V]] = {}
-
-        def read(atom: core.Var | core.Literal) -> Value[V]:
-            return self._constant(atom.val, aval_of(atom)) if isinstance(atom, core.Literal) else values[atom]
-
-        for variable, value in zip(jaxpr.constvars, consts, strict=True):
-            values[variable] = self._constant(value, aval_of(variable))
-        values.update(zip(jaxpr.invars, arguments, strict=True))
-        for equation in jaxpr.eqns:
-            results = self._equation(equation, [read(atom) for atom in equation.invars])
-            values.update(zip(equation.outvars, results, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
-
-    def _constant(self, value: ArrayLike, aval: ArrayAval) -> Value[V]:
-        self.check_dtype(aval.dtype)
-        numbers = np.asarray(value).reshape(-1)
-        return array_of([self.literal(number, aval.dtype) for number in numbers], aval.shape)
-
-    def _equation(self, equation: Equation, operands: Values[V]) -> Values[V]:
-        name, params = equation.primitive.name, equation.params
-        for index in range(len(equation.outvars)):
-            self.check_dtype(result_of(equation, index).dtype)
+    for equation in inner.eqns:
+        name = equation.primitive.name
+        if name not in CALLS and name not in primitives:
+            error = Untranslatable(f"{target} have no translation for the primitive '{name}'")
+            error.primitive = name
+            raise error
+        operands = [read(atom) for atom in equation.invars]
         if name in CALLS:
-            return self.run(params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"], operands)
-        if name in SHAPES:
-            result = SHAPES[name](operands, params)
-            return [array_of(entries(result), result_of(equation).shape)]
-        if name in REDUCTIONS:
-            return [self._reduction(REDUCTIONS[name], cast(np.ndarray, operands[0]), equation)]
-        if name == "optimization_barrier":
-            return operands
-        if name == "cond":
-            return self.branches(operands[0], params["branches"], operands[1:], equation)
-        if name == "while":
-            return self._while(operands, params)
-        if name == "scan":
-            return self._scan(operands, equation)
-        return [map_entries(lambda numbers: self.element(name, numbers, equation), operands)]
+            called = equation.params["jaxpr"] if "jaxpr" in equation.params else equation.params["call_jaxpr"]
+            results = make_code(called, operands, literal, primitives, target)
+        else:
+            results = [primitives[name](operands, equation)]
+        values.update(zip(equation.outvars, results, strict=True))
+    return [read(atom) for atom in inner.outvars]
 
-    def element(self, name: str, operands: list[V], equation: Equation) -> V:
-        """Emit an element-wise primitive on scalars."""
-        emit = self.primitive(name)
-        if emit is None:
-            raise Untranslatable.of(name, self.target)
-        return emit(operands, equation)
 
-    def _reduction(self, name: str, array: np.ndarray, equation: Equation) -> Value[V]:
-        """Reduce axes of an array by an element-wise primitive."""
-        axes, result = equation.params["axes"], result_of(equation)
-        kept = np.moveaxis(array, axes, range(len(axes)))
-        rows = kept.reshape(math.prod(kept.shape[: len(axes)]), -1)
-        # Sums begin with 0 as in XLA, which matters if all addends are −0.
-        first = [self.literal(0, result.dtype)] if name == "add" else []
-        combine = lambda x, y: self.element(name, [x, y], equation)  # noqa: E731
-        return array_of([functools.reduce(combine, [*first, *column]) for column in rows.T], result.shape)
+def operand_dtype(equation: Equation) -> np.dtype:
+    """Return the dtype of an equation's first operand."""
+    return np.dtype(equation.invars[0].aval.dtype)  # type: ignore[attr-defined]
 
-    def _while(self, operands: Values[V], params: Params) -> Values[V]:
-        num_cond, num_body = params["cond_nconsts"], params["body_nconsts"]
-        cond_consts, body_consts = operands[:num_cond], operands[num_cond : num_cond + num_body]
-        return self.loop(
-            operands[num_cond + num_body :],
-            lambda carry: self.run(params["cond_jaxpr"], [*cond_consts, *carry])[0],
-            lambda carry: self.run(params["body_jaxpr"], [*body_consts, *carry]),
-        )
 
-    def _scan(self, operands: Values[V], equation: Equation) -> Values[V]:
-        """Emit a loop, unrolled if it reads or writes arrays."""
-        params, length = equation.params, equation.params["length"]
-        num_consts, num_carry = _scan_sizes(params)
-        consts, carry = operands[:num_consts], operands[num_consts : num_consts + num_carry]
-        arrays = cast(list[np.ndarray], operands[num_consts + num_carry :])
-        num_written = len(equation.outvars) - num_carry
-        if not arrays and not num_written:
-            return self.counted(length, carry, lambda carry: self.run(params["jaxpr"], [*consts, *carry]))
-        if length > MOST_ENTRIES:
-            raise Untranslatable(
-                f"{self.target} unroll a scan over arrays for {MOST_ENTRIES} steps at most; got {length}"
+def result_dtype(equation: Equation) -> np.dtype:
+    """Return the dtype of an equation's result."""
+    return np.dtype(equation.outvars[0].aval.dtype)  # type: ignore[attr-defined]
+
+
+class PixelFunctions:
+    """Jaxprs of scalars for one spec.
+
+    `prepare` and `prepare_vjp` run once per splat and tile; `reach`, `forward` and `backward` run at every pixel.
+    """
+
+    def __init__(self, spec: KernelSpec):
+        self.spec, self._functions = spec, spec.static.functions
+        number, integer, flag = example(spec.dtype), example(jnp.int32), example(jnp.bool_)
+        triple = (number,) * 3
+        normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_own_numbers
+        splat = pixel.Splat((triple,) * 3, number, (number,) * spec.num_colors, normal, numbers)
+        values = (number,) * spec.num_columns
+        region = TextureRegion(integer, integer, integer) if values else None
+        lookup = Lookup(region, Sample(values, values, values)) if region else None
+
+        tile = (number,) * spec.num_tile_numbers
+        self.prepare, structure = trace(pixel.planes_of, splat.M, tile)
+        self.num_planes = structure.num_leaves
+        planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
+        self.prepare_vjp, _ = trace(_planes_vjp, splat.M, tile, planes)
+        self.reach, _ = trace(self._reach, planes, region, number, number)
+        at_pixel, channels = (number, number, number, flag), (number,) * spec.num_channels
+        self.forward, _ = trace(self._forward, planes, splat, values, *at_pixel, channels)
+        of_backward = number, channels, tile, (triple,) * 3
+        self.backward, _ = trace(self._backward, planes, splat, lookup, *at_pixel, *of_backward)
+
+    def _reach(
+        self, planes: pixel.Planes, region: TextureRegion | None, x: Array, y: Array
+    ) -> tuple[Array, tuple[Array, ...]]:
+        """Return the squared distance ρ of the pixel, and the position of the texture lookup."""
+        hit = pixel.intersect(planes, x, y, self.spec.near_plane, self._functions.has_low_pass)
+        return hit.rho, () if region is None else self._functions.texel_position(region, hit.u, hit.v)
+
+    def _forward(
+        self, planes: pixel.Planes, splat: pixel.Splat, values: tuple[Array, ...], x: Array, y: Array,
+        transmittance: Array, is_live: Array, channels: tuple[Array, ...],
+    ) -> tuple[Array, Array, tuple[Array, ...]]:  # fmt: skip
+        """Return transmittance and liveness behind the splat, and the channels with it."""
+        at_pixel = planes, splat, values, x, y, transmittance, is_live
+        added, transmittance, is_live = pixel.blend(self._functions, self.spec.near_plane, *at_pixel)
+        return transmittance, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
+
+    def _backward(
+        self, planes: pixel.Planes, splat: pixel.Splat, lookup: Lookup | None, x: Array, y: Array,
+        transmittance: Array, is_live: Array, suffix_sum: Array, g: tuple[Array, ...], tile: pixel.TileNumbers,
+        jacobian: pixel.Rows,
+    ) -> tuple[pixel.State, Array, tuple[Array, ...], Any]:  # fmt: skip
+        """Return the state behind the splat, whether it contributes, the cotangents of the values, and all others."""
+        spec, functions = self.spec, self._functions
+        at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
+        state, weight, d = pixel.blend_vjp(functions, spec.near_plane, *at_pixel, spec.statistic is not None)
+        added: tuple[Array, ...] = ()
+        if spec.statistic and d.rho is not None:
+            added = pixel.positional_gradient(
+                spec.statistic, splat.M, x, y, tile, d.rho, jacobian, spec.near_plane, functions.has_low_pass
             )
-        written: list[Any] = [None] * length
-        for step in reversed(range(length)) if params["reverse"] else range(length):
-            results = self.run(params["jaxpr"], [*consts, *carry, *(array[step] for array in arrays)])
-            carry, written[step] = results[:num_carry], results[num_carry:]
-        stacked = []
-        for k in range(num_written):
-            flat = [entry for row in written for entry in entries(row[k])]
-            stacked.append(array_of(flat, result_of(equation, num_carry + k).shape))
-        return [*carry, *stacked]
+        # Without weight the cotangents may be anything, NaN included; kernels leave them out.
+        return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
 
 
-def aval_of(atom: core.Var | core.Literal) -> ArrayAval:
-    """Return the abstract value of an array."""
-    return cast(ArrayAval, atom.aval)
+def _planes_vjp(M: pixel.Rows, tile: pixel.TileNumbers, d_planes: pixel.Planes) -> pixel.Rows:
+    """Return the cotangent of M, given that of its planes."""
+    d_M: pixel.Rows = jax.vjp(lambda M: pixel.planes_of(M, tile), M)[1](d_planes)[0]
+    return d_M
 
 
-def result_of(equation: Equation, index: int = 0) -> ArrayAval:
-    """Return the abstract value of a result."""
-    return aval_of(equation.outvars[index])
+def refusal_of(spec: KernelSpec, translate: Callable[[KernelSpec], Any]) -> str | None:
+    """Return why a kind of kernels cannot be made for a spec; None if `translate` makes them."""
+    try:
+        translate(spec)
+    except Untranslatable as error:
+        return str(error) + (_place_of(error.primitive, spec) if error.primitive else "")
+    return None
 
 
-def entries(value: Value[V]) -> list[V]:
-    """Return all entries of an array, or a scalar as the only one."""
-    return list(value.flat) if isinstance(value, np.ndarray) else [value]
+def _place_of(primitive: str, spec: KernelSpec) -> str:
+    """Return in which function of an appearance a primitive occurs, as in " in MyRule.shade"; "" if in none."""
+
+    def gradient(*given: Any) -> Any:
+        results, pull_back = jax.vjp(function, *given)
+        return pull_back(results)
+
+    for name, given in spec.arguments.of(()).items():
+        function = getattr(spec.static.functions, name)
+        if primitive in _primitives(trace(function, *given)[0]):
+            return f" in {spec.static.name}.{name}"
+        # Texture regions are integers, which have no gradient.
+        if name != "texel_position" and primitive in _primitives(trace(gradient, *given)[0]):
+            return f" in the gradient of {spec.static.name}.{name}"
+    return ""
 
 
-def rebuilt_like(value: Value[V], new: Iterator[V]) -> Value[V]:
-    """Make a scalar or an array of the same shape from the next values."""
-    if not isinstance(value, np.ndarray):
-        return next(new)
-    return array_of([next(new) for _ in range(value.size)], value.shape)
-
-
-def array_of(values: Sequence[V], shape: Sequence[int]) -> Value[V]:
-    """Make an array of a shape from its entries; a scalar if the shape is ()."""
-    if math.prod(shape) > MOST_ENTRIES:
-        raise Untranslatable(f"kernels take functions of scalars; an array has shape {tuple(shape)}")
-    array = np.empty(len(values), object)
-    array[:] = values
-    return array.reshape(shape) if shape else values[0]
-
-
-def map_entries(emit: Callable[[list[V]], V], operands: Sequence[Value[V]]) -> Value[V]:
-    """Emit an element-wise operation on scalars, or entry by entry on arrays; axes of length 1 broadcast."""
-    scalars = [operand for operand in operands if not isinstance(operand, np.ndarray)]
-    if len(scalars) == len(operands):
-        return emit(scalars)
-    shape = np.broadcast_shapes(*(operand.shape for operand in operands if isinstance(operand, np.ndarray)))
-    rows = [list(np.broadcast_to(cast(np.ndarray, operand), shape).flat) for operand in operands]
-    return array_of([emit(list(numbers)) for numbers in zip(*rows, strict=True)], shape)
-
-
-def _scan_sizes(params: Params) -> tuple[int, int]:
-    """Return the numbers of constants and of carried values of a scan."""
-    if "num_consts" in params:
-        return params["num_consts"], params["num_carry"]
-    consts, carry, _ = params["ft_in"].unpack()  # JAX 0.12
-    return len(list(consts)), len(list(carry))
-
-
-def _broadcast(operands: Values[V], params: Params) -> Value[V]:
-    (operand,), shape = operands, params["shape"]
-    if not isinstance(operand, np.ndarray):
-        return array_of([operand] * math.prod(shape), shape)
-    inner = [1] * len(shape)
-    for size, dimension in zip(operand.shape, params["broadcast_dimensions"], strict=True):
-        inner[dimension] = size
-    return np.broadcast_to(operand.reshape(inner), shape)
-
-
-def _slice(operands: Values[V], params: Params) -> Value[V]:
-    starts, limits = params["start_indices"], params["limit_indices"]
-    strides = params["strides"] or (1,) * len(starts)
-    part: np.ndarray = cast(np.ndarray, operands[0])[tuple(map(slice, starts, limits, strides))]
-    return part
-
-
-def _stack(operands: Values[V], params: Params) -> Value[V]:
-    shape = operands[0].shape if isinstance(operands[0], np.ndarray) else ()
-    flat = [entry for operand in operands for entry in entries(operand)]
-    return np.moveaxis(cast(np.ndarray, array_of(flat, (len(operands), *shape))), 0, params["axis"])
-
-
-SHAPES: dict[str, Callable[[list[Any], Params], Any]] = {
-    "broadcast_in_dim": _broadcast,
-    "concatenate": lambda operands, params: np.concatenate(operands, axis=params["dimension"]),
-    "reshape": lambda operands, _: operands[0],
-    "rev": lambda operands, params: np.flip(operands[0], params["dimensions"]),
-    "slice": _slice,
-    "squeeze": lambda operands, _: operands[0],
-    "stack": _stack,
-    "transpose": lambda operands, params: np.transpose(operands[0], params["permutation"]),
-}
-"""Primitives that rearrange the entries of arrays."""
+def _primitives(jaxpr: Any) -> set[str]:
+    """Return the names of the primitives of a jaxpr and of the jaxprs within it."""
+    found: set[str] = set()
+    for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
+        inner = [leaf for leaf in jax.tree.leaves(tuple(equation.params.values())) if hasattr(leaf, "eqns")]
+        found |= {equation.primitive.name}.union(*map(_primitives, inner))
+    return found

@@ -18,8 +18,8 @@ from a2tg_jax.host.startup import cache_folder
 from a2tg_jax.rasterize.kernels import xla
 from a2tg_jax.rasterize.kernels.cuda import composite as cuda
 from a2tg_jax.rasterize.kernels.cuda.source import source
-from a2tg_jax.rasterize.kernels.tracing import in_clean_context
-from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats
+from a2tg_jax.rasterize.kernels.jaxprs import in_clean_context
+from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, PassInputs, Splats
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists
 
 MOST_DIFFERENCE = 1e-3
@@ -44,6 +44,7 @@ def _failure() -> str | None:
         device = jax.local_devices(backend="cuda")[0]
     except RuntimeError:  # Something is compiled for a GPU of another machine.
         return None
+    # An empty file stands for kernels that agree.
     file = cache_folder() / f"cuda-kernels-{_key(device)}.txt"
     with contextlib.suppress(OSError):
         return file.read_text(encoding="utf-8") or None
@@ -75,12 +76,13 @@ def largest_difference(device: Any) -> float:
 
     def drawn(kernels: Any, *arrays: Any) -> list[Any]:
         splats, texels, regions, cutoff, jacobian, probe, g = arrays
+        # A capacity for every splat in every tile: nothing overflows.
         lists = tile_lists(splats.M, cutoff, settings.kernel.near_plane, GRID, NUM * GRID.num)
-        inputs = settings, splats, texels, regions, cutoff, lists
-        channels, transmittance = kernels.forward(*inputs)
+        inputs = PassInputs(splats, texels, regions, cutoff, lists)
+        channels, transmittance = kernels.forward(settings, inputs)
         # The transmittance has the cotangent 1.
         suffix_sum = jnp.sum(g * channels, axis=1) + transmittance
-        gradients = kernels.backward(*inputs, jacobian, probe, g, suffix_sum)
+        gradients = kernels.backward(settings, inputs, jacobian, probe, g, suffix_sum)
         return jax.tree.leaves((channels, transmittance, gradients))
 
     with jax.default_device(device):

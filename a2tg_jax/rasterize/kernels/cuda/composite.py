@@ -1,22 +1,36 @@
 """Compositing by CUDA kernels on NVIDIA GPUs. Each thread composites one pixel; `tiles.c` is the kernel.
 
 What a splat adds to the gradient is summed over warps and added atomically: gradients are reproducible to rounding.
+
+XLA's GPU backend launches PTX that a custom call carries (`launch`). A kernel gets pointers to the operands, then to
+the results.
 """
 
 import functools
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.bilinear import TextureRegion
-from a2tg_jax.rasterize.kernels.cuda.launch import launch
-from a2tg_jax.rasterize.kernels.cuda.source import source
-from a2tg_jax.rasterize.kernels.packing import pack_inputs, split_image, unpack_gradients
-from a2tg_jax.rasterize.kernels.traced import refusal_of
-from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats
-from a2tg_jax.rasterize.tiles import TileLists
+from a2tg_jax.rasterize.kernels.cuda import nvrtc
+from a2tg_jax.rasterize.kernels.cuda.source import block_threads, num_parts, source
+from a2tg_jax.rasterize.kernels.jaxprs import refusal_of
+from a2tg_jax.rasterize.splats import (
+    CompositingSettings,
+    KernelSpec,
+    PassInputs,
+    Splats,
+    pack_inputs,
+    split_image,
+    unpack_gradients,
+)
+
+TARGET = "__gpu$xla.gpu.ptx"
+DEFAULT_CAPABILITY = "9.0"
+"""Compute capability that is compiled for if there is no GPU."""
 
 
 @functools.cache
@@ -27,28 +41,61 @@ def refusal(spec: KernelSpec) -> str | None:
     return refusal_of(spec, functools.partial(source, dialect="cuda"))
 
 
-def forward(
-    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
-    cutoff: Array, lists: TileLists,
-) -> tuple[Array, Array]:  # fmt: skip
+def forward(settings: CompositingSettings, inputs: PassInputs) -> tuple[Array, Array]:
     """Return channels [tiles, D, P] and transmittance [tiles, P], as `xla.forward` does."""
     spec = settings.kernel
     size = settings.grid.num, spec.num_channels + 1, spec.tile_size**2
-    shape = jax.ShapeDtypeStruct(size, splats.M.dtype)
-    inputs = pack_inputs(settings, splats, texels, regions, cutoff, lists)
-    (image,) = launch(spec, "forward", settings.grid.num, inputs, [shape])
+    shape = jax.ShapeDtypeStruct(size, inputs.splats.M.dtype)
+    (image,) = launch(spec, "forward", settings.grid.num, pack_inputs(settings, inputs), [shape])
     return split_image(image)
 
 
 def backward(
-    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
-    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array, g: Array, suffix_sum: Array,
-) -> tuple[Splats, Array, Array]:  # fmt: skip
+    settings: CompositingSettings, inputs: PassInputs, jacobian: Array, probe: Array, g: Array, suffix_sum: Array
+) -> tuple[Splats, Array, Array]:
     """Return the cotangents of splats, texels and probe, as `xla.backward` does."""
-    spec = settings.kernel
-    dtype = np.dtype(spec.dtype)
-    inputs = pack_inputs(settings, splats, texels, regions, cutoff, lists)
-    inputs = (*inputs, *(array.astype(dtype) for array in (g, suffix_sum, jacobian)))
-    totals = [jnp.zeros(shape, dtype) for shape in spec.gradient_shapes(splats, texels, probe)]
-    found = launch(spec, "backward", settings.grid.num, inputs, [], totals)
-    return unpack_gradients(settings, found, splats, texels, probe)
+    spec, dtype = settings.kernel, np.dtype(settings.kernel.dtype)
+    given = (*pack_inputs(settings, inputs), *(array.astype(dtype) for array in (g, suffix_sum, jacobian)))
+    # Blocks add to these atomically: they start as zeros, and are operands that the call returns.
+    totals = [jnp.zeros(shape, dtype) for shape in spec.gradient_shapes(inputs)]
+    found = launch(spec, "backward", settings.grid.num, given, [], totals)
+    return unpack_gradients(settings, found, inputs, probe)
+
+
+def capability() -> str:
+    """Return the least compute capability of this process's GPUs."""
+    try:
+        found: list[str] = [device.compute_capability for device in jax.local_devices(backend="cuda")]
+    except RuntimeError:
+        return DEFAULT_CAPABILITY
+    return min(found, key=lambda text: [int(part) for part in text.split(".")])
+
+
+def launch(
+    spec: KernelSpec, name: str, num_tiles: int, inputs: Sequence[Array], results: Sequence[Any],
+    totals: Sequence[Array] = (),
+) -> list[Array]:  # fmt: skip
+    """Run a kernel of `source.source` on a GPU.
+
+    Args:
+      spec: what the kernel is made for.
+      name: the kernel's name; its parameters are pointers to inputs, then to results or totals.
+      num_tiles: tiles of the image.
+      inputs: arrays that it reads.
+      results: shapes and dtypes of the arrays that it writes whole.
+      totals: arrays that it adds to.
+
+    Returns:
+      The results, then the totals.
+    """
+    program = nvrtc.ptx(source(spec, "cuda"), capability())
+    shapes = [*results, *(jax.typeof(total) for total in totals)]
+    # XLA passes operands before results: an aliased operand and its result are one buffer, passed twice.
+    aliases = {len(inputs) + k: len(results) + k for k in range(len(totals))}
+    call = jax.ffi.ffi_call(TARGET, shapes, input_output_aliases=aliases, vmap_method="sequential")
+    attributes = {f"{kind}_{axis}": np.int32(1) for kind in ("grid", "block") for axis in "xyz"}
+    attributes["grid_x"] = np.int32(num_tiles * num_parts(spec.tile_size))
+    attributes["block_x"] = np.int32(block_threads(spec.tile_size))
+    attributes["shared_mem_bytes"] = np.int32(0)  # Beyond what the kernel declares.
+    found = call(*inputs, *totals, name=name, kernel_type="ptx", kernel_data=program, **attributes)
+    return list(found)

@@ -20,16 +20,6 @@
 #define a2tg_nan_float() __int_as_float(0x7fc00000)
 #define a2tg_inf_double() __longlong_as_double(0x7ff0000000000000ll)
 #define a2tg_nan_double() __longlong_as_double(0x7ff8000000000000ll)
-#define a2tg_float_as_int(x) __float_as_int(x)
-#define a2tg_float_as_unsigned_int(x) __float_as_uint(x)
-#define a2tg_int_as_float(x) __int_as_float(x)
-#define a2tg_unsigned_int_as_float(x) __uint_as_float(x)
-#define a2tg_double_as_long(x) __double_as_longlong(x)
-#define a2tg_double_as_unsigned_long(x) ((unsigned long)__double_as_longlong(x))
-#define a2tg_long_as_double(x) __longlong_as_double(x)
-#define a2tg_unsigned_long_as_double(x) __longlong_as_double((long long)(x))
-#define a2tg_int_as_unsigned_int(x) ((unsigned int)(x))
-#define a2tg_unsigned_int_as_int(x) ((int)(x))
 
 // One step of a sum over a warp: two lanes exchange halves of what they hold, and each adds what it got to its own half.
 #define EXCHANGE(width)                                                                             \

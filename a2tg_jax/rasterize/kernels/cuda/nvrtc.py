@@ -36,6 +36,7 @@ def _library() -> ctypes.CDLL:
         raise ModuleNotFoundError(
             "GPU kernels need NVRTC, which is not installed: pip install 'a2tg-jax[cuda13]', or [cuda12]"
         )
+    # NVRTC opens its builtins by name, and does not look beside itself for them.
     for builtins in sorted(path.parent.glob("*nvrtc-builtins*")):
         ctypes.CDLL(str(builtins), mode=getattr(ctypes, "RTLD_GLOBAL", 0))
     return ctypes.CDLL(str(path))

@@ -34,16 +34,6 @@
 #define a2tg_nan_float() NAN
 #define a2tg_inf_double() as_double(0x7ff0000000000000ul)
 #define a2tg_nan_double() as_double(0x7ff8000000000000ul)
-#define a2tg_float_as_int(x) as_int(x)
-#define a2tg_float_as_unsigned_int(x) as_uint(x)
-#define a2tg_int_as_float(x) as_float(x)
-#define a2tg_unsigned_int_as_float(x) as_float(x)
-#define a2tg_double_as_long(x) as_long(x)
-#define a2tg_double_as_unsigned_long(x) as_ulong(x)
-#define a2tg_long_as_double(x) as_double(x)
-#define a2tg_unsigned_long_as_double(x) as_double(x)
-#define a2tg_int_as_unsigned_int(x) as_uint(x)
-#define a2tg_unsigned_int_as_int(x) as_int(x)
 
 static int any_in_group(volatile __local int *votes, int flag) {
   BARRIER;

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from a2tg_jax.core import bilinear
 from a2tg_jax.core.bilinear import Corner, TextureRegion
 from a2tg_jax.rasterize.kernels.cuda.printing import Argument, c_function
-from a2tg_jax.rasterize.kernels.traced import CUTOFF_SLACK, Functions
-from a2tg_jax.rasterize.kernels.tracing import example, trace
+from a2tg_jax.rasterize.kernels.jaxprs import CUTOFF_SLACK, PixelFunctions, example, trace
 from a2tg_jax.rasterize.splats import KernelSpec
 
 Dialect = Literal["cuda", "opencl"]
@@ -35,7 +34,7 @@ def source(spec: KernelSpec, dialect: Dialect) -> str:
     Raises:
       Untranslatable: if the appearance uses a primitive or a dtype that has no translation.
     """
-    functions = Functions(spec)
+    functions = PixelFunctions(spec)
     constants = _constants(spec, functions.num_planes)
     defines = "".join(f"#define {name} {value}\n" for name, value in constants.items())
     real = f"typedef {'float' if spec.dtype == 'float32' else 'double'} real;\n"
@@ -48,12 +47,15 @@ def source(spec: KernelSpec, dialect: Dialect) -> str:
 
 def _constants(spec: KernelSpec, num_planes: int) -> dict[str, Any]:
     num_numbers = spec.num_floats - 1
+    # Sums of a splat over pixels: its planes stand for the nine numbers of M, and the statistic has three. In NUM_SUMS
+    # follow the number of pixels and, for textures of one texel, that texel.
     count = num_planes + num_numbers - 9 + (3 if spec.statistic else 0)
     return {
         "TILE_SIZE": spec.tile_size,
         "NUM_PIXELS": spec.tile_size**2,
         "THREADS": block_threads(spec.tile_size),
         "PARTS": num_parts(spec.tile_size),
+        # Splats that a block copies to shared memory at a time.
         "BATCH": 64 if spec.dtype == "float32" else 32,
         "NUM_NUMBERS": num_numbers,
         "NUM_PLANES": num_planes,
@@ -67,7 +69,7 @@ def _constants(spec: KernelSpec, num_planes: int) -> dict[str, Any]:
     }
 
 
-def _pixel_functions(spec: KernelSpec, functions: Functions, count: int) -> list[str]:
+def _pixel_functions(spec: KernelSpec, functions: PixelFunctions, count: int) -> list[str]:
     """Return the functions that tiles.c calls; `blend_vjp` writes `count` sums."""
     num_columns, has_texture = spec.num_columns, spec.num_columns > 0
     planes, numbers = Argument("planes", functions.num_planes), Argument("numbers", spec.num_floats - 1)

@@ -1,86 +1,76 @@
 """Tile lists and compositing by native loops on CPUs: a faster form of `tiles` and `kernels.xla`, on all cores.
 
 Each thread takes a contiguous part of the tiles, with about as many pairs as the others. Results do not depend on
-timing; the last bits of gradients depend on the number of threads (`sums`).
+timing; the last bits of gradients depend on the number of threads (`SumsOfParts`).
 """
 
 import functools
 import itertools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import Outline
-from a2tg_jax.rasterize.kernels.native import ffi, sums, threads
-from a2tg_jax.rasterize.kernels.packing import pack_inputs, split_image, unpack_gradients
-from a2tg_jax.rasterize.kernels.traced import refusal_of
-from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats
+from a2tg_jax.rasterize.kernels.jaxprs import refusal_of
+from a2tg_jax.rasterize.kernels.native import ffi
+from a2tg_jax.rasterize.kernels.native.lists import ListFunctions, list_functions
+from a2tg_jax.rasterize.kernels.native.llvm_code import CompiledFunction
+from a2tg_jax.rasterize.kernels.native.passes import compiled_passes, packed_pixels
+from a2tg_jax.rasterize.splats import (
+    CompositingSettings,
+    KernelSpec,
+    PassInputs,
+    Splats,
+    pack_inputs,
+    split_image,
+    unpack_gradients,
+)
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
-if TYPE_CHECKING:
-    from a2tg_jax.rasterize.kernels.native.lists import ListFunctions
-    from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
-
-PAIRS_PER_THREAD, SPLATS_PER_THREAD = 2_000, 10_000
-"""Least numbers of pairs and of splats that are worth another thread."""
+PAIRS_PER_THREAD, SPLATS_PER_THREAD, ROWS_PER_THREAD = 2_000, 10_000, 2_000
+"""Least numbers of pairs, of splats, and of rows of a gradient to add that are worth another thread."""
 
 
 @functools.cache
 def refusal(spec: KernelSpec) -> str | None:
     """Return why an appearance cannot run in native loops; None if it can, after compiling them."""
-    from a2tg_jax.rasterize.kernels.native.passes import compiled_passes
-
     return refusal_of(spec, compiled_passes)
 
 
-def forward(
-    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
-    cutoff: Array, lists: TileLists,
-) -> tuple[Array, Array]:  # fmt: skip
+def forward(settings: CompositingSettings, inputs: PassInputs) -> tuple[Array, Array]:
     """Return channels [tiles, D, P] and transmittance [tiles, P], as `xla.forward` does."""
-    spec = settings.kernel
+    spec, dtype = settings.kernel, inputs.splats.M.dtype
     name = _registered(spec, "forward", _forward_handler)
     shape = settings.grid.num, spec.num_channels + 1, spec.tile_size**2
-    inputs = _packed(spec, settings, splats, texels, regions, cutoff, lists)
-    (image,) = ffi.call(name, [(shape, splats.M.dtype)], *inputs)
+    (image,) = ffi.call(name, [(shape, dtype)], *_packed(settings, inputs))
     return split_image(image)
 
 
-def _packed(
-    spec: KernelSpec, settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
-    cutoff: Array, lists: TileLists,
-) -> tuple[Array, ...]:  # fmt: skip
-    """Return `pack_inputs`, with the pixels of the tiles before the last."""
-    from a2tg_jax.rasterize.kernels.native.passes import packed_pixels
-
-    *inputs, size = pack_inputs(settings, splats, texels, regions, cutoff, lists)
-    return (*inputs, packed_pixels(spec, lists.pixels, splats.M.dtype), size)
-
-
 def backward(
-    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None,
-    cutoff: Array, lists: TileLists, jacobian: Array, probe: Array, g: Array, suffix_sum: Array,
-) -> tuple[Splats, Array, Array]:  # fmt: skip
+    settings: CompositingSettings, inputs: PassInputs, jacobian: Array, probe: Array, g: Array, suffix_sum: Array
+) -> tuple[Splats, Array, Array]:
     """Return the cotangents of splats, texels and probe, as `xla.backward` does."""
-    spec = settings.kernel
+    spec, dtype = settings.kernel, inputs.splats.M.dtype
     name = _registered(spec, "backward", _backward_handler)
-    dtype, shapes = splats.M.dtype, spec.gradient_shapes(splats, texels, probe)
     cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]
-    inputs = (*_packed(spec, settings, splats, texels, regions, cutoff, lists), *cotangents)
-    found = ffi.call(name, [(shape, dtype) for shape in shapes], *inputs)
-    return unpack_gradients(settings, found, splats, texels, probe)
+    shapes = [(shape, dtype) for shape in spec.gradient_shapes(inputs)]
+    found = ffi.call(name, shapes, *_packed(settings, inputs), *cotangents)
+    return unpack_gradients(settings, found, inputs, probe)
+
+
+def _packed(settings: CompositingSettings, inputs: PassInputs) -> tuple[Array, ...]:
+    """Return `pack_inputs`, with the pixels of the tiles before the last."""
+    *packed, size = pack_inputs(settings, inputs)
+    return (*packed, packed_pixels(settings.kernel, inputs.lists.pixels, inputs.splats.M.dtype), size)
 
 
 def tile_lists(
     M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, height: Array | None = None
 ) -> TileLists:
     """List the splats of each tile; arguments and result are those of `rasterize.tiles.tile_lists`."""
-    from a2tg_jax.rasterize.kernels.native.lists import list_functions
-
     key = str(M.dtype), grid.tile_size, near_plane
     name = ffi.registered(
         f"lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_functions(*key))
@@ -91,8 +81,8 @@ def tile_lists(
     return TileLists(ids, starts, num_pairs, overflow, height=height)
 
 
-def _list_handler(functions: "ListFunctions", arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
-    """List the splats of each tile, on all threads."""
+def _list_handler(functions: ListFunctions, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+    """List the splats of each tile, on all ffi."""
     M, cutoff, size = arguments
     ids, starts, total, overflow = results
     columns, width, height = map(int, size)
@@ -102,14 +92,15 @@ def _list_handler(functions: "ListFunctions", arguments: list[np.ndarray], resul
     def bound(first: int, last: int, _: int) -> None:
         functions.bound(*_addresses(M, cutoff, outlines, rectangles), first, last, width, height)
 
-    threads.run_spans(bound, threads.even_spans(num, SPLATS_PER_THREAD))
+    ffi.run_spans(bound, ffi.even_spans(num, SPLATS_PER_THREAD))
     room = int(rectangles[:, 3].sum(dtype=np.int64))
     total[...], overflow[...] = room, room > len(ids)
+    # XLA hands over buffers as they are, and places behind the last pair are not written.
     starts[:], ids[:] = 0, 0
     if overflow:
         return
     order = _depth_order(M[:, 2, 2], np.flatnonzero(rectangles[:, 3]))
-    # Each thread lists the pairs of a range of splats, and places them behind those of nearer ranges.
+    # A counting sort. Each thread lists the pairs of a range of splats, and places them behind those of nearer ranges.
     begins = np.concatenate([[0], np.cumsum(rectangles[order, 3], dtype=np.int64)])
     spans = _parts(begins)
     counts = np.zeros((len(spans), len(starts) - 1), np.int32)
@@ -120,15 +111,16 @@ def _list_handler(functions: "ListFunctions", arguments: list[np.ndarray], resul
         buffers = order[first:], rectangles, outlines, counts[index], *found
         functions.find(*_addresses(*buffers), last - first, columns)
 
-    threads.run_spans(find, spans)
+    ffi.run_spans(find, spans)
     np.cumsum(counts.sum(axis=0), out=starts[1:])
+    # Where each thread begins in each tile's list: behind the pairs that threads of nearer splats found there.
     cursors = starts[:-1] + np.cumsum(counts, axis=0, dtype=np.int32) - counts
 
     def place(first: int, _: int, index: int) -> None:
         found = tiles[begins[first] :], splats[begins[first] :]
         functions.place(*_addresses(*found, cursors[index], ids), int(counts[index].sum()))
 
-    threads.run_spans(place, spans)
+    ffi.run_spans(place, spans)
 
 
 def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
@@ -144,10 +136,9 @@ def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
 
 
 def _registered(
-    spec: KernelSpec, which: Literal["forward", "backward"], make_handler: Callable[["CompiledFunction"], ffi.Handler]
+    spec: KernelSpec, which: Literal["forward", "backward"], make_handler: Callable[[CompiledFunction], ffi.Handler]
 ) -> str:
     """Return the name under which XLA knows a pass of a spec."""
-    from a2tg_jax.rasterize.kernels.native.passes import compiled_passes
 
     def handler() -> ffi.Handler:
         return make_handler(getattr(compiled_passes(spec), which))
@@ -159,7 +150,7 @@ def _addresses(*arrays: np.ndarray) -> list[int]:
     return [array.ctypes.data for array in arrays]
 
 
-def _forward_handler(run: "CompiledFunction") -> ffi.Handler:
+def _forward_handler(run: CompiledFunction) -> ffi.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
         *inputs, size = arguments
         starts = inputs[1]
@@ -168,37 +159,151 @@ def _forward_handler(run: "CompiledFunction") -> ffi.Handler:
         def part(first: int, last: int, _: int) -> None:
             run(*pointers, first, last, *map(int, size))
 
-        threads.run_spans(part, _parts(starts))
+        ffi.run_spans(part, _parts(starts))
 
     return handler
 
 
-def _backward_handler(run: "CompiledFunction") -> ffi.Handler:
+def _backward_handler(run: CompiledFunction) -> ffi.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
         *inputs, size, g, suffix_sum, jacobian = arguments
         starts = inputs[1]
         parts = _parts(starts)
-        room = sums.SumsOfParts(inputs[0], starts, inputs[3], results, parts)
+        room = SumsOfParts(inputs[0], starts, inputs[3], results, parts)
         given = _addresses(*inputs, g, suffix_sum, jacobian)
 
         def part(first: int, last: int, index: int) -> None:
             run(*given, *_addresses(*room.outputs(index)), first, last, *map(int, size))
 
-        threads.run_spans(part, parts)
+        ffi.run_spans(part, parts)
         room.add_up()
 
     return handler
 
 
-def _parts(starts: np.ndarray) -> list[threads.Span]:
+def _parts(starts: np.ndarray) -> list[ffi.Span]:
     """Split tiles, or splats, into ranges with about as many pairs each, one per thread that is worth starting.
 
     Args:
       starts: [items + 1] start of each item's pairs.
     """
     num_items, num_pairs = len(starts) - 1, int(starts[-1])
-    count = max(1, min(threads.num_threads(), num_pairs // PAIRS_PER_THREAD))
+    count = max(1, min(ffi.num_threads(), num_pairs // PAIRS_PER_THREAD))
+    # A tile costs one more than its pairs, so that tiles without pairs are divided, too.
     work = starts.astype(np.int64) + np.arange(num_items + 1)
     borders = np.searchsorted(work, np.linspace(0, work[-1], count + 1)[1:-1]).tolist()
     borders = [0, *borders, num_items]
     return list(itertools.pairwise(borders))
+
+
+class SumsOfParts:
+    """Results of one call, set to zero at first, and the extra rows of its parts.
+
+    A splat's row of the results belongs to the first part that lists it. The few splats that a later part lists again,
+    at the borders between parts, have extra rows of that part, which are added at the end, part by part. The sums equal
+    ((part 0 + part 1) + part 2) + …, bit for bit, and no thread needs memory for all splats.
+
+    Args:
+      ids: [pairs] splats.
+      starts: [tiles + 1] start of each tile's pairs.
+      regions: [N, 3] first texel, height and width of each splat's texture; of another length without textures.
+      results: cotangents [N, S] of splats, [T, C] of texels, and [N, 4] of the probe, or [1, 4] without a statistic.
+      parts: ranges of tiles.
+    """
+
+    def __init__(
+        self,
+        ids: np.ndarray,
+        starts: np.ndarray,
+        regions: np.ndarray,
+        results: list[np.ndarray],
+        parts: list[ffi.Span],
+    ):
+        for result in results:
+            result[...] = 0
+        d_splats, d_texels, d_probe = self.results = results
+        spans = [(int(starts[first]), int(starts[last])) for first, last in parts]
+        self.places, self.splats, self.borders = _places(ids, spans, len(d_splats))
+        num = max(1, len(self.splats))
+        self.more_splats = np.zeros((num, d_splats.shape[1]), d_splats.dtype)
+        self.more_probe = np.zeros((num, d_probe.shape[1]), d_probe.dtype)
+        has_textures = d_texels.shape[1] > 0 and len(regions) == len(d_splats)
+        self.regions = regions[self.splats] if has_textures else np.zeros((0, 3), np.int32)
+        areas = self.regions[:, 1].astype(np.int64) * self.regions[:, 2]
+        self.is_shared = has_textures and len(parts) > 1 and _overlap(regions)
+        # Where textures share texels, two parts may add to the same one: each has its own copy of all.
+        if self.is_shared:
+            self.texels_of_parts = [d_texels, *(np.zeros_like(d_texels) for _ in parts[1:])]
+            self.more_texels, self.more_first = self.texels_of_parts, self.regions[:, 0]
+        else:
+            self.ends = np.concatenate([[0], np.cumsum(areas)])
+            self.texels_of_parts = [d_texels] * len(parts)
+            self.more_texels = [np.zeros((max(1, self.ends[-1]), d_texels.shape[1]), d_texels.dtype)] * len(parts)
+            self.more_first = self.ends[:-1]
+        self.more_first = np.append(self.more_first, 0).astype(np.int32)
+
+    def outputs(self, index: int) -> list[np.ndarray]:
+        """Return the buffers that the backward pass adds to in a part, from `d_splats` on."""
+        d_splats, _, d_probe = self.results
+        more = self.more_splats, self.more_texels[index], self.more_probe, self.more_first
+        return [d_splats, self.texels_of_parts[index], d_probe, self.places, *more]
+
+    def add_up(self) -> None:
+        """Add the extra rows to the results, in the order of the parts."""
+        for first, last in itertools.pairwise(self.borders):
+            # A splat has at most one extra row in a part, so that threads can divide them.
+            spans = ffi.even_spans(last - first, ROWS_PER_THREAD)
+            ffi.run_spans(self._add_rows, [(first + begin, first + end) for begin, end in spans])
+        for texels in self.texels_of_parts[1:] if self.is_shared else ():
+            self.results[1][...] += texels
+
+    def _add_rows(self, first: int, last: int, _: int) -> None:
+        d_splats, d_texels, d_probe = self.results
+        splats = self.splats[first:last]
+        d_splats[splats] += self.more_splats[first:last]
+        if len(d_probe) == len(d_splats):
+            d_probe[splats] += self.more_probe[first:last]
+        if not self.is_shared and len(self.regions):
+            begins, ends = self.ends[first:last], self.ends[first + 1 : last + 1]
+            # Extra texels are one after the other, row by row: each is moved from its row's begin to its texture's.
+            entries = np.arange(self.ends[first], self.ends[last])
+            more = self.more_texels[0][self.ends[first] : self.ends[last]]
+            d_texels[entries + np.repeat(self.regions[first:last, 0] - begins, ends - begins)] += more
+
+
+def _places(ids: np.ndarray, spans: list[ffi.Span], num: int) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Assign extra rows to the pairs of splats that an earlier part lists.
+
+    Args:
+      ids: [pairs] splats.
+      spans: range of each part's pairs.
+      num: number of splats.
+
+    Returns:
+      The extra row of every pair, −1 if it has none; the splat of every extra row; and the borders between the parts'
+      extra rows.
+    """
+    places, is_listed, row = np.full(max(1, spans[-1][1]), -1, np.int32), np.zeros(num, bool), np.empty(num, np.int32)
+    again: list[np.ndarray] = []
+    borders = [0]
+    for index, (first, last) in enumerate(spans):
+        listed = ids[first:last]
+        pairs = np.flatnonzero(is_listed[listed]) if index else np.zeros(0, np.int64)
+        splats = np.unique(listed[pairs])
+        row[splats] = borders[-1] + np.arange(len(splats), dtype=np.int32)
+        places[first + pairs] = row[listed[pairs]]
+        # `row` needs no reset: it is read only where this part has just written it.
+        if index + 1 < len(spans):
+            is_listed[listed] = True
+        again.append(splats)
+        borders.append(borders[-1] + len(splats))
+    return places, np.concatenate(again), borders
+
+
+def _overlap(regions: np.ndarray) -> bool:
+    """Return whether two textures share texels."""
+    first, area = regions[:, 0].astype(np.int64), regions[:, 1].astype(np.int64) * regions[:, 2]
+    # Sorted by first texel; the area comes along in the lower bits.
+    both = np.sort(first << 32 | area)
+    first, area = both >> 32, both & 0xFFFFFFFF
+    return bool(np.any(first[:-1] + area[:-1] > first[1:]))

@@ -1,11 +1,25 @@
-"""Functions on numpy arrays that XLA calls on CPUs, through its foreign function interface (xla/ffi/api/c_api.h)."""
+"""Functions on numpy arrays that XLA calls on CPUs, through its foreign function interface (xla/ffi/api/c_api.h).
 
+Handlers divide their work among threads (`run_spans`).
+
+XLA may still compute on its own threads when a program ends. A thread that then waits for Python's GIL never gets it:
+the program crashes or hangs. So these threads pass a gate in native code, which closes at the end. Threads that come
+later return with an error; the gate waits for those inside. The same holds for daemon threads of Python that wait for
+arrays in native code: the program ends once XLA has computed what they wait for, or met the error.
+"""
+
+import atexit
+import concurrent.futures
 import contextlib
 import ctypes
+import functools
 import hashlib
+import itertools
+import os
 import re
 import signal
 import threading
+import time
 import traceback
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from pathlib import Path
@@ -15,9 +29,17 @@ import jax
 import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
+from llvmlite import ir
+
+from a2tg_jax.host.machine import num_threads as num_threads
+from a2tg_jax.rasterize.kernels.native import llvm_code
+from a2tg_jax.rasterize.kernels.native.llvm_code import INT, LONG, POINTER
 
 Handler = Callable[[list[np.ndarray], list[np.ndarray]], None]
 """Function of arguments and results, views of XLA's buffers: it reads the arguments and fills the results."""
+
+Span = tuple[int, int]
+"""First item, and the end, which is excluded."""
 
 VERSION = 0, 3
 """Version of the interface, major and minor, from which the structures below were copied."""
@@ -93,6 +115,10 @@ _LOCK = threading.RLock()
 _AT_THE_END = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, b"the program is ending", INTERNAL_ERROR)
 ctypes.pythonapi.Py_IncRef(ctypes.py_object(_AT_THE_END))  # in use as long as the process lives
 _entries: dict[str, tuple[Hashable, object]] = {}
+_num_inside, _is_closed = ctypes.c_int32(0), ctypes.c_int32(0)
+"""Threads of XLA inside the gate, and whether it is closed."""
+SECONDS_TO_RETURN = 0.1
+"""Time for daemon threads to return from native code to Python, where the end of the program is harmless."""
 
 
 def installed_version() -> tuple[int, int] | None:
@@ -127,6 +153,7 @@ def registered(description: str, key: Hashable, make_handler: Callable[[], Handl
         while name in _entries and _entries[name][0] != key:
             name += "_"
         if name not in _entries:
+            # Kept for the life of the process: XLA's programs hold its bare address.
             entry = _Entry(_entry(make_handler()))
             _entries[name] = key, entry
             jax.ffi.register_ffi_target(name, _capsule(_gated(entry)), platform="cpu")
@@ -153,12 +180,36 @@ def _capsule(address: int | None, destructor: int | None = None) -> object:
 
 
 def _gated(entry: Any) -> int:
-    """Return the address of an entry behind the gate, which closes when the program ends."""
-    from a2tg_jax.rasterize.kernels.native import shutdown_gate
+    """Return the address of a function like `entry`, frame → error, that makes an error if the gate is closed."""
+    module, name = ir.Module("gate"), llvm_code.unique("gate")
+    signature = ir.FunctionType(POINTER, [POINTER])
+    function = ir.Function(module, signature, name)
+    b = ir.IRBuilder(function.append_basic_block("come"))
+    inside, outside = function.append_basic_block("inside"), function.append_basic_block("outside")
+    (frame,) = function.args
 
-    address = ctypes.cast(entry, _pointer).value or 0
-    path = _CallFrame.api.offset, _Api.create_error.offset
-    return shutdown_gate.gated(address, path, ctypes.addressof(_AT_THE_END))
+    def pointer(address: int) -> ir.Value:
+        return b.inttoptr(LONG(address), POINTER)
+
+    def field(structure: ir.Value, offset: int, type_: ir.Type) -> ir.Value:
+        return b.load(b.gep(structure, [LONG(offset)], source_etype=ir.IntType(8)), typ=type_)
+
+    def leave_with_result_of(address: ir.Value, argument: ir.Value) -> None:
+        result = b.call(b.inttoptr(address, signature.as_pointer()), [argument])
+        b.atomic_rmw("sub", num_inside, INT(1), "seq_cst")
+        b.ret(result)
+
+    num_inside, is_closed = (pointer(ctypes.addressof(number)) for number in (_num_inside, _is_closed))
+    # Counted before the gate is looked at: the end, which closes it and then waits for nobody inside, misses no thread.
+    b.atomic_rmw("add", num_inside, INT(1), "seq_cst")
+    b.cbranch(b.icmp_signed("==", b.load_atomic(is_closed, "seq_cst", 4, typ=INT), INT(0)), inside, outside)
+    b.position_at_end(inside)
+    leave_with_result_of(LONG(ctypes.cast(entry, _pointer).value or 0), frame)
+    b.position_at_end(outside)
+    # frame->api->create_error(&_AT_THE_END)
+    create_error = field(field(frame, _CallFrame.api.offset, POINTER), _Api.create_error.offset, LONG)
+    leave_with_result_of(create_error, pointer(ctypes.addressof(_AT_THE_END)))
+    return llvm_code.compile_module(module)[name]
 
 
 def _entry(handler: Handler) -> Callable[..., int | None]:
@@ -240,3 +291,60 @@ def _array(buffer: _Buffer) -> np.ndarray:
         return np.empty(shape, dtype)
     memory = (ctypes.c_ubyte * num_bytes).from_address(buffer.data)
     return np.frombuffer(memoryview(memory), dtype).reshape(shape)
+
+
+def even_spans(num: int, least_items: int) -> list[Span]:
+    """Split 0..num into even spans, one per thread, of at least `least_items` each if there is more than one."""
+    count = max(1, min(num_threads(), num // max(1, least_items)))
+    return list(itertools.pairwise(num * k // count for k in range(count + 1)))
+
+
+def run_spans(work: Callable[[int, int, int], None], spans: Sequence[Span]) -> None:
+    """Call work(first, last, index) for every span: the first one on this thread, the others on the pool's."""
+    others: list[concurrent.futures.Future[None]] = []
+    try:
+        for index, span in enumerate(spans[1:], start=1):
+            others.append(_pool(num_threads()).submit(work, *span, index))
+        work(*spans[0], 0)
+    finally:
+        # Also after an exception: nobody may write to XLA's buffers once they are given back.
+        concurrent.futures.wait(others)
+    for other in others:
+        other.result()
+
+
+@functools.cache
+def _pool(size: int) -> concurrent.futures.ThreadPoolExecutor:
+    return concurrent.futures.ThreadPoolExecutor(size, thread_name_prefix="a2tg")
+
+
+def _empty() -> None:
+    _num_inside.value = 0
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_empty)  # the child has none of the parent's threads
+
+
+@atexit.register
+def _close() -> None:
+    """Close the gate, and wait until no thread is inside and none waits for arrays."""
+    if not _entries:
+        return
+    # The gate is used as long as the process lives, so that its parts must outlive Python's shutdown.
+    for kept in (_num_inside, _is_closed, llvm_code.engine()):
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))
+    _is_closed.value = 1
+    while _num_inside.value:
+        time.sleep(1e-3)
+    if threading.active_count() > 1:
+        _wait_for_arrays()
+
+
+def _wait_for_arrays() -> None:
+    """Wait until all arrays on the CPU are computed or have failed, and other threads have had time to see it."""
+    with contextlib.suppress(RuntimeError):  # no CPU among JAX's platforms
+        for array in jax.live_arrays("cpu"):
+            with contextlib.suppress(RuntimeError):
+                array.block_until_ready()
+    time.sleep(SECONDS_TO_RETURN)

@@ -12,10 +12,9 @@ d_product three of these; share [1] the weight of each score; rows: workspace fo
 """
 
 import contextlib
-import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +23,11 @@ from jax import Array
 from jax.typing import DTypeLike
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels.native import ffi, llvm_modules, threads
-from a2tg_jax.rasterize.kernels.native.lanes import INT, Lanes
-from a2tg_jax.rasterize.kernels.native.llvm_modules import CompiledFunction
-from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
-from a2tg_jax.rasterize.kernels.tracing import example, trace
-from a2tg_jax.rasterize.kernels.windows import Score
+from a2tg_jax.rasterize.kernels.jaxprs import example, trace
+from a2tg_jax.rasterize.kernels.native import ffi, llvm_code
+from a2tg_jax.rasterize.kernels.native.lanes import Lanes
+from a2tg_jax.rasterize.kernels.native.llvm_code import INT, LONG, CompiledFunction, Writer
+from a2tg_jax.rasterize.kernels.window_scores import Score
 
 SCORE = ("x", "y", "sums", "d_means", "rows")
 PULL_BACK = ("x", "y", "d_mean", "d_squares", "d_product", "share", "d_x", "rows")
@@ -40,11 +38,7 @@ LEAST_PIXELS = 10_000
 
 def least_width(dtype: DTypeLike, num_taps: int) -> int:
     """Return the least width of an image: the windows of a row must fill a vector."""
-    return _num_lanes(dtype) + num_taps - 1
-
-
-def _num_lanes(dtype: DTypeLike) -> int:
-    return llvm_modules.vector_bytes() // int(np.dtype(dtype).itemsize)
+    return llvm_code.num_lanes(dtype) + num_taps - 1
 
 
 def mean_score(score: Score, x: Array, y: Array) -> Array:
@@ -57,6 +51,7 @@ def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Ar
     value, (d_x_mean, d_y_mean, *d_products) = _score(score, x, y)
     share = jnp.full(1, 1 / _num_windows(score, x), x.dtype)
     name = _registered(score, str(x.dtype), "pull_back", _pull_back_handler)
+    # x² + y² and x·y are symmetric: the derivative by y is the one by x with the images and their means exchanged.
     inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
     d_x, d_y = (ffi.call(name, [(x.shape, x.dtype)], *given)[0] for given in inputs)
     return value, d_x, d_y
@@ -92,6 +87,7 @@ def _registered(score: Score, dtype: str, which: Literal["score", "pull_back"], 
 def _score_handler(run: CompiledFunction, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
     sums, d_means = results
     count, height, width = arguments[0].shape
+    # `pull_back` reads T rows of windows for each row of pixels, also at the edges.
     d_means[:, :, :margin], d_means[:, :, -margin:] = 0, 0
 
     def part(first: int, last: int, _: int) -> None:
@@ -117,7 +113,7 @@ def _pull_back_handler(
 
 def _in_spans(part: Callable[[int, int, int], None], num_rows: int, num_pixels: int) -> None:
     """Call part(first, last, _) for all rows, on as many threads as the pixels are worth."""
-    threads.run_spans(part, threads.even_spans(num_rows, max(1, num_rows * LEAST_PIXELS // num_pixels)))
+    ffi.run_spans(part, ffi.even_spans(num_rows, max(1, num_rows * LEAST_PIXELS // num_pixels)))
 
 
 class _Rows(Writer):
@@ -126,7 +122,7 @@ class _Rows(Writer):
     def __init__(self, module: ir.Module, name: str, buffers: Sequence[str], score: Score, dtype: str):
         super().__init__(module, name, buffers, INTEGERS, dtype)
         self.score, self.margin = score, len(score.taps) - 1
-        self.lanes = Lanes(self.b, _num_lanes(dtype))
+        self.lanes = Lanes(self.b, llvm_code.num_lanes(dtype))
         self.reals = self.lanes.vector(self.real)
         self.channels, self.height, self.width = (self.long(self.arguments[name]) for name in INTEGERS[2:])
         self.down, self.across = (self.b.sub(size, LONG(self.margin)) for size in (self.height, self.width))
@@ -144,6 +140,7 @@ class _Rows(Writer):
         """
         b, length = self.b, LONG(self.lanes.width)
         with self.loop(LONG(0), b.sdiv(b.add(num, LONG(self.lanes.width - 1)), length)) as (k, _):
+            # The last vector begins L numbers before the end, so that no code for a remainder is needed.
             place, last = b.mul(k, length), b.sub(num, length)
             start = b.select(b.icmp_signed("<", place, last), place, last)
             yield start, b.sub(place, start)
@@ -184,6 +181,7 @@ class _ScoreRows(_Rows):
             with self.vectors(self.across) as (start, num_done):
                 windows = [self.weighed(self.along(mean, start, LONG(1)), self.score.taps) for mean in means]
                 value, *slopes = self.lanes.emit(with_slopes, windows)
+                # Each score counts once, where vectors overlap.
                 is_new = b.icmp_signed(">=", lane, self.lanes.broadcast(b.trunc(num_done, INT)))
                 b.store(self.sum(b.load(total, typ=self.reals), b.select(is_new, value, zero)), total)
                 for k, slope in enumerate(slopes):
@@ -225,14 +223,14 @@ class _PullBackRows(_Rows):
             with self.vectors(self.width) as (start, _):
                 d_mean, d_squares, d_product = (self.weighed(self.along(row, start, LONG(1)), taps) for row in rows)
                 x, y = (self.vector(self.row(name, index, self.width), start) for name in "xy")
+                # d(x² + y²)/dx = 2x and d(x·y)/dx = y.
                 by_x = self.sum(self.product(self.product(two, x), d_squares), self.product(y, d_product))
                 d_x = self.product(share, self.sum(d_mean, by_x))
                 self.store(d_x, self.at(self.row("d_x", index, self.width), start, self.real), 0)
         b.ret_void()
 
 
-@dataclasses.dataclass(frozen=True)
-class _WindowFunctions:
+class _WindowFunctions(NamedTuple):
     """Compiled functions `score` and `pull_back`."""
 
     score: CompiledFunction
@@ -243,11 +241,8 @@ class _WindowFunctions:
 def _window_functions(score: Score, dtype: str) -> _WindowFunctions:
     """Return the functions of a score, compiled at the first call."""
     module = ir.Module("windows")
-    forward, backward = (llvm_modules.unique(name) for name in ("score", "pull_back"))
+    forward, backward = (llvm_code.unique(name) for name in ("score", "pull_back"))
     _ScoreRows(module, forward, SCORE, score, dtype).write(dtype)
     _PullBackRows(module, backward, PULL_BACK, score, dtype).write()
-    addresses = llvm_modules.compile_module(module)
-    return _WindowFunctions(
-        score=llvm_modules.as_function(addresses[forward], len(SCORE), len(INTEGERS)),
-        pull_back=llvm_modules.as_function(addresses[backward], len(PULL_BACK), len(INTEGERS)),
-    )
+    signatures = {forward: (len(SCORE), len(INTEGERS)), backward: (len(PULL_BACK), len(INTEGERS))}
+    return _WindowFunctions(*llvm_code.compiled(module, signatures))

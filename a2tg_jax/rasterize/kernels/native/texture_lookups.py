@@ -5,15 +5,14 @@ distance. The sum is that of the four corners in `core.bilinear`. Textures of up
 code unrolled along a row; in larger ones, the texels between the least and the largest coordinate of the lanes are.
 """
 
-import contextlib
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from llvmlite import ir
 
-from a2tg_jax.rasterize.kernels.native.lanes import INT, Lanes
-from a2tg_jax.rasterize.kernels.native.writer import LONG, Writer
+from a2tg_jax.rasterize.kernels.native.lanes import Lanes
+from a2tg_jax.rasterize.kernels.native.llvm_code import INT, LONG, Writer
 
 EMPTY = 0
 """Width of a texture without texels."""
@@ -88,21 +87,14 @@ class TexelWriter(Writer):
                 for none, value in zip(self.empty, values, strict=True):
                     self.b.store(self.lanes.constant(none, self.real), value)
                 continue
-            with self.rows(texture, width, place, has_slopes) as row:
+            for row in self.rows(texture, width, place, has_slopes):
+                # Bilinear weights are products: a row is summed by the columns' weights, and weighed once.
                 in_row, in_row_along_x = self.zeros(count), self.zeros(num_slopes)
-
-                def add_texel(
-                    column: Line,
-                    row: Line = row,
-                    in_row: list[ir.Value] = in_row,
-                    in_row_along_x: list[ir.Value] = in_row_along_x,
-                ) -> None:
+                for column in self.columns(texture, width, place, has_slopes):
                     texel = self.texel(texture, column, row)
                     numbers = [self.lanes.broadcast(self.load(texel, k, self.real)) for k in range(count)]
                     self.accumulate(in_row, column.weight, numbers)
                     self.accumulate(in_row_along_x, column.slope, numbers)
-
-                self.each_column(texture, width, place, has_slopes, add_texel)
                 numbers = self.loads(in_row)
                 self.accumulate(values, row.weight, numbers)
                 self.accumulate(along_y, row.slope, numbers)
@@ -114,22 +106,18 @@ class TexelWriter(Writer):
         for width in self.cases(texture):
             if width == EMPTY:
                 continue
-            with self.rows(texture, width, place, False) as row:
+            for row in self.rows(texture, width, place, False):
                 in_row = [self.product(row.weight, d_value) for d_value in d_values]
-
-                def add_texel(
-                    column: Line, width: int | None = width, row: Line = row, in_row: list[ir.Value] = in_row
-                ) -> None:
+                for column in self.columns(texture, width, place, False):
                     addends = [self.product(column.weight, d_value) for d_value in in_row]
                     if width is None:
                         self.add_sums(self.texel(texture, column, row), addends)
-                        return
+                        continue
+                    # Lanes are summed once per splat and tile, not once per vector of pixels.
                     texel = self.b.add(self.times(row.index, width), column.index)
                     for k, addend in enumerate(addends):
                         index = self.b.add(self.times(texel, self.num_columns), LONG(k))
                         self.store(self.b.fadd(self.load(self.sums, index, self.reals), addend), self.sums, index)
-
-                self.each_column(texture, width, place, False, add_texel)
 
     def finish_texels(self, texture: NativeTexture) -> None:
         """Add the lanes' sums of a small texture to the cotangents of its texels."""
@@ -170,9 +158,8 @@ class TexelWriter(Writer):
             b.branch(end)
         b.position_at_end(end)
 
-    @contextlib.contextmanager
     def rows(self, texture: NativeTexture, width: int | None, place: Place, has_slope: bool) -> Iterator[Line]:
-        """Write a loop over the rows that may be seen; for the width of a small texture, over all rows."""
+        """Write a loop, which the caller fills, over the rows that may be seen; over all of a small texture."""
         if width is None:
             span, y = self.seen(place.y, place.is_reached, texture.height)
         else:
@@ -180,19 +167,17 @@ class TexelWriter(Writer):
         with self.loop(*span) as (index, _):
             yield self.line(index, y, texture.height, has_slope)
 
-    def each_column(
-        self, texture: NativeTexture, width: int | None, place: Place, has_slope: bool, visit: Callable[[Line], None]
-    ) -> None:
-        """Call `visit` on the columns that may be seen: in a loop, or unrolled for a small texture."""
+    def columns(self, texture: NativeTexture, width: int | None, place: Place, has_slope: bool) -> Iterator[Line]:
+        """Write a loop, which the caller fills, over the columns that may be seen; unrolled for a small texture."""
         if width is None:
             span, x = self.seen(place.x, place.is_reached, texture.width)
             with self.loop(*span) as (index, _):
-                visit(self.line(index, x, texture.width, has_slope))
+                yield self.line(index, x, texture.width, has_slope)
         elif width == 1:
-            visit(Line(LONG(0), self.lanes.constant(1.0, self.real), None))
+            yield Line(LONG(0), self.lanes.constant(1.0, self.real), None)
         else:
-            for index in range(width):
-                visit(self.line(LONG(index), place.x, LONG(width), has_slope))
+            for k in range(width):
+                yield self.line(LONG(k), place.x, LONG(width), has_slope)
 
     def seen(
         self, places: ir.Value, is_reached: ir.Value, size: ir.Value
@@ -210,10 +195,12 @@ class TexelWriter(Writer):
         # Clipped, so that no lane reads outside the texture, even if it holds NaN.
         places = b.select(b.fcmp_ordered(">", places, number(0.0)), places, number(0.0))
         places = b.select(b.fcmp_ordered("<", places, most), places, most)
-        least = self.lanes.smallest(b.select(is_reached, places, most))
-        largest = self.lanes.largest(b.select(is_reached, places, number(0.0)))
+        least = self.lanes.fold(b.select(is_reached, places, most), self.lanes.smaller)
+        largest = self.lanes.fold(b.select(is_reached, places, number(0.0)), self.lanes.larger)
+        # The last texel with a weight is ⌊largest⌋ + 1.
         end = b.add(b.fptosi(largest, LONG), LONG(2))
         end = b.select(b.icmp_signed("<", end, size), end, size)
+        # Other lanes are composited too. They show nothing, as the cutoff says, if their values are averages of texels.
         moved = self.lanes.smaller(
             self.lanes.larger(places, self.lanes.broadcast(least)), self.lanes.broadcast(largest)
         )
@@ -229,6 +216,7 @@ class TexelWriter(Writer):
         # Beyond the last texel the texture is constant.
         is_last = b.icmp_signed("==", index, b.sub(size, LONG(1)))
         falling = self.lanes.broadcast(b.select(is_last, self.real(0.0), self.real(-1.0)))
+        # d(1 − |distance|)/dx: +1 before the texel, −1 from it on, as the cell of ⌊x⌋ has it.
         slope = b.select(b.fcmp_ordered("<", distance, number(0.0)), number(1.0), falling)
         is_in_cell = b.fcmp_ordered("<", distance, number(1.0)), b.fcmp_ordered(">=", distance, number(-1.0))
         return Line(index, weight, b.select(b.and_(*is_in_cell), slope, number(0.0)))
@@ -243,7 +231,15 @@ class TexelWriter(Writer):
 
     def add_sums(self, entry: ir.Value, vectors: Sequence[ir.Value]) -> None:
         """Add the sums over lanes of C vectors to a texel."""
-        sums = self.sums_over_lanes(vectors)
+        b = self.b
+        if len(vectors) == 4 and self.lanes.width % 4 == 0:
+            # A transposition of 4×4 lanes and L/4 − 1 additions, where four separate sums would take 4·log L steps.
+            total = functools.reduce(b.fadd, self.transpose_quarters(vectors))
+            sums = self.lanes.fold(total, b.fadd, 4)
+        else:
+            sums = ir.Constant(ir.VectorType(self.real, len(vectors)), ir.Undefined)
+            for k, vector in enumerate(vectors):
+                sums = b.insert_element(sums, self.lanes.sum(vector), INT(k))
         self.store(self.b.fadd(self.load(entry, 0, sums.type), sums), entry, 0)
 
     def accumulate(self, totals: Sequence[ir.Value], weight: ir.Value | None, numbers: Sequence[ir.Value]) -> None:
@@ -264,16 +260,6 @@ class TexelWriter(Writer):
     def loads(self, rooms: Sequence[ir.Value]) -> list[ir.Value]:
         """Load variables of one vector each."""
         return [self.b.load(room, typ=self.reals) for room in rooms]
-
-    def sums_over_lanes(self, vectors: Sequence[ir.Value]) -> ir.Value:
-        """Sum C vectors over their lanes; return one vector of the C sums."""
-        if len(vectors) == 4 and self.lanes.width % 4 == 0:
-            total = functools.reduce(self.b.fadd, self.transpose_quarters(vectors))
-            return self.lanes.fold(total, self.b.fadd, 4)
-        sums = ir.Constant(ir.VectorType(self.real, len(vectors)), ir.Undefined)
-        for k, vector in enumerate(vectors):
-            sums = self.b.insert_element(sums, self.lanes.sum(vector), INT(k))
-        return sums
 
     def transpose_quarters(self, vectors: Sequence[ir.Value]) -> list[ir.Value]:
         """Transpose every four lanes of four vectors as a 4×4 matrix."""

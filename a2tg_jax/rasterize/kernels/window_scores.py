@@ -1,9 +1,11 @@
-"""Scores of two images by windows, in plain array code: the average of a function of the means of x, y, x² + y², x·y.
+"""Scores of two images by windows: the average of a function of the means of x, y, x² + y² and x·y (SSIM).
 
-`native.ssim` has the same on CPUs, faster; `scores` chooses. Every derivative exists, in forward and reverse mode.
+Native loops compute them on CPUs (`native.ssim`), plain array code elsewhere. Every derivative exists, in forward and
+reverse mode; second ones are of plain array code.
 """
 
 import functools
+import importlib
 import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,8 +13,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+
+from a2tg_jax.rasterize.kernels.platforms import by_platform, is_available
 
 
 class Score(NamedTuple):
@@ -24,7 +29,55 @@ class Score(NamedTuple):
     """Weights of a window along one axis, symmetric."""
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def mean_score(score: Score, x: Array, y: Array) -> Array:
+    """Return the average over all windows of images [C, H, W]."""
+    mean: Array = by_platform(_code_of, ("mean_score", score), jax.ShapeDtypeStruct((), jnp.result_type(x, y)), x, y)
+    return mean
+
+
+@functools.partial(mean_score.defjvp, symbolic_zeros=True)
+def _mean_score_jvp(score: Score, primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+    value, *slopes = value_and_slopes(score, *primals)
+    # Mostly y is a photograph, whose tangent is zero: its slope is then not computed.
+    terms = [
+        jnp.sum(slope * tangent)
+        for slope, tangent in zip(slopes, tangents, strict=True)
+        if not isinstance(tangent, SymbolicZero)
+    ]
+    return value, sum(terms, jnp.zeros_like(value))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return the average, and its derivatives by x and y; under jit, XLA drops one that is not used."""
+    value = jax.ShapeDtypeStruct((), jnp.result_type(x, y))
+    slopes = (jax.ShapeDtypeStruct(image.shape, image.dtype) for image in (x, y))
+    found: tuple[Array, Array, Array] = by_platform(_code_of, ("value_and_slopes", score), (value, *slopes), x, y)
+    return found
+
+
+@value_and_slopes.defjvp
+def _value_and_slopes_jvp(score: Score, primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Any, Any]:
+    plain = functools.partial(plain_value_and_slopes, score)
+    return value_and_slopes(score, *primals), jax.jvp(plain, primals, tangents)[1]
+
+
+def _code_of(platform: str, name: str, score: Score) -> Callable[[Array, Array], Any]:
+    """Return a function of plain array code, or of `native.ssim` where native loops run and take the images."""
+
+    def code(x: Array, y: Array) -> Any:
+        plain = {"mean_score": plain_mean_score, "value_and_slopes": plain_value_and_slopes}[name]
+        if is_available("native", platform) and x.dtype == y.dtype and x.dtype in (jnp.float32, jnp.float64):
+            ssim = importlib.import_module(f"{__package__}.native.ssim")  # Here, where llvmlite is installed.
+            if x.shape[2] >= ssim.least_width(x.dtype, len(score.taps)):
+                return getattr(ssim, name)(score, x, y)
+        return plain(score, x, y)
+
+    return code
+
+
+def plain_mean_score(score: Score, x: Array, y: Array) -> Array:
     """Return the average over all windows of images [C, H, W]."""
     # The mean of y is blurred apart, so that no gradient is computed for it where y is constant. The two second moments
     # are needed only as their sum: four blurs instead of five.
@@ -33,9 +86,9 @@ def mean_score(score: Score, x: Array, y: Array) -> Array:
     return jnp.mean(score.function(mean_x, window_mean(y, score.taps), mean_squares, mean_product))
 
 
-def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Array]:
+def plain_value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Array]:
     """Return the average, and its derivatives by x and y."""
-    value, slopes = jax.value_and_grad(functools.partial(mean_score, score), argnums=(0, 1))(x, y)
+    value, slopes = jax.value_and_grad(functools.partial(plain_mean_score, score), argnums=(0, 1))(x, y)
     return value, *slopes
 
 
