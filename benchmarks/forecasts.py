@@ -73,7 +73,7 @@ def arguments_of(name: str, scenes: pathlib.Path, folder: pathlib.Path) -> list[
 
 def compare(name: str, arguments: list[str], peak: int) -> dict:
     """Return a case for the file: the forecast and the peak."""
-    record = cli.parsed("train", arguments).record
+    record = cli.parsed("train", arguments).whole_record
     phase, told = forecast_run(record.scene.load(), record.plan).peak
     ratio = round(told.total / peak, 3)
     return {"case": name, "phase": phase, **told._asdict(), "forecast": told.total, "peak": peak, "ratio": ratio}

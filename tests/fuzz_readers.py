@@ -227,7 +227,7 @@ def _record(folder: Path, file: Path) -> None:
     from a2tg_jax.results.folder import open_run
     from a2tg_jax.results.record import read_record
 
-    assert read_record(open_run(folder)).leaves()
+    assert read_record(open_run(folder)).systems
 
 
 def _marker(folder: Path, file: Path) -> None:
