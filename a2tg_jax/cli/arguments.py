@@ -57,8 +57,9 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: P
       SystemExit: after help (code 0) or an error (code 2), which tyro has printed.
       ValueError: if a URL is given where only paths on this machine work.
     """
-    for one in _nested(default or kind):
-        _fill_help(one)
+    if {"-h", "--help"} & set(arguments):  # It takes a second.
+        for one in _nested(default or kind):
+            _fill_help(one)
     rules = ConstructorRegistry()
     rules.primitive_rule(_optional_rule)
     about = inspect.getdoc(kind) or ""
