@@ -91,9 +91,8 @@ from .mesh.distance import (
 )
 from .mesh.extract import MeshResult as MeshResult, extract_mesh as extract_mesh
 from .mesh.files import save_mesh as save_mesh
-from .mesh.simplify import simplify_mesh as simplify_mesh
 from .mesh.texturing import texture_mesh as texture_mesh
-from .mesh.triangles import Mesh as Mesh
+from .mesh.triangles import Mesh as Mesh, simplify_mesh as simplify_mesh
 from .model import Model as Model, concatenate as concatenate
 from .rasterize.render_types import RenderOutput as RenderOutput, RenderSettings as RenderSettings
 from .render import (

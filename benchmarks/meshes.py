@@ -21,12 +21,8 @@ from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.core.similarity import transform_gaussians
 from a2tg_jax.data.synthetic import exact_points, still_life
 from a2tg_jax.host.machine import memory_peak
-from a2tg_jax.mesh.blocks import BlockGrid
-from a2tg_jax.mesh.depth_maps import rendered_depth
-from a2tg_jax.mesh.extract import GRID_BYTES
-from a2tg_jax.mesh.fusion import fuse
-from a2tg_jax.mesh.marching import surface_of
-from a2tg_jax.mesh.space import Space, common_sphere
+from a2tg_jax.mesh.extract import GRID_BYTES, common_sphere, surface_of
+from a2tg_jax.mesh.fusion import BlockGrid, Space, fuse, rendered_depth
 from a2tg_jax.renderer import Renderer
 
 SMALL = (160, 106)

@@ -23,7 +23,6 @@ from scipy.io import loadmat
 import a2tg_jax as a2tg
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.synthetic import exact_points
-from a2tg_jax.mesh.distance import thinned
 
 SPACING, THRESHOLD = 0.01, 0.02
 """Distance of points on the built-in scene, and largest distance that its F-score counts, in its metres."""
@@ -73,6 +72,15 @@ def synthetic_table(args: argparse.Namespace) -> str:
     return markdown(
         ["losses", "test PSNR", "accuracy, mm", "completeness, mm", "Chamfer, mm", "F-score", "faces"], rows
     )
+
+
+def thinned(points: np.ndarray, spacing: float, seed: int = 0) -> np.ndarray:
+    """Return points [P, 3] such that no two lie in one cube of side `spacing`."""
+    order = np.random.default_rng(seed).permutation(len(points))
+    cubes = np.floor(points[order] / spacing).astype(np.int64)
+    _, first = np.unique(cubes, axis=0, return_index=True)
+    kept: np.ndarray = points[order[np.sort(first)]]
+    return kept
 
 
 def _trained(args: argparse.Namespace, scene: a2tg.Scene, name: str, weights: Mapping[str, float]) -> a2tg.Model:

@@ -25,9 +25,8 @@ from a2tg_jax.cli.main import main
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import WHITE, Origin
 from a2tg_jax.finish import baking
-from a2tg_jax.finish.baking import as_plain, bake, kernels, split_splats
-from a2tg_jax.finish.distilling import distill, drawn_scene, likeness, pictures
-from a2tg_jax.finish.texel_choice import fewest_texels
+from a2tg_jax.finish.baking import as_plain, bake, distill, drawn_scene, kernels, likeness, pictures, split_splats
+from a2tg_jax.finish.shrinking import fewest_texels
 from a2tg_jax.results import conversion
 
 CAMERA = Camera(jnp.eye(4).at[2, 3].set(4), jnp.asarray([[60.0, 0, 24], [0, 60, 18], [0, 0, 1]]), 48, 36)
@@ -152,7 +151,7 @@ def test_training_draws_over_the_background_of_the_model(split):
 
 def test_growth_is_kept_where_degrees_differ(monkeypatch):
     monkeypatch.setattr(baking, "least_degree", lambda *_: 3)
-    monkeypatch.setattr(baking, "texel_weights_of", lambda model, *_: model.textures)
+    monkeypatch.setattr(baking, "texel_weights", lambda model, *_: model.textures)
     inner = textured(30, side=1)
     for model in (banded(inner), banded(Model(inner.gaussians))):
         baked = split_splats(model, [CAMERA], 1.6)

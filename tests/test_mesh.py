@@ -14,14 +14,10 @@ import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_points
 from a2tg_jax.io.other_programs import upright
 from a2tg_jax.mesh import distance
-from a2tg_jax.mesh.blocks import BlockGrid, unique_blocks
-from a2tg_jax.mesh.depth_maps import RenderedDepth
-from a2tg_jax.mesh.distance import thinned
+from a2tg_jax.mesh.extract import common_sphere, surface_of
 from a2tg_jax.mesh.files import mesh_files
-from a2tg_jax.mesh.fusion import fuse
-from a2tg_jax.mesh.marching import surface_of
-from a2tg_jax.mesh.raster import draw_view
-from a2tg_jax.mesh.space import Space, common_sphere
+from a2tg_jax.mesh.fusion import BlockGrid, RenderedDepth, Space, fuse
+from a2tg_jax.mesh.texturing import draw_view
 from a2tg_jax.mesh.triangles import largest_clusters
 from a2tg_jax.results import meshing
 
@@ -107,11 +103,10 @@ def test_far_surfaces_are_meshed_in_an_unbounded_space_only():
 
 def test_blocks_are_named_and_found():
     blocks = np.array([[0, 0, 0], [-1, 5, 7], [0, 0, 0], [-(1 << 21), 0, 0]])
-    different = unique_blocks(blocks)
-    assert sorted(map(tuple, different.tolist())) == [(-1, 5, 7), (0, 0, 0)]
     grid = BlockGrid(10**6)
-    assert sorted(grid.allocate(different)) == [0, 1] == sorted(grid.allocate(different))
-    assert grid.find(np.array([[9, 9, 9]]))[0] == -1 and grid.num == 2
+    assert list(grid.allocate(blocks)) == [0, 1] == list(grid.allocate(blocks))
+    assert grid.coordinates.tolist() == [[-1, 5, 7], [0, 0, 0]]
+    assert list(grid.find(np.array([[9, 9, 9], [0, 0, 0], [-1, 5, 7]]))) == [-1, 1, 0]
 
 
 def test_small_parts_are_dropped_and_counted(sphere):
@@ -142,7 +137,7 @@ def test_distances_of_two_planes():
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     lower, upper = a2tg.Mesh(square, faces), a2tg.Mesh(square + np.array([0, 0, 0.1]), faces)
-    points = [thinned(a2tg.sample_surface(mesh, 0.01), 0.005) for mesh in (lower, upper)]
+    points = [surface_quality.thinned(a2tg.sample_surface(mesh, 0.01), 0.005) for mesh in (lower, upper)]
     found = a2tg.surface_distance(*points, threshold=0.15)
     assert found.accuracy == pytest.approx(0.1, rel=0.01) and found.completeness == pytest.approx(0.1, rel=0.01)
     assert found.chamfer == pytest.approx(0.1, rel=0.01) and found.f_score == 1

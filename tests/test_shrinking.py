@@ -79,7 +79,7 @@ def test_no_more_is_lost_than_may_be(max_loss):
 
 def test_single_texels_go_into_their_gaussians():
     model = some_model()
-    step = halve_textures(model, texel_weights(model, views_of(model), BACKGROUND))
+    step = halve_textures(model, texel_weights(model, circle(4), BACKGROUND))
     is_single = (model.textures.sizes == 1).all(axis=1)
     after = taken(model, step, is_single)
     np.testing.assert_allclose(images_of(after), images_of(model), atol=1e-5)
@@ -92,8 +92,8 @@ def test_single_texels_go_into_their_gaussians():
 
 def test_the_cost_predicts_the_change_of_the_picture():
     model = some_model(2)
-    views = views_of(model) * 8  # many draws of signs
-    step = halve_textures(model, texel_weights(model, views, BACKGROUND))
+    cameras = circle(4) * 8  # Many draws of signs.
+    step = halve_textures(model, texel_weights(model, cameras, BACKGROUND))
     before, costs, changes = images_of(model), [], []
     for index in range(0, NUM, 3):
         is_chosen = np.arange(NUM) == index
@@ -106,8 +106,8 @@ def test_the_cost_predicts_the_change_of_the_picture():
 def test_weights_are_the_squared_slopes_of_the_picture():
     """Against finite differences, on one texture."""
     model = some_model(3)
-    views = views_of(model) * 50
-    weights = texture_arrays(texel_weights(model, views, BACKGROUND))[0] / 50
+    cameras = circle(4) * 50
+    weights = texture_arrays(texel_weights(model, cameras, BACKGROUND))[0] / 50
     texels = texture_arrays(model.textures)
     for place in [(1, 2, 0), (2, 1, 1), (1, 1, 3)]:
         images = []

@@ -18,8 +18,17 @@ from a2tg_jax.data import Scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import tuning
 from a2tg_jax.finish.compaction import Trial, loss_on_views
-from a2tg_jax.finish.rounding import GradualRounding, GridRounding, partly_rounded
-from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tuned, TunedFiles, smallest_tuned, tune_compact
+from a2tg_jax.finish.tuning import (
+    MOST_TUNINGS,
+    TUNED_LADDER,
+    GradualRounding,
+    GridRounding,
+    Tuned,
+    TunedFiles,
+    partly_rounded,
+    smallest_tuned,
+    tune_compact,
+)
 from a2tg_jax.io.compact import GROUPS, CompactChoices, decode_model, encode_model, grids_of, half_turned
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model

@@ -1,4 +1,4 @@
-"""Plain Gaussians in place of textured ones, for programs that know no textures.
+"""Plain Gaussians instead of textured ones, for programs without textures.
 
 Textures shrink where that changes pictures least, until a splat per texel makes few enough splats. Each textured
 Gaussian then becomes a grid of smaller ones in its plane: texel j of an axis takes the Gaussian with the mass, mean and
@@ -6,12 +6,13 @@ variance of w_j(u)·exp(−u²/2), w_j being the texel's bilinear kernel. The ke
 Gaussians add up to about the large one. Their opacities are such that their optical depths −log(1 − alpha) add up to
 that of the textured splat at each of their centres, with the kernel that it has; a splat of one texel becomes the
 Gaussian nearest to its kernel. Splats smaller than a pixel are still drawn a pixel wide. Training on pictures of the
-textured model, without photographs, therefore follows (`distilling`).
+textured model, without photographs, therefore follows.
 """
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -23,12 +24,19 @@ from a2tg_jax.appearance.parts import MAX_DEGREE, curves_of, falloff_of, nearest
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, floats_per_gaussian, logit, rotation_matrices
+from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.finish.distilling import distill, likeness, pictures
-from a2tg_jax.finish.shrinking import texel_weights_of
-from a2tg_jax.finish.texel_choice import Tables, fewest_texels
+from a2tg_jax.core.similarity import Similarity, camera_centers
+from a2tg_jax.data.assembly import scene_scale
+from a2tg_jax.data.scene import Scene, View
+from a2tg_jax.finish.shrinking import Tables, fewest_texels, texel_weights
 from a2tg_jax.io.other_programs import plain_gaussians
 from a2tg_jax.model import Model
+from a2tg_jax.renderer import Renderer
+from a2tg_jax.systems.baselines import Gaussians2d
+from a2tg_jax.training import fit_stage
+from a2tg_jax.training.fitting import BACKGROUNDS
+from a2tg_jax.training.stage import Background
 
 MOST_GROWTH = 2.0
 """Largest ratio of the bytes after baking to those before."""
@@ -38,14 +46,7 @@ MOST_VIEWS = 12
 LEAST_ALPHA, MOST_ALPHA = 1 / 255, 0.99
 """Alphas of splats: fainter ones are left out, others are at most so opaque."""
 SAME_PSNR = 38.0
-"""PSNR in dB beside the whole model above which higher degrees of spherical harmonics are left out."""
-
-
-class Kernels(NamedTuple):
-    """Gaussians along an axis that add up to exp(−u²/2), one for each of n texels."""
-
-    means: np.ndarray
-    scales: np.ndarray
+"""PSNR in dB against the whole model above which higher degrees of spherical harmonics are left out."""
 
 
 def bake(
@@ -79,16 +80,25 @@ def bake(
 
 def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Model:
     """Return a plain model with a splat per texel or fewer, without training. Arguments as in `bake`."""
+
+    def fitting(highest: int) -> tuple[int, int]:
+        """Return the highest degree with which a splat for each Gaussian stays within the growth, and how many do."""
+        # Degree 0 always does: no Gaussian of the model takes less.
+        for degree in range(highest, -1, -1):
+            most = int(growth * model.num_bytes / (BYTES_PER_FLOAT * floats_per_gaussian(degree)))
+            if most >= model.num or degree == 0:
+                break
+        return degree, most
+
     options = model.appearance.texture_options if model.appearance.is_portable else None
     if options is None or model.textures is None:
         whole = plain_gaussians(model)
-        degree = fitting_degree(model, whole.sh_degree, growth)
+        degree, _ = fitting(whole.sh_degree)
         return as_plain(dataclasses.replace(whole, sh=whole.sh[:, : NUM_BASES[degree]]), model)
-    degree = fitting_degree(model, least_degree(model, cameras), growth)
+    degree, most = fitting(least_degree(model, cameras))
     assert model.appearance.texture is not None
-    weights = texel_weights_of(model, cameras, model.background)
-    shown = model.appearance.texture.shown()
-    tables = fewest_texels(shown, weights, most_splats(model, degree, growth))
+    weights = texel_weights(model, cameras, model.background)
+    tables = fewest_texels(model.appearance.texture.shown(), weights, most)
     whole = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh[:, : NUM_BASES[degree]]))
     return as_plain(_split(whole, model.appearance.shapes, tables, options.uv), model)
 
@@ -98,31 +108,23 @@ def as_plain(gaussians: Gaussians, model: Model) -> Model:
     return Model(gaussians, background=model.background, origin=model.origin)
 
 
-def most_splats(model: Model, degree: int, growth: float) -> int:
-    """Return how many plain splats of a degree take at most `growth` times the bytes of a model (host)."""
-    return int(growth * model.num_bytes / (BYTES_PER_FLOAT * floats_per_gaussian(degree)))
-
-
-def fitting_degree(model: Model, highest: int, growth: float) -> int:
-    """Return the highest degree, at most `highest`, in which a splat for each Gaussian stays within the growth (host).
-
-    Degree 0 always does: no Gaussian of the model takes less.
-    """
-    return max((d for d in range(highest + 1) if most_splats(model, d, growth) >= model.num), default=0)
-
-
 def least_degree(model: Model, cameras: Sequence[Camera]) -> int:
     """Return the lowest degree of spherical harmonics with which pictures stay about the same (host)."""
     highest = model.gaussians.sh_degree if model.appearance.bands is None else MAX_DEGREE
-    if highest == 0:
-        return 0
-    wanted = list(pictures(model, cameras))
+    wanted = list(pictures(model, cameras)) if highest else []
     for degree in range(highest):
         sh = np.array(model.sh)
         sh[:, NUM_BASES[degree] :] = 0
         if likeness(pictures(model.with_sh(sh), cameras), wanted) > SAME_PSNR:
             return degree
     return highest
+
+
+class Kernels(NamedTuple):
+    """Gaussians along an axis that add up to exp(−u²/2), one for each of n texels."""
+
+    means: np.ndarray
+    scales: np.ndarray
 
 
 @functools.cache
@@ -145,42 +147,39 @@ def _weights(u: np.ndarray, num: int, convention: str) -> np.ndarray:
 def _split(gaussians: Gaussians, shapes: Array | None, tables: Tables, convention: str) -> Gaussians:
     """Return the Gaussians of all splats, given the shapes [N] of their kernels if they are not Gaussians."""
     pieces = []
-    for ids, texels in (_looked_up(*table, convention) for table in tables):
-        parents, own, size = gaussians[ids], None, texels.shape[1:3]
-        if shapes is not None:
-            own = np.asarray(shapes)[ids]
-            parents, own = (nearest_gaussians(parents, own), None) if size == (1, 1) else (parents, own)
-        pieces.append(_grid(parents, own, texels, kernels(size[0], convention), kernels(size[1], convention)))
+    for ids, texels in tables:
+        parents, own, size = gaussians[ids], None if shapes is None else np.asarray(shapes)[ids], texels.shape[1:3]
+        if own is not None and size == (1, 1):
+            parents, own = nearest_gaussians(parents, own), None
+        axes = [kernels(side, convention) for side in size]
+        weights = [_weights(axis.means, side, convention) for axis, side in zip(axes, size, strict=True)]
+        shown = np.einsum("ntsc,tv,su->nvuc", texels, *weights)  # At the centres of the splats.
+        pieces.append(_grid(parents, own, shown, *axes))
     joined: Gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *pieces)
     is_seen = np.asarray(joined.opacities) >= LEAST_ALPHA
     return joined[is_seen if is_seen.any() else slice(None)]
 
 
-def _looked_up(ids: np.ndarray, texels: np.ndarray, convention: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return textures [n, Tv, Tu, 4] at the centres of their splats in place of the texels."""
-    v, u = (_weights(kernels(size, convention).means, size, convention) for size in texels.shape[1:3])
-    found: np.ndarray = np.einsum("ntsc,tv,su->nvuc", texels, v, u)
-    return ids, found
-
-
-def _falloff(shapes: np.ndarray | None, rho: np.ndarray) -> np.ndarray:
-    """Return kernels of shapes [n] at squared distances [Tv, Tu], that of a Gaussian without shapes."""
-    if shapes is None:
-        return np.exp(-0.5 * rho)
-    return np.asarray(falloff_of(curves_of(jnp.asarray(shapes)[:, None, None]), jnp.asarray(rho)[None]), np.float64)
-
-
 def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: Kernels, u: Kernels) -> Gaussians:
-    """Return n·Tv·Tu Gaussians in place of n that show textures [n, Tv, Tu, 4] at their centres."""
+    """Return n·Tv·Tu Gaussians for n that show textures [n, Tv, Tu, 4] at their centres."""
     tv, tu = texels.shape[1:3]
     places, scales = (
         np.stack(np.broadcast_arrays(own_u[None, :], own_v[:, None]), -1).reshape(-1, 2)
         for own_u, own_v in zip(u, v, strict=True)
     )
-    opacities = np.asarray(parents.opacities, np.float64)[:, None, None]
-    shown = opacities * texels[..., 3] * _falloff(shapes, v.means[:, None] ** 2 + u.means[None, :] ** 2)
+    rho = v.means[:, None] ** 2 + u.means[None, :] ** 2
+    if shapes is None:
+        falloff = np.exp(-0.5 * rho)
+    else:
+        falloff = np.asarray(falloff_of(curves_of(jnp.asarray(shapes)[:, None, None]), jnp.asarray(rho)[None]), float)
+    shown = np.asarray(parents.opacities, np.float64)[:, None, None] * texels[..., 3] * falloff
     depths = -np.log1p(-np.clip(shown, 0, MOST_ALPHA))
-    own = np.einsum("vw,nwx,xu->nvu", _unmixed(v), depths, _unmixed(u).T)
+    # Each Gaussian reaches the centres of the others: the inverse of these shares, axis by axis, gives its own depth.
+    unmixed = [
+        np.linalg.inv(np.exp(-0.5 * ((axis.means[:, None] - axis.means[None, :]) / axis.scales[None, :]) ** 2))
+        for axis in (v, u)
+    ]
+    own = np.einsum("vw,nwx,xu->nvu", unmixed[0], depths, unmixed[1].T)
     alphas = np.clip(1 - np.exp(-np.maximum(own, 0)), 1e-6, MOST_ALPHA).reshape(-1)
     axes = np.asarray(rotation_matrices(parents.quats))[:, :, :2] * np.asarray(parents.scales)[:, None, :]
     means = np.asarray(parents.means)[:, None] + np.einsum("nxk,pk->npx", axes, places)
@@ -198,8 +197,51 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
     )
 
 
-def _unmixed(axis: Kernels) -> np.ndarray:
-    """Return the inverse of the matrix of each Gaussian of an axis at the centre of each."""
-    apart = (axis.means[:, None] - axis.means[None, :]) / axis.scales[None, :]
-    inverse: np.ndarray = np.linalg.inv(np.exp(-0.5 * apart**2))
-    return inverse
+# Training on pictures of another model
+
+
+def distill(
+    model: Model, wanted: Model, cameras: Sequence[Camera], *, iterations: int, progress: bool = False
+) -> Model:
+    """Return a plain model after training on pictures of another one; the number of Gaussians stays.
+
+    Both are drawn over black or white, whichever is nearer to the other model's background.
+
+    Args:
+      model: of plain Gaussians, in the world of the other.
+      wanted: any model.
+      cameras: views to draw, at least one.
+      iterations: each draws one view.
+      progress: show a progress bar.
+    """
+    highest = model.gaussians.sh_degree
+    behind: Background = "white" if np.mean(wanted.background) > 0.5 else "black"
+    system = Gaussians2d(stage1_iterations=1, stage2_iterations=iterations, sh_degree=highest, background=behind)
+    scene, start = drawn_scene(wanted, cameras, BACKGROUNDS[behind]), dataclasses.replace(model, origin=None)
+    trained = fit_stage(scene, system, 1, start, progress=progress, title="bake").model
+    return dataclasses.replace(trained, origin=wanted.origin)
+
+
+def drawn_scene(model: Model, cameras: Sequence[Camera], background: Color) -> Scene:
+    """Return a scene whose photographs are pictures of a model over a background (host)."""
+    drawn = (np.rint(255 * image).astype(np.uint8) for image in pictures(model, cameras, background))
+    views = tuple(View(str(index), *pair) for index, pair in enumerate(zip(cameras, drawn, strict=True)))
+    points = np.asarray(model.gaussians.means, np.float32)
+    world = Similarity(1.0, np.eye(3), np.zeros(3)) if model.origin is None else model.origin.transform
+    centers = camera_centers(np.array([camera.viewmat for camera in cameras], np.float64))
+    # Cameras in one place have no extent: the distance of what they see takes its place.
+    scale = scene_scale(centers) or float(np.median(np.linalg.norm(points - centers[0], axis=1)))
+    return Scene("drawn", views, (), points, np.zeros_like(points), world, scale)
+
+
+def pictures(model: Model, cameras: Sequence[Camera], background: Color | None = None) -> Iterator[np.ndarray]:
+    """Yield the pictures [H, W, 3] of a model over its own background or another, clipped to [0, 1] (host)."""
+    renderer = Renderer(model, cameras=cameras, background=background, has_geometry=False)
+    for camera in cameras:
+        yield np.clip(np.asarray(renderer(camera).color), 0, 1)
+
+
+def likeness(found: Iterable[np.ndarray], wanted: Iterable[np.ndarray]) -> float:
+    """Return the PSNR in dB of pictures against others, from the mean of their squared errors; at most 100."""
+    error = np.mean([np.mean((x - y) ** 2) for x, y in zip(found, wanted, strict=True)])
+    return -10 * math.log10(max(float(error), 1e-10))

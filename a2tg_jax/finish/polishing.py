@@ -7,7 +7,6 @@ colours, and its transpose is the backward pass.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -66,24 +65,37 @@ def polish(
       views: training views.
       num_steps: number of steps of conjugate gradients; each draws every view forwards and backwards. Few steps
         regularise, many overfit the training views.
-      ridge: weight of the squared changes beside the squared error, summed over pixels.
+      ridge: weight of the squared changes besides the squared error, summed over pixels.
       background: [3] colour; None is the model's own.
 
     Raises:
       ValueError: if there is no view, or a picture is not linear in the appearance parameters.
     """
-    _check(model, views)
+    check_kind("model", model, Model, "say polish(model, scene.train)")
+    check_are_views(views, "polish(model, scene.train)")
+    if not views:
+        raise ValueError("views must hold at least one view; got none")
+    if not model.appearance.is_linear:
+        raise ValueError(
+            f"a picture is not linear in the colours of {in_words(model.appearance)}: Gaussians with or without "
+            "textures of signed RGB can be polished"
+        )
     model = model.live
-    background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
+    dtype = model.gaussians.means.dtype
+    background = jnp.asarray(model.background if background is None else background, dtype)
     settings = plan_render(model, [view.camera for view in views])
-    groups = _stacked(views, background)
-    changes = _jitted()(model, groups, background, settings, num_steps, ridge)
+    groups = [
+        Targets(
+            jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),
+            jnp.stack([jnp.asarray(view.camera.K, dtype) for view in own]),
+            jnp.stack([jnp.asarray(view_image(view, np.asarray(background)), dtype) for view in own]),
+            jnp.asarray(counted_pixels(own), dtype),
+            None if own[0].camera.rays is None else jnp.asarray(own[0].camera.rays, dtype),
+        )
+        for own in views_by_kind(views)
+    ]
+    changes = jax.jit(_solve, static_argnums=(3, 4))(model, groups, background, settings, num_steps, ridge)
     return with_colors(model, jax.tree.map(jnp.add, colors_of(model), changes))
-
-
-@functools.cache
-def _jitted() -> jax.stages.Wrapped:
-    return jax.jit(_solve, static_argnums=(3, 4))
 
 
 def _solve(
@@ -95,38 +107,31 @@ def _solve(
     ridge: ArrayLike,
 ) -> Colors:
     """Return the changes of the colours."""
+    nothing = jax.tree.map(jnp.zeros_like, colors_of(model))
 
-    def over_views(function: Callable[[Camera, Targets], Colors]) -> Colors:
-        """Return the sum over all views of a function of camera and photograph."""
-        total: Colors = jax.tree.map(jnp.zeros_like, colors_of(model))
+    def pulled(residual: Callable[[Camera, Targets], Array]) -> Colors:
+        """Return the sum over all views of the transpose of `draw_change`, of the weighted images of a function."""
+        total: Colors = nothing
         for group in groups:
-            height, width = group.images.shape[1:3]
 
-            seen = functools.partial(Camera, width=width, height=height, rays=group.rays)
-
-            def step(total: Colors, view: Targets, seen: Callable[..., Camera] = seen) -> tuple[Colors, None]:
-                return jax.tree.map(jnp.add, total, function(seen(view.viewmats, view.Ks), view)), None
+            def step(total: Colors, view: Targets, rays: Array | None = group.rays) -> tuple[Colors, None]:
+                height, width = view.images.shape[:2]
+                camera = Camera(view.viewmats, view.Ks, width, height, rays)
+                _, back = jax.vjp(lambda change: draw_change(model, change, camera, settings), nothing)
+                return jax.tree.map(jnp.add, total, back(view.weights * residual(camera, view))[0]), None
 
             total, _ = jax.lax.scan(step, total, group._replace(rays=None))
         return total
 
-    def right(camera: Camera, view: Targets) -> Colors:
-        residual = view.images - _drawn(model, camera, background, settings)
-        return _transpose(model, camera, settings, view.weights * residual)
+    def missing(camera: Camera, view: Targets) -> Array:
+        output, _ = render_traced(model.gaussians, camera, model.appearance, background, settings, has_geometry=False)
+        return view.images - output.color
 
     def normal(change: Colors) -> Colors:
-        def of_view(camera: Camera, view: Targets) -> Colors:
-            return _transpose(model, camera, settings, view.weights * draw_change(model, change, camera, settings))
+        return pulled(lambda camera, _: draw_change(model, change, camera, settings))
 
-        return over_views(of_view)
-
-    changes: Colors = solve_cg(normal, over_views(right), ridge=ridge, maxiter=num_steps, tol=0.0)
+    changes: Colors = solve_cg(normal, pulled(missing), ridge=ridge, maxiter=num_steps, tol=0.0)
     return changes
-
-
-def _drawn(model: Model, camera: Camera, background: Array, settings: RenderSettings) -> Array:
-    output, _ = render_traced(model.gaussians, camera, model.appearance, background, settings, has_geometry=False)
-    return output.color
 
 
 def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSettings) -> Array:
@@ -140,14 +145,6 @@ def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSe
     return output.color
 
 
-def _transpose(model: Model, camera: Camera, settings: RenderSettings, image: Array) -> Colors:
-    """Return the transpose of `draw_change`, of an image."""
-    nothing = jax.tree.map(jnp.zeros_like, colors_of(model))
-    _, back = jax.vjp(lambda change: draw_change(model, change, camera, settings), nothing)
-    transposed: Colors = back(image)[0]
-    return transposed
-
-
 def colors_of(model: Model) -> Colors:
     """Return the colours, in which a picture of the model is linear."""
     tables = model.appearance.coefficients, model.textures
@@ -157,40 +154,11 @@ def colors_of(model: Model) -> Colors:
 
 def with_colors(model: Model, colors: Colors) -> Model:
     """Return the model with other colours; alpha textures stay."""
-    gaussians = dataclasses.replace(model.gaussians, sh=colors.sh)
-    model = dataclasses.replace(model, gaussians=gaussians)
-    if (coefficients := model.appearance.coefficients) is not None:
-        appearance = model.appearance.with_coefficients(dataclasses.replace(coefficients, buckets=colors.bands))
-        model = dataclasses.replace(model, appearance=appearance)
-    if model.textures is None:
-        return model
-    pairs = zip(colors.rgb, model.textures.buckets, strict=True)
-    buckets = tuple(jnp.concatenate([rgb, old[..., 3:]], -1) for rgb, old in pairs)
-    return model.with_textures(dataclasses.replace(model.textures, buckets=buckets))
-
-
-def _check(model: Model, views: Sequence[View]) -> None:
-    check_kind("model", model, Model, "say polish(model, scene.train)")
-    check_are_views(views, "polish(model, scene.train)")
-    if not views:
-        raise ValueError("views must hold at least one view; got none")
-    if not model.appearance.is_linear:
-        raise ValueError(
-            f"a picture is not linear in the colours of {in_words(model.appearance)}: Gaussians with or without "
-            "textures of signed RGB can be polished"
-        )
-
-
-def _stacked(views: Sequence[View], background: Array) -> list[Targets]:
-    """Return the views, one stack for each image size and lens, in the dtype of the background."""
-    color, dtype = np.asarray(background), background.dtype
-    return [
-        Targets(
-            jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),
-            jnp.stack([jnp.asarray(view.camera.K, dtype) for view in own]),
-            jnp.stack([jnp.asarray(view_image(view, color), dtype) for view in own]),
-            jnp.asarray(counted_pixels(own), dtype),
-            None if own[0].camera.rays is None else jnp.asarray(own[0].camera.rays, dtype),
-        )
-        for own in views_by_kind(views)
-    ]
+    gaussians, appearance = dataclasses.replace(model.gaussians, sh=colors.sh), model.appearance
+    if (table := appearance.coefficients) is not None:
+        appearance = appearance.with_coefficients(dataclasses.replace(table, buckets=colors.bands))
+    if (textures := appearance.textures) is not None:
+        pairs = zip(colors.rgb, textures.buckets, strict=True)
+        buckets = tuple(jnp.concatenate([rgb, old[..., 3:]], -1) for rgb, old in pairs)
+        appearance = appearance.with_textures(dataclasses.replace(textures, buckets=buckets))
+    return dataclasses.replace(model, gaussians=gaussians, appearance=appearance)

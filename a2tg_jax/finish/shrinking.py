@@ -1,16 +1,16 @@
-"""Shrinking of textures where it costs next to nothing: the reverse of upscaling, for finished models.
+"""Smaller textures where that changes pictures least: the reverse of upscaling, for finished models.
 
-A texture is halved along the side where its pairs of texels differ least, weighted by h. A texture of one texel is only
-another colour and opacity, and merges into those of its Gaussian. Rounds of the cheapest steps per byte are taken, as
-many as a loss of PSNR on given views allows.
+A texture is halved along the side where its pairs of texels differ less, weighted by h. h is the visibility of a texel,
+Σ over pixels and views of (∂picture/∂texel)², by Hutchinson's estimator with a vector of random signs for each view.
+Changing texels by δ then changes the squared error by about Σ h·δ².
 
-h is the visibility of a texel, Σ over pixels and views of (∂picture/∂texel)², by Hutchinson's estimator with a vector
-of random signs for each view. Changing texels by δ then changes the squared error by about Σ h·δ².
+`shrink_textures` takes rounds of the cheapest steps per byte, as many as a loss of PSNR on given views allows. Textures
+of one texel, which are only another colour and opacity, merge into their Gaussians. `fewest_texels` takes as many steps
+as a number of texels needs.
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -36,6 +36,8 @@ LEAST_OPACITY = 1e-4
 """Largest opacity of a Gaussian after absorbing a texel's alpha: its logit must be finite."""
 LEAST_SAVED = 0.005
 """Smallest share of a model's bytes that a round must save for another one."""
+LEAST_WEIGHT = 1e-9
+"""Visibility of texels that no view sees; it keeps means finite."""
 
 
 def shrink_textures(
@@ -55,25 +57,6 @@ def shrink_textures(
     Raises:
       ValueError: if there are no views, the loss is negative, or the model has no such textures.
     """
-    _check(model, views, max_loss)
-    model = model.live
-    background = model.background if background is None else background
-    loss = loss_on_views(model, views, background=background)
-    while True:
-        shrunk = _shrunk_once(model, views, background, lambda found: loss(found) <= max_loss)
-        saved = model.num_bytes - shrunk.num_bytes
-        model = shrunk
-        if saved < LEAST_SAVED * model.num_bytes:
-            return model
-
-
-def can_shrink(model: Model) -> bool:
-    """Return whether the model has textures that can shrink: signed RGB and projected alpha."""
-    options = model.appearance.texture_options if model.appearance.is_portable else None
-    return options is not None and options.rgb == "signed" and options.alpha == "projected"
-
-
-def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
     check_is_model(model)
     check_are_views(views, "shrink_textures(model, scene.train)")
     if not views:
@@ -84,34 +67,21 @@ def _check(model: Model, views: Sequence[View], max_loss: float) -> None:
         raise ValueError(
             f"{in_words(model.appearance)} cannot shrink: only textures with signed RGB and projected alpha can"
         )
+    model = model.live
+    background = model.background if background is None else background
+    loss, cameras = loss_on_views(model, views, background=background), [view.camera for view in views]
+    while True:
+        step = halve_textures(model, texel_weights(model, cameras, background))
+        shrunk = _cheapest(model, step, lambda found: loss(found) <= max_loss)
+        saved, model = model.num_bytes - shrunk.num_bytes, shrunk
+        if saved < LEAST_SAVED * model.num_bytes:
+            return model
 
 
-def _shrunk_once(
-    model: Model, views: Sequence[View], background: ArrayLike | None, is_allowed: Callable[[Model], bool]
-) -> Model:
-    """Return the model after the cheapest allowed steps, at most one for each texture."""
-    step = halve_textures(model, texel_weights(model, views, background))
-    saved = step.saved
-    order = np.argsort(step.cost / np.maximum(saved, 1), kind="stable")
-    order = order[saved[order] > 0]
-
-    def after(count: int) -> Model:
-        is_chosen = np.zeros(model.num, bool)
-        is_chosen[order[:count]] = True
-        return taken(model, step, is_chosen)
-
-    # The most steps that are allowed, by bisection: what is lost grows with their number.
-    least, most, best = 0, len(order), model
-    while least < most:
-        middle = (least + most + 1) // 2
-        found = after(middle)
-        if is_allowed(found):
-            least, best = middle, found
-        else:
-            most = middle - 1
-        if most - least < LEAST_SAVED * len(order):
-            break
-    return best
+def can_shrink(model: Model) -> bool:
+    """Return whether the model has textures that can shrink: signed RGB and projected alpha."""
+    options = model.appearance.texture_options if model.appearance.is_portable else None
+    return options is not None and options.rgb == "signed" and options.alpha == "projected"
 
 
 class Step(NamedTuple):
@@ -126,120 +96,87 @@ class Step(NamedTuple):
     """[N] bytes."""
 
 
+def _cheapest(model: Model, step: Step, is_allowed: Callable[[Model], bool]) -> Model:
+    """Return the model after the cheapest steps per byte, as many as are allowed."""
+    order = np.argsort(step.cost / np.maximum(step.saved, 1), kind="stable")
+    order = order[step.saved[order] > 0]
+    # By bisection: what is lost grows with the number of steps.
+    least, most, best = 0, len(order), model
+    while least < most:
+        middle = (least + most + 1) // 2
+        is_chosen = np.zeros(model.num, bool)
+        is_chosen[order[:middle]] = True
+        found = taken(model, step, is_chosen)
+        if is_allowed(found):
+            least, best = middle, found
+        else:
+            most = middle - 1
+        if most - least < LEAST_SAVED * len(order):
+            break
+    return best
+
+
 def halve_textures(model: Model, weights: Textures) -> Step:
-    """Return all textures halved along the cheaper side, and single texels merged (host).
+    """Return all textures halved along the cheaper even side, and single texels merged (host).
 
     Args:
       model: with textures.
       weights: h of every texel, in the layout of the model.
     """
     assert model.textures is not None
-    textures = model.textures
+    textures, gaussians = model.textures, model.gaussians
     old_sizes, cost = textures.sizes, np.zeros(textures.num)
-    sizes = old_sizes.copy()
-    pieces = []
-    for index, (tv, tu) in enumerate(textures.bucket_sizes):
-        ids = np.flatnonzero(np.asarray(textures.bucket) == index)
-        rows = np.asarray(textures.row)[ids]
+    sizes, single = old_sizes.copy(), np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
+    pieces: Tables = []
+    for index, size in enumerate(textures.bucket_sizes):
+        ids, rows = _rows_of(textures, index)
         old, own = (np.asarray(tree.buckets[index])[rows] for tree in (textures, weights))
-        choices = [_halved_along(old, own, axis) for axis, side in ((1, tv), (2, tu)) if side > 1 and side % 2 == 0]
-        if (tv, tu) == (1, 1):
-            sizes[ids] = 0
-        elif choices:
-            costs = np.stack([own_cost for _, own_cost in choices])
-            best = costs.argmin(axis=0)
-            cost[ids] = costs.min(axis=0)
-            for place, (smaller, _) in enumerate(choices):
-                is_own = best == place
-                sizes[ids[is_own]] = smaller.shape[1:3]
-                pieces.append((ids[is_own], smaller[is_own]))
-        else:
+        axes = [axis for axis, side in enumerate(size, 1) if side > 1 and side % 2 == 0]
+        if size == (1, 1):
+            sizes[ids], single[ids] = 0, old[:, 0, 0]
+        elif not axes:
             pieces.append((ids, old))
-    new = _filled(sizes, pieces, textures.buckets[0].dtype)
-    saved = BYTES_PER_TEXEL * (old_sizes.prod(axis=1) - sizes.prod(axis=1))
-    return Step(_with_single_texels(model), new, cost, saved)
-
-
-def _halved_along(texels: np.ndarray, weights: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return textures [n, Tv, Tu, 4] with weighted means of pairs along an axis, and the cost [n] of each."""
-    pairs = texels.reshape(*texels.shape[:axis], -1, 2, *texels.shape[axis + 1 :])
-    own = weights.reshape(pairs.shape) + 1e-9
-    means = (own * pairs).sum(axis=axis + 1) / own.sum(axis=axis + 1)
-    error = own * (pairs - np.expand_dims(means, axis + 1)) ** 2
-    return means.astype(texels.dtype), error.sum(axis=tuple(range(1, error.ndim)))
-
-
-def _with_single_texels(model: Model) -> Gaussians:
-    """Return the Gaussians after absorbing the colour and opacity of textures of one texel."""
-    gaussians, textures = model.gaussians, model.textures
-    assert textures is not None
-    texels = np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
-    if (1, 1) in textures.bucket_sizes:
-        index = textures.bucket_sizes.index((1, 1))
-        ids = np.flatnonzero(np.asarray(textures.bucket) == index)
-        texels[ids] = np.asarray(textures.buckets[index])[np.asarray(textures.row)[ids], 0, 0]
+        for chosen, smaller, _, costs in _halved(ids, old, own + LEAST_WEIGHT, axes):
+            sizes[chosen], cost[chosen] = smaller.shape[1:3], costs
+            pieces.append((chosen, smaller))
     sh = np.array(gaussians.sh, np.float64)
-    sh[:, 0] += texels[:, :3] / SH_C0
-    opacities = np.clip(np.asarray(gaussians.opacities, np.float64) * texels[:, 3], LEAST_OPACITY, 1 - LEAST_OPACITY)
-    logits = np.where(texels[:, 3] == 1, np.asarray(gaussians.logit_opacities), np.log(opacities / (1 - opacities)))
+    sh[:, 0] += single[:, :3] / SH_C0
+    opacities = np.clip(np.asarray(gaussians.opacities, np.float64) * single[:, 3], LEAST_OPACITY, 1 - LEAST_OPACITY)
+    logits = np.where(single[:, 3] == 1, np.asarray(gaussians.logit_opacities), np.log(opacities / (1 - opacities)))
     dtype = gaussians.means.dtype
-    return dataclasses.replace(gaussians, sh=jnp.asarray(sh, dtype), logit_opacities=jnp.asarray(logits, dtype))
+    absorbed = dataclasses.replace(gaussians, sh=jnp.asarray(sh, dtype), logit_opacities=jnp.asarray(logits, dtype))
+    saved = BYTES_PER_TEXEL * (old_sizes.prod(axis=1) - sizes.prod(axis=1))
+    return Step(absorbed, _textures_of(sizes, pieces, textures.buckets[0].dtype), cost, saved)
 
 
 def taken(model: Model, step: Step, is_chosen: np.ndarray) -> Model:
     """Return the model in which the chosen Gaussians [N] have taken their step (host)."""
     old = model.textures
     assert old is not None
-    sizes = np.where(is_chosen[:, None], step.textures.sizes, old.sizes)
-    pieces = []
+    sizes, pieces = np.where(is_chosen[:, None], step.textures.sizes, old.sizes), []
     for textures, is_from in ((old, ~is_chosen), (step.textures, is_chosen)):
         for index, bucket in enumerate(textures.buckets):
-            ids = np.flatnonzero(is_from & (np.asarray(textures.bucket) == index))
-            pieces.append((ids, np.asarray(bucket)[np.asarray(textures.row)[ids]]))
-    textures = _filled(sizes, pieces, old.buckets[0].dtype)
+            ids, rows = _rows_of(textures, index)
+            pieces.append((ids[is_from[ids]], np.asarray(bucket)[rows[is_from[ids]]]))
 
     def chosen(before: Array, after: Array) -> Array:
         return jnp.where(is_chosen.reshape(-1, *[1] * (before.ndim - 1)), after, before)
 
     gaussians = jax.tree.map(chosen, model.gaussians, step.gaussians)
-    return dataclasses.replace(model, gaussians=gaussians).with_textures(textures)
+    new = _textures_of(sizes, pieces, old.buckets[0].dtype)
+    return dataclasses.replace(model, gaussians=gaussians).with_textures(new)
 
 
-def _filled(sizes: np.ndarray, pieces: Sequence[tuple[np.ndarray, np.ndarray]], dtype: np.dtype[Any]) -> Textures:
-    """Return textures of the given sizes [N, 2] from pieces: Gaussians and their texels [n, Tv, Tu, 4] of one size."""
-    empty = allocate_textures(sizes, dtype=dtype)
-    buckets, rows = [np.array(bucket) for bucket in empty.buckets], np.asarray(empty.row)
-    for ids, texels in pieces:
-        if len(ids):
-            buckets[empty.bucket_sizes.index(texels.shape[1:3])][rows[ids]] = texels
-    return dataclasses.replace(empty, buckets=tuple(map(jnp.asarray, buckets)))
-
-
-def texel_weights(model: Model, views: Sequence[View], background: ArrayLike | None) -> Textures:
-    """Return h of every texel in some views, whose photographs are not used. Arguments as in `texel_weights_of`."""
-    return texel_weights_of(model, [view.camera for view in views], background)
-
-
-def texel_weights_of(model: Model, cameras: Sequence[Camera], background: ArrayLike | None) -> Textures:
-    """h of every texel, in the layout of the model (host).
-
-    Args:
-      model: with textures.
-      cameras: views in which texels are visible.
-      background: [3] colour.
-    """
+def texel_weights(model: Model, cameras: Sequence[Camera], background: ArrayLike) -> Textures:
+    """Return h of every texel in some views over a background [3], in the layout of the model (host)."""
     assert model.textures is not None
     settings = plan_render(model, cameras)
     background = jnp.asarray(background, model.gaussians.means.dtype)
     total = tuple(map(jnp.zeros_like, model.textures.buckets))
+    weights_in = jax.jit(_weights_in, static_argnums=(4,))
     for index, camera in enumerate(cameras):
-        total = jax.tree.map(jnp.add, total, _jitted()(model, camera, background, jax.random.key(index), settings))
+        total = jax.tree.map(jnp.add, total, weights_in(model, camera, background, jax.random.key(index), settings))
     return dataclasses.replace(model.textures, buckets=total)
-
-
-@functools.cache
-def _jitted() -> jax.stages.Wrapped:
-    return jax.jit(_weights_in, static_argnums=(4,))
 
 
 def _weights_in(
@@ -257,3 +194,115 @@ def _weights_in(
     color, back = jax.vjp(draw, textures.buckets)
     (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
     return tuple(map(jnp.square, slopes))
+
+
+# Textures of few texels in all
+
+Tables = list[tuple[np.ndarray, np.ndarray]]
+"""Indices [n] of Gaussians, and their textures [n, Tv, Tu, C]; one table or more for each size."""
+
+
+def fewest_texels(textures: Textures, weights: Textures, most: int) -> Tables:
+    """Return textures that have `most` texels at most in all, at least one each, a table for each size (host).
+
+    Each texture has a row of halvings down to one texel. Of all rows together, those are taken that change least per
+    texel saved.
+
+    Args:
+      textures: of N Gaussians; empty ones become a neutral texel.
+      weights: the visibility of each texel, as `texel_weights` gives it.
+      most: at least N.
+    """
+    start: Tables = []
+    for index, size in enumerate(textures.bucket_sizes):
+        ids, rows = _rows_of(textures, index)
+        own = np.tile(np.asarray([*NEUTRAL_TEXEL, LEAST_WEIGHT]), (len(ids), 1, 1, 1))
+        if min(size) > 0:
+            texels, squares = (np.asarray(tree.buckets[index], np.float64)[rows] for tree in (textures, weights))
+            # The visibility becomes a fifth channel, which is added up where texels are joined.
+            own = np.concatenate([texels, squares.sum(axis=-1, keepdims=True) + LEAST_WEIGHT], axis=-1)
+        start.append((ids, own))
+    start = tables = _merged(start)
+    steps: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int),) * 4]
+    least, number = np.zeros(textures.num), 0
+    while tables := [table for table in tables if table[1].shape[1:3] != (1, 1)]:
+        smaller: Tables = []
+        for ids, texels in tables:
+            for chosen, halved, cost in _halved_table(ids, texels):
+                saved = texels[0, ..., 0].size - halved[0, ..., 0].size
+                # A step that follows a costlier one is never taken before it.
+                least[chosen] = np.maximum(least[chosen], cost / saved)
+                smaller.append((chosen, halved))
+                steps.append((chosen, np.full(len(chosen), number), least[chosen], np.full(len(chosen), saved)))
+        tables, number = _merged(smaller), number + 1
+    ids, numbers, costs, saved_texels = (np.concatenate(parts) for parts in zip(*steps, strict=True))
+    order = np.lexsort((numbers, costs))
+    excess = sum(texels[..., 0].size for _, texels in start) - most
+    count = int(np.searchsorted(np.cumsum(saved_texels[order]), excess)) + 1 if excess > 0 else 0
+    rounds, tables = np.bincount(ids[order[:count]], minlength=textures.num), start
+    for index in range(int(rounds.max(initial=0))):
+        moved: Tables = []
+        for ids, texels in tables:
+            is_own = rounds[ids] > index
+            moved.append((ids[~is_own], texels[~is_own]))
+            moved += [(chosen, halved) for chosen, halved, _ in _halved_table(ids[is_own], texels[is_own])]
+        tables = _merged(moved)
+    return [(ids, texels[..., :4]) for ids, texels in tables]
+
+
+def _merged(tables: Tables) -> Tables:
+    """Return one table for each size, ascending."""
+    by_size: dict[Any, Tables] = {}
+    for ids, texels in tables:
+        if len(ids):
+            by_size.setdefault(texels.shape[1:3], []).append((ids, texels))
+    columns = [zip(*by_size[size], strict=True) for size in sorted(by_size)]
+    return [(np.concatenate(ids), np.concatenate(texels)) for ids, texels in columns]
+
+
+def _halved_table(ids: np.ndarray, texels: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield indices, halved textures [n, Tv, Tu, 5] and costs of a table, by the side that is halved."""
+    axes = [axis for axis in (1, 2) if texels.shape[axis] > 1]
+    for chosen, smaller, weights, cost in _halved(ids, texels[..., :4], texels[..., 4:], axes):
+        yield chosen, np.concatenate([smaller, weights], axis=-1), cost
+
+
+# What both share
+
+
+def _rows_of(textures: Textures, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Gaussians of a bucket, and their rows in it."""
+    ids = np.flatnonzero(np.asarray(textures.bucket) == index)
+    return ids, np.asarray(textures.row)[ids]
+
+
+def _halved(
+    ids: np.ndarray, texels: np.ndarray, weights: np.ndarray, axes: Sequence[int]
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Halve textures [n, Tv, Tu, 4] along the axis where that costs less; an odd last texel stays.
+
+    Yields, for each axis that was chosen, the indices, weighted means of pairs, sums of their weights, and costs.
+    """
+    choices = []
+    for axis in axes if len(ids) else ():
+        size = texels.shape[axis]
+        starts = np.arange(0, size, 2)
+        sums = np.add.reduceat(weights, starts, axis=axis)
+        means = np.add.reduceat(weights * texels, starts, axis=axis) / sums
+        error = weights * (texels - np.take(means, np.arange(size) // 2, axis=axis)) ** 2
+        choices.append((means, sums, error.sum(axis=(1, 2, 3))))
+    costs = np.asarray([cost for *_, cost in choices])
+    for place, parts in enumerate(choices):
+        if (is_own := costs.argmin(axis=0) == place).any():
+            means, sums, cost = (part[is_own] for part in parts)
+            yield ids[is_own], means, sums, cost
+
+
+def _textures_of(sizes: np.ndarray, pieces: Iterable[tuple[np.ndarray, np.ndarray]], dtype: np.dtype[Any]) -> Textures:
+    """Return textures of the given sizes [N, 2] from pieces: Gaussians and their texels [n, Tv, Tu, 4] of one size."""
+    empty = allocate_textures(sizes, dtype=dtype)
+    buckets, rows = [np.array(bucket) for bucket in empty.buckets], np.asarray(empty.row)
+    for ids, texels in pieces:
+        if len(ids):
+            buckets[empty.bucket_sizes.index(texels.shape[1:3])][rows[ids]] = texels
+    return dataclasses.replace(empty, buckets=tuple(map(jnp.asarray, buckets)))

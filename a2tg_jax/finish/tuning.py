@@ -1,7 +1,9 @@
 """Training of a finished model while its numbers are rounded to the grids of a compact file: fewer bits then suffice.
 
-Gradually more numbers are rounded, and the others make up for it (`finish.rounding`). The file keeps the grids that
-training knew: it holds the tuned model up to the last digit of a float32.
+Rounding all numbers in each step, with gradients that pass straight through, helps little: numbers whose optimum lies
+between two steps jump from one to the other until the end. Here more and more numbers stay rounded. Those that are not
+yet rounded follow exact gradients and make up for it. The file keeps the grids of the training: it holds the tuned
+model up to the last digit of a float32.
 """
 
 import dataclasses
@@ -9,25 +11,41 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import in_words, template_of
+from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MAX_DEGREE, MOST_SHARE
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.pytree import pytree
+from a2tg_jax.core.gaussians import Gaussians, logit
+from a2tg_jax.core.numerics import normalize
+from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.data.scene import Scene
+from a2tg_jax.events import Change, Now, StepEvent
 from a2tg_jax.finish.compaction import LADDER, Ladder, Loss, TooMuchLostError, Trial, smallest_within
-from a2tg_jax.finish.rounding import GradualRounding, GridRounding
-from a2tg_jax.io.compact import CompactChoices, Grids, decode_model, encode_model, grids_of, half_turned
+from a2tg_jax.io.columns import LEAST_OPACITY
+from a2tg_jax.io.compact import (
+    CompactChoices,
+    Grids,
+    decode_model,
+    encode_model,
+    grids_of,
+    half_turned,
+)
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.training import DivergedError, Stage, System, fit_stage
 from a2tg_jax.training.corrections import Correction
 
 ITERATIONS = 1000
+LAST_ROUNDED = 0.95
+"""Share of a training after which all numbers are rounded."""
+KEY_OF_TIMES = 0x6121D
 RATE_OF_MEANS = 0.3
 """Factor of the means' learning rate, which has decayed by the time a model is finished."""
 FIRST_TOLERANCE = 0.5
@@ -49,6 +67,160 @@ TUNED_LADDER: Ladder = MappingProxyType({group: (*COARSER.get(group, ()), *steps
 """Candidate precisions of each group of a model that is tuned, from coarse to fine."""
 
 
+# Rounding to the grids of a file, as writing and reading it does (`io.compact`), but traced and with rows in order
+
+
+class Steps(NamedTuple):
+    """Even steps from the first one on, of numbers x or of asinh((x − centre) / spread) (`io.columns.AxisSteps`)."""
+
+    first: Any
+    size: Any
+    last: Any
+    """Number of the last step, from 0."""
+    contraction: tuple[Any, ...]
+    """Centre and spread, or ()."""
+
+    @classmethod
+    def of(cls, ends: Sequence[float], bits: int) -> Self:
+        """Return 2^bits steps between two ends, or one if the ends are equal; centre and spread may come before."""
+        *contraction, low, high = ends
+        last = (1 << bits) - 1
+        size, last = ((high - low) / last, last) if high > low else (1.0, 0)
+        return cls(low, size, last, tuple(contraction))
+
+    def nearest(self, values: Array) -> Array:
+        """Return the nearest step to each number."""
+        if self.contraction:
+            centre, spread = self.contraction
+            contracted = self._replace(contraction=()).nearest(jnp.arcsinh((values - centre) / spread))
+            nearest: Array = centre + spread * jnp.sinh(contracted)
+        else:
+            nearest = self.first + self.size * jnp.round(jnp.clip((values - self.first) / self.size, 0, self.last))
+        return nearest.astype(values.dtype)
+
+
+@pytree
+class GridRounding:
+    """Rounding to the grids of a compact file, for models that `half_turned` made: no splat is turned again."""
+
+    steps: dict[str, Any]
+    """Steps by the name of the part of the file; a part kept as floats has none. Means have three, by axis."""
+
+    @classmethod
+    def to(cls, grids: Grids, choices: CompactChoices) -> Self:
+        """Return the rounding to given grids (host).
+
+        Args:
+          grids: ends of the groups that are kept in bits (`io.compact.grids_of`).
+          choices: the bits.
+        """
+        steps: dict[str, Any] = {}
+        for name, ends in grids.items():
+            bits = choices.of_part(name)
+            assert isinstance(bits, int)
+            axes = [Steps.of(ends[at : at + 4], bits) for at in (0, 4, 8)] if name == "means" else []
+            steps[name] = tuple(axes) or Steps.of(ends, bits)
+        return cls(steps)
+
+    def __call__(self, model: Model) -> Model:
+        """Return the model that the file holds, its rows in their order; traced."""
+        gaussians, shown, steps = model.gaussians, model.appearance, self.steps
+
+        def nearest(name: str, values: Array) -> Array:
+            return steps[name].nearest(values) if name in steps else values
+
+        def bands(blocks: Array, first: int) -> Array:
+            """Round blocks [M, K, 3] of the bands from degree `first` on, each by itself."""
+            rounded, start = [blocks[:, :0]], 0
+            for degree in range(first, MAX_DEGREE + 1):
+                if start < blocks.shape[1]:
+                    rounded.append(nearest(f"sh_{degree}", blocks[:, start : start + 2 * degree + 1]))
+                    start += 2 * degree + 1
+            return jnp.concatenate(rounded, axis=1)
+
+        def texels(bucket: Array) -> Array:
+            parts = nearest("texel_colors", bucket[..., :3]), nearest("texel_alphas", bucket[..., 3:])
+            return jnp.concatenate(parts, axis=-1)
+
+        means, quats, logits = gaussians.means, gaussians.quats, gaussians.logit_opacities
+        if "means" in steps:
+            means = jnp.stack([own.nearest(means[:, axis]) for axis, own in enumerate(steps["means"])], 1)
+        if "quats" in steps:
+            quats = _with_w(nearest("quats", _xyz(quats)))
+        if "opacities" in steps:
+            opacities = nearest("opacities", jax.nn.sigmoid(logits))
+            logits = logit(jnp.clip(opacities, LEAST_OPACITY, 1 - LEAST_OPACITY))
+        log_scales = nearest("log_scales", gaussians.log_scales)
+        if (table := shown.coefficients) is not None:
+            buckets = tuple(bands(blocks, gaussians.sh_degree + 1) for blocks in table.buckets)
+            shown = shown.with_coefficients(dataclasses.replace(table, buckets=buckets))
+        if (textures := shown.textures) is not None:
+            shown = shown.with_textures(dataclasses.replace(textures, buckets=tuple(map(texels, textures.buckets))))
+        if shown.shapes is not None and "shapes" in steps:
+            shares = nearest("shapes", LARGEST_LOG_EXPONENT * jnp.tanh(shown.shapes)) / LARGEST_LOG_EXPONENT
+            shown = shown.with_shapes(jnp.arctanh(jnp.clip(shares, -MOST_SHARE, MOST_SHARE)))
+        rounded = Gaussians(means, quats, log_scales, logits, bands(gaussians.sh, 0))
+        return dataclasses.replace(model, gaussians=rounded, appearance=shown)
+
+
+def _xyz(quats: Array) -> Array:
+    """Return the last three numbers [N, 3] of rotations as unit quaternions of which no w is negative."""
+    unit = normalize(quats)
+    return unit[:, 1:] * jnp.where(unit[:, :1] < 0, -1, 1)
+
+
+def _with_w(xyz: Array) -> Array:
+    """Return unit quaternions [N, 4] from their last three numbers (`io.columns.with_w`)."""
+    w = jnp.sqrt(jnp.maximum(1 - jnp.sum(xyz**2, axis=1, keepdims=True), 0))
+    return normalize(jnp.concatenate([w, xyz], axis=1))
+
+
+@pytree
+class GradualRounding(StepEvent):
+    """Rounding of more and more numbers, each from a random time on, until all of them are rounded.
+
+    A number is rounded after every later iteration too, so that it leaves its step of the grid only if an update is
+    larger than half a step.
+    """
+
+    rounding: GridRounding
+
+    num_keys = 0
+
+    def init(self, model: Model) -> Model:
+        """Return the time of each number, as a share of the iterations before all are rounded."""
+        leaves, tree = jax.tree.flatten(partition(model)[0])
+        keys = jax.random.split(jax.random.key(KEY_OF_TIMES), len(leaves))
+        times = [jax.random.uniform(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
+        of_numbers: Model = jax.tree.unflatten(tree, times)
+        return of_numbers
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: Model) -> Change:
+        share = now.iteration.astype(float) / (LAST_ROUNDED * now.num_iterations.astype(float))
+        is_rounded = jax.tree.map(lambda time: time < share, state)
+        return Change(partly_rounded(self.rounding, model, is_rounded), moments, state)
+
+
+def partly_rounded(rounding: GridRounding, model: Model, is_rounded: Model) -> Model:
+    """Return the model with some numbers rounded; traced.
+
+    Args:
+      rounding: of all numbers.
+      model: as `half_turned` gives it, with numbers that may have changed since.
+      is_rounded: bool, in the shapes of the model's floats; w of a quaternion follows from its other numbers.
+    """
+    (rounded, _), (before, rest) = partition(rounding(model)), partition(model)
+    chosen: Model = jax.tree.map(jnp.where, is_rounded, rounded, before)
+    if "quats" in rounding.steps:
+        pair = _xyz(rounded.gaussians.quats), _xyz(before.gaussians.quats)
+        quats = _with_w(jnp.where(is_rounded.gaussians.quats[:, 1:], *pair))
+        chosen = dataclasses.replace(chosen, gaussians=dataclasses.replace(chosen.gaussians, quats=quats))
+    return combine(chosen, rest)
+
+
+# Training with rounding
+
+
 @dataclasses.dataclass(frozen=True)
 class Tuned:
     """A model whose numbers lie on the grids of a compact file."""
@@ -61,10 +233,6 @@ class Tuned:
     def data(self) -> bytes:
         """The file, as `save_compact` writes it with these choices and grids."""
         return encode_model(self.model, self.choices, self.grids)
-
-
-Tune = Callable[[Model, CompactChoices, int], Tuned]
-"""Tunes a model for choices, given the number of the tuning, from 1."""
 
 
 def tune_compact(
@@ -82,7 +250,7 @@ def tune_compact(
         tuned = tune_compact(model, scene, system, CompactChoices(quats=5))
         save_compact("scene.a2tgz", tuned.model, choices=tuned.choices, grids=tuned.grids)
 
-    Losses, learning rates and corrections are those of the system's last stage; the rates fall to a tenth, and
+    Losses, learning rates and corrections are taken from the system's last stage; the rates fall to a tenth, and
     corrections stay as they are. Groups kept as floats are trained without rounding.
 
     Args:
@@ -103,14 +271,24 @@ def tune_compact(
     _check(model, stage, iterations)
     start = dataclasses.replace(half_turned(model), origin=model.origin)
     grids = grids_of(start, choices)
-    rounding = GradualRounding(GridRounding.to(grids, choices))
-    tuning = _tuning(system, dataclasses.replace(stage, events=(rounding,), iterations=iterations))
-    found = fit_stage(scene, tuning, 0, start, progress=progress, title=title).model
+    tuning = dataclasses.replace(
+        stage,
+        name="tuning",
+        iterations=iterations,
+        rates=dataclasses.replace(stage.rates, means=RATE_OF_MEANS * stage.rates.means),
+        events=(GradualRounding(GridRounding.to(grids, choices)),),
+        corrections=tuple(map(_Constant, stage.corrections)),
+        raises_sh_degree=False,
+        cools_down=True,
+    )
+    shared = {field.name: getattr(system, field.name) for field in dataclasses.fields(System)}
+    one_stage = _OneStage(**shared | {"memory_budget": None}, stage=tuning)
+    found = fit_stage(scene, one_stage, 0, start, progress=progress, title=title).model
     return Tuned(dataclasses.replace(found, origin=start.origin), choices, grids)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Tuning(System):
+class _OneStage(System):
     """The options that all systems have, with a given stage."""
 
     stage: Stage
@@ -120,17 +298,6 @@ class _Tuning(System):
 
     def check(self) -> None:
         self.stage.check()
-
-
-def _tuning(system: System, stage: Stage) -> _Tuning:
-    """Return the options of a system with a stage whose rates fall and whose corrections stay."""
-    rates = dataclasses.replace(stage.rates, means=RATE_OF_MEANS * stage.rates.means)
-    corrections = tuple(map(_Constant, stage.corrections))
-    stage = dataclasses.replace(
-        stage, name="tuning", rates=rates, corrections=corrections, raises_sh_degree=False, cools_down=True
-    )
-    shared = {field.name: getattr(system, field.name) for field in dataclasses.fields(System)}
-    return _Tuning(**shared | {"memory_budget": None}, stage=stage)
 
 
 @pytree
@@ -190,6 +357,10 @@ class TunedFiles(NamedTuple):
     """The model of that file."""
     diverged: str | None = None
     """Error that ended the search; None: it came to its end."""
+
+
+Tune = Callable[[Model, CompactChoices, int], Tuned]
+"""Tunes a model for choices, given the number of the tuning, from 1."""
 
 
 def smallest_tuned(

@@ -88,12 +88,3 @@ def sample_surface(mesh: Mesh, spacing: float, seed: int = 0) -> np.ndarray:
         weights = np.stack([1 - a[part], a[part] * (1 - b[part]), a[part] * b[part]], -1)
         points[part] = np.einsum("pk,pkc->pc", weights, mesh.vertices[mesh.faces[chosen[part]]])
     return points
-
-
-def thinned(points: np.ndarray, spacing: float, seed: int = 0) -> np.ndarray:
-    """Return points [P, 3] such that no two lie in one cube of side `spacing`."""
-    order = np.random.default_rng(seed).permutation(len(points))
-    cubes = np.floor(points[order] / spacing).astype(np.int64)
-    _, first = np.unique(cubes, axis=0, return_index=True)
-    kept: np.ndarray = points[order[np.sort(first)]]
-    return kept

@@ -1,21 +1,24 @@
 """Extraction of a mesh from a model: depths of views, their fusion, marching cubes, and cleaning (host)."""
 
 import dataclasses
-import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.capture_geometry import nearest_point
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.host.text import counted
-from a2tg_jax.mesh.blocks import BlockGrid, GridFullError
-from a2tg_jax.mesh.depth_maps import RenderedDepth, rendered_depth
-from a2tg_jax.mesh.fusion import fuse
-from a2tg_jax.mesh.marching import surface_of
-from a2tg_jax.mesh.space import RADII, Space, common_sphere
+from a2tg_jax.mesh.fusion import SIDE, VOXELS, BlockGrid, GridFullError, Space, fuse, rendered_depth
 from a2tg_jax.mesh.triangles import Mesh, largest_clusters
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
@@ -25,9 +28,15 @@ RESOLUTION = 512
 """Default number of voxels along the radius."""
 GRID_BYTES = 4 * 10**9
 """Default memory budget of the voxels."""
+RADII = 2.0
+"""Default radius, in median distances of the cameras from the centre."""
 LEAST_WEIGHT = 0.05
 MOST_CLUSTERS, LEAST_FACES = 50, 50
 """Default of the connected parts that are kept, as in 2DGS."""
+BRICK = 16
+"""Blocks along a side of a brick, for which marching cubes run at once."""
+SAME = 1e-3
+"""Distance in voxels of vertices that two bricks share."""
 
 
 class NoSurfaceError(ValueError):
@@ -36,10 +45,8 @@ class NoSurfaceError(ValueError):
     def __init__(self, radius: float, num_dropped: int, least_faces: int):
         """Keep the radius in units of the model's world, and how many parts had fewer than the least faces."""
         self.radius, self.num_dropped, self.least_faces = radius, num_dropped, least_faces
-        what, advice = self.told(), "give a larger radius, or unbounded"
-        if num_dropped:
-            advice = "raise the resolution, or lower least_faces"
-        super().__init__(f"{what}: {advice}")
+        advice = "raise the resolution, or lower least_faces" if num_dropped else "give a larger radius, or unbounded"
+        super().__init__(f"{self.told()}: {advice}")
 
     def told(self, scale: float = 1.0) -> str:
         """Return what happened, with lengths divided by `scale`."""
@@ -89,9 +96,8 @@ def extract_mesh(
 ) -> MeshResult:
     """Return the surface of a model as triangles, by fusion of rendered depths and marching cubes (2DGS).
 
-    Each view is rendered, and its depths are fused into a truncated signed distance function on sparse voxels. A depth
-    is the mean of the splats that a ray meets. It counts less where they lie apart, in inverse proportion to its
-    variance. Small connected parts are removed.
+    The depths of each view are fused into a truncated signed distance function on sparse voxels. A depth is the mean of
+    the splats that a ray meets, and counts less where they lie apart. Small connected parts are removed.
 
         result = a2tg.extract_mesh(model, resolution=256)
         a2tg.save_mesh("scene.glb", result.mesh, model.origin.transform)
@@ -100,15 +106,13 @@ def extract_mesh(
       model: a model of any appearance.
       cameras: the views to fuse; None takes the training views that the model was trained on.
       resolution: number of voxels along the radius, 512 by default.
-      voxel: side of a voxel in units of the model's world, in place of the resolution.
-      center: [3] centre of the space; None is the point nearest to all optical axes.
-      radius: radius of the space in units of the model's world; None is twice the median distance of the cameras from
-        the centre.
-      unbounded: go on beyond the radius, with voxels that grow in proportion to their distance.
+      voxel: side of a voxel in units of the model's world, instead of the resolution.
+      center, radius: the space to fuse, in the model's world; None is the point nearest to all optical axes, and twice
+        the median distance of the cameras from there.
+      unbounded: extend the space beyond the radius, with voxels that grow in proportion to their distance.
       least_weight: voxels of no larger weight have no surface. One view of a sharp depth has a weight of 1.
-      most_clusters: largest number of connected parts to keep.
-      least_faces: smallest number of triangles of a part.
-      max_bytes: memory budget of the voxels. Beside them, extraction needs memory for one view and for the mesh.
+      most_clusters, least_faces: largest number of connected parts to keep, and smallest number of triangles of one.
+      max_bytes: memory budget of the voxels. Extraction also needs memory for one view and for the mesh.
       settings: static options of the renderer.
       progress: show a progress bar.
 
@@ -130,32 +134,31 @@ def extract_mesh(
         raise ValueError(f"max_bytes must be positive and finite; got {max_bytes}")
     if most_clusters < 1:
         raise ValueError(f"most_clusters must be at least 1; got {most_clusters}")
-    renderer = Renderer(model, cameras=cameras, settings=settings)
-    if center is None or radius is None:
-        center, radius = _sphere(renderer, cameras, center, radius)
+    renderer, depths_of = Renderer(model, cameras=cameras, settings=settings), jax.jit(rendered_depth)
+    own_center, own_radius = common_sphere([camera.viewmat for camera in cameras])
+    if not own_radius:  # Cameras at one place look at what lies at the median depth of the first.
+        depth = np.asarray(depths_of(renderer(cameras[0]), cameras[0]).depth)
+        middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+        own_center += middle * np.asarray(cameras[0].viewmat, np.float64)[2, :3]
+        own_radius = RADII * middle
+    center = own_center if center is None else np.asarray(center, np.float64)
+    radius = own_radius if radius is None else radius
     voxel = radius / (resolution or RESOLUTION) if voxel is None else voxel
-    space = Space.of(center, radius, voxel, unbounded)
-    grid = _fused(renderer, cameras, space, max_bytes, progress)
-    mesh, num_dropped = largest_clusters(surface_of(grid, space, least_weight), most_clusters, least_faces)
-    if not mesh.num_faces:
-        raise NoSurfaceError(radius, num_dropped, least_faces)
-    seconds = time.perf_counter() - start
-    return MeshResult(mesh, np.asarray(center), radius, voxel, len(cameras), num_dropped, grid.num_bytes, seconds)
-
-
-def _fused(renderer: Renderer, cameras: Sequence[Camera], space: Space, max_bytes: int, progress: bool) -> BlockGrid:
-    """Return the voxels of all views."""
-    grid = BlockGrid(max_bytes)
+    space, grid = Space.of(center, radius, voxel, unbounded), BlockGrid(max_bytes)
     for index, camera in enumerate(progress_over(cameras, "fusing", "view", is_shown=progress)):
         try:
-            fuse(grid, _depths(renderer, camera), space)
+            fuse(grid, depths_of(renderer(camera), camera), space)
         except GridFullError:
             raise GridFullError(
-                f"a resolution of {float(space.radius / space.voxel):.0f} voxels along the radius takes more than "
+                f"a resolution of {radius / voxel:.0f} voxels along the radius takes more than "
                 f"{max_bytes / 1e9:.3g} GB after {index + 1} of {len(cameras)} views: lower the resolution or the "
                 "radius, or raise max_bytes"
             ) from None
-    return grid
+    mesh, num_dropped = largest_clusters(surface_of(grid, space, least_weight), most_clusters, least_faces)
+    if not mesh.num_faces:
+        raise NoSurfaceError(radius, num_dropped, least_faces)
+    facts = center, radius, voxel, len(cameras), num_dropped, grid.num_bytes
+    return MeshResult(mesh, *facts, seconds=time.perf_counter() - start)
 
 
 def training_cameras(model: Model) -> list[Camera]:
@@ -177,26 +180,85 @@ def check_lengths(resolution: int | None, voxel: float | None, radius: float | N
             raise ValueError(f"{name} must be positive and finite; got {value}")
 
 
-def _depths(renderer: Renderer, camera: Camera) -> RenderedDepth:
-    return _jitted_depths()(renderer(camera), camera)
+def common_sphere(viewmats: ArrayLike) -> tuple[np.ndarray, float]:
+    """Return centre [3] and radius of the sphere that cameras [V, 4, 4] look at.
 
-
-def _sphere(
-    renderer: Renderer, cameras: Sequence[Camera], center: np.ndarray | None, radius: float | None
-) -> tuple[np.ndarray, float]:
-    """Return centre and radius that the cameras tell, where they are not given.
-
-    Cameras at one place look at what lies at the median depth of the first.
+    The centre is the point nearest to all optical axes, the radius twice the median distance of the cameras from it.
     """
-    viewmats = np.stack([np.asarray(camera.viewmat, np.float64) for camera in cameras])
-    own, reach = common_sphere(viewmats)
-    if not reach:
-        depth = np.asarray(_depths(renderer, cameras[0]).depth)
-        middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
-        own, reach = own + middle * viewmats[0, 2, :3], RADII * middle
-    return (own if center is None else np.asarray(center, np.float64)), reach if radius is None else radius
+    viewmats = np.asarray(viewmats, np.float64)
+    centers = camera_centers(viewmats)
+    center = nearest_point(centers, viewmats[:, 2, :3]) if len(viewmats) > 1 else centers[0]
+    return center, float(RADII * np.median(np.linalg.norm(centers - center, axis=1)))
 
 
-@functools.cache
-def _jitted_depths() -> Callable[..., RenderedDepth]:
-    return jax.jit(rendered_depth)
+# Marching cubes over sparse voxels
+
+
+def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh:
+    """Return the surface where the mean signed distance is zero, with colours.
+
+    Args:
+      grid: fused views.
+      space: the space of its voxels.
+      least_weight: voxels of no larger weight are unknown, and their cells have no surface.
+    """
+    parts = list(_parts(grid, least_weight))
+    if not parts:
+        return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
+    starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts[:-1])])
+    vertices = np.concatenate([vertices for vertices, _, _ in parts])
+    faces = np.concatenate([faces + start for (_, faces, _), start in zip(parts, starts, strict=True)])
+    colors = np.concatenate([colors for _, _, colors in parts])
+    # Vertices on the border of bricks become one, and faces between such vertices vanish.
+    side = BRICK * SIDE
+    on_border = np.flatnonzero((np.abs(vertices - side * np.rint(vertices / side)) < SAME).any(axis=1))
+    pairs = on_border[cKDTree(vertices[on_border]).query_pairs(SAME, output_type="ndarray")] if len(on_border) else []
+    if len(pairs):
+        graph = coo_matrix((np.ones(len(pairs), bool), tuple(np.transpose(pairs))), [len(vertices)] * 2)
+        _, labels = connected_components(graph, directed=False)
+        _, first = np.unique(labels, return_index=True)
+        a, b, c = labels[faces].T
+        vertices, colors = vertices[first], colors[first]
+        faces = labels[faces][(a != b) & (b != c) & (a != c)]
+    positions = np.asarray(space.positions(jnp.asarray(vertices, jnp.float32)))
+    return Mesh(positions, faces.astype(np.int32), colors)
+
+
+def _parts(grid: BlockGrid, least_weight: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield vertices in voxels, faces and colours of each brick that has a surface."""
+    from skimage import measure
+
+    marching_cubes: Any = measure.marching_cubes
+    # The cells at a brick's end need the first voxels of the next bricks.
+    blocks = np.stack(np.meshgrid(*[np.arange(BRICK + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    for brick in np.unique(grid.coordinates // BRICK, axis=0):
+        rows = grid.find(brick * BRICK + blocks)
+        found = np.flatnonzero(rows >= 0)
+        rows = rows[found]
+        weight = grid.weight[rows]
+        known = weight > least_weight
+        mean = np.where(known, grid.distance[rows] / np.where(known, weight, 1.0), 1.0)
+        distance, is_known = _dense(mean.astype(np.float32), found, 1.0), _dense(known, found, False)
+        for axis in range(3):  # A cell is known if its eight corners are, and is named by its last corner.
+            is_known &= np.roll(is_known, 1, axis)
+            is_known[(slice(None),) * axis + (0,)] = False
+        if not is_known.any() or not distance.min() < 0 < distance.max():
+            continue
+        try:
+            vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=is_known, gradient_direction="descent")
+        except RuntimeError:  # No cell has a surface.
+            continue
+        color = np.rint(255 * np.clip(grid.color[rows].astype(np.float32), 0, 1)).astype(np.uint8)
+        nearest = tuple(np.rint(vertices).astype(int).T)
+        yield vertices.astype(np.float64) + brick * (BRICK * SIDE), faces, _dense(color, found, 0)[nearest]
+
+
+def _dense(values: np.ndarray, places: np.ndarray, empty: float) -> np.ndarray:
+    """Return blocks of values [B, VOXELS, ...] as one array of a brick's voxels and the first ones of the next."""
+    num, channels = BRICK + 1, values.shape[2:]
+    whole = np.full((num**3, VOXELS, *channels), empty, values.dtype)
+    whole[places] = values
+    whole = whole.reshape(num, num, num, SIDE, SIDE, SIDE, *channels)
+    whole = whole.transpose(0, 3, 1, 4, 2, 5, *range(6, whole.ndim)).reshape(*[num * SIDE] * 3, *channels)
+    end = BRICK * SIDE + 1
+    return whole[:end, :end, :end]

@@ -1,10 +1,12 @@
-"""Fusion of depth maps into sparse voxels: truncated signed distances, their mean over the views, and colours.
+"""Fusion of rendered depths into sparse voxels: truncated signed distances, their mean over the views, and colours.
 
-The distance is that from the surface's plane, by the normal of the render. A view counts where it faces the surface and
-its depths are sure: its weight falls with the spread of a depth.
+A render has the sums Σ w·z and Σ w·z² of its splats, so that a depth is a mean with a spread. At an edge, or in a cloud
+of splats, the spread is large, and the mean lies between surfaces. A view therefore counts where it faces the surface
+and its depths are sure. The distance is measured from the surface's plane, by the normal of the render.
 """
 
-import functools
+import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,112 +14,238 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.mesh.blocks import LOCAL, SIDE, VOXELS, BlockGrid, unique_blocks
-from a2tg_jax.mesh.depth_maps import RenderedDepth
-from a2tg_jax.mesh.space import TRUNCATION, Space
+from a2tg_jax.core.numerics import normalize
+from a2tg_jax.core.pytree import pytree
+from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import back_project
 
+TRUNCATION = 5.0
+"""Truncation of signed distances in voxels."""
 SURE = 0.5
 """Spread of a depth, in truncations, that halves its weight."""
-NOWHERE = -(2**31)
-"""Coordinate of blocks of pixels without a depth."""
-CHUNK = 64
-"""Blocks that are fused at a time: few, so that they stay in the cache."""
 OFFSETS = np.linspace(-TRUNCATION, TRUNCATION, 5).tolist()
 """Places along a ray around its depth, in voxels, whose blocks exist."""
+FARTHEST = 1e3
+"""Largest distance from the centre in an unbounded space, in radii."""
+LEAST_FACING = 0.1
+"""Smallest cosine between a ray and a normal; smaller ones count as this."""
+LEAST_ALPHA = 0.5
+"""Smallest alpha of a pixel that has a depth."""
+SIDE = 8
+"""Voxels along a side of a block."""
+VOXELS = SIDE**3
+BYTES_PER_BLOCK = VOXELS * (3 * 4 + 3 * 2)
+LOCAL = np.stack(np.meshgrid(*[np.arange(SIDE, dtype=np.int32)] * 3, indexing="ij"), -1).reshape(-1, 3)
+"""[VOXELS, 3] voxels within a block."""
+LIMIT = 1 << 20
+"""Bound of block coordinates: three of them fit into a key of 63 bits."""
+NOWHERE = -(2**31)
+"""Coordinate of blocks of pixels without a depth, beyond the bound."""
+CHUNK = 64
+"""Blocks that are fused at a time: few, so that they stay in the cache."""
 
-Voxels = tuple[Array, Array, Array, Array]
-"""Distances, weights, colours and colour weights of some blocks."""
+
+@pytree
+class Space:
+    """The space that voxels divide: even within a radius, and coarser with the distance beyond.
+
+    Voxel i [3] lies at y = voxel·i, relative to the centre. Within the radius R, x = y. Beyond it, an unbounded space
+    has |x| = R·exp(|y|/R - 1) in the same direction: voxels grow in proportion to their distance, as pixels do.
+    """
+
+    center: Array
+    """[3] position of voxel 0."""
+    radius: Array
+    """[] radius within which voxels are even."""
+    voxel: Array
+    """[] side of a voxel within the radius."""
+    is_unbounded: bool = dataclasses.field(default=False, metadata={"static": True})
+    """Whether the space goes on beyond the radius."""
+
+    @staticmethod
+    def of(center: np.ndarray, radius: float, voxel: float, is_unbounded: bool) -> "Space":
+        """Make a space from numbers of the host."""
+        return Space(jnp.asarray(center, jnp.float32), jnp.float32(radius), jnp.float32(voxel), is_unbounded)
+
+    def positions(self, indices: Array) -> Array:
+        """Return positions [P, 3] of voxels in the world; indices may be fractions."""
+        offset = indices.astype(jnp.float32) * self.voxel
+        if self.is_unbounded:
+            ratio = jnp.maximum(jnp.linalg.norm(offset, axis=-1, keepdims=True) / self.radius, 1.0)
+            offset = offset * (jnp.exp(ratio - 1) / ratio)
+        return self.center[None] + offset
+
+    def indices(self, points: Array) -> Array:
+        """Return the indices [P, 3] of positions, as fractions; the inverse of `positions`."""
+        offset = points - self.center[None]
+        if self.is_unbounded:
+            ratio = jnp.maximum(jnp.linalg.norm(offset, axis=-1, keepdims=True) / self.radius, 1.0)
+            offset = offset * ((1 + jnp.log(ratio)) / ratio)
+        return offset / self.voxel
+
+    def radii(self, points: Array) -> Array:
+        """Return the distances [P] of positions from the centre, in radii."""
+        distance: Array = jnp.linalg.norm(points - self.center[None], axis=-1)
+        return distance / self.radius
+
+    def scale(self, points: Array) -> Array:
+        """Return the size [P] of voxels at positions, relative to those within the radius."""
+        ratio = self.radii(points)
+        return jnp.maximum(ratio, 1.0) if self.is_unbounded else jnp.ones_like(ratio)
+
+    def contains(self, points: Array) -> Array:
+        """Return [P] whether positions lie within the space."""
+        return self.radii(points) <= (FARTHEST if self.is_unbounded else 1.0)
+
+
+class GridFullError(ValueError):
+    """The memory budget has no room for the voxels."""
+
+
+class BlockGrid:
+    """Truncated signed distances and colours of voxels, with their weights, in blocks of 8 × 8 × 8 near surfaces.
+
+    A block has integer coordinates [3]: its voxels are 8·block to 8·block + 7. Memory is reserved for as many blocks as
+    the budget has room for, and used as blocks are made.
+    """
+
+    def __init__(self, max_bytes: int):
+        """Make an empty grid with a memory budget."""
+        self.capacity = max(1, int(max_bytes) // BYTES_PER_BLOCK)
+        self.distance = np.zeros((self.capacity, VOXELS), np.float32)
+        """Weighted sums of distances, in units of the truncation."""
+        self.weight = np.zeros((self.capacity, VOXELS), np.float32)
+        """Sums of weights."""
+        self.color = np.zeros((self.capacity, VOXELS, 3), np.float16)
+        """Mean colours."""
+        self.color_weight = np.zeros((self.capacity, VOXELS), np.float32)
+        """Sums of the weights of colours."""
+        self.coordinates = np.zeros((0, 3), np.int32)
+        self._rows: dict[int, int] = {}
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of the blocks that exist."""
+        return len(self._rows) * BYTES_PER_BLOCK
+
+    def find(self, blocks: np.ndarray) -> np.ndarray:
+        """Return the rows [B] of blocks [B, 3]; -1 where there is none."""
+        return np.asarray([self._rows.get(key, -1) for key in _keys_of(blocks).tolist()], np.int64)
+
+    def allocate(self, blocks: np.ndarray) -> np.ndarray:
+        """Return the rows of the different blocks among blocks [P, 3], after making new ones; far ones are left out.
+
+        Raises:
+          GridFullError: if the memory budget has no room for them.
+        """
+        if len(blocks):  # Neighbouring pixels mostly repeat a block, and sorting is slow.
+            blocks = blocks[np.r_[True, (blocks[1:] != blocks[:-1]).any(axis=1)]]
+        keys = np.unique(_keys_of(blocks[((blocks > -LIMIT) & (blocks < LIMIT)).all(axis=1)]))
+        num, new = len(self._rows), [key for key in keys.tolist() if key not in self._rows]
+        if num + len(new) > self.capacity:
+            raise GridFullError(f"there is room for no more than {self.capacity:,} blocks of voxels")
+        self._rows |= zip(new, range(num, num + len(new)), strict=True)
+        made = [(np.asarray(new, np.int64) >> shift & (2 * LIMIT - 1)) - LIMIT for shift in (42, 21, 0)]
+        self.coordinates = np.concatenate([self.coordinates, np.stack(made, axis=-1).astype(np.int32)])
+        return np.asarray([self._rows[key] for key in keys.tolist()], np.int64)
+
+
+def _keys_of(blocks: np.ndarray) -> np.ndarray:
+    """Return [B] int64 names of blocks [B, 3], different for different ones."""
+    x, y, z = blocks.astype(np.int64).T + LIMIT
+    keys: np.ndarray = x << 42 | y << 21 | z
+    return keys
+
+
+class RenderedDepth(NamedTuple):
+    """Depths and colours of one view."""
+
+    camera: Camera
+    """The view."""
+    depth: Array
+    """[H, W] along the camera's z axis, at pixel centres; 0 where there is none."""
+    spread: Array
+    """[H, W] standard deviation of the splats' depths, weighted as the depth is."""
+    slant: Array
+    """[H, W] in (0, 1]: distance from the surface's plane for a unit of distance along the z axis, on the ray."""
+    facing: Array
+    """[H, W] cosine between the ray and the surface's normal."""
+    color: Array
+    """[H, W, 3] in [0, 1]."""
+
+
+def rendered_depth(output: RenderOutput, camera: Camera) -> RenderedDepth:
+    """Return the depths of a render."""
+    is_opaque = (output.alpha > LEAST_ALPHA) & jnp.isfinite(output.depth)
+    alpha = jnp.where(is_opaque, output.alpha, 1.0)
+    depth = jnp.where(is_opaque, output.depth, 0.0) / alpha
+    spread = jnp.sqrt(jnp.maximum(output.distortion, 0.0)) / alpha
+    normal = normalize(output.normal)
+    rays = back_project(jnp.ones_like(depth), camera) - camera.center[None, None]
+    slant = jnp.abs(jnp.sum(normal * rays, axis=-1))
+    facing = jnp.maximum(slant / jnp.linalg.norm(rays, axis=-1), LEAST_FACING)
+    slant = jnp.clip(slant, LEAST_FACING, 1.0)
+    color = jnp.clip(jnp.nan_to_num(output.color), 0.0, 1.0)
+    return RenderedDepth(camera, jnp.where(is_opaque & (depth > 0), depth, 0.0), spread, slant, facing, color)
 
 
 def fuse(grid: BlockGrid, depths: RenderedDepth, space: Space) -> None:
-    """Fuse one view into the blocks around its depths.
+    """Fuse one view into the blocks within a truncation of its depths.
 
     Raises:
       GridFullError: if the grid's memory budget has no room for the blocks.
     """
-    rows = grid.allocate(blocks_near(depths, space))
+    rows = grid.allocate(np.asarray(jax.jit(_blocks_near)(depths, space)))
     arrays: tuple[np.ndarray, ...] = grid.distance, grid.weight, grid.color, grid.color_weight
+    jitted = jax.jit(_fused)
     for start in range(0, len(rows), CHUNK):
         chosen = rows[start : start + CHUNK]
-        padded = np.concatenate([chosen, np.repeat(chosen[:1], CHUNK - len(chosen))])
-        before = tuple(jnp.asarray(array[padded]) for array in arrays)
-        fused = _jitted_fuse()(before, jnp.asarray(grid.coordinates[padded]), depths, space)
+        padded = np.resize(chosen, CHUNK)  # Blocks repeat, so that all chunks have one shape.
+        fused = jitted([array[padded] for array in arrays], grid.coordinates[padded], depths, space)
         for array, values in zip(arrays, fused, strict=True):
             array[chosen] = np.asarray(values)[: len(chosen)]
 
 
-def blocks_near(depths: RenderedDepth, space: Space) -> np.ndarray:
-    """Return the blocks [B, 3] within a truncation of the depths, along their rays."""
-    return unique_blocks(np.asarray(_jitted_near()(depths, space)))
-
-
-@functools.cache
-def _jitted_near() -> jax.stages.Wrapped:
-    return jax.jit(_near)
-
-
-def _near(depths: RenderedDepth, space: Space) -> Array:
-    """Return blocks [P, 3] around the depths, with repetitions; NOWHERE where there is no depth."""
+def _blocks_near(depths: RenderedDepth, space: Space) -> Array:
+    """Return blocks [P, 3] around the depths along their rays, with repetitions; NOWHERE where there is no depth."""
     points = back_project(depths.depth, depths.camera).reshape(-1, 3)
     rays = points - depths.camera.center[None]
     rays = rays / jnp.maximum(jnp.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
     reach = (space.voxel * space.scale(points))[:, None]
     is_valid = (depths.depth.reshape(-1) > 0) & space.contains(points)
     blocks = [jnp.floor(space.indices(points + offset * reach * rays) / SIDE) for offset in OFFSETS]
-    named = [jnp.where(is_valid[:, None], block.astype(jnp.int32), NOWHERE) for block in blocks]
-    return jnp.concatenate(named)
+    return jnp.concatenate([jnp.where(is_valid[:, None], block.astype(jnp.int32), NOWHERE) for block in blocks])
 
 
-@functools.cache
-def _jitted_fuse() -> jax.stages.Wrapped:
-    return jax.jit(_fused)
-
-
-def _fused(voxels: Voxels, blocks: Array, depths: RenderedDepth, space: Space) -> Voxels:
-    """Return the voxels of blocks [B, 3] after one more view."""
+def _fused(voxels: list[Array], blocks: Array, depths: RenderedDepth, space: Space) -> tuple[Array, ...]:
+    """Return distances, weights, colours and colour weights of blocks [B, 3] after one more view."""
     distance, weight, color, color_weight = voxels
     points = space.positions((blocks[:, None] * SIDE + LOCAL[None]).reshape(-1, 3))
     truncation = TRUNCATION * space.voxel * space.scale(points)
-    x, y, z = pixels_and_depths(points, depths.camera)
+    # Written out: XLA is tens of times slower at products of many rows with a 3 × 3 matrix.
+    viewmat, K = depths.camera.viewmat, depths.camera.K
+    across, down, z = (
+        row[0] * points[:, 0] + row[1] * points[:, 1] + row[2] * points[:, 2] + row[3] for row in viewmat[:3]
+    )
+    is_ahead = z > 0
+    ahead = jnp.where(is_ahead, z, 1.0)
+    # Points behind the camera are far outside of the image.
+    x, y = (jnp.where(is_ahead, (row[0] * across + row[1] * down) / ahead + row[2], -1e6) for row in K[:2])
     seen, is_seen = _depths_at(depths.depth, x, y, truncation)
     pixel = _pixels(x, y, *depths.depth.shape)
     spread, slant, facing = (image.reshape(-1)[pixel] for image in (depths.spread, depths.slant, depths.facing))
     signed = slant * (seen - z) / truncation
     behind = jnp.clip((1 + signed) / (1 - 1 / TRUNCATION), 0.0, 1.0)
     sure = facing**2 * behind / (1 + (spread / (SURE * truncation)) ** 2)
-    own = jnp.where(is_seen & (z > 0) & (signed >= -1), sure, 0.0).reshape(-1, VOXELS)
+    own = jnp.where(is_seen & is_ahead & (signed >= -1), sure, 0.0).reshape(-1, VOXELS)
+    distance = distance + own * jnp.minimum(signed, 1.0).reshape(-1, VOXELS)
     near = jnp.where(signed.reshape(-1, VOXELS) < 1, own, 0.0)
     color_weight = color_weight + near
-    share = near / jnp.maximum(color_weight, 1e-12)
-    return (
-        distance + own * jnp.minimum(signed, 1.0).reshape(-1, VOXELS),
-        weight + own,
-        _mixed(color, share, depths.color, pixel),
-        color_weight,
-    )
-
-
-def _mixed(color: Array, share: Array, image: Array, pixel: Array) -> Array:
-    """Return colours [B, VOXELS, 3] moved by a share [B, VOXELS] towards those of pixels."""
-    mean = color.astype(jnp.float32)
-    shown = [image[..., channel].reshape(-1)[pixel].reshape(share.shape) for channel in range(3)]
+    share, mean = near / jnp.maximum(color_weight, 1e-12), color.astype(jnp.float32)
+    # Channel by channel, which keeps arrays of three numbers a row out of the loops over voxels.
+    shown = [depths.color[..., channel].reshape(-1)[pixel].reshape(share.shape) for channel in range(3)]
     mixed = [mean[..., channel] + share * (shown[channel] - mean[..., channel]) for channel in range(3)]
-    return jnp.stack(mixed, -1).astype(jnp.float16)
-
-
-def pixels_and_depths(points: Array, camera: Camera) -> tuple[Array, Array, Array]:
-    """Return pixel coordinates x and y, and the depth z, of points [P, 3]; x and y are far out behind the camera."""
-    # Written out: XLA is tens of times slower at products of many rows with a 3 × 3 matrix.
-    across, down, z = (_affine(camera.viewmat[row, :3], points, camera.viewmat[row, 3]) for row in range(3))
-    is_ahead = z > 0
-    depth = jnp.where(is_ahead, z, 1.0)
-    x, y = ((K[0] * across + K[1] * down) / depth + K[2] for K in (camera.K[0], camera.K[1]))
-    return jnp.where(is_ahead, x, -1e6), jnp.where(is_ahead, y, -1e6), z
-
-
-def _affine(row: Array, points: Array, offset: Array) -> Array:
-    return row[0] * points[:, 0] + row[1] * points[:, 1] + row[2] * points[:, 2] + offset
+    return distance, weight + own, jnp.stack(mixed, -1).astype(jnp.float16), color_weight
 
 
 def _depths_at(depth: Array, x: Array, y: Array, truncation: Array) -> tuple[Array, Array]:

@@ -1,13 +1,14 @@
 """Textures of meshes from pictures: each texel is a weighted mean over the views that see it (host)."""
 
-from collections.abc import Iterable
+import importlib
+from collections.abc import Iterable, Iterator
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.mesh.atlas import Texels, texels_of, unwrapped
-from a2tg_jax.mesh.raster import Raster, draw_view
 from a2tg_jax.mesh.triangles import Mesh
 
 POWER = 6
@@ -17,7 +18,12 @@ LEAST_FACING = 0.15
 HIDDEN = 0.01
 """Distance behind the mesh, in units of its depth, from which on a texel is hidden."""
 CHUNK = 1 << 20
-"""Texels that are projected at a time."""
+"""Texels that are projected at a time, and pixels that are tested at a time."""
+PADDING = 2
+"""Texels between charts."""
+SMALLEST_SIDE, LARGEST_SIDE = 16, 8_192
+NEAR = 1e-3
+"""Smallest depth of a corner of a face that is drawn, in units of the median depth."""
 
 Picture = tuple[Camera, np.ndarray, np.ndarray | None]
 """A view: its camera, its picture [H, W, 3] in [0, 1], and the mask [H, W] of the pixels that count, or None."""
@@ -41,25 +47,89 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
     Raises:
       ValueError: if xatlas is not installed (`pip install 'a2tg-jax[mesh]'`), or the size is out of range.
     """
-    mesh = unwrapped(mesh, size)
-    texels = texels_of(mesh, size)
+    mesh = _unwrapped(mesh, size)
+    texels = _texels_of(mesh, size)
     total = np.zeros((len(texels.place), 3), np.float32)
     weight = np.zeros(len(texels.place), np.float32)
     for camera, picture, mask in pictures:
-        drawn = draw_view(mesh, camera)
+        depth = draw_view(mesh, camera).depth
         for start in range(0, len(weight), CHUNK):
             part = Texels(*(rows[start : start + CHUNK] for rows in texels))
-            seen, own, color = _seen(part, camera, np.asarray(picture, np.float32), mask, drawn)
+            seen, own, color = _seen(part, camera, np.asarray(picture, np.float32), mask, depth)
             weight[start + seen] += own
             total[start + seen] += own[:, None] * color
     color = np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-30)[:, None], texels.color)
-    return Mesh(mesh.vertices, mesh.faces, mesh.colors, mesh.uv, _filled(texels.place, color, size))
+    atlas, is_empty = np.zeros((size, size, 3), np.uint8), np.ones((size, size), bool)
+    atlas.reshape(-1, 3)[texels.place] = np.rint(255 * np.clip(color, 0, 1))
+    is_empty.flat[texels.place] = False
+    if not is_empty.all():  # Where no chart lies, the nearest texel's colour keeps seams from showing.
+        atlas = atlas[tuple(distance_transform_edt(is_empty, return_distances=False, return_indices=True))]
+    return Mesh(mesh.vertices, mesh.faces, mesh.colors, mesh.uv, atlas)
+
+
+def check_texture(size: int) -> ModuleType:
+    """Return the library xatlas.
+
+    Raises:
+      ValueError: if it is not installed, or the side of an atlas is out of range.
+    """
+    if not SMALLEST_SIDE <= size <= LARGEST_SIDE:
+        raise ValueError(f"texture_size must lie in {SMALLEST_SIDE}..{LARGEST_SIDE} texels; got {size}")
+    try:
+        return importlib.import_module("xatlas")
+    except ImportError:
+        raise ValueError("a texture needs xatlas, which is not installed: pip install 'a2tg-jax[mesh]'") from None
+
+
+def _unwrapped(mesh: Mesh, size: int) -> Mesh:
+    """Return the mesh with positions in a square atlas, by xatlas; vertices at seams are repeated."""
+    xatlas = check_texture(size)
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
+    pack = xatlas.PackOptions()
+    pack.resolution, pack.padding, pack.bruteForce = size, PADDING, False
+    atlas.generate(xatlas.ChartOptions(), pack)
+    source, faces, uv = atlas.get_mesh(0)
+    colors = None if mesh.colors is None else mesh.colors[source]
+    return Mesh(mesh.vertices[source], faces.astype(np.int32), colors, np.asarray(uv, np.float32))
+
+
+class Texels(NamedTuple):
+    """Texels that charts cover."""
+
+    place: np.ndarray
+    """[T] number in the atlas, row by row from the top."""
+    position: np.ndarray
+    """[T, 3] float32 position in the world."""
+    normal: np.ndarray
+    """[T, 3] float32 unit normal of the face."""
+    color: np.ndarray
+    """[T, 3] float32 colour in [0, 1] between those of the vertices; grey without them."""
+
+
+def _texels_of(mesh: Mesh, size: int) -> Texels:
+    """Return the texels of a square atlas of `size` that the charts of an unwrapped mesh cover."""
+    assert mesh.uv is not None
+    corners = (mesh.uv * (size, -size) + (0, size)).astype(np.float32)[mesh.faces]
+    drawn = _draw(corners, np.ones(mesh.faces.shape, np.float32), size, size)
+    place = np.flatnonzero(drawn.face >= 0)
+    hit, weights = drawn.face.reshape(-1)[place], drawn.weights.reshape(-1, 3)[place]
+    faces, normals = mesh.faces[hit], mesh.face_normals[hit]
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    colors = np.full((mesh.num_vertices, 3), 128, np.uint8) if mesh.colors is None else mesh.colors
+    position, color = (
+        np.einsum("tk,tkc->tc", weights, rows[faces].astype(np.float32)) for rows in (mesh.vertices, colors)
+    )
+    return Texels(place, position, normals.astype(np.float32), color / 255)
 
 
 def _seen(
-    texels: Texels, camera: Camera, picture: np.ndarray, mask: np.ndarray | None, drawn: Raster
+    texels: Texels, camera: Camera, picture: np.ndarray, mask: np.ndarray | None, depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the texels that a view sees, as indices [S], its weights [S] for them, and its colours [S, 3]."""
+    """Return the texels that a view sees, as indices [S], its weights [S] for them, and its colours [S, 3].
+
+    A texel that is farther than the drawn mesh's depth [H, W] is hidden.
+    """
     viewmat, K = np.asarray(camera.viewmat, np.float32), np.asarray(camera.K, np.float32)
     at = texels.position @ viewmat[:3, :3].T + viewmat[:3, 3]
     toward = -np.sum(at * (texels.normal @ viewmat[:3, :3].T), axis=1)
@@ -69,7 +139,7 @@ def _seen(
     distance = np.linalg.norm(at, axis=1)
     is_inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height) & (toward > LEAST_FACING * distance)
     row, column = (np.where(is_inside, each, 0).astype(int) for each in (y, x))
-    is_seen = is_inside & (at[:, 2] < (1 + HIDDEN) * drawn.depth[row, column])
+    is_seen = is_inside & (at[:, 2] < (1 + HIDDEN) * depth[row, column])
     if mask is not None:
         is_seen &= mask[row, column]
     places = np.stack([y, x])[:, is_seen] - np.float32(0.5)
@@ -79,14 +149,75 @@ def _seen(
     return seen[is_seen], own.astype(np.float32), np.stack(channels, -1)
 
 
-def _filled(place: np.ndarray, color: np.ndarray, size: int) -> np.ndarray:
-    """Return the atlas [size, size, 3] uint8, with the nearest texel's colour where no chart lies."""
-    atlas = np.zeros((size * size, 3), np.uint8)
-    atlas[place] = np.rint(255 * np.clip(color, 0, 1))
-    is_empty = np.ones(size * size, bool)
-    is_empty[place] = False
-    if not len(place):
-        return atlas.reshape(size, size, 3)
-    rows, columns = distance_transform_edt(is_empty.reshape(size, size), return_distances=False, return_indices=True)
-    filled: np.ndarray = atlas.reshape(size, size, 3)[rows, columns]
-    return filled
+# Triangles drawn into pixels
+
+
+class Raster(NamedTuple):
+    """Faces and places of pixels."""
+
+    face: np.ndarray
+    """[H, W] int32 face of each pixel; -1 without one."""
+    weights: np.ndarray
+    """[H, W, 3] float32 barycentric coordinates there."""
+    depth: np.ndarray
+    """[H, W] float32 depth there; infinite without a face."""
+
+
+def draw_view(mesh: Mesh, camera: Camera) -> Raster:
+    """Draw a mesh as a camera sees it; faces that reach behind the camera are left out."""
+    viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+    at = mesh.vertices @ viewmat[:3, :3].T + viewmat[:3, 3]
+    z = at[:, 2]
+    least = NEAR * np.median(z[z > 0]) if (z > 0).any() else 1.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = np.where(z[:, None] > least, (at / z[:, None]) @ K[:2].T, np.nan)
+    return _draw(pixels[mesh.faces].astype(np.float32), z[mesh.faces].astype(np.float32), camera.width, camera.height)
+
+
+def _draw(points: np.ndarray, depths: np.ndarray, width: int, height: int) -> Raster:
+    """Draw triangles of corners [F, 3, 2] in pixels, NaN if not drawn, at depths [F, 3]; the nearest one shows."""
+    face = np.full(width * height, -1, np.int32)
+    nearest = np.full(width * height, np.inf, np.float32)
+    weights = np.zeros((width * height, 3), np.float32)
+    for faces, pixels in _candidates(points, width, height):
+        at = np.stack([pixels % width, pixels // width], -1) + np.float32(0.5)
+        own = _barycentric(points[faces], at)
+        depth = 1 / np.sum(own / depths[faces], axis=1)  # Inverse depths are linear in the image.
+        shows = np.flatnonzero((own >= 0).all(axis=1) & (depth < nearest[pixels]))
+        shows = shows[np.argsort(-depth[shows], kind="stable")]  # The nearest is written last.
+        chosen = pixels[shows]
+        face[chosen], nearest[chosen], weights[chosen] = faces[shows], depth[shows], own[shows]
+    corrected = weights / np.where(face[:, None] >= 0, depths[face], 1.0)
+    corrected /= np.maximum(corrected.sum(axis=1, keepdims=True), 1e-30)
+    shape = height, width
+    return Raster(face.reshape(shape), corrected.reshape(*shape, 3).astype(np.float32), nearest.reshape(shape))
+
+
+def _candidates(points: np.ndarray, width: int, height: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield (faces, pixels) [P] of the pixels within the bounds of each face, some at a time."""
+    with np.errstate(invalid="ignore"):
+        low = np.maximum(np.ceil(points.min(axis=1) - 0.5), 0)
+        high = np.minimum(np.floor(points.max(axis=1) - 0.5), (width - 1, height - 1))
+        order = np.flatnonzero((high >= low).all(axis=1))
+    low, span = low[order].astype(np.int64), (high[order] - low[order] + 1).astype(np.int64)
+    areas = span.prod(axis=1)
+    ends = np.cumsum(areas)
+    start = done = 0
+    while start < len(order):
+        end = max(start + 1, int(np.searchsorted(ends, done + CHUNK, side="right")))
+        rows = np.repeat(np.arange(start, end), areas[start:end])
+        index = done + np.arange(len(rows)) - (ends - areas)[rows]  # Number of the pixel within its face's bounds.
+        x, y = low[rows, 0] + index % span[rows, 0], low[rows, 1] + index // span[rows, 0]
+        yield order[rows], y * width + x
+        start, done = end, int(ends[end - 1])
+
+
+def _barycentric(corners: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return barycentric coordinates [P, 3] of points [P, 2] in triangles [P, 3, 2]; NaN in those without an area."""
+    a, b, c = corners.transpose(1, 0, 2)
+    along, across, own = b - a, c - a, at - a
+    area = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        second = (own[:, 0] * across[:, 1] - own[:, 1] * across[:, 0]) / area
+        third = (along[:, 0] * own[:, 1] - along[:, 1] * own[:, 0]) / area
+        return np.stack([1 - second - third, second, third], -1)

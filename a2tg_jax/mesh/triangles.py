@@ -1,12 +1,18 @@
-"""Triangle meshes: vertices, faces, colours, and a texture atlas; on the host."""
+"""Triangle meshes: vertices, faces, colours and a texture atlas; their connected parts; fewer triangles (host)."""
 
 import dataclasses
+import importlib
+from types import ModuleType
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from a2tg_jax.core.similarity import Similarity
+
+LEAST_FACES = 4
+"""Smallest number of faces to simplify to, that of a closed mesh."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,43 +57,20 @@ class Mesh:
         """Area of all faces."""
         return float(np.linalg.norm(self.face_normals, axis=1).sum() / 2)
 
-    @property
-    def vertex_normals(self) -> np.ndarray:
-        """[V, 3] unit normals of the vertices, the means of their faces' by area; zero at vertices without faces."""
-        normals, of_faces = np.zeros((self.num_vertices, 3)), self.face_normals
-        for corner in range(3):
-            np.add.at(normals, self.faces[:, corner], of_faces)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return np.asarray(normals / np.where(length > 0, length, 1.0), np.float32)
-
     def transform(self, similarity: Similarity) -> "Mesh":
         """Return the same mesh in the world that `similarity` leads to."""
         return dataclasses.replace(self, vertices=similarity.apply(np.asarray(self.vertices, np.float64)))
 
     def with_faces(self, chosen: np.ndarray) -> "Mesh":
         """Return the mesh of some faces, by a mask [F] or indices, without the vertices that no face needs."""
-        faces = self.faces[chosen]
-        kept, inverse = np.unique(faces, return_inverse=True)
-        return dataclasses.replace(
-            self,
-            vertices=self.vertices[kept],
-            faces=inverse.reshape(-1, 3).astype(np.int32),
-            colors=None if self.colors is None else self.colors[kept],
-            uv=None if self.uv is None else self.uv[kept],
-        )
+        kept, inverse = np.unique(self.faces[chosen], return_inverse=True)
+        faces = inverse.reshape(-1, 3).astype(np.int32)
+        colors, uv = (None if rows is None else rows[kept] for rows in (self.colors, self.uv))
+        return dataclasses.replace(self, vertices=self.vertices[kept], faces=faces, colors=colors, uv=uv)
 
     def __repr__(self) -> str:
         kind = "with a texture" if self.texture is not None else "with colours" if self.colors is not None else "bare"
         return f"Mesh({self.num_vertices:,} vertices, {self.num_faces:,} faces, {kind})"
-
-
-def clusters_of(mesh: Mesh) -> np.ndarray:
-    """Return [F] the number of the connected part that a face belongs to, from 0."""
-    a, b, c = mesh.faces.T
-    rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
-    graph = coo_matrix((np.ones(len(rows), bool), (rows, columns)), (mesh.num_vertices, mesh.num_vertices))
-    labels: np.ndarray = connected_components(graph, directed=False)[1][a]
-    return labels
 
 
 def largest_clusters(mesh: Mesh, most: int, least_faces: int) -> tuple[Mesh, int]:
@@ -100,8 +83,46 @@ def largest_clusters(mesh: Mesh, most: int, least_faces: int) -> tuple[Mesh, int
     """
     if not mesh.num_faces:
         return mesh, 0
-    _, cluster, sizes = np.unique(clusters_of(mesh), return_inverse=True, return_counts=True)
+    a, b, c = mesh.faces.T
+    edges = np.concatenate([a, b]), np.concatenate([b, c])
+    graph = coo_matrix((np.ones(len(edges[0]), bool), edges), [mesh.num_vertices] * 2)
+    _, labels = connected_components(graph, directed=False)
+    _, cluster, sizes = np.unique(labels[a], return_inverse=True, return_counts=True)
     ranks = np.empty(len(sizes), int)
     ranks[np.argsort(-sizes, kind="stable")] = np.arange(len(sizes))
     is_kept = (ranks < most) & (sizes >= least_faces)
     return mesh.with_faces(is_kept[cluster]), int((~is_kept).sum())
+
+
+def check_simplifying(num_faces: int) -> ModuleType:
+    """Return the library fast-simplification.
+
+    Raises:
+      ValueError: if it is not installed, or the number of faces is less than 4.
+    """
+    if num_faces < LEAST_FACES:
+        raise ValueError(f"faces must be at least {LEAST_FACES}; got {num_faces}")
+    try:
+        return importlib.import_module("fast_simplification")
+    except ImportError:
+        raise ValueError(
+            "fewer faces need fast-simplification, which is not installed: pip install 'a2tg-jax[mesh]'"
+        ) from None
+
+
+def simplify_mesh(mesh: Mesh, num_faces: int) -> Mesh:
+    """Return a mesh of about `num_faces` triangles, by quadric decimation; the same if it has no more.
+
+    Raises:
+      ValueError: if fast-simplification is not installed, the number is less than 4, or no face would be left.
+    """
+    library = check_simplifying(num_faces)
+    if mesh.num_faces <= num_faces:
+        return mesh
+    vertices, faces = library.simplify(
+        np.asarray(mesh.vertices, np.float32), mesh.faces, target_reduction=1 - num_faces / mesh.num_faces
+    )
+    if not len(faces):
+        raise ValueError(f"no faces are left of {mesh.num_faces:,}: ask for more faces than {num_faces:,}")
+    colors = None if mesh.colors is None else mesh.colors[cKDTree(mesh.vertices).query(vertices)[1]]
+    return Mesh(vertices, faces.astype(np.int32), colors).with_faces(np.arange(len(faces)))

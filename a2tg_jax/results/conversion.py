@@ -7,8 +7,7 @@ from pathlib import Path
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Origin
-from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake
-from a2tg_jax.finish.distilling import likeness, pictures
+from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake, likeness, pictures
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.formats import (
     file_bytes,

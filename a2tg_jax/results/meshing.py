@@ -15,8 +15,6 @@ from a2tg_jax.data import view_image
 from a2tg_jax.host.machine import memory_limit
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.host.text import counted, in_bytes
-from a2tg_jax.mesh.atlas import check_texture
-from a2tg_jax.mesh.blocks import GridFullError
 from a2tg_jax.mesh.extract import (
     MOST_CLUSTERS,
     NoSurfaceError,
@@ -25,8 +23,9 @@ from a2tg_jax.mesh.extract import (
     training_cameras,
 )
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
-from a2tg_jax.mesh.simplify import check_simplifying, simplify_mesh
-from a2tg_jax.mesh.texturing import Picture, texture_mesh
+from a2tg_jax.mesh.fusion import GridFullError
+from a2tg_jax.mesh.texturing import Picture, check_texture, texture_mesh
+from a2tg_jax.mesh.triangles import check_simplifying, simplify_mesh
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.model_source import Source
 

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from a2tg_jax import Gaussians, Origin, Similarity, load_splats, save_splats
 from a2tg_jax.core.gaussians import SH_C0
-from a2tg_jax.finish.distilling import pictures
+from a2tg_jax.finish.baking import pictures
 from a2tg_jax.io.other_programs import upright
 from benchmarks.readers.browser import Camera, draw
 
