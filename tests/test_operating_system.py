@@ -3,7 +3,6 @@
 import gc
 import os
 import signal
-import socket
 import sys
 import time
 from types import SimpleNamespace
@@ -71,14 +70,6 @@ def test_cores_and_features_without_linux(monkeypatch, tmp_path):
 def test_features_are_those_of_the_first_processor(tmp_path):
     (tmp_path / "cpuinfo").write_text("processor\t: 0\nflags\t\t: fpu avx2\n\nprocessor\t: 1\nflags\t\t: fpu\n")
     assert machine.processor_features(tmp_path / "cpuinfo") == {"fpu", "avx2"}
-
-
-@pytest.mark.parametrize("system", SYSTEMS)
-def test_a_port_is_never_shared(monkeypatch, system):
-    monkeypatch.setattr(sys, "platform", system)
-    with socket.socket() as listening:
-        operating_system.allow_recent_port(listening)
-        assert bool(listening.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR)) == (system != "win32")
 
 
 @pytest.mark.parametrize("library", [SimpleNamespace(), None])

@@ -78,8 +78,12 @@ def loss_on_views(
     draw = _drawing(model, [view.camera for view in views], background, settings)
 
     def psnr(other: Model) -> float:
-        errors = (_error_on(view, image, background) for view, image in zip(views, draw(other), strict=True))
-        return float(np.mean([-10 * math.log10(max(error, 1e-12)) for error in errors]))
+        decibels = []
+        for view, image in zip(views, draw(other), strict=True):
+            counts = ... if view.mask is None else view.mask.read()
+            error = _squared_error(image[counts], np.clip(view_image(view, background), 0, 1)[counts])
+            decibels.append(-10 * math.log10(max(error, 1e-12)))
+        return float(np.mean(decibels))
 
     own = psnr(model)
     return lambda other: own - psnr(other)
@@ -112,24 +116,18 @@ def loss_beside_renders(
 def _drawing(
     model: Model, cameras: Sequence[Camera], background: ArrayLike | None, settings: RenderSettings
 ) -> Callable[[Model], Iterator[np.ndarray]]:
-    """Draw models like the given one for cameras, clipped to [0, 1]; compiled once while the capacity suffices."""
+    """Draw models like the given one for cameras, clipped to [0, 1]."""
     if not cameras:
         raise ValueError("there are no views to measure a loss on")
     options: dict[str, Any] = {"background": background, "settings": settings, "has_geometry": False}
-    first = Renderer(model, cameras=cameras, **options)
-    capacities = {size: 2 * capacity for size, capacity in first.capacities.items()}
+    # Programs compile once, while twice the capacity of the given model suffices.
+    capacities = {size: 2 * num for size, num in Renderer(model, cameras=cameras, **options).capacities.items()}
 
     def draw(other: Model) -> Iterator[np.ndarray]:
         renderer = Renderer(other, capacities=capacities, **options)
         return (np.clip(np.asarray(renderer(camera).color), 0, 1) for camera in cameras)
 
     return draw
-
-
-def _error_on(view: View, image: np.ndarray, background: Color) -> float:
-    """Return the mean squared error of a render over the pixels of a photograph that count."""
-    counts = ... if view.mask is None else view.mask.read()
-    return _squared_error(image[counts], np.clip(view_image(view, background), 0, 1)[counts])
 
 
 def _squared_error(image: np.ndarray, target: np.ndarray) -> float:
@@ -153,7 +151,7 @@ def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDE
 
     Args:
       model: the model.
-      losses: measures of what is lost.
+      losses: measures of loss.
       ladder: steps of groups, from coarse to fine.
 
     Returns:
@@ -181,9 +179,9 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
 
     Args:
       model: the model.
-      losses: measures of what is lost.
+      losses: measures of loss.
       max_loss: in dB.
-      trials: what `measure_choices` found.
+      trials: results of `measure_choices`.
 
     Raises:
       TooMuchLostError: if the finest choices lose more.
@@ -196,15 +194,10 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
     for chosen in [*reversed(_descent(by_size, max_loss)), finest]:
         found = try_choices(model, finest_choices().keeping(chosen), losses)
         if found.losses[0] <= max_loss:
-            return _with_single_steps(model, losses, max_loss, by_size, found)
-    least = f"{found.losses[0]:.4f} dB or more"
-    raise TooMuchLostError(f"max_loss must be {least}: the finest choices lose that; got {max_loss}")
-
-
-def _with_single_steps(
-    model: Model, losses: Sequence[Loss], max_loss: float, by_size: Mapping[str, Sequence[Trial]], found: Trial
-) -> Trial:
-    """Return the file with each group a step smaller, within the allowed loss: largest savings first."""
+            break
+    else:
+        least = f"{found.losses[0]:.4f} dB or more"
+        raise TooMuchLostError(f"max_loss must be {least}: the finest choices lose that; got {max_loss}")
 
     def next_step(group: str) -> tuple[int, Precision]:
         """Return what the next smaller step of a group saves, and its precision; nothing if there is none."""
@@ -212,7 +205,7 @@ def _with_single_steps(
         at = [trial.precision for trial in own].index(getattr(found.choices, group))
         return own[at].num_bytes - own[max(at - 1, 0)].num_bytes, own[max(at - 1, 0)].precision
 
-    for group in sorted(by_size, key=lambda group: -next_step(group)[0]):
+    for group in sorted(by_size, key=lambda group: -next_step(group)[0]):  # Largest savings first.
         saved, precision = next_step(group)
         if saved:
             tried = try_choices(model, found.choices.keeping({group: precision}), losses)

@@ -10,7 +10,7 @@ as a number of texels needs.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -30,7 +30,7 @@ from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
-from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, Textures, allocate_textures
+from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, Textures
 
 LEAST_OPACITY = 1e-4
 """Largest opacity of a Gaussian after absorbing a texel's alpha: its logit must be finite."""
@@ -89,7 +89,8 @@ class Step(NamedTuple):
 
     gaussians: Gaussians
     """Gaussians after absorbing their 1×1 textures."""
-    textures: Textures
+    texels: list[np.ndarray]
+    """N textures [Tv, Tu, 4]."""
     cost: np.ndarray
     """[N] estimated growth of the squared error."""
     saved: np.ndarray
@@ -125,46 +126,41 @@ def halve_textures(model: Model, weights: Textures) -> Step:
     """
     assert model.textures is not None
     textures, gaussians = model.textures, model.gaussians
-    old_sizes, cost = textures.sizes, np.zeros(textures.num)
-    sizes, single = old_sizes.copy(), np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
-    pieces: Tables = []
+    halved, cost = textures.blocks(), np.zeros(textures.num)
+    single = np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
     for index, size in enumerate(textures.bucket_sizes):
         ids, rows = _rows_of(textures, index)
         old, own = (np.asarray(tree.buckets[index])[rows] for tree in (textures, weights))
-        axes = [axis for axis, side in enumerate(size, 1) if side > 1 and side % 2 == 0]
         if size == (1, 1):
-            sizes[ids], single[ids] = 0, old[:, 0, 0]
-        elif not axes:
-            pieces.append((ids, old))
+            single[ids] = old[:, 0, 0]
+            for gaussian in ids:
+                halved[gaussian] = old[0, :0, :0]
+        axes = [axis for axis, side in enumerate(size, 1) if side > 1 and side % 2 == 0]
         for chosen, smaller, _, costs in _halved(ids, old, own + LEAST_WEIGHT, axes):
-            sizes[chosen], cost[chosen] = smaller.shape[1:3], costs
-            pieces.append((chosen, smaller))
+            cost[chosen] = costs
+            for gaussian, texels in zip(chosen, smaller, strict=True):
+                halved[gaussian] = texels
     sh = np.array(gaussians.sh, np.float64)
     sh[:, 0] += single[:, :3] / SH_C0
     opacities = np.clip(np.asarray(gaussians.opacities, np.float64) * single[:, 3], LEAST_OPACITY, 1 - LEAST_OPACITY)
     logits = np.where(single[:, 3] == 1, np.asarray(gaussians.logit_opacities), np.log(opacities / (1 - opacities)))
     dtype = gaussians.means.dtype
     absorbed = dataclasses.replace(gaussians, sh=jnp.asarray(sh, dtype), logit_opacities=jnp.asarray(logits, dtype))
-    saved = BYTES_PER_TEXEL * (old_sizes.prod(axis=1) - sizes.prod(axis=1))
-    return Step(absorbed, _textures_of(sizes, pieces, textures.buckets[0].dtype), cost, saved)
+    areas = np.asarray([texels.shape[0] * texels.shape[1] for texels in halved])
+    return Step(absorbed, halved, cost, BYTES_PER_TEXEL * (textures.sizes.prod(axis=1) - areas))
 
 
 def taken(model: Model, step: Step, is_chosen: np.ndarray) -> Model:
     """Return the model in which the chosen Gaussians [N] have taken their step (host)."""
-    old = model.textures
-    assert old is not None
-    sizes, pieces = np.where(is_chosen[:, None], step.textures.sizes, old.sizes), []
-    for textures, is_from in ((old, ~is_chosen), (step.textures, is_chosen)):
-        for index, bucket in enumerate(textures.buckets):
-            ids, rows = _rows_of(textures, index)
-            pieces.append((ids[is_from[ids]], np.asarray(bucket)[rows[is_from[ids]]]))
+    assert model.textures is not None
+    states = zip(is_chosen, model.textures.blocks(), step.texels, strict=True)
+    textures = Textures.of_blocks([after if is_taken else before for is_taken, before, after in states])
 
     def chosen(before: Array, after: Array) -> Array:
         return jnp.where(is_chosen.reshape(-1, *[1] * (before.ndim - 1)), after, before)
 
     gaussians = jax.tree.map(chosen, model.gaussians, step.gaussians)
-    new = _textures_of(sizes, pieces, old.buckets[0].dtype)
-    return dataclasses.replace(model, gaussians=gaussians).with_textures(new)
+    return dataclasses.replace(model, gaussians=gaussians).with_textures(textures)
 
 
 def texel_weights(model: Model, cameras: Sequence[Camera], background: ArrayLike) -> Textures:
@@ -296,13 +292,3 @@ def _halved(
         if (is_own := costs.argmin(axis=0) == place).any():
             means, sums, cost = (part[is_own] for part in parts)
             yield ids[is_own], means, sums, cost
-
-
-def _textures_of(sizes: np.ndarray, pieces: Iterable[tuple[np.ndarray, np.ndarray]], dtype: np.dtype[Any]) -> Textures:
-    """Return textures of the given sizes [N, 2] from pieces: Gaussians and their texels [n, Tv, Tu, 4] of one size."""
-    empty = allocate_textures(sizes, dtype=dtype)
-    buckets, rows = [np.array(bucket) for bucket in empty.buckets], np.asarray(empty.row)
-    for ids, texels in pieces:
-        if len(ids):
-            buckets[empty.bucket_sizes.index(texels.shape[1:3])][rows[ids]] = texels
-    return dataclasses.replace(empty, buckets=tuple(map(jnp.asarray, buckets)))

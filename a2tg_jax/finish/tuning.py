@@ -29,14 +29,7 @@ from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Change, Now, StepEvent
 from a2tg_jax.finish.compaction import LADDER, Ladder, Loss, TooMuchLostError, Trial, smallest_within
 from a2tg_jax.io.columns import LEAST_OPACITY
-from a2tg_jax.io.compact import (
-    CompactChoices,
-    Grids,
-    decode_model,
-    encode_model,
-    grids_of,
-    half_turned,
-)
+from a2tg_jax.io.compact import CompactChoices, Grids, decode_model, encode_model, grids_of, half_turned
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.training import DivergedError, Stage, System, fit_stage
@@ -52,17 +45,10 @@ FIRST_TOLERANCE = 0.5
 """Loss in dB before tuning that is tried first."""
 MOST_TUNINGS = 4
 """Largest number of times that a model is tuned."""
-COARSER: Mapping[str, tuple[int, ...]] = MappingProxyType(
-    {
-        "means": (8, 9),
-        "log_scales": (3,),
-        "quats": (3, 4),
-        "opacities": (2,),
-        "sh_0": (3,),
-        "texels": (2,),
-        "shapes": (1, 2),
-    }
-)
+COARSER: Mapping[str, tuple[int, ...]] = {
+    "means": (8, 9), "log_scales": (3,), "quats": (3, 4), "opacities": (2,), "sh_0": (3,), "texels": (2,),
+    "shapes": (1, 2),
+}  # fmt: skip
 TUNED_LADDER: Ladder = MappingProxyType({group: (*COARSER.get(group, ()), *steps) for group, steps in LADDER.items()})
 """Candidate precisions of each group of a model that is tuned, from coarse to fine."""
 
@@ -268,7 +254,21 @@ def tune_compact(
       DivergedError: if the loss or a gradient is not finite, or the loss explodes.
     """
     stage = system.stages()[-1]
-    _check(model, stage, iterations)
+    check_encodable(model.appearance)
+    if iterations < 1:
+        raise ValueError(f"iterations must be at least 1; got {iterations}")
+    if template_of(model.appearance) != stage.appearance:
+        wanted, shown = in_words(stage.appearance), in_words(model.appearance)
+        shown = f"{shown} with other options" if shown == wanted else shown
+        raise ValueError(
+            f"model must show what the last stage of the system, {stage.name!r}, trains, {wanted}; it shows {shown}"
+        )
+    learned = {} if model.origin is None else model.origin.corrections
+    if missing := [correction.name for correction in stage.corrections if correction.name not in learned]:
+        raise ValueError(
+            f"model must have the corrections that training learned, {' and '.join(missing)}, which a compact file "
+            "drops: give the model that training saved"
+        )
     start = dataclasses.replace(half_turned(model), origin=model.origin)
     grids = grids_of(start, choices)
     tuning = dataclasses.replace(
@@ -328,24 +328,6 @@ class _Constant(Correction):
         return self.learned.color(row, color)
 
 
-def _check(model: Model, stage: Stage, iterations: int) -> None:
-    check_encodable(model.appearance)
-    if iterations < 1:
-        raise ValueError(f"iterations must be at least 1; got {iterations}")
-    if template_of(model.appearance) != stage.appearance:
-        wanted, shown = in_words(stage.appearance), in_words(model.appearance)
-        shown = f"{shown} with other options" if shown == wanted else shown
-        raise ValueError(
-            f"model must show what the last stage of the system, {stage.name!r}, trains, {wanted}; it shows {shown}"
-        )
-    learned = {} if model.origin is None else model.origin.corrections
-    if missing := [correction.name for correction in stage.corrections if correction.name not in learned]:
-        raise ValueError(
-            f"model must have the corrections that training learned, {' and '.join(missing)}, which a compact file "
-            "drops: give the model that training saved"
-        )
-
-
 class TunedFiles(NamedTuple):
     """Result of `smallest_tuned`."""
 
@@ -375,9 +357,9 @@ def smallest_tuned(
 
     Args:
       model: the model.
-      losses: measures of what is lost.
-      max_loss: in dB, by the first measure, of the file of the tuned model beside `model`.
-      trials: what `measure_choices` found, as with `TUNED_LADDER`.
+      losses: measures of loss.
+      max_loss: in dB, by the first measure, of the tuned model's file against `model`.
+      trials: results of `measure_choices`, as with `TUNED_LADDER`.
       tune: tunes a model for choices.
     """
     found, latest = TunedFiles([]), model

@@ -5,7 +5,6 @@ import ctypes
 import functools
 import os
 import signal
-import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -56,15 +55,6 @@ def flush_folder(folder: Path) -> None:
             os.fsync(number)
     finally:
         os.close(number)
-
-
-def allow_recent_port(listening: socket.socket) -> None:
-    """Let a socket bind to the port of a program that has just ended.
-
-    Windows allows that anyway; there the option would let two programs share the port.
-    """
-    if sys.platform != "win32":
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
 
 
 @contextlib.contextmanager

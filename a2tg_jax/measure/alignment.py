@@ -5,9 +5,8 @@ is the custom, these few numbers of a test photograph are found from itself, wit
 """
 
 import dataclasses
-import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -96,32 +95,19 @@ def align_poses(
     return tuple(_aligned(view, model, background, planned, num_steps) for view in views)
 
 
-class _Best(NamedTuple):
-    """The best camera that was looked from so far."""
-
-    loss: Array
-    twist: Array
-    overflow: Array
-    """Least loss at any step."""
-
-
 def _aligned(view: View, model: Model, background: Array, settings: RenderSettings, num_steps: int) -> View:
     dtype = background.dtype
     target = jnp.asarray(view_image(view, np.asarray(background)), dtype)
-    mask = None if view.mask is None else jnp.asarray(view.mask.read())
+    mask = None if view.mask is None else jnp.asarray(view.mask.read())[..., None]
     camera = jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera)
-    best = _jitted_descent()(model.gaussians, model.appearance, camera, target, mask, background, settings, num_steps)
-    if bool(best.overflow):
+    descend = jax.jit(_descent, static_argnums=(6, 7))
+    twist, overflow = descend(model.gaussians, model.appearance, camera, target, mask, background, settings, num_steps)
+    if bool(overflow):
         assert settings.capacity is not None
         more = dataclasses.replace(settings, capacity=2 * settings.capacity)
         return _aligned(view, model, background, more, num_steps)
-    viewmat = moved_viewmat(best.twist, camera.viewmat)
+    viewmat = moved_viewmat(twist, camera.viewmat)
     return dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat.astype(jnp.float32)))
-
-
-@functools.cache
-def _jitted_descent() -> jax.stages.Wrapped:
-    return jax.jit(_descent, static_argnums=(6, 7))
 
 
 def _descent(
@@ -133,28 +119,26 @@ def _descent(
     background: Array,
     settings: RenderSettings,
     num_steps: int,
-) -> _Best:
-    """Return the twist of least loss among those that Adam comes to."""
+) -> tuple[Array, Array]:
+    """Return the twist of least loss among those that Adam comes to, and whether a render needs more capacity."""
     ssim_weight = 0.2 if min(target.shape[:2]) >= SSIM_WINDOW else 0.0
-    shown = target if mask is None else jnp.where(mask[..., None], target, 0.0)
+    shown = target if mask is None else jnp.where(mask, target, 0.0)
 
     def loss(twist: Array) -> Any:
         moved = dataclasses.replace(camera, viewmat=moved_viewmat(twist, camera.viewmat))
         output, _ = render_traced(gaussians, moved, appearance, background, settings, has_geometry=False)
-        color = output.color if mask is None else jnp.where(mask[..., None], output.color, 0.0)
+        color = output.color if mask is None else jnp.where(mask, output.color, 0.0)
         return photometric_loss(color, shown, ssim_weight=ssim_weight), output.overflow
 
     def step(carry: Any, index: Array) -> tuple[Any, None]:
-        twist, moments, best = carry
+        twist, moments, least, best, is_full = carry
         (value, overflow), grad = jax.value_and_grad(loss, has_aux=True)(twist)
-        is_better = value < best.loss
-        loss_now, twist_now = jnp.where(is_better, value, best.loss), jnp.where(is_better, twist, best.twist)
+        best, least = jnp.where(value < least, twist, best), jnp.where(value < least, value, least)
         rate = FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (index / num_steps)
         twist, moments = adam_update(twist, grad, moments, rate)
-        return (twist, moments, _Best(loss_now, twist_now, best.overflow | overflow)), None
+        return (twist, moments, least, best, is_full | overflow), None
 
     start = jnp.zeros(6, target.dtype)
-    best = _Best(jnp.asarray(jnp.inf, target.dtype), start, jnp.zeros((), bool))
-    steps = jnp.arange(num_steps + 1, dtype=target.dtype)
-    (_, _, best), _ = jax.lax.scan(step, (start, adam_init(start), best), steps)
-    return best
+    carry = start, adam_init(start), jnp.asarray(jnp.inf, target.dtype), start, jnp.zeros((), bool)
+    (_, _, _, best, is_full), _ = jax.lax.scan(step, carry, jnp.arange(num_steps + 1, dtype=target.dtype))
+    return best, is_full

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import Color
 from a2tg_jax.data import View, view_image
@@ -63,16 +62,6 @@ class Evaluation:
         return float(np.mean([view.psnr for view in self.per_view]))
 
     @property
-    def flat_psnr(self) -> float:
-        """Mean over the views."""
-        return float(np.mean([view.flat_psnr for view in self.per_view]))
-
-    @property
-    def has_learned(self) -> bool:
-        """Whether the model shows more than one flat colour per view."""
-        return has_learned(self.psnr, self.flat_psnr)
-
-    @property
     def ssim(self) -> float:
         """Mean over the views."""
         return float(np.mean([view.ssim for view in self.per_view]))
@@ -81,6 +70,16 @@ class Evaluation:
     def lpips(self) -> float | None:
         """Mean over the views; None without weights."""
         return None if self.lpips_network is None else float(np.mean([view.lpips for view in self.per_view]))
+
+    @property
+    def flat_psnr(self) -> float:
+        """Mean over the views."""
+        return float(np.mean([view.flat_psnr for view in self.per_view]))
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether the model shows more than one flat colour per view."""
+        return has_learned(self.psnr, self.flat_psnr)
 
     def __repr__(self) -> str:
         facts = [counted(len(self.per_view), "view")]
@@ -121,7 +120,13 @@ def evaluate(
     if not views:
         raise ValueError("there are no views to evaluate; load the scene with a test_every that leaves some")
     weights = None if lpips_weights is None else load_lpips(lpips_weights)
-    model = _model_of(gaussians, textures, settings)
+    if isinstance(gaussians, Model):
+        if textures is not None:
+            raise ValueError("textures are part of a model: give the model alone")
+        model = gaussians
+    else:
+        check_gaussians(gaussians)
+        model = Model(gaussians, appearance_of(gaussians, textures, settings))
     background = model.background if background is None else background
     cameras = [view.camera for view in views]
     renderer = Renderer(model, cameras=cameras, background=background, settings=settings, has_geometry=False)
@@ -131,7 +136,9 @@ def evaluate(
     renders: list[np.ndarray] = []
     for view in views:
         image, target = renderer(view.camera).color, jnp.asarray(view_image(view, background))
-        seconds.append(_seconds_to_draw(renderer, view.camera))
+        start = time.perf_counter()  # The renderer has drawn this size before.
+        jax.block_until_ready(renderer(view.camera))
+        seconds.append(time.perf_counter() - start)
         mask = None if view.mask is None else jnp.asarray(view.mask.read())
         if fit_colors:
             image = exposed(jnp.asarray(color_fit(image, target, mask), image.dtype), image)
@@ -142,20 +149,3 @@ def evaluate(
             renders.append(np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8))
     network = None if weights is None else weights.network
     return Evaluation(tuple(per_view), network, 1.0 / float(np.median(seconds)), tuple(renders))
-
-
-def _model_of(gaussians: Gaussians | Model, textures: Textures | None, settings: RenderSettings) -> Model:
-    """Return the model that the arguments describe."""
-    if isinstance(gaussians, Model):
-        if textures is not None:
-            raise ValueError("textures are part of a model: give the model alone")
-        return gaussians
-    check_gaussians(gaussians)
-    return Model(gaussians, appearance_of(gaussians, textures, settings))
-
-
-def _seconds_to_draw(renderer: Renderer, camera: Camera) -> float:
-    """Return the seconds of one image; the renderer has drawn this size before."""
-    start = time.perf_counter()
-    jax.block_until_ready(renderer(camera))
-    return time.perf_counter() - start

@@ -9,13 +9,11 @@ import functools
 import os
 import pathlib
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import DTypeLike
 
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.checks import check_kind, check_shape, plain_array
@@ -28,7 +26,6 @@ from a2tg_jax.texture import BYTES_PER_TEXEL, Textures
 from a2tg_jax.training import losses
 
 LPIPS_MIN_SIDE = 32
-LPIPS_LINEAR_LAYERS = {"alex": 5, "squeeze": 7}
 
 
 def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
@@ -62,7 +59,10 @@ def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
     if mask is None:
         return similarity
     # Windows in which nothing counts are equal, and count 1 each.
-    return 1 - (1 - similarity) / _share_of_windows(jnp.asarray(mask), similarity.dtype)
+    window = (losses.SSIM_WINDOW, losses.SSIM_WINDOW)
+    counts = jnp.asarray(mask).astype(similarity.dtype)
+    counts = jax.lax.reduce_window(counts, -jnp.inf, jax.lax.max, window, (1, 1), "VALID")
+    return 1 - (1 - similarity) / jnp.mean(counts)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,7 +109,11 @@ def lpips(
     shift = jnp.asarray([[[[-0.030, -0.088, -0.188]]]], pair.dtype)
     scale = jnp.asarray([[[[0.458, 0.448, 0.450]]]], pair.dtype)
     features = _FEATURES[weights.network](weights.arrays, (2 * pair - 1 - shift) / scale)
-    distances = [_layer_distance(feature, weights.arrays[f"lin{i}.weight"]) for i, feature in enumerate(features)]
+    distances = []
+    for index, feature in enumerate(features):  # Spatial means of weighted squared differences of unit features.
+        first, second = feature / (safe_norm(feature, keepdims=True) + 1e-10)
+        linear = jnp.asarray(weights.arrays[f"lin{index}.weight"], feature.dtype).reshape(1, 1, -1)
+        distances.append(jnp.mean(jnp.sum(linear * (first - second) ** 2, axis=-1)))
     return jnp.sum(jnp.stack(distances))
 
 
@@ -132,7 +136,11 @@ def parameter_bytes(gaussians: Gaussians, textures: Textures | None = None) -> i
 
 def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[Array, Array]:
     """Return both images in [0, 1], and black where pixels do not count."""
-    image, target = _converted("image", image), _converted("target", target)
+    # Arrays of other libraries and nested lists become arrays of JAX; the check reports all else.
+    image, target = (
+        jnp.asarray(value) if hasattr(value, "__array__") or type(value) in (list, tuple) else value
+        for value in (plain_array("image", image), plain_array("target", target))
+    )
     losses.check_same_shape(image, target)
     image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
     if mask is None:
@@ -141,19 +149,6 @@ def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[
     check_shape("mask", mask, image.shape[:2])
     counts = jnp.asarray(mask)[..., None]
     return jnp.where(counts, image, 0.0), jnp.where(counts, target, 0.0)
-
-
-def _converted(name: str, image: Any) -> Any:
-    """Return arrays of other libraries and nested lists as arrays of JAX, and all else as it is."""
-    image = plain_array(name, image)
-    return jnp.asarray(image) if hasattr(image, "__array__") or type(image) in (list, tuple) else image
-
-
-def _share_of_windows(mask: Array, dtype: DTypeLike) -> Array:
-    """Return the share of SSIM's windows in which at least one pixel counts."""
-    window = (losses.SSIM_WINDOW, losses.SSIM_WINDOW)
-    counts = jax.lax.reduce_window(mask.astype(dtype), -jnp.inf, jax.lax.max, window, (1, 1), "VALID")
-    return jnp.mean(counts)
 
 
 @functools.lru_cache(maxsize=4)
@@ -165,67 +160,50 @@ def _load_lpips(path: pathlib.Path) -> LpipsWeights:
     except ValueError as error:
         raise ValueError(f"{path} is not an .npz archive of LPIPS weights ({error})") from error
     network = "squeeze" if "features.3.squeeze.weight" in arrays else "alex"
-    weights = LpipsWeights(network, arrays)
-    _check_weights(path, weights)
-    return weights
-
-
-def _check_weights(path: pathlib.Path, weights: LpipsWeights) -> None:
-    """Raise ValueError unless the network runs on these arrays, tried by shapes alone."""
+    # The network is tried by shapes alone.
     image = jax.ShapeDtypeStruct((1, LPIPS_MIN_SIDE, LPIPS_MIN_SIDE, 3), jnp.float32)
     try:
-        features = jax.eval_shape(functools.partial(_FEATURES[weights.network], weights.arrays), image)
-        linear = [weights.arrays[f"lin{i}.weight"] for i in range(LPIPS_LINEAR_LAYERS[weights.network])]
-    except Exception as error:  # What JAX makes of shapes that do not fit is of many types.
+        features = jax.eval_shape(functools.partial(_FEATURES[network], arrays), image)
+        linear = [arrays[f"lin{i}.weight"].shape for i in range(len(features))]
+    except Exception as error:  # JAX raises many types for shapes that do not fit.
         raise ValueError(
-            f"{path} does not hold LPIPS weights of AlexNet or SqueezeNet (taken for {weights.network}): "
+            f"{path} does not hold LPIPS weights of AlexNet or SqueezeNet (taken for {network}): "
             f"{shortened(str(error), 200)}"
         ) from error
-    if [x.shape for x in linear] != [(1, feature.shape[-1], 1, 1) for feature in features]:
-        raise ValueError(f"{path}: the linear layers do not fit the channels of {weights.network}")
-    if not all(np.isfinite(array).all() for array in weights.arrays.values()):
+    if linear != [(1, feature.shape[-1], 1, 1) for feature in features]:
+        raise ValueError(f"{path}: the linear layers do not fit the channels of {network}")
+    if not all(np.isfinite(array).all() for array in arrays.values()):
         raise ValueError(f"{path}: weights must be finite; some are NaN or infinite")
-
-
-def _layer_distance(features: Array, linear: np.ndarray) -> Array:
-    """Spatial mean of the weighted squared difference of the two unit-normalised feature maps [2, h, w, C]."""
-    first, second = features / (safe_norm(features, keepdims=True) + 1e-10)
-    weights = jnp.asarray(linear, features.dtype).reshape(1, 1, -1)
-    return jnp.mean(jnp.sum(weights * (first - second) ** 2, axis=-1))
+    return LpipsWeights(network, arrays)
 
 
 def _alexnet(arrays: Mapping[str, np.ndarray], x: Array) -> list[Array]:
     """Return the five ReLU outputs of torchvision's AlexNet that LPIPS compares; x and they are NHWC."""
-    relu1 = _conv_relu(arrays, "features.0", x, stride=4, padding=2)
-    relu2 = _conv_relu(arrays, "features.3", _max_pool(relu1), padding=2)
-    relu3 = _conv_relu(arrays, "features.6", _max_pool(relu2), padding=1)
-    relu4 = _conv_relu(arrays, "features.8", relu3, padding=1)
-    relu5 = _conv_relu(arrays, "features.10", relu4, padding=1)
-    return [relu1, relu2, relu3, relu4, relu5]
+    shown = [_conv_relu(arrays, "features.0", x, stride=4, padding=2)]
+    for layer, padding in ((3, 2), (6, 1), (8, 1), (10, 1)):
+        pooled = _max_pool(shown[-1]) if layer < 8 else shown[-1]
+        shown.append(_conv_relu(arrays, f"features.{layer}", pooled, padding=padding))
+    return shown
 
 
 def _squeezenet(arrays: Mapping[str, np.ndarray], x: Array) -> list[Array]:
     """Return the seven outputs of torchvision's SqueezeNet 1.1 that LPIPS compares; x and they are NHWC."""
-    fire = functools.partial(_fire, arrays)
-    relu1 = _conv_relu(arrays, "features.0", x, stride=2)
-    fire2 = fire("features.4", fire("features.3", _max_pool(relu1, is_ceil=True)))
-    fire3 = fire("features.7", fire("features.6", _max_pool(fire2, is_ceil=True)))
-    fire4 = fire("features.9", _max_pool(fire3, is_ceil=True))
-    fire5 = fire("features.10", fire4)
-    fire6 = fire("features.11", fire5)
-    fire7 = fire("features.12", fire6)
-    return [relu1, fire2, fire3, fire4, fire5, fire6, fire7]
+    x = _conv_relu(arrays, "features.0", x, stride=2)
+    shown = [x]
+    for layer in (3, 4, 6, 7, 9, 10, 11, 12):
+        if layer in (3, 6, 9):
+            x = _max_pool(x, is_ceil=True)
+        # A fire module: squeeze, then expand with 1×1 and 3×3 kernels side by side.
+        squeezed = _conv_relu(arrays, f"features.{layer}.squeeze", x)
+        narrow = _conv_relu(arrays, f"features.{layer}.expand1x1", squeezed)
+        wide = _conv_relu(arrays, f"features.{layer}.expand3x3", squeezed, padding=1)
+        x = jnp.concatenate([narrow, wide], axis=-1)
+        if layer not in (3, 6):
+            shown.append(x)
+    return shown
 
 
 _FEATURES = {"alex": _alexnet, "squeeze": _squeezenet}
-
-
-def _fire(arrays: Mapping[str, np.ndarray], name: str, x: Array) -> Array:
-    """SqueezeNet's fire module: squeeze, then expand with 1×1 and 3×3 kernels side by side."""
-    squeezed = _conv_relu(arrays, f"{name}.squeeze", x)
-    narrow = _conv_relu(arrays, f"{name}.expand1x1", squeezed)
-    wide = _conv_relu(arrays, f"{name}.expand3x3", squeezed, padding=1)
-    return jnp.concatenate([narrow, wide], axis=-1)
 
 
 def _conv_relu(arrays: Mapping[str, np.ndarray], name: str, x: Array, stride: int = 1, padding: int = 0) -> Array:

@@ -75,8 +75,7 @@ def sample_surface(mesh: Mesh, spacing: float, seed: int = 0) -> np.ndarray:
     wanted = np.ceil(areas.sum() / spacing**2) if len(areas) else 0
     if not wanted <= MOST_POINTS:
         raise ValueError(f"spacing {spacing:g} takes {wanted:.3g} points; give one for up to {MOST_POINTS:,}")
-    num = int(wanted)
-    points = np.zeros((num, 3))
+    points = np.zeros((num := int(wanted), 3))
     if not num:
         return points
     rng = np.random.default_rng(seed)

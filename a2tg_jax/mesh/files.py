@@ -56,13 +56,6 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     mesh = mesh if transform is None else mesh.transform(transform.inverse())
     if suffix == ".obj":
         return _save_obj(path, mesh)
-    with replacing(path) as temporary:
-        temporary.write_bytes(_ply_of(mesh))
-    return [path]
-
-
-def _ply_of(mesh: Mesh) -> bytes:
-    """Return a PLY file, binary, little-endian."""
     kind = "<f8" if needs_doubles(mesh.vertices) else "<f4"
     columns: list[tuple[str, str, np.ndarray]] = [(n, kind, c) for n, c in zip("xyz", mesh.vertices.T, strict=True)]
     if mesh.colors is not None:
@@ -78,7 +71,9 @@ def _ply_of(mesh: Mesh) -> bytes:
         *(f"property {words[dtype]} {name}" for name, dtype, _ in columns),
         f"element face {mesh.num_faces}", "property list uchar int vertex_indices", "end_header", "",
     ]  # fmt: skip
-    return "\n".join(header).encode() + rows.tobytes() + faces.tobytes()
+    with replacing(path) as temporary:
+        temporary.write_bytes("\n".join(header).encode() + rows.tobytes() + faces.tobytes())
+    return [path]
 
 
 def needs_doubles(vertices: np.ndarray) -> bool:

@@ -19,11 +19,10 @@ def viewer_html(*, is_training: bool = False) -> str:
 
 def viewer_html_with(scene: bytes) -> str:
     """Return the viewer's page with a scene in it; it needs no other file."""
-    before, end, after = viewer_html().rpartition("</body>")
-    data = base64.b64encode(scene).decode("ascii")
-    # Text that no browser runs, so that the page's policy needs to allow nothing more; it stands before the script.
-    head, script, rest = before.partition('<script type="module">')
-    return f'{head}<script type="text/plain" id="scene-data">{data}</script>\n  {script}{rest}{end}{after}'
+    # Text that no browser runs, so that the page's policy needs to allow nothing more, before the script.
+    data = f'<script type="text/plain" id="scene-data">{base64.b64encode(scene).decode("ascii")}</script>\n  '
+    head, script, rest = viewer_html().partition('<script type="module">')
+    return f"{head}{data}{script}{rest}"
 
 
 def photograph_name(index: int) -> str:

@@ -1,7 +1,7 @@
 """Server of a page and its files from memory; runs on waitress.
 
-It listens on the loopback, or, if asked, on a network. There it answers only below a random path, the token: whoever
-has the address has access.
+It listens on the loopback, or on a network. There it answers only below a random path, the token: whoever has the
+address has access.
 """
 
 import contextlib
@@ -18,7 +18,6 @@ from concurrent.futures import Future
 from typing import Any
 
 from a2tg_jax.host import signals
-from a2tg_jax.host.operating_system import allow_recent_port
 
 LOOPBACK, ANY = "127.0.0.1", "0.0.0.0"
 ELSEWHERE = "192.0.2.1"
@@ -31,8 +30,7 @@ HEADERS = (
     ("X-Content-Type-Options", "nosniff"),
 )
 
-StartResponse = Callable[[str, list[tuple[str, str]]], Any]
-Application = Callable[[Mapping[str, Any], StartResponse], Iterable[bytes]]
+Application = Callable[[Mapping[str, Any], Callable[[str, list[tuple[str, str]]], Any]], Iterable[bytes]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +40,6 @@ class Route:
     content_type: str
     content: bytes | Callable[[], bytes | None]
     """Bytes, or a function that finds them at each request and returns None if there are none."""
-
     act: Callable[[], None] | None = None
     """Function called first. Such a path answers POST, from the page itself."""
 
@@ -55,18 +52,12 @@ class Door:
     """Address at which a server listens, and the token that lets requests in."""
 
     name: str = LOOPBACK
-    """Name or address by which the server was asked to listen."""
+    """Name or address by which the user named this machine."""
     address: str = LOOPBACK
     """IPv4 address at which it listens; 0.0.0.0 for all of this machine."""
     port: int = 0
     token: str = ""
     """First part of every path; empty for none."""
-
-    @staticmethod
-    def of(listening: socket.socket, name: str) -> "Door":
-        """Return the door of a bound socket, with a new token if other machines can reach it."""
-        address, port = listening.getsockname()
-        return Door(name.lower(), address, port, "" if _is_loopback(address) else secrets.token_urlsafe(16))
 
     @property
     def url(self) -> str:
@@ -78,7 +69,11 @@ class Door:
         """Return whether `host`, such as 127.0.0.1:8000, names this server, and not by a name that others chose."""
         name, _, port = host.rpartition(":")
         is_own = name in (self.name, self.address, LOOPBACK, "localhost")
-        return port == str(self.port) and (is_own or (self.address == ANY and _is_ip(name)))
+        if self.address == ANY and not is_own:
+            with contextlib.suppress(ValueError):
+                ipaddress.IPv4Address(name)
+                is_own = True
+        return is_own and port == str(self.port)
 
     def behind(self, path: str) -> str | None:
         """Return the path behind the token; None if the path has another token or none."""
@@ -98,26 +93,16 @@ def lan_address() -> str:
         return str(probe.getsockname()[0])
 
 
-def _is_ip(name: str) -> bool:
-    try:
-        ipaddress.IPv4Address(name)
-    except ValueError:
-        return False
-    return True
-
-
-def _is_loopback(address: str) -> bool:
-    return ipaddress.IPv4Address(address).is_loopback
-
-
 def application(routes: Mapping[str, Route], door: Door) -> Application:
     """Answer GET and HEAD, or POST, at the paths of `routes`, such as "/", and nothing else.
 
-    A request must name this machine as the host that it asks, and begin its path with the door's token. A page from
-    elsewhere, whose name is made to lead here, cannot read the scene.
+    A request must name this machine as its host, and begin its path with the door's token. A page from elsewhere, whose
+    name is made to lead here, cannot read the scene.
     """
 
-    def answer(environ: Mapping[str, Any], start_response: StartResponse) -> Iterable[bytes]:
+    def answer(
+        environ: Mapping[str, Any], start_response: Callable[[str, list[tuple[str, str]]], Any]
+    ) -> Iterable[bytes]:
         def refuse(status: str) -> list[bytes]:
             start_response(status, [("Content-Type", "text/plain"), *HEADERS])
             return [status.encode()]
@@ -125,19 +110,19 @@ def application(routes: Mapping[str, Route], door: Door) -> Application:
         path = door.behind(environ["PATH_INFO"] or "/")
         if path is None or not door.admits(environ.get("HTTP_HOST") or ""):
             return refuse("403 Forbidden")
-        route = routes.get(path)
-        is_action = route is not None and route.act is not None
-        if environ["REQUEST_METHOD"] not in (("POST",) if is_action else ("GET", "HEAD")):
+        route, method = routes.get(path), environ["REQUEST_METHOD"]
+        act = None if route is None else route.act
+        if method not in (("GET", "HEAD") if act is None else ("POST",)):
             return refuse("405 Method Not Allowed")
-        if route is not None and route.act is not None:
+        if act is not None:
             if environ.get("HTTP_ORIGIN") != f"http://{environ['HTTP_HOST']}":
                 return refuse("403 Forbidden")
-            route.act()
+            act()
         body = None if route is None else route.read()
         if route is None or body is None:
             return refuse("404 Not Found")
         start_response("200 OK", [("Content-Type", route.content_type), ("Content-Length", str(len(body))), *HEADERS])
-        return [] if environ["REQUEST_METHOD"] == "HEAD" else [body]
+        return [] if method == "HEAD" else [body]
 
     return answer
 
@@ -155,7 +140,7 @@ def serve(
 
     Raises:
       ValueError: if waitress is not installed, the port is taken, or this machine has no such address.
-      Stopped: if the process is asked to end otherwise (`signals.raised`).
+      Stopped: if the process is to end otherwise (`signals.raised`).
     """
     with _running(routes, host, port) as (url, ended):  # In a thread, for waitress hides how its loop was ended.
         try:
@@ -171,7 +156,7 @@ def serve(
 
 @contextlib.contextmanager
 def served(routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0) -> Iterator[str]:
-    """Serve in a thread within the block, and yield the address. Arguments and errors are those of `serve`.
+    """Serve in a thread within the block, and yield the address. Arguments and errors as in `serve`.
 
     An error that ends the server is a warning at the end of the block.
     """
@@ -183,9 +168,25 @@ def served(routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0) 
 
 @contextlib.contextmanager
 def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tuple[str, Future[None]]]:
-    """Yield the address of a server in a thread, and what tells its end and the error that ended it."""
+    """Yield the address of a server in a thread, and a future of its end or the error that ended it."""
+    try:
+        waitress: Any = importlib.import_module("waitress")
+    except ImportError as error:
+        raise ValueError("the viewer's server needs waitress: pip install 'a2tg-jax[viewer]'") from error
+    try:
+        listening = socket.create_server((host, port))
+    except (OSError, OverflowError, UnicodeError) as error:
+        place, remedy = f"port {port}", "leave out --port for a free one"
+        if host != LOOPBACK:
+            place, remedy = f"{host}:{port}", "--host takes an IPv4 address of this machine, or 0.0.0.0"
+        raise ValueError(f"{place} cannot be used: {getattr(error, 'strerror', None) or error}; {remedy}") from error
+    address, port = listening.getsockname()
+    is_private = ipaddress.IPv4Address(address).is_loopback
+    door = Door(host.lower(), address, port, "" if is_private else secrets.token_urlsafe(16))
     connections: dict[int, Any] = {}
-    server, url = _opened(routes, host, port, connections)
+    server = waitress.create_server(
+        application(routes, door), map=connections, sockets=[listening], threads=4, ident=None
+    )
     ended: Future[None] = Future()
 
     def run() -> None:
@@ -195,47 +196,16 @@ def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tupl
         except BaseException as error:
             ended.set_exception(error)
 
+    def close() -> None:
+        for connection in list(connections.values()):
+            connection.close()
+
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     try:
-        yield url, ended
+        yield door.url, ended
     finally:
-        # In the server's own thread, which ends when all is closed.
-        server.trigger.pull_trigger(lambda: _close(connections))
+        server.trigger.pull_trigger(close)  # In the server's own thread, which ends when all is closed.
         thread.join()
-        _close(connections)  # If an error has ended the thread.
+        close()  # If an error has ended the thread.
         server.task_dispatcher.shutdown()
-
-
-def _close(connections: Mapping[int, Any]) -> None:
-    for connection in list(connections.values()):
-        connection.close()
-
-
-def _opened(routes: Mapping[str, Route], host: str, port: int, connections: dict[int, Any]) -> tuple[Any, str]:
-    """Return a server of waitress that listens, and answers once it is run, and the address of the page; the server
-    keeps what it holds open in `connections`."""
-    try:
-        waitress: Any = importlib.import_module("waitress")
-    except ImportError as error:
-        raise ValueError("the viewer's server needs waitress: pip install 'a2tg-jax[viewer]'") from error
-    listening = _listening(host, port)
-    door = Door.of(listening, host)
-    app = application(routes, door)
-    return waitress.create_server(app, map=connections, sockets=[listening], threads=4, ident=None), door.url
-
-
-def _listening(host: str, port: int) -> socket.socket:
-    """Return a socket bound to a port of an address of this machine."""
-    found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        allow_recent_port(found)
-        found.bind((host, port))
-    except (OSError, OverflowError, UnicodeError) as error:
-        found.close()
-        reason = getattr(error, "strerror", None) or error
-        place, remedy = f"port {port}", "leave out --port for a free one"
-        if host != LOOPBACK:
-            place, remedy = f"{host}:{port}", "--host takes an IPv4 address of this machine, or 0.0.0.0"
-        raise ValueError(f"{place} cannot be used: {reason}; {remedy}") from error
-    return found
