@@ -139,8 +139,7 @@ def extract_mesh(
     if not own_radius:  # Cameras at one place look at what lies at the median depth of the first.
         depth = np.asarray(depths_of(renderer(cameras[0]), cameras[0]).depth)
         middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
-        own_center += middle * np.asarray(cameras[0].viewmat, np.float64)[2, :3]
-        own_radius = RADII * middle
+        own_center, own_radius = own_center + middle * np.asarray(cameras[0].viewmat, float)[2, :3], RADII * middle
     center = own_center if center is None else np.asarray(center, np.float64)
     radius = own_radius if radius is None else radius
     voxel = radius / (resolution or RESOLUTION) if voxel is None else voxel

@@ -1,17 +1,24 @@
-"""Files of meshes: PLY, OBJ and GLB (host)."""
+"""Files of meshes: PLY, OBJ and GLB, a binary glTF 2.0 (host)."""
 
+import io
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.mesh.gltf import save_glb
+from a2tg_jax.io.gltf import OWN
+from a2tg_jax.io.gltf_container import Builder
+from a2tg_jax.io.other_programs import linear_colors, matrix_of, upright
 from a2tg_jax.mesh.triangles import Mesh
 
 SUFFIXES = (".glb", ".ply", ".obj")
+JPEG_QUALITY = 92
+FAR = 100.0
+"""Distance from the origin, in extents, from which on positions are relative to the middle, as float32 needs."""
 
 
 def check_mesh_suffix(path: str | os.PathLike[str], name: str = "path") -> None:
@@ -51,12 +58,12 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".glb":
-        save_glb(path, mesh, transform)
+        _save_glb(path, mesh, transform)
         return [path]
     mesh = mesh if transform is None else mesh.transform(transform.inverse())
     if suffix == ".obj":
         return _save_obj(path, mesh)
-    kind = "<f8" if needs_doubles(mesh.vertices) else "<f4"
+    kind = "<f8" if _needs_doubles(mesh.vertices) else "<f4"
     columns: list[tuple[str, str, np.ndarray]] = [(n, kind, c) for n, c in zip("xyz", mesh.vertices.T, strict=True)]
     if mesh.colors is not None:
         columns += [(n, "u1", c) for n, c in zip(("red", "green", "blue"), mesh.colors.T, strict=True)]
@@ -76,7 +83,7 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     return [path]
 
 
-def needs_doubles(vertices: np.ndarray) -> bool:
+def _needs_doubles(vertices: np.ndarray) -> bool:
     """Return whether float32 would round positions by more than 1e-5 of their extent, as far from the origin."""
     if not len(vertices):
         return False
@@ -99,7 +106,7 @@ def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
         rows = mesh.vertices
         if mesh.colors is not None and mesh.texture is None:
             rows = np.hstack([rows, mesh.colors / 255])
-        number = " %.15g" if needs_doubles(mesh.vertices) else " %.9g"
+        number = " %.15g" if _needs_doubles(mesh.vertices) else " %.9g"
         np.savetxt(file, rows, "v" + number * 3 + " %.4g" * (rows.shape[1] - 3))
         if mesh.uv is not None:
             np.savetxt(file, mesh.uv, "vt %.6f %.6f")
@@ -107,3 +114,57 @@ def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
         else:
             np.savetxt(file, mesh.faces + 1, "f %d %d %d")
     return written
+
+
+def _save_glb(path: Path, mesh: Mesh, transform: Similarity | None) -> None:
+    """Write a GLB file of a mesh, unlit.
+
+    With a transform, the node leads to the upright world that `save_gltf` places splats in, and its extras have the
+    transform if the original world is far from there. Without, positions far from the origin are relative to the
+    translation of the node.
+    """
+    builder = Builder()
+    node: dict[str, Any] = {"name": "mesh", "mesh": 0}
+    middle = _middle(mesh.vertices) if transform is None else np.zeros(3)
+    if transform is not None:
+        node["matrix"] = matrix_of(upright(transform, "y")).T.ravel().tolist()
+        if _middle(mesh.transform(transform.inverse()).vertices).any():
+            kept = {"scale": float(transform.scale), "rotation": np.asarray(transform.rotation).tolist()}
+            node["extras"] = {OWN: kept | {"translation": np.asarray(transform.translation).tolist()}}
+    elif middle.any():
+        node["translation"] = middle.tolist()
+    attributes = {"POSITION": builder.add((mesh.vertices - middle).astype(np.float32), has_bounds=True)}
+    surface: dict[str, Any] = {"metallicFactor": 0, "roughnessFactor": 1}
+    if mesh.texture is not None and mesh.uv is not None:
+        # The origin of glTF's textures is the upper left corner.
+        attributes["TEXCOORD_0"] = builder.add((mesh.uv * (1, -1) + (0, 1)).astype(np.float32))
+        surface["baseColorTexture"] = {"index": 0}
+    elif mesh.colors is not None:
+        opaque = np.full((mesh.num_vertices, 1), 65535)
+        rows = np.hstack([np.rint(65535 * linear_colors(mesh.colors / 255)), opaque])
+        attributes["COLOR_0"] = builder.add(rows.astype(np.uint16), normalized=True)
+    indices = builder.add(mesh.faces.astype(np.uint32).reshape(-1), is_attribute=False)
+    unlit = {"pbrMetallicRoughness": surface, "extensions": {"KHR_materials_unlit": {}}, "doubleSided": True}
+    described: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "a2tg-jax"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
+        "materials": [unlit],
+        "extensionsUsed": ["KHR_materials_unlit"],
+    }
+    if mesh.texture is not None:
+        file = io.BytesIO()
+        Image.fromarray(mesh.texture).save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+        described["images"] = [{"bufferView": builder.add_bytes(file.getvalue()), "mimeType": "image/jpeg"}]
+        described["samplers"] = [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}]
+        described["textures"] = [{"source": 0, "sampler": 0}]
+    builder.save(path, described)
+
+
+def _middle(vertices: np.ndarray) -> np.ndarray:
+    """Return the middle of positions far from the origin; otherwise zeros."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    middle = (low + high) / 2
+    return middle if np.abs(middle).max() > FAR * (high - low).max() else np.zeros(3)
