@@ -276,8 +276,7 @@ def keep_rows(model: Model, moments: AdamState, state: Any, is_kept: Array | np.
     All shapes stay: the rows of the Gaussians that are kept come first, in their order, and `Model.num_live` falls.
 
     Args:
-      model: as given to `HostEvent.apply`.
-      moments: as given to `HostEvent.apply`.
+      model, moments: as given to `HostEvent.apply`.
       state: of the event.
       is_kept: mask of the Gaussians that stay, [num] bool for those that exist (`Model.num`), or [N] for all rows, such
         as `model.gaussians.opacities > 0.01`.

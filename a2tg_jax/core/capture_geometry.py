@@ -69,10 +69,6 @@ def turntable(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     It keeps the cameras' mean distance and elevation, looks at the subject with a level horizon, and begins at the side
     of the first camera, whose intrinsics and image size are used throughout.
 
-    Args:
-      cameras: cameras that look at a subject.
-      num_frames: number of cameras on the orbit, at least one.
-
     Raises:
       ValueError: if there are no cameras or frames, or the cameras do not look at one subject.
     """

@@ -293,15 +293,11 @@ def resize(
     kept: np.ndarray | None = None,
     room: Shape | None = None,
 ) -> Resized:
-    """Rebuild the buckets at new sizes (host). Padding, and what grows from an empty block, is `Table.padding` in the
-    table and 0 in moments.
+    """Rebuild the buckets at new sizes [N, D] (host). Padding, and what grows from an empty block, is `Table.padding`
+    in the table and 0 in moments.
 
-    Args:
-      table: blocks of N Gaussians.
-      sizes: [N, D] integers.
-      moments: any pytree, such as the state of Adam: all tables in it of the same class are rebuilt, other leaves stay.
-      known, room: as for `plan_places`.
-      kept: [N] bool, whose moments are kept, the others' being 0; None: all.
+    Moments are any pytree, such as the state of Adam: all tables in it of the same class are rebuilt, other leaves
+    stay. Of blocks that are not `kept` [N] they become 0. `known` and `room` are as for `plan_places`.
     """
     places, capacities = plan_places(sizes, known, like=table.bucket, room=room)
     ends = (on_host(table.bucket), on_host(table.row)), (on_host(places.bucket), on_host(places.row))
