@@ -223,7 +223,7 @@ class StepEvent(Event):
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         """Return the model after the event; traced."""
-        raise NotImplementedError(f"{type(self).__name__} must say what it does")
+        raise NotImplementedError(f"{type(self).__name__} must define apply(now, model, moments, state)")
 
 
 class HostEvent(Event):
@@ -231,7 +231,7 @@ class HostEvent(Event):
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         """Return the iterations of a stage after which it happens, ascending."""
-        raise NotImplementedError(f"{type(self).__name__} must say when it happens")
+        raise NotImplementedError(f"{type(self).__name__} must define iterations(num_iterations)")
 
     def num_programs(self, num_iterations: int) -> int:
         """Return the number of programs compiled because of it, about, for forecasts (host).
@@ -252,7 +252,7 @@ class HostEvent(Event):
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
         """Return the model after the event (host)."""
-        raise NotImplementedError(f"{type(self).__name__} must say what it does")
+        raise NotImplementedError(f"{type(self).__name__} must define apply(due, model, moments, state)")
 
 
 def iterations_at(fractions: tuple[float, ...], num_iterations: int, *, with_end: bool = False) -> tuple[int, ...]:

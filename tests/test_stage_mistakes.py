@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
@@ -57,6 +58,25 @@ class Named(a2tg.StepEvent):
 class Never(a2tg.HostEvent):
     def iterations(self, num_iterations):
         return (0.5,)
+
+
+@a2tg.pytree
+class Always(a2tg.HostEvent):
+    """At all times if its period is 0; removes everything."""
+
+    every: int = 1
+
+    def iterations(self, num_iterations):
+        return tuple(range(self.every, num_iterations + 1, self.every))
+
+    def apply(self, due, model, moments, state):
+        return a2tg.keep_rows(model, moments, state, np.zeros(len(model.gaussians.means), bool))
+
+
+@a2tg.pytree
+class Unending(a2tg.StepEvent):
+    def times(self, num_iterations):
+        return a2tg.Times(1, num_iterations, 0)
 
 
 @a2tg.pytree
@@ -137,6 +157,8 @@ GIVEN = {
     "stage 'own': events[0] must be a pytree: decorate the class Undecorated": {"events": (Undecorated(),)},
     "stage 'own': events[0] must hold numbers; got 'a': make fields of Named": {"events": (Named(),)},
     "stage 'own': Never.iterations must return ascending integers in a tuple; got (0.5,)": {"events": (Never(),)},
+    "stage 'own': Always.iterations: range() arg 3 must not be zero": {"events": (Always(0),)},
+    "stage 'own': Unending.times: every must be at least 1; got 0": {"events": (Unending(),)},
     "stage 'own': losses must be a tuple or a list; got function": {"losses": roughness},
     "stage 'own': losses must have a term": {"losses": ()},
     "stage 'own': losses[0] must be a loss term, such as Term(function); got function: say Term(roughness)": {
@@ -160,6 +182,7 @@ RETURNED = {
     "stage 'own': Returning.apply: state must keep its structure": {"events": (Returning("state"),)},
     "stage 'own': Observing.observe must keep its structure": {"events": (Observing(),)},
     "stage 'own': OnHost.apply: the result must be a Change; got Model": {"events": (OnHost(),)},
+    "stage 'own': Always.apply: is_kept must keep at least 2 Gaussians; got 0 of 50": {"events": (Always(),)},
     "the loss function 'each_pixel' must return a scalar, such as jnp.mean(…); got float32[16, 16, 3]": {
         "losses": (a2tg.Term(each_pixel),)
     },

@@ -355,6 +355,7 @@ def test_unknown_systems_are_named():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("Own2 = 1", "has no attribute 'Own'; did you mean Own2"),
         ("def f(:", "cannot be imported: SyntaxError: "),
         ("1 / 0", "cannot be imported: ZeroDivisionError: division by zero"),
         (OWN.format(options="x: int", names=("a",)), "every option of the system .* must have a default"),

@@ -153,7 +153,7 @@ class Appearance:
     def rates(self, rate: Any) -> Any:
         """Return Adam's learning rates, a prefix of the tree of floats, from the rates of a stage.
 
-        A number holds for all floats. A mapping has rates by field, 0 for those it lacks.
+        A number holds for all floats. A mapping has rates by field; a field that it lacks does not learn.
         """
         if not isinstance(rate, Mapping):
             return rate
@@ -411,7 +411,13 @@ def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
 
 
 def check_arrays_given(appearance: Appearance) -> None:
-    """Raise ValueError if a part, or a table of a subclass, is a template without its arrays."""
+    """Raise ValueError if a subclass or a part is a template without its arrays."""
+    own = [field.name for field in array_fields(appearance) if field.name not in PARTS]
+    if own and all(getattr(appearance, name) is None for name in own):
+        raise ValueError(
+            f"model.appearance.{own[0]} is None: this {type(appearance).__name__} is a template, without arrays; say "
+            "Model(gaussians, allocate_appearance(appearance, key, gaussians))"
+        )
     for name in PARTS:
         part = getattr(appearance, name)
         for field in [] if part is None else array_fields(part):

@@ -44,11 +44,11 @@ class Correction:
     @property
     def neutral(self) -> np.ndarray:
         """The row that changes nothing."""
-        raise NotImplementedError(f"{type(self).__name__} must say what changes nothing")
+        raise NotImplementedError(f"{type(self).__name__} must define neutral, the row that changes nothing")
 
     def learning_rate(self, progress: Array) -> Array:
         """Return Adam's learning rate at a share of the stage between 0 and 1; traced."""
-        raise NotImplementedError(f"{type(self).__name__} must say how fast it learns")
+        raise NotImplementedError(f"{type(self).__name__} must define learning_rate(progress)")
 
     def camera(self, row: Array, camera: Camera) -> Camera:
         """Return the camera that the view is drawn from; traced."""

@@ -417,8 +417,12 @@ class StageRun:
         """Apply a host event."""
         due = event.iterations(self.stage.iterations)
         now = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes)
-        change = event.apply(now, self.state.model, self.state.moments, self.state.events[place])
-        change = checked_change(f"stage {self.stage.name!r}: {type(event).__name__}.apply", change)
+        name = f"stage {self.stage.name!r}: {type(event).__name__}.apply"
+        try:
+            change = event.apply(now, self.state.model, self.state.moments, self.state.events[place])
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+        change = checked_change(name, change)
         self.effects.apply(place, self.state, change)
         self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
         if change.rows is not None:

@@ -38,9 +38,11 @@ def find_system(reference: str) -> System:
         )
     try:
         found = getattr(importlib.import_module(path), attribute)
-    except Exception as error:  # A module of one's own may fail in any way.
+    except Exception as error:  # A custom module may fail in any way.
+        names = vars(sys.modules[path]) if path in sys.modules else {}
         raise ValueError(
             f"the system {shortened(reference)!r} cannot be imported: {shortened(_told(error), LONGEST_REASON)}"
+            f"{did_you_mean(attribute, names)}"
         ) from error
     if isinstance(found, type) and issubclass(found, System):
         return _with_defaults(found, reference)

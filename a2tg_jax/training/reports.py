@@ -330,7 +330,7 @@ class StageEffects:
             first = _first_time(event, end)
             if first is not None and not 1 <= first <= end:
                 warnings.warn(
-                    f"stage {self._stage.name!r}: {type(event).__name__} never happens, for it is first due at "
+                    f"stage {self._stage.name!r}: {self._system.path_of(event)} never happens, for it is first due at "
                     f"iteration {first:,} of {end:,}",
                     stacklevel=2,
                 )
@@ -342,10 +342,11 @@ class StageEffects:
             times = event.iterations(self._stage.iterations)
             if not own.num_applied or own.num_applied < len(times):  # A resumed stage has not seen the first ones.
                 continue
+            name = self._system.path_of(event)
             if not own.has_changed:
-                told.append(f"{type(event).__name__} changed nothing, though it happened {own.num_applied:,} times")
+                told.append(f"{name} changed nothing, though it happened {own.num_applied:,} times")
             elif own.unused:
-                told.append(f"{self._system.path_of(event)}.{own.unused}")
+                told.append(f"{name}.{own.unused}")
         if told:
             warnings.warn(f"stage {self._stage.name!r}: {'; '.join(told)}", stacklevel=2)
 

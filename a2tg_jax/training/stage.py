@@ -254,11 +254,16 @@ def _check_part(name: str, part: Any, kinds: tuple[type, ...]) -> None:
 
 
 def _check_times(name: str, event: Event, num_iterations: int) -> None:
-    """Raise ValueError unless the times of an event are such."""
+    """Raise ValueError unless the times of an event are valid."""
     if isinstance(event, StepEvent):
-        check_kind(f"{name}.times: the result", event.times(num_iterations), Times)
+        times = event.times(num_iterations)
+        check_kind(f"{name}.times: the result", times, Times)
+        check_number(f"{name}.times: every", times.every, least=1)
     elif isinstance(event, HostEvent):
-        found = event.iterations(num_iterations)
+        try:
+            found = event.iterations(num_iterations)
+        except (ValueError, ArithmeticError) as error:
+            raise ValueError(f"{name}.iterations: {error}") from error
         is_integers = isinstance(found, Sequence) and all(isinstance(number, int | np.integer) for number in found)
         if not is_integers or list(found) != sorted(set(found)):
             raise ValueError(f"{name}.iterations must return ascending integers in a tuple; got {shortened(found)}")
