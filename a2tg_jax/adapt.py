@@ -323,8 +323,7 @@ def select(
     if budget_bytes is not None:
         return within_budget(statistic, can_grow, added_bytes, budget_bytes)
     check_number("threshold", threshold)
-    chosen: np.ndarray = can_grow & (statistic > threshold)
-    return chosen
+    return can_grow & (statistic > threshold)
 
 
 def reallocate(

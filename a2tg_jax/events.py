@@ -42,8 +42,7 @@ class Times(NamedTuple):
 
     def is_due(self, iteration: Any) -> Array:
         """Return whether the event follows this iteration."""
-        is_due: Array = (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
-        return is_due
+        return (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
 
     def num_left(self, iteration: Any) -> Any:
         """Return the number of its times from an iteration on."""

@@ -355,8 +355,7 @@ def without_arrays(node: Any, instead: Callable[[str], Any], name: str = "") -> 
 
 def template_of(appearance: A) -> A:
     """Return the appearance without its arrays: its options."""
-    template: A = without_arrays(appearance, lambda path: None)
-    return template
+    return without_arrays(appearance, lambda path: None)
 
 
 def allocate_appearance(template: A, key: Array, gaussians: Gaussians) -> A:

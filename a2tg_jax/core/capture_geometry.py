@@ -31,8 +31,7 @@ def nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
     projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal_matrix = projections.mean(axis=0)
     if np.linalg.eigvalsh(normal_matrix)[0] < MIN_AXIS_SPREAD:
-        mean: np.ndarray = centers.mean(axis=0)
-        return mean
+        return centers.mean(axis=0)
     return np.linalg.solve(normal_matrix, np.einsum("vij,vj->i", projections, centers) / len(centers))
 
 

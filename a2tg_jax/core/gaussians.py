@@ -118,8 +118,7 @@ class Gaussians:
 
     def __getitem__(self, rows: Any) -> "Gaussians":
         """Return the Gaussians of the given rows (slice, mask or index array)."""
-        chosen: Gaussians = jax.tree.map(lambda x: x[rows], self)
-        return chosen
+        return jax.tree.map(lambda x: x[rows], self)
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -308,5 +307,4 @@ def stacked_integral(opacities: Array, num_shares: Array) -> Array:
 
     # A loop over nodes, not an axis of nodes: the memory stays one value per row.
     half = jax.lax.fori_loop(1, QUADRATURE_STEPS + 1, add_node, 0.5 * integrand(0.0))
-    whole: Array = half * (2 * spacing / math.sqrt(math.pi))
-    return whole
+    return half * (2 * spacing / math.sqrt(math.pi))

@@ -22,8 +22,7 @@ def as_bytes(image: Any) -> np.ndarray | None:
         return None
     if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape or not np.issubdtype(pixels.dtype, np.floating):
         return None
-    rounded: np.ndarray = np.rint(255 * np.clip(np.nan_to_num(pixels), 0, 1)).astype(np.uint8)
-    return rounded
+    return np.rint(255 * np.clip(np.nan_to_num(pixels), 0, 1)).astype(np.uint8)
 
 
 def enlarged(pixels: np.ndarray) -> np.ndarray:

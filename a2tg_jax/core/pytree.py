@@ -112,7 +112,6 @@ def partition(tree: T) -> tuple[T, T]:
 
 def combine(floats: T, rest: T) -> T:
     """Return the pytree that `partition` split, or one with other floats."""
-    whole: T = jax.tree.map(
+    return jax.tree.map(
         lambda one, other: other if one is None else one, floats, rest, is_leaf=lambda leaf: leaf is None
     )
-    return whole

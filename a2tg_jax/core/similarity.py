@@ -30,8 +30,7 @@ class Similarity:
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Return positions [..., 3] in the new world; `scale` multiplies lengths, `rotation` directions."""
-        moved: np.ndarray = self.scale * np.asarray(points) @ self.rotation.T + self.translation
-        return moved
+        return self.scale * np.asarray(points) @ self.rotation.T + self.translation
 
     def apply_to_viewmat(self, viewmat: np.ndarray) -> np.ndarray:
         """Return the world-to-camera matrix [4, 4] of the new world for one of the old; again a rigid motion.

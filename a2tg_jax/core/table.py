@@ -117,8 +117,7 @@ class Table:
     def sizes(self) -> np.ndarray:
         """[N, D] integers, the sides of each block (host)."""
         sides = np.asarray(self.bucket_sizes, np.int64).reshape(-1, self.num_sides)
-        sizes: np.ndarray = sides[on_host(self.bucket)]
-        return sizes
+        return sides[on_host(self.bucket)]
 
     @property
     def shape(self) -> Shape:

@@ -227,5 +227,4 @@ def _chosen(points: np.ndarray, indices: ArrayLike, what: str) -> np.ndarray:
         advice = ": say np.flatnonzero of a mask" if indices.dtype == bool else ""
         wanted = f"{what} must hold integers [S] from 0 to {len(points) - 1}, indices of points"
         raise ValueError(f"{wanted}; got {indices.dtype} {[*indices.shape]}{advice}")
-    chosen: np.ndarray = points[indices.astype(int)]
-    return chosen
+    return points[indices.astype(int)]

@@ -259,8 +259,7 @@ def _usable(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud
 
 def _are_somewhere(points: np.ndarray) -> np.ndarray:
     """Return [P] whether all coordinates of a point are within bounds."""
-    are_within: np.ndarray = (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
-    return are_within
+    return (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
 
 
 def _view(shot: Shot, viewmat: np.ndarray, scale: float) -> View:

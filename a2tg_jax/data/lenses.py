@@ -128,8 +128,7 @@ class Lens:
         """Return x and y [P, 2] in pixels of points [P, 3] before the camera, in a view of a K and (width, height)."""
         if not self.is_kept:
             return pinhole_pixels(points, K)
-        xy: np.ndarray = np.asarray(self.camera.img_from_cam(points)) * np.divide(size, self.size)
-        return xy
+        return np.asarray(self.camera.img_from_cam(points)) * np.divide(size, self.size)
 
     def rays(self, width: int, height: int) -> np.ndarray | None:
         """Return the rays [height, width, 2] of views of a size, as `Camera.rays` has them; NaN where there is none.
@@ -232,5 +231,4 @@ def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def _scaled_intrinsics(K: np.ndarray, old: tuple[int, int], new: tuple[int, int]) -> np.ndarray:
     """Return K [3, 3] for an image of the size `new` instead of `old`, both (width, height); pixel edges stay edges."""
-    scaled: np.ndarray = np.diag([new[0] / old[0], new[1] / old[1], 1.0]) @ K
-    return scaled
+    return np.diag([new[0] / old[0], new[1] / old[1], 1.0]) @ K

@@ -62,8 +62,7 @@ def before_camera(points: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
 def pinhole_pixels(points: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Return x and y [P, 2] in pixels of points [P, 3] before a pinhole camera, in its frame."""
     seen = points @ K.T
-    xy: np.ndarray = seen[:, :2] / seen[:, 2:]
-    return xy
+    return seen[:, :2] / seen[:, 2:]
 
 
 def _are_usable(depths: np.ndarray) -> np.ndarray:

@@ -38,8 +38,7 @@ def coordinates(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
 
 def mix(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return (1 - weight)·first + weight·second, [rows, columns, 3]."""
-    mixed: np.ndarray = first + weight[..., None].astype(np.float32) * (second - first)
-    return mixed
+    return first + weight[..., None].astype(np.float32) * (second - first)
 
 
 def fractal_noise(rng: np.random.Generator, rows: int, columns: int, cells: int, octaves: int = 2) -> np.ndarray:
@@ -87,8 +86,7 @@ def mosaic(rng: np.random.Generator, side: int, ring: int) -> np.ndarray:
     to_edge = np.minimum(radius - index, index + 1 - radius) * ring
     along_edge = np.minimum(along - stone, stone + 1 - along) * (2 * np.pi * radius * ring / sectors)
     grout = np.clip(np.minimum(to_edge, along_edge) - 0.6, 0, 1)[..., None]
-    paving: np.ndarray = palette[kind] * shade[..., None] * grout + GROUT * (1 - grout)
-    return paving
+    return palette[kind] * shade[..., None] * grout + GROUT * (1 - grout)
 
 
 def marble(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:

@@ -112,8 +112,7 @@ def _within_border(pixels: np.ndarray) -> np.ndarray:
     parts, _ = label(pixels[..., :3].max(axis=-1) <= BLACKEST)
     at_edge = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
     border = np.isin(parts, at_edge[at_edge > 0])
-    counts: np.ndarray = ~binary_dilation(border, iterations=MARGIN)
-    return counts
+    return ~binary_dilation(border, iterations=MARGIN)
 
 
 def record3d(path: Path) -> Callable[[], Frames] | None:

@@ -162,5 +162,4 @@ def _colors(vertices: np.ndarray, fields: Mapping[str, str]) -> np.ndarray:
         colors = given / next(largest for largest in FLOAT_RANGES if mean <= largest)
     else:
         colors = given / next(largest for largest in INTEGER_RANGES if given.max() <= largest)
-    pixels: np.ndarray = np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)
-    return pixels
+    return np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)

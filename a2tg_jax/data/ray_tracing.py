@@ -207,8 +207,7 @@ def column(vector: Vector) -> np.ndarray:
 
 def squares(*components: np.ndarray) -> np.ndarray:
     """Return the sum of their squares."""
-    total: np.ndarray = sum(component * component for component in components)
-    return total
+    return sum(component * component for component in components)
 
 
 def quadratic_roots(a: np.ndarray, half_b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -254,8 +253,7 @@ def _shaded(
     coarse = coarse + LAMP_LIGHT * (lamp / NUM_LAMP_RAYS)
     factors = colors.shape[0] / rows, colors.shape[1] / columns
     fine = zoom(coarse.reshape(rows, columns), factors, order=1, grid_mode=True, mode="nearest")
-    pixels: np.ndarray = np.rint(255 * np.clip(colors * fine[..., None], 0, 1)).astype(np.uint8)
-    return pixels
+    return np.rint(255 * np.clip(colors * fine[..., None], 0, 1)).astype(np.uint8)
 
 
 def _unit_vectors(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -232,8 +232,7 @@ def view_image(view: View, background: Sequence[float] | np.ndarray | None = Non
     if not view.has_alpha:
         return color
     alpha = pixels[..., 3:].astype(np.float32) / np.float32(255)
-    composed: np.ndarray = alpha * color + (1 - alpha) * np.asarray(background, np.float32)
-    return composed
+    return alpha * color + (1 - alpha) * np.asarray(background, np.float32)
 
 
 def scene_name(folder: Path | str) -> str:

@@ -113,8 +113,7 @@ def _grey(frame: Any, width: int) -> np.ndarray:
     """Return a frame as greyscale of at most a width, [h, w] uint8."""
     width = min(width, frame.width)
     height = max(2, round(frame.height * width / frame.width))
-    grey: np.ndarray = frame.reformat(width=width, height=height, format="gray").to_ndarray()
-    return grey
+    return frame.reformat(width=width, height=height, format="gray").to_ndarray()
 
 
 def _display_matrix(frame: Any) -> np.ndarray:

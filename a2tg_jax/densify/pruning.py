@@ -165,8 +165,7 @@ def _weights(
 
     none = jnp.zeros(len(nothing), jnp.int32)
     found, _ = jax.lax.scan(of_view, (nothing[:, 0], none), (cameras, counted))
-    shown: tuple[Array, Array] = spread(None if settings.exchange is None else settings.exchange.mesh, found)
-    return shown
+    return spread(None if settings.exchange is None else settings.exchange.mesh, found)
 
 
 # Floaters

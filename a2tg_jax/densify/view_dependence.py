@@ -167,5 +167,4 @@ def raised_degrees(degrees: np.ndarray, strengths: np.ndarray, budget: float, hi
     cost = BYTES_PER_FLOAT * np.asarray([floats_of_band(degree) for degree in (1, 2, 3)])[following]
     strength = np.take_along_axis(strengths, following[:, None], axis=1)[:, 0]
     is_candidate = (degrees < highest) & (strength > 0)
-    raised: np.ndarray = degrees + within_budget(strength, is_candidate, cost, budget)
-    return raised
+    return degrees + within_budget(strength, is_candidate, cost, budget)

@@ -140,8 +140,7 @@ def kernels(num: int, convention: str) -> Kernels:
 def _weights(u: np.ndarray, num: int, convention: str) -> np.ndarray:
     """Return the bilinear weights [num, Q] of texels at points of an axis."""
     place = np.asarray(texel_coordinates(jnp.asarray(u), jnp.asarray(float(num)), convention), np.float64)
-    found: np.ndarray = np.maximum(0.0, 1 - np.abs(place[None] - np.arange(num)[:, None]))
-    return found
+    return np.maximum(0.0, 1 - np.abs(place[None] - np.arange(num)[:, None]))
 
 
 def _split(gaussians: Gaussians, shapes: Array | None, tables: Tables, convention: str) -> Gaussians:

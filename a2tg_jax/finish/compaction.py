@@ -60,8 +60,7 @@ class Trial:
     @property
     def precision(self) -> Precision:
         """Precision of its group."""
-        chosen: Precision = getattr(self.choices, self.group)
-        return chosen
+        return getattr(self.choices, self.group)
 
 
 def loss_on_views(

@@ -130,8 +130,7 @@ def _solve(
     def normal(change: Colors) -> Colors:
         return pulled(lambda camera, _: draw_change(model, change, camera, settings))
 
-    changes: Colors = solve_cg(normal, pulled(missing), ridge=ridge, maxiter=num_steps, tol=0.0)
-    return changes
+    return solve_cg(normal, pulled(missing), ridge=ridge, maxiter=num_steps, tol=0.0)
 
 
 def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSettings) -> Array:

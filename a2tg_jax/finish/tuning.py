@@ -178,8 +178,7 @@ class GradualRounding(StepEvent):
         leaves, tree = jax.tree.flatten(partition(model)[0])
         keys = jax.random.split(jax.random.key(KEY_OF_TIMES), len(leaves))
         times = [jax.random.uniform(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
-        of_numbers: Model = jax.tree.unflatten(tree, times)
-        return of_numbers
+        return jax.tree.unflatten(tree, times)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Model) -> Change:
         share = now.iteration.astype(float) / (LAST_ROUNDED * now.num_iterations.astype(float))

@@ -208,8 +208,7 @@ ALONE = Devices()
 def default_platform() -> str:
     """Return JAX's platform of the device on which new arrays are placed ("cpu" or "gpu")."""
     (device,) = jnp.zeros(()).devices()
-    platform: str = device.platform
-    return platform
+    return device.platform
 
 
 def this_machine() -> Machine:

@@ -182,8 +182,7 @@ def with_green(codes: np.ndarray, bits: int, sign: int = 1) -> np.ndarray:
 
 def opacities_of(logits: np.ndarray) -> np.ndarray:
     """Return the opacities of logits, float64."""
-    opacities: np.ndarray = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
-    return opacities
+    return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
 
 
 def logits_of(opacities: np.ndarray) -> np.ndarray:
@@ -196,8 +195,7 @@ def with_w(xyz: np.ndarray) -> np.ndarray:
     """Return unit quaternions [n, 4] from their last three numbers [3, n]; w is not negative."""
     squares = np.minimum(np.sum(xyz**2, axis=0), 1.0)
     quats = np.concatenate([np.sqrt(1.0 - squares)[None], xyz]).T
-    units: np.ndarray = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
-    return units
+    return quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
 
 
 # Positions
@@ -229,8 +227,7 @@ class AxisSteps(NamedTuple):
 
     def values(self, codes: np.ndarray, bits: int) -> np.ndarray:
         """Return the numbers of steps, float64."""
-        found: np.ndarray = self.centre + self.spread * np.sinh(dequantised(codes, Ends(self.low, self.high), bits))
-        return found
+        return self.centre + self.spread * np.sinh(dequantised(codes, Ends(self.low, self.high), bits))
 
 
 def morton(codes: np.ndarray, bits: int) -> np.ndarray:

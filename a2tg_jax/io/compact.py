@@ -94,8 +94,7 @@ class CompactChoices:
         """Return the precision of a part of the file, such as sh_2 or texel_colors."""
         groups = {"sh_0": "sh_0", "texel_colors": "texels", "texel_alphas": "texels"}
         group = groups.get(name, "sh_rest" if name.startswith("sh_") else name)
-        precision: Precision = getattr(self, group)
-        return precision
+        return getattr(self, group)
 
     def check(self) -> Self:
         """Raise ValueError, naming the choice, if one is invalid."""

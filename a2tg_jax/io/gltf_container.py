@@ -141,8 +141,7 @@ class Document:
             raise ValueError(f"has no {kind}[{shortened(index)}]")
         if not isinstance(entries[index], dict):
             raise ValueError(f"its {kind}[{index}] is no object")
-        found: dict[str, Any] = entries[index]
-        return found
+        return entries[index]
 
     def numbers(self, index: Any, kind: str, what: str) -> np.ndarray:
         """Return the numbers of an accessor as float32 [n, columns]; integers that are normalised become fractions.

@@ -163,8 +163,7 @@ def _appearance_of(kind: type[Appearance], data: Mapping[str, Any]) -> Appearanc
         return config_from_dict(kind, options, f"options of {kind.__name__}", given={**arrays, **parts})
 
     parts = {name: read(PART_CLASSES[name], own, {}) for name, own in data.get("parts", {}).items()}
-    read_appearance: Appearance = read(kind, data["options"], parts)
-    return read_appearance
+    return read(kind, data["options"], parts)
 
 
 # Origins

@@ -120,8 +120,7 @@ def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarra
     row, column = np.divmod(within, np.maximum(widths, 1))
     row = np.where(np.repeat(np.isin(axis, V_MIRRORED), areas), heights - 1 - row, row)
     column = np.where(np.repeat(np.isin(axis, U_MIRRORED), areas), widths - 1 - column, column)
-    places: np.ndarray = np.repeat(starts, areas) + row * widths + column
-    return places
+    return np.repeat(starts, areas) + row * widths + column
 
 
 def nearest_half_turn(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,8 +141,7 @@ def with_positive_w(quats: np.ndarray) -> np.ndarray:
     quats = np.asarray(quats, np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1.0), [1.0, 0.0, 0.0, 0.0])
-    positive: np.ndarray = unit * np.where(unit[:, :1] < 0, -1.0, 1.0)
-    return positive
+    return unit * np.where(unit[:, :1] < 0, -1.0, 1.0)
 
 
 def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origin | None, background: Color) -> Model:

@@ -135,8 +135,7 @@ def splats_of(model: Model, *, keeps_shapes: bool = False) -> Ellipsoids:
 
 def third_log_scales(log_scales: np.ndarray) -> np.ndarray:
     """Return the logarithms [N, 1] of third scales: of flat Gaussians [N, 2], a thousandth of the shorter one."""
-    third: np.ndarray = log_scales.min(axis=1, keepdims=True) + np.log(THICKNESS)
-    return third
+    return log_scales.min(axis=1, keepdims=True) + np.log(THICKNESS)
 
 
 def linear_colors(colors: np.ndarray) -> np.ndarray:
@@ -425,8 +424,7 @@ def _rounding(kind: Kind, means: np.ndarray) -> np.ndarray:
     logarithms = np.sign(means) * np.log1p(np.abs(means))
     step = np.ptp(logarithms, axis=0) / SOG_LEVELS
     single = np.spacing(np.abs(logarithms).astype(np.float32))
-    rounding: np.ndarray = ((1 + np.abs(means)) * np.maximum(step, single) / 2).max(axis=1)
-    return rounding
+    return ((1 + np.abs(means)) * np.maximum(step, single) / 2).max(axis=1)
 
 
 def cut_numbers(name: str, model: Model) -> list[str]:

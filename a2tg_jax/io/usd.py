@@ -139,8 +139,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
 def _world_of(usd: Any, prim: Any, unit: float) -> np.ndarray:
     """Return the matrix [4, 4] from a particle field to the world, in metres."""
     placed = usd.UsdVol.ParticleField(prim).ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())
-    matrix: np.ndarray = np.diag([unit, unit, unit, 1.0]) @ np.array(placed, np.float64).T
-    return matrix
+    return np.diag([unit, unit, unit, 1.0]) @ np.array(placed, np.float64).T
 
 
 def _model_of(usd: Any, prim: Any, path: Path) -> Model:
@@ -188,6 +187,5 @@ def _numbers(usd: Any, prim: Any, name: str, columns: int, wanted: int | None = 
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
         values = attribute.Get(usd.Usd.TimeCode.EarliestTime()) if attribute else None
         if values is not None and len(values) >= (wanted or 0):
-            rows: np.ndarray = np.asarray(values).reshape(-1, columns)[:wanted].astype(np.float32)
-            return rows
+            return np.asarray(values).reshape(-1, columns)[:wanted].astype(np.float32)
     return None

@@ -221,8 +221,7 @@ def importance(rows: Rows, origin: Origin | None) -> np.ndarray:
     centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
     squares = np.stack([np.sum((rows.means - center) ** 2, axis=1) for center in centers])
     least = NEAREST * np.median(squares) if squares.size else 1.0
-    seen: np.ndarray = areas * np.mean(1 / np.maximum(squares, max(least, 1e-30)), axis=0)
-    return seen
+    return areas * np.mean(1 / np.maximum(squares, max(least, 1e-30)), axis=0)
 
 
 def _origin_to_dict(model: Model) -> dict[str, Any]:

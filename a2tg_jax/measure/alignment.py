@@ -59,8 +59,7 @@ def color_fit(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite where its pixels count; it has NaN or infinite colours")
     inputs = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
-    affine: np.ndarray = np.linalg.lstsq(inputs.T @ inputs, inputs.T @ wanted, rcond=None)[0].T
-    return affine
+    return np.linalg.lstsq(inputs.T @ inputs, inputs.T @ wanted, rcond=None)[0].T
 
 
 def align_poses(

@@ -223,7 +223,4 @@ def _conv_relu(arrays: Mapping[str, np.ndarray], name: str, x: Array, stride: in
 def _max_pool(x: Array, is_ceil: bool = False) -> Array:
     """3×3 maximum at stride 2; `is_ceil` keeps the last window that only starts inside the image."""
     padding = [(0, (size - 3) % 2 if is_ceil else 0) for size in x.shape[1:3]]
-    pooled: Array = jax.lax.reduce_window(
-        x, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), [(0, 0), *padding, (0, 0)]
-    )
-    return pooled
+    return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), [(0, 0), *padding, (0, 0)])

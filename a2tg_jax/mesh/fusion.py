@@ -153,8 +153,7 @@ class BlockGrid:
 def _keys_of(blocks: np.ndarray) -> np.ndarray:
     """Return [B] int64 names of blocks [B, 3], different for different ones."""
     x, y, z = blocks.astype(np.int64).T + LIMIT
-    keys: np.ndarray = x << 42 | y << 21 | z
-    return keys
+    return x << 42 | y << 21 | z
 
 
 class RenderedDepth(NamedTuple):

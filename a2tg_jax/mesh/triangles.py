@@ -43,8 +43,7 @@ class Mesh:
     @property
     def corners(self) -> np.ndarray:
         """[F, 3, 3] positions of the corners of each face."""
-        corners: np.ndarray = self.vertices[self.faces]
-        return corners
+        return self.vertices[self.faces]
 
     @property
     def face_normals(self) -> np.ndarray:

@@ -334,8 +334,7 @@ def _composite_band(
 def _send(chosen: Array, x: Array, fill: float = 0.0) -> Array:
     """Send the chosen rows [D, C] of an array [n, ...] to each device; return the rows received [D·C, ...]."""
     rows = jnp.take(x, chosen.reshape(-1), axis=0, mode="fill", fill_value=fill)
-    received: Array = jax.lax.all_to_all(rows, AXIS, 0, 0, tiled=True)
-    return received
+    return jax.lax.all_to_all(rows, AXIS, 0, 0, tiled=True)
 
 
 def _shifted(M: Array, top: Array) -> Array:

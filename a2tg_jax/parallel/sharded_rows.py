@@ -79,8 +79,7 @@ def placed(x: Any, sharding: NamedSharding) -> Array:
     if isinstance(x, jax.Array) and x.sharding.is_equivalent_to(sharding, x.ndim):
         return x
     if sharding.is_fully_addressable:
-        array: Array = jax.device_put(x, sharding)
-        return array
+        return jax.device_put(x, sharding)
     return jax.make_array_from_callback(jnp.shape(x), sharding, on_host(x).__getitem__)
 
 
@@ -123,8 +122,7 @@ def placed_like(new: Any, old: Any) -> Array:
     if mesh is None:
         return jnp.asarray(new)
     new = np.asarray(new)
-    placed: Array = spread(mesh, new.astype(jax.dtypes.canonicalize_dtype(new.dtype), copy=False))
-    return placed
+    return spread(mesh, new.astype(jax.dtypes.canonicalize_dtype(new.dtype), copy=False))
 
 
 def zeros_beside(old: Any, shape: Sequence[int], dtype: DTypeLike) -> Array:
@@ -139,8 +137,7 @@ def rows_moved(x: Array, rows: Array | np.ndarray) -> Array:
     It is traceable. Outside jit, rows that are spread over devices move on the host.
     """
     if mesh_of(x) is None:
-        moved: Array = x[rows]
-        return moved
+        return x[rows]
     return placed_like(on_host(x)[np.asarray(rows)], x)
 
 
@@ -179,8 +176,7 @@ def of_first(mesh: Mesh | None, tree: Any) -> Any:
     def of_leaf(x: Any) -> np.ndarray:
         x = np.ascontiguousarray(x)
         sent = multihost_utils.broadcast_one_to_all(x.reshape(-1).view(np.uint8))  # As bytes: JAX may round numbers.
-        same: np.ndarray = np.asarray(sent, np.uint8).view(x.dtype).reshape(x.shape)
-        return same
+        return np.asarray(sent, np.uint8).view(x.dtype).reshape(x.shape)
 
     return jax.tree.map(of_leaf, tree)
 

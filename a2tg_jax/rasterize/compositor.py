@@ -129,8 +129,7 @@ def _forward(settings: CompositingSettings, *arrays: Any) -> tuple[Array, Array]
     tiles, pixels = settings.grid.num, settings.grid.tile_size**2
     shapes = (tiles, settings.kernel.num_channels, pixels), (tiles, pixels)
     results = tuple(jax.ShapeDtypeStruct(shape, inputs.splats.M.dtype) for shape in shapes)
-    shown: tuple[Array, Array] = _by_platform("forward", settings, results, inputs)
-    return shown
+    return _by_platform("forward", settings, results, inputs)
 
 
 _composite_tiles = jax.custom_vjp(_forward, nondiff_argnums=(0,))

@@ -125,8 +125,7 @@ class CompositingSettings(NamedTuple):
     @property
     def num_groups(self) -> int:
         """Number of batches of tiles in the image."""
-        num: int = -(-self.grid.num // self.tile_batch)
-        return num
+        return -(-self.grid.num // self.tile_batch)
 
 
 def num_channels(has_geometry: bool, num_colors: int) -> int:

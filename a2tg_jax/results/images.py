@@ -36,8 +36,7 @@ LONGEST_SIDE = 1280
 
 def to_uint8(image: ArrayLike) -> np.ndarray:
     """Return 8-bit pixels of a float image, clipped to [0, 1] and rounded."""
-    pixels: np.ndarray = np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
-    return pixels
+    return np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8)
 
 
 def checkered(shape: tuple[int, ...], side: int) -> np.ndarray:
@@ -49,8 +48,7 @@ def checkered(shape: tuple[int, ...], side: int) -> np.ndarray:
 def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the absolute difference, brightened ERROR_GAIN times."""
     difference = np.abs(image.astype(np.int32) - target.astype(np.int32))
-    picture: np.ndarray = np.minimum(ERROR_GAIN * difference, 255).astype(np.uint8)
-    return picture
+    return np.minimum(ERROR_GAIN * difference, 255).astype(np.uint8)
 
 
 @dataclasses.dataclass(frozen=True)

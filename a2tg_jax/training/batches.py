@@ -203,8 +203,7 @@ class PhotoStore:
                 self._rays[kind] = rays
         batch = batch._replace(rays=rays)
         if self._exchange is not None:
-            placed: Photographs = on_devices(self._exchange, batch, is_batch=not self.is_resident)
-            return placed
+            return on_devices(self._exchange, batch, is_batch=not self.is_resident)
         return jax.device_put(batch) if self.is_resident else batch
 
     def _read(self, indices: Sequence[int]) -> Photographs:

@@ -366,8 +366,7 @@ def sliced(grid: Array, color: Array) -> Array:
         weight = jnp.maximum(1 - jnp.abs(luminance - number), 0)
         return total + weight[..., None] * mapped, None
 
-    result: Array = jax.lax.scan(add, jnp.zeros_like(color), (grid, jnp.arange(levels, dtype=color.dtype)))[0]
-    return result
+    return jax.lax.scan(add, jnp.zeros_like(color), (grid, jnp.arange(levels, dtype=color.dtype)))[0]
 
 
 def total_variation(grid: Array) -> Array:

@@ -101,8 +101,7 @@ def unwatched(run: "StageRun", is_stopped: IsStopped) -> float:
 
 def read(infos: list[StepInfo]) -> list[StepInfo]:
     """Return the scalars of some steps as host numbers. Only here the loop waits for the device."""
-    known: list[StepInfo] = jax.device_get(infos)
-    return known
+    return jax.device_get(infos)
 
 
 class StageRun:
@@ -204,8 +203,7 @@ class StageRun:
         if self.mesh is None:
             return self.state.model.live
         live = jax.tree.map(on_host, self.state.model).live
-        on_one: Model = jax.device_put(live, self.mesh.local_mesh.devices.flat[0])
-        return on_one
+        return jax.device_put(live, self.mesh.local_mesh.devices.flat[0])
 
     @property
     def checkpoint(self) -> Checkpoint:

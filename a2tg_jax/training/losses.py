@@ -189,5 +189,4 @@ def back_project(depth: Array, camera: Camera) -> Array:
         x, y = jnp.moveaxis(jnp.where(jnp.isfinite(camera.rays), camera.rays, 0.0), -1, 0)
     rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ jnp.linalg.inv(camera.K).T
     rotation = camera.viewmat[:3, :3]
-    points: Array = (rays @ rotation) * depth[..., None] + camera.center[None, None]
-    return points
+    return (rays @ rotation) * depth[..., None] + camera.center[None, None]

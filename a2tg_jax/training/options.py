@@ -409,8 +409,7 @@ def like(kind: type[System] | System, other: System) -> System:
       kind: class or instance that gives all other options.
       other: the other system.
     """
-    changed: System = _like(kind() if isinstance(kind, type) else kind, other)
-    return changed
+    return _like(kind() if isinstance(kind, type) else kind, other)
 
 
 def own_options(system: Any, other: Any) -> dict[str, Any]:

@@ -43,8 +43,7 @@ def checked_change(name: str, change: Any) -> Change:
         except ValueError as error:
             hint = "keep_rows(model, moments, state, is_kept) removes Gaussians from both"
             raise ValueError(f"{error}, as in the model: {hint}") from None
-    checked: Change = change._replace(model=dataclasses.replace(change.model, num_live=change.model.live_count))
-    return checked
+    return change._replace(model=dataclasses.replace(change.model, num_live=change.model.live_count))
 
 
 def check_kept(name: str, found: object, wanted: object) -> None:

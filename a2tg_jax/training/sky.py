@@ -183,14 +183,12 @@ def is_bare(camera: Camera, cells: tuple[np.ndarray, float], points: np.ndarray,
     rays, spacing = cells
     towards = _units(points[:: -(-len(points) // MOST_POINTS)] - np.asarray(camera.center, np.float64))
     is_far = cKDTree(towards).query(rays)[0] > REACH * spacing
-    bare: np.ndarray = has_ray(rays) & is_far & (rays @ up > LOWEST)
-    return bare
+    return has_ray(rays) & is_far & (rays @ up > LOWEST)
 
 
 def has_ray(rays: np.ndarray) -> np.ndarray:
     """Return [C] whether cells with the rays [C, 3] of `cell_rays` lie somewhere."""
-    somewhere: np.ndarray = np.any(rays != NOWHERE, axis=1)
-    return somewhere
+    return np.any(rays != NOWHERE, axis=1)
 
 
 def cell_rays(camera: Camera) -> tuple[np.ndarray, float]:
@@ -244,14 +242,12 @@ def _blocks(image: np.ndarray, camera: Camera) -> np.ndarray:
     step = _step(camera)
     rows, columns = camera.height // step, camera.width // step
     blocks = image[: rows * step, : columns * step].reshape(rows, step, columns, step, -1)
-    means: np.ndarray = blocks.mean(axis=(1, 3)).reshape(rows * columns, -1)
-    return means
+    return blocks.mean(axis=(1, 3)).reshape(rows * columns, -1)
 
 
 def _units(vectors: np.ndarray) -> np.ndarray:
     """Return vectors [..., 3] of length 1; 0 of 0."""
-    units: np.ndarray = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
-    return units
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
 
 
 def even_directions(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:

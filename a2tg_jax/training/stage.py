@@ -200,8 +200,7 @@ class Stage:
         if not self.cools_down:
             return rates
         factor = 1 - (1 - COOLED) * progress
-        lower: T = jax.tree.map(lambda rate: rate * factor.astype(jnp.result_type(rate, float)), rates)
-        return lower
+        return jax.tree.map(lambda rate: rate * factor.astype(jnp.result_type(rate, float)), rates)
 
     def clock(self) -> "Clock":
         """Return the schedule for the step (host)."""

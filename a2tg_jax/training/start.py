@@ -273,10 +273,8 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
 def new_appearance(template: Appearance, gaussians: Gaussians, system: System) -> Appearance:
     """Return the appearance that a stage of a system begins with, of the options of a template."""
     key = jax.random.fold_in(jax.random.key(system.seed), KEY_OF_APPEARANCE)
-    allocated: Appearance = allocate_appearance(template, key, gaussians)
-    return allocated
+    return allocate_appearance(template, key, gaussians)
 
 
 def _followed_by(gaussians: Gaussians, others: Gaussians) -> Gaussians:
-    joined: Gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, others)
-    return joined
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, others)

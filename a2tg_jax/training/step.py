@@ -290,8 +290,7 @@ def batch_gradients(
         views, appearance = jax.lax.map(gradients_of, arrays)
     else:
         views, appearance = map_views(gradients_of, arrays, exchange.views_at_once)
-    found: BatchGradients = views._replace(grads=(views.grads[0], appearance, views.grads[2]))
-    return found
+    return views._replace(grads=(views.grads[0], appearance, views.grads[2]))
 
 
 def term_parts(term: LossTerm, model: Model, target: Target, output: RenderOutput) -> dict[str, Array]:

@@ -196,8 +196,7 @@ def inliers(residual: Array, share: Array | float, factor: Array | float, mask: 
 def _patch_sums(image: Array, side: int) -> Array:
     """Return the sums over square patches; those at the right and lower edges may be cut off."""
     zero = jnp.zeros((), image.dtype)
-    sums: Array = jax.lax.reduce_window(image, zero, jax.lax.add, (side, side), (side, side), _padding(image, side))
-    return sums
+    return jax.lax.reduce_window(image, zero, jax.lax.add, (side, side), (side, side), _padding(image, side))
 
 
 def _padding(image: Array, side: int) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -209,8 +208,7 @@ def _around(patches: Array) -> Array:
     side = 2 * REACH + 1
     zero = jnp.zeros((), patches.dtype)
     reach = (REACH, REACH), (REACH, REACH)
-    sums: Array = jax.lax.reduce_window(patches, zero, jax.lax.add, (side, side), (1, 1), reach)
-    return sums
+    return jax.lax.reduce_window(patches, zero, jax.lax.add, (side, side), (1, 1), reach)
 
 
 DepthKind = Literal["inverse", "depth"]
@@ -298,10 +296,7 @@ def points_loss(depth: Array, alpha: Array, points: ObservedPoints, mask: Array 
 
 def _at(pixels: Array, image: Array) -> Array:
     """Return the values [S] of an image [H, W] at pixels in order, 0 at those beyond its end."""
-    values: Array = (
-        image.reshape(-1).at[pixels].get(mode="fill", fill_value=0, unique_indices=True, indices_are_sorted=True)
-    )
-    return values
+    return image.reshape(-1).at[pixels].get(mode="fill", fill_value=0, unique_indices=True, indices_are_sorted=True)
 
 
 def _mean_error(one: Array, other: Array, counts: Array) -> Array:

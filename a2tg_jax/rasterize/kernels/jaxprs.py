@@ -187,8 +187,7 @@ class PixelFunctions:
 
 def _planes_vjp(M: pixel.Rows, tile: pixel.TileNumbers, d_planes: pixel.Planes) -> pixel.Rows:
     """Return the cotangent of M, given that of its planes."""
-    d_M: pixel.Rows = jax.vjp(lambda M: pixel.planes_of(M, tile), M)[1](d_planes)[0]
-    return d_M
+    return jax.vjp(lambda M: pixel.planes_of(M, tile), M)[1](d_planes)[0]
 
 
 def refusal_of(spec: KernelSpec, translate: Callable[[KernelSpec], Any]) -> str | None:

@@ -32,8 +32,7 @@ class Score(NamedTuple):
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def mean_score(score: Score, x: Array, y: Array) -> Array:
     """Return the average over all windows of images [C, H, W]."""
-    mean: Array = by_platform(_code_of, ("mean_score", score), jax.ShapeDtypeStruct((), jnp.result_type(x, y)), x, y)
-    return mean
+    return by_platform(_code_of, ("mean_score", score), jax.ShapeDtypeStruct((), jnp.result_type(x, y)), x, y)
 
 
 @functools.partial(mean_score.defjvp, symbolic_zeros=True)
@@ -53,8 +52,7 @@ def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Ar
     """Return the average, and its derivatives by x and y; under jit, XLA drops one that is not used."""
     value = jax.ShapeDtypeStruct((), jnp.result_type(x, y))
     slopes = (jax.ShapeDtypeStruct(image.shape, image.dtype) for image in (x, y))
-    found: tuple[Array, Array, Array] = by_platform(_code_of, ("value_and_slopes", score), (value, *slopes), x, y)
-    return found
+    return by_platform(_code_of, ("value_and_slopes", score), (value, *slopes), x, y)
 
 
 @value_and_slopes.defjvp
@@ -99,8 +97,7 @@ def window_mean(images: Array, taps: tuple[float, ...]) -> Array:
       images: [..., H, W], at least as large as the window.
       taps: T weights along one axis, symmetric.
     """
-    mean: Array = window_mean_p.bind(images, taps=taps)
-    return mean
+    return window_mean_p.bind(images, taps=taps)
 
 
 def _window_mean(images: Array, *, taps: tuple[float, ...]) -> Array:
@@ -115,8 +112,7 @@ def _blur(x: Array, taps: tuple[float, ...], axis: int) -> Array:
     pairs = [(shifted[tap] + shifted[-1 - tap]) * taps[tap] for tap in range(half)]
     middle = [shifted[half] * taps[half]] if num % 2 else []
     # Without the barrier XLA fuses the two passes into one of T² taps.
-    kept: Array = jax.lax.optimization_barrier(functools.reduce(operator.add, middle + pairs))
-    return kept
+    return jax.lax.optimization_barrier(functools.reduce(operator.add, middle + pairs))
 
 
 def _shape(images: Any, *, taps: tuple[float, ...]) -> Any:

@@ -213,8 +213,7 @@ class _Pass:
         """Return the splats [G, B, ...] of some ids [G, B], and their texture regions."""
         flat = ids.reshape(-1)
         rows = jax.tree.map(lambda x: x[flat], (self.splats, self.regions))
-        block: Block = jax.tree.map(lambda x: x.reshape(*ids.shape, *x.shape[1:]), rows)
-        return block
+        return jax.tree.map(lambda x: x.reshape(*ids.shape, *x.shape[1:]), rows)
 
     def pixel_offsets(self, tile: Tiles) -> tuple[Array, Array]:
         """Return x and y of a tile's pixels, each [1, P]: from its centre, or in its frame."""

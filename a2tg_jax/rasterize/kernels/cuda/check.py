@@ -35,8 +35,7 @@ def failure() -> str | None:
     Call it at any time, also while JAX traces or compiles: the check runs on a thread of its own. The first process
     keeps the result in the cache folder, for this GPU, driver, jaxlib and text of the kernels.
     """
-    reason: str | None = in_clean_context(_failure)
-    return reason
+    return in_clean_context(_failure)
 
 
 def _failure() -> str | None:

@@ -175,8 +175,7 @@ def call(name: str, results: Sequence[tuple[tuple[int, ...], DTypeLike]], *input
 def _capsule(address: int | None, destructor: int | None = None) -> object:
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, (_pointer, ctypes.c_char_p, _pointer)
-    capsule: object = new(address, None, destructor)
-    return capsule
+    return new(address, None, destructor)
 
 
 def _gated(entry: Any) -> int:
@@ -276,8 +275,7 @@ def _failure(frame: _CallFrame, error: BaseException) -> int:
     where = "".join(traceback.format_tb(error.__traceback__)[2:])
     message = f"{what}raised, most recent call last, at\n{where}".encode(errors="replace")
     arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, INTERNAL_ERROR)
-    address: int = frame.api.contents.create_error(ctypes.byref(arguments))
-    return address
+    return frame.api.contents.create_error(ctypes.byref(arguments))
 
 
 def _arrays(buffers: _Buffers) -> list[np.ndarray]:
