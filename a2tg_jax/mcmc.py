@@ -51,7 +51,7 @@ class MoveResult(NamedTuple):
     info: MoveInfo
 
 
-def relocate(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int) -> MoveResult:
+def relocate(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Array | int) -> MoveResult:
     """Move each dead Gaussian (opacity at most 0.005) onto a live one, drawn with probability ∝ its opacity.
 
     Host and moved ones share the opacity and size of `share`; everything else is copied from the host. The moments
@@ -74,7 +74,7 @@ def relocate(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | i
     return _moved(gaussians, moments, num_live, plan_relocation(key, gaussians.opacities, num_live))
 
 
-def grow(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int, cap: Array | int) -> MoveResult:
+def grow(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Array | int, cap: Array | int) -> MoveResult:
     """Grow the live count n to min(cap, max(n + 1, ⌊1.05·n⌋)) by copies of hosts drawn as in `relocate`.
 
     Hosts and added rows start with zero moments. A count at the cap or above stays.
@@ -228,7 +228,7 @@ def _copied_rows(hosts: Array, is_target: Array) -> tuple[Array, Array]:
     return jnp.where(is_target, hosts, jnp.arange(hosts.shape[0], dtype=jnp.int32)), num_draws
 
 
-def _moved(gaussians: Gaussians, moments: Any, num_live: Array, moves: Moves) -> MoveResult:
+def _moved(gaussians: Gaussians, moments: AdamState, num_live: Array, moves: Moves) -> MoveResult:
     """Copy rows from their hosts after sharing, and clear their moments."""
     logits, scales = share(gaussians.logit_opacities, gaussians.log_scales, moves.num_shares)
     copied = dataclasses.replace(gaussians, logit_opacities=logits, log_scales=scales)[moves.rows]

@@ -67,7 +67,7 @@ class Model:
             return self
         return dataclasses.replace(self._taken(np.arange(self.num)), num_live=None)
 
-    def __getitem__(self, rows: Any) -> "Model":
+    def __getitem__(self, rows: ArrayLike | slice) -> "Model":
         """Return the model of some of the Gaussians that exist (host).
 
         Args:
@@ -220,7 +220,7 @@ class Model:
         return facts if self.origin is None else [*facts, ("origin", repr(self.origin))]
 
 
-def _indices(rows: Any, num: int) -> np.ndarray:
+def _indices(rows: ArrayLike | slice, num: int) -> np.ndarray:
     """Return the indices of the rows that a mask, indices or a slice choose of `num`."""
     if isinstance(rows, int | np.integer) and not isinstance(rows, bool):
         if not -num <= rows < num:
@@ -237,7 +237,7 @@ def _indices(rows: Any, num: int) -> np.ndarray:
         raise ValueError(f"rows must choose among {num} Gaussians: {error}") from None
 
 
-def check_is_model(model: Any) -> None:
+def check_is_model(model: object) -> None:
     """Raise ValueError unless a value is a model."""
     check_kind("model", model, Model, "say Model(gaussians)" if isinstance(model, Gaussians) else "")
 

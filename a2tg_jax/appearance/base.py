@@ -45,6 +45,8 @@ from a2tg_jax.core.sh import sh_sum
 from a2tg_jax.core.table import Table, check_places, check_table, is_table
 from a2tg_jax.texture import NEUTRAL_TEXEL, Textures
 
+T = TypeVar("T")
+
 MAX_ALPHA = 0.99
 
 
@@ -430,7 +432,7 @@ def check_arrays_given(appearance: Appearance) -> None:
 # Rows, of Gaussians and appearances alike: every array has a row for each Gaussian, every table a block
 
 
-def clear_rows(tree: Any, is_cleared: Array) -> Any:
+def clear_rows(tree: T, is_cleared: Array) -> T:
     """Return moments with the rows of marked Gaussians [N] at zero; traceable. Tables must have their places."""
 
     def cleared(leaf: Any) -> Any:
@@ -441,12 +443,12 @@ def clear_rows(tree: Any, is_cleared: Array) -> Any:
     return jax.tree.map(cleared, tree, is_leaf=is_table)
 
 
-def take_rows(tree: Any, rows: np.ndarray) -> Any:
+def take_rows(tree: T, rows: np.ndarray) -> T:
     """Return the rows of some Gaussians, which may repeat; tables in buckets as small as they need (host)."""
     return jax.tree.map(lambda leaf: leaf.take(rows) if is_table(leaf) else leaf[rows], tree, is_leaf=is_table)
 
 
-def join_rows(trees: Sequence[Any]) -> Any:
+def join_rows(trees: Sequence[T]) -> T:
     """Return the rows of several trees of one structure but for their tables, one after the other (host)."""
 
     def joined(*leaves: Any) -> Any:

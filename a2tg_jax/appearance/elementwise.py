@@ -107,7 +107,7 @@ class _LeftOut:
         # Without an address: compiled kernels have the same name in every process, for XLA's compilation cache.
         return f"<array {self._name}>"
 
-    def _refuse(self, *_: Any) -> NoReturn:
+    def _refuse(self, *_: object) -> NoReturn:
         raise ValueError(
             f"{self._name} is an array, and texel_position, shade and falloff see only the static fields of an "
             "appearance: return it from numbers(), or put it in the texels of atlas()"

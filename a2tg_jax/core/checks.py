@@ -33,7 +33,7 @@ def fields_of(path: str) -> Iterator[None]:
         raise ValueError(f"{path}.{error}") from error
 
 
-def check_kind(name: str, value: Any, kind: type | tuple[type, ...], hint: str = "") -> None:
+def check_kind(name: str, value: object, kind: type | tuple[type, ...], hint: str = "") -> None:
     """Raise ValueError, with an optional hint, unless a value is an instance of a class, or of one of several.
 
     Without a hint, the error of a class instead of its instance says so.
@@ -186,7 +186,7 @@ def check_mask(name: str, x: object, wanted: Wanted) -> None:
         raise ValueError(f"{name} must be bools; got {dtype_of(x)}")
 
 
-def dtype_of(x: Any) -> Any:
+def dtype_of(x: object) -> Any:
     """Return the dtype of an array, a tracer, or nested sequences of numbers."""
     return x.dtype if hasattr(x, "dtype") else np.asarray(x).dtype
 

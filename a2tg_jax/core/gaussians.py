@@ -6,7 +6,6 @@ N is the number of Gaussians; quaternions are wxyz and need not be unit.
 import dataclasses
 import math
 import os
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -116,7 +115,7 @@ class Gaussians:
         """[N] peak opacities in (0, 1)."""
         return jax.nn.sigmoid(self.logit_opacities)
 
-    def __getitem__(self, rows: Any) -> "Gaussians":
+    def __getitem__(self, rows: ArrayLike | slice) -> "Gaussians":
         """Return the Gaussians of the given rows (slice, mask or index array)."""
         return jax.tree.map(lambda x: x[rows], self)
 

@@ -6,7 +6,7 @@ matrix, M = K·[Rc·R₀·s_x | Rc·R₁·s_y | Rc·μ + t]. Its last row gives 
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,8 +20,10 @@ FILTER_VARIANCE = 0.5
 NEAR_PLANE = 0.2
 """Default depth from which splats are drawn."""
 
+Floats = Array | np.ndarray
 
-def pixel_sizes(means: Any, scales: Any, viewmat: Any, K: Any) -> Any:
+
+def pixel_sizes(means: Floats, scales: Floats, viewmat: Floats, K: Floats) -> Floats:
     """Return the smaller standard deviation of Gaussians in pixels [N], of NumPy or JAX; 0 before the near plane."""
     depths = means @ viewmat[2, :3] + viewmat[2, 3]
     focal = (K[0, 0] * K[1, 1]) ** 0.5

@@ -35,7 +35,7 @@ class AdamState:
     """int32 number of updates so far."""
 
 
-def adam_init(params: Any) -> AdamState:
+def adam_init(params: object) -> AdamState:
     """Return the state before the first update of a pytree of float arrays: zero moments. ValueError: a leaf holds no
     floats, naming it."""
     _check_floats(params)
@@ -114,7 +114,7 @@ def exponential_decay(start: float, final_factor: float, iteration: Array | int,
     return start * jnp.exp(math.log(final_factor) * progress)
 
 
-def _one_each(rates: Any, params: Any) -> Any:
+def _one_each(rates: object, params: object) -> object:
     """Return a rate for each leaf of the parameters. Raise ValueError, naming the leaf, if a rate does not fit."""
     try:
         found = jax.tree.broadcast(rates, params)

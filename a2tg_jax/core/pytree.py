@@ -16,12 +16,12 @@ T = TypeVar("T")
 MARK = "_registered_pytree"
 
 
-def static(*, default: Any = dataclasses.MISSING) -> Any:
+def static(*, default: object = dataclasses.MISSING) -> Any:
     """Return a field that chooses shapes or code, and is not traced. Its values must be hashable."""
     return dataclasses.field(default=default, metadata={"static": True})
 
 
-def beside(*, default: Any) -> Any:
+def beside(*, default: object) -> Any:
     """Return a field that is no part of the pytree: whatever a transformation returns has the default instead."""
     return dataclasses.field(default=default, metadata={"beside": True})
 
@@ -101,7 +101,7 @@ def num_compiled(jitted: Any) -> int:
 def partition(tree: T) -> tuple[T, T]:
     """Return a pytree with its float arrays only, None for all other leaves, and one with the others only."""
 
-    def is_float(leaf: Any) -> bool:
+    def is_float(leaf: object) -> bool:
         dtype = getattr(leaf, "dtype", None)
         return isinstance(leaf, float) if dtype is None else jnp.issubdtype(dtype, jnp.floating)
 

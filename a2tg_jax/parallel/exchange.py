@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ from a2tg_jax.rasterize.compositor import Composited, composite, list_tiles
 from a2tg_jax.rasterize.splats import CompositingSettings, Splats, pack_splats, unpack_splats
 from a2tg_jax.rasterize.tile_pixels import TilePixels, band_pixels, tile_pixels
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
+
+T = TypeVar("T")
 
 EMPTY_TILES = 10
 """Rows of tiles without pairs that together cost as much as a mean row. Their cost keeps borders near an even cut in an
@@ -210,7 +212,7 @@ class Exchange:
         return jnp.concatenate([x, jnp.repeat(last, num, axis=0)]) if num else x
 
 
-def exchange_of(x: Any) -> Exchange | None:
+def exchange_of(x: object) -> Exchange | None:
     """Return the exchange among the devices over which an array is spread; None if it is on one (host)."""
     mesh = mesh_of(x)
     return None if mesh is None else Exchange(mesh)
@@ -388,18 +390,18 @@ def map_views(function: Callable[[Any], tuple[Any, Any]], views: Any, num_at_onc
     return of_views, shared
 
 
-def of_all_views(tree: Any) -> Any:
+def of_all_views(tree: T) -> T:
     """Return the arrays [G, ...] of all views that are drawn at once."""
     return jax.tree.map(lambda x: jax.lax.all_gather(x, VIEWS_AXIS), tree)
 
 
-def of_own_view(views: Any) -> Any:
+def of_own_view(views: T) -> T:
     """Return this view's part of arrays [G, ...] of all views."""
     return _own(views, jax.lax.axis_index(VIEWS_AXIS))
 
 
 @jax.custom_batching.custom_vmap
-def _own(views: Any, index: Array) -> Any:
+def _own(views: T, index: Array) -> T:
     return jax.tree.map(lambda x: x[index], views)
 
 

@@ -9,7 +9,7 @@ all of them make the same calls.
 import warnings
 import zlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +17,15 @@ import numpy as np
 from jax import Array, lax
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec as P
-from jax.typing import DTypeLike
+from jax.typing import ArrayLike, DTypeLike
+
+T = TypeVar("T")
 
 LARGEST_PART = 2**28
 """Largest number of bytes read at a time. Each device holds them besides the array, for all processes."""
 
 
-def mesh_of(x: Any) -> Mesh | None:
+def mesh_of(x: object) -> Mesh | None:
     """Return the mesh of the devices that share an array; None for an array on one device, of NumPy, or traced."""
     sharding = None if isinstance(x, jax.core.Tracer) else getattr(x, "sharding", None)
     mesh = sharding.mesh if isinstance(sharding, NamedSharding) else None
@@ -41,7 +43,7 @@ def sharding_of_rows(mesh: Mesh, shape: tuple[int, ...], axis: int = 0) -> Named
     return NamedSharding(mesh, P(*[None] * axis, mesh.axis_names[0]) if is_divided else P())
 
 
-def spread(mesh: Mesh | None, tree: Any, axis: int = 0) -> Any:
+def spread(mesh: Mesh | None, tree: T, axis: int = 0) -> T:
     """Return arrays with their rows, along an axis, spread over the devices; those that D does not divide are on every
     device.
 
@@ -69,12 +71,12 @@ def spread(mesh: Mesh | None, tree: Any, axis: int = 0) -> Any:
     return jax.tree.map(of_leaf, tree)
 
 
-def everywhere(mesh: Mesh | None, tree: Any) -> Any:
+def everywhere(mesh: Mesh | None, tree: T) -> T:
     """Return arrays that every device has whole (host)."""
     return tree if mesh is None else jax.tree.map(lambda x: placed(x, NamedSharding(mesh, P())), tree)
 
 
-def placed(x: Any, sharding: NamedSharding) -> Array:
+def placed(x: ArrayLike, sharding: NamedSharding) -> Array:
     """Return an array whose parts are where a sharding says; other processes place theirs of an equal one."""
     if isinstance(x, jax.Array) and x.sharding.is_equivalent_to(sharding, x.ndim):
         return x
@@ -110,12 +112,12 @@ def on_host(x: Any) -> np.ndarray:
     return found
 
 
-def _is_own(x: Any) -> bool:
+def _is_own(x: object) -> bool:
     """Return whether an array is of this process alone, in one part."""
     return mesh_of(x) is None and getattr(x, "is_fully_addressable", True)
 
 
-def placed_like(new: Any, old: Any) -> Array:
+def placed_like(new: Any, old: object) -> Array:
     """Return values of the host, their rows spread over the devices of another array, whose shape may differ.
     ValueError: several processes have different values."""
     mesh = mesh_of(old)
@@ -125,7 +127,7 @@ def placed_like(new: Any, old: Any) -> Array:
     return spread(mesh, new.astype(jax.dtypes.canonicalize_dtype(new.dtype), copy=False))
 
 
-def zeros_beside(old: Any, shape: Sequence[int], dtype: DTypeLike) -> Array:
+def zeros_beside(old: object, shape: Sequence[int], dtype: DTypeLike) -> Array:
     """Return zeros, their rows spread over the devices of another array."""
     mesh = mesh_of(old)
     return jnp.zeros(shape, dtype, device=None if mesh is None else sharding_of_rows(mesh, tuple(shape)))
@@ -141,7 +143,7 @@ def rows_moved(x: Array, rows: Array | np.ndarray) -> Array:
     return placed_like(on_host(x)[np.asarray(rows)], x)
 
 
-def readable(tree: Any) -> Any:
+def readable(tree: T) -> T:
     """Return arrays that this process can read: those that are on other processes' devices too are read (host)."""
 
     def of_leaf(x: Any) -> Any:
@@ -168,7 +170,7 @@ def asked_by_any(mesh: Mesh | None, is_asked: bool) -> bool:
     return bool(np.any(multihost_utils.process_allgather(np.asarray(is_asked))))
 
 
-def of_first(mesh: Mesh | None, tree: Any) -> Any:
+def of_first(mesh: Mesh | None, tree: T) -> T:
     """Return the first process's NumPy arrays in all processes, which have arrays of the same shapes."""
     if num_processes(mesh) == 1:
         return tree
@@ -184,13 +186,13 @@ def of_first(mesh: Mesh | None, tree: Any) -> Any:
 # Inside shard_map: results of foreign functions, of which JAX assumes that they are the same on all devices
 
 
-def _axes(tree: Any) -> frozenset[str]:
+def _axes(tree: object) -> frozenset[str]:
     """Return the axes of a mesh along which an array of a pytree varies."""
     types = [getattr(jax.typeof(leaf), "manual_axis_type", None) for leaf in jax.tree.leaves(tree)]
     return frozenset().union(*(type_.varying for type_ in types if type_ is not None))
 
 
-def vary_with(inputs: Any, results: Any) -> Any:
+def vary_with(inputs: object, results: T) -> T:
     """Mark the results as varying along every axis of the mesh along which an input varies."""
     axes = _axes(inputs)
 
@@ -201,7 +203,7 @@ def vary_with(inputs: Any, results: Any) -> Any:
     return jax.tree.map(vary, results)
 
 
-def cotangent_of(primal: Any, cotangent: Any) -> Any:
+def cotangent_of(primal: object, cotangent: T) -> T:
     """Sum a cotangent over the devices that share its primal value, leaf by leaf."""
 
     def total(value: Any, cotangent: Any) -> Any:
