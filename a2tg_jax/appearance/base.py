@@ -413,7 +413,8 @@ def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
 
 def check_arrays_given(appearance: Appearance) -> None:
     """Raise ValueError if a subclass or a part is a template without its arrays."""
-    own = [field.name for field in array_fields(appearance) if field.name not in PARTS]
+    common = {field.name for field in dataclasses.fields(Appearance)}
+    own = [field.name for field in array_fields(appearance) if field.name not in common]
     if own and all(getattr(appearance, name) is None for name in own):
         raise ValueError(
             f"model.appearance.{own[0]} is None: this {type(appearance).__name__} is a template, without arrays; say "
