@@ -88,7 +88,7 @@ def test_models_with_numbers_that_are_not_finite(tmp_path, name, value):
         (with_number("origin/sizes", 10**9), r"camera a\.png: its image must have sides"),
         (with_number("origin/sizes", -3), r"camera a\.png: its image must have sides"),
         (with_array("origin/sizes", lambda x: x.astype(float)), "sizes must be integers"),
-        (with_array("origin/is_test", lambda x: x.astype(int)), "is_test bool"),
+        (with_array("origin/is_test", lambda x: x.astype(int)), "is_test must be bool"),
         (with_number("origin/scale", 0.0), "positive scale"),
         (with_number("origin/scale", np.inf), "positive scale"),
         (with_number("origin/rotation", 3.0), "must have a rotation"),

@@ -194,8 +194,7 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
             arrays = {
                 name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()
             }
-            arrays |= {"sizes": arrays["sizes"].astype(np.int64), "is_test": arrays["is_test"].astype(bool)}
-            origin = origin_of(header["origin"], arrays)
+            origin = origin_of(header["origin"], arrays | {"is_test": arrays["is_test"].astype(bool)})
         reader.end()
         return model_of(rows, header["base_degree"], appearance, origin, background_of(header))
 
@@ -299,22 +298,18 @@ def _rows_of(reader: ColumnReader, header: Mapping[str, Any], choices: CompactCh
         bands.append(columns.reshape(3, 2 * degree + 1, count).transpose(2, 1, 0))
     sizes, texels = None, None
     if "sizes" in header:
-        sizes, texels = _textures_of(reader, header["sizes"], num, choices)
+        pairs = header["sizes"]
+        if not all(type(side) is int and 0 <= side <= MAX_SIDE for size in pairs for side in size):
+            raise ValueError(f"texture sides must lie in 0..{MAX_SIDE}; got {pairs}")
+        if any(len(size) != 2 for size in pairs):
+            raise ValueError(f"texture sides must be pairs; got {pairs}")
+        sizes = np.asarray(pairs, np.int64).reshape(-1, 2)[reader.indices("sizes", num, len(pairs))]
+        count = int(sizes.prod(axis=1).sum())
+        colors = reader.numbers("texel_colors", 3, count, choices.texels, is_color=True)
+        texels = np.concatenate([colors, reader.numbers("texel_alphas", 1, count, choices.texels)]).T
     shapes = None
     if appearance.exponents is not None:
         shapes = reader.numbers("shapes", 1, num, choices.shapes)[0]
         shapes = shapes_of(shapes) if isinstance(choices.shapes, int) else shapes
     logits = logits_of(opacities) if isinstance(choices.opacities, int) else opacities
     return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)
-
-
-def _textures_of(reader: ColumnReader, table: Any, num: int, choices: CompactChoices) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes [N, 2] and texels [T, 4]."""
-    if not all(type(side) is int and 0 <= side <= MAX_SIDE for size in table for side in size):
-        raise ValueError(f"texture sides must lie in 0..{MAX_SIDE}; got {table}")
-    if any(len(size) != 2 for size in table):
-        raise ValueError(f"texture sides must be pairs; got {table}")
-    sizes = np.asarray(table, np.int64).reshape(-1, 2)[reader.indices("sizes", num, len(table))]
-    count = int(sizes.prod(axis=1).sum())
-    colors = reader.numbers("texel_colors", 3, count, choices.texels, is_color=True)
-    return sizes, np.concatenate([colors, reader.numbers("texel_alphas", 1, count, choices.texels)]).T

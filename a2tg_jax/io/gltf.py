@@ -24,7 +24,7 @@ from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.columns import LARGEST_FLOAT, Ends, dequantised, ends_of, quantised
 from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes
-from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict, background_of
+from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict, background_of, origin_of
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
 from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
 from a2tg_jax.model import Model
@@ -184,7 +184,7 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
             warnings.warn(f"{document.path}: {message}", stacklevel=5)
     extras = primitive.get("extras", {})
     kept = extras.get(OWN, {}) if isinstance(extras, dict) else {}
-    origin = others.origin_from_json(kept["origin"]) if "origin" in kept else None
+    origin = origin_of(kept["origin"], kept["origin"]) if "origin" in kept else None
     extended = described.get("extensions", {}).get(EXTENSION)
     if extended is not None:
         shown, rows, base_degree = _shown(document, extended, splats)

@@ -33,6 +33,11 @@ FORMAT = "a2tg-jax model"
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
 APPEARANCE, ORIGIN, CORRECTIONS = "appearance/", "origin/", "corrections/"
 """Prefixes of the names of their arrays."""
+ORIGIN_KINDS: dict[str, tuple[str, str, Any]] = {
+    "sizes": ("iu", "integers", np.int64),
+    "is_test": ("b", "bool", np.bool_),
+}
+"""Kinds of arrays of an origin that are no floats, in words, and their type."""
 
 
 def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, Any] | None = None) -> None:
@@ -195,17 +200,24 @@ def origin_shapes(num: int) -> dict[str, tuple[int, ...]]:
     return shapes | {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
 
 
-def origin_of(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Origin:
-    """Return the origin of `origin_arrays`, with data["names"]. ValueError: a shape or a number is wrong."""
-    names = data["names"]
+def origin_of(data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Origin:
+    """Return the origin of `origin_arrays`, which may be nested lists, with data["names"].
+
+    Raises:
+      ValueError: if a shape or a number is wrong.
+    """
+    names, found = data["names"], dict[str, np.ndarray]()
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"origin/names must be texts; got {shortened(names)}")
-    shapes = origin_shapes(len(names))
-    for name, shape in shapes.items():
-        check_shape(ORIGIN + name, arrays[name], shape)
-    viewmats, Ks, sizes, is_test, scale, rotation, translation = (arrays[name] for name in shapes)
-    if not np.issubdtype(sizes.dtype, np.integer) or is_test.dtype != bool:
-        raise ValueError(f"origin/sizes must be integers, origin/is_test bool; got {sizes.dtype}, {is_test.dtype}")
+    for name, shape in origin_shapes(len(names)).items():
+        kinds, what, dtype = ORIGIN_KINDS.get(name, ("iuf", "numbers", np.float64))
+        array = np.asarray(arrays[name])
+        array = array if array.size else array.reshape(shape).astype(dtype)  # An empty list has no type.
+        check_shape(ORIGIN + name, array, shape)
+        if array.dtype.kind not in kinds:
+            raise ValueError(f"{ORIGIN}{name} must be {what}; got {array.dtype}")
+        found[name] = array.astype(dtype)
+    viewmats, Ks, sizes, is_test, scale, rotation, translation = found.values()
     learned = {name.removeprefix(CORRECTIONS): rows for name, rows in arrays.items() if name.startswith(CORRECTIONS)}
     world = Similarity(float(scale), rotation, translation)
     return Origin(viewmats, Ks, sizes, tuple(names), is_test, world, learned)

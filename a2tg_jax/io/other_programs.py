@@ -20,8 +20,8 @@ from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gau
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity, transform_gaussians
-from a2tg_jax.host.text import counted, shortened
-from a2tg_jax.io.model_file import origin_arrays, origin_of
+from a2tg_jax.host.text import counted
+from a2tg_jax.io.model_file import origin_arrays
 from a2tg_jax.io.validate import check_origin
 from a2tg_jax.model import Model, concatenate
 
@@ -298,20 +298,6 @@ def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
 def origin_to_json(origin: Origin) -> dict[str, Any]:
     """Return an origin as lists of numbers and texts, without the corrections."""
     return {"names": list(origin.names)} | {name: array.tolist() for name, array in origin_arrays(origin).items()}
-
-
-def origin_from_json(data: Mapping[str, Any]) -> Origin:
-    """Return the origin that `origin_to_json` was given. ValueError: it is damaged."""
-    shapes = {"viewmats": (-1, 4, 4), "Ks": (-1, 3, 3), "sizes": (-1, 2)}
-    kinds = {"sizes": np.int64, "is_test": bool}
-    arrays = {}
-    for name in ("viewmats", "Ks", "sizes", "is_test", "scale", "rotation", "translation"):
-        kind = kinds.get(name, np.float64)
-        array = np.asarray(data[name])
-        if array.dtype.kind not in "biuf" or (array.size and np.dtype(kind).kind == "b" != array.dtype.kind):
-            raise ValueError(f"origin/{name} must be numbers; got {shortened(data[name])}")
-        arrays[name] = array.astype(kind).reshape(shapes.get(name, array.shape))
-    return origin_of(data, arrays)
 
 
 # Ranges and steps of numbers

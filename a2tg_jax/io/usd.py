@@ -20,7 +20,7 @@ from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io import other_programs as others
-from a2tg_jax.io.model_file import background_of
+from a2tg_jax.io.model_file import background_of, origin_of
 from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
 from a2tg_jax.model import Model
 
@@ -150,7 +150,7 @@ def _model_of(usd: Any, prim: Any, path: Path) -> Model:
     gaussians = others.gaussians_of(_splats(usd, prim, path), path, is_flat=SURFLET in kernels)
     kept = prim.GetCustomDataByKey(ORIGIN)
     described = parse_json(kept) if isinstance(kept, str) else None
-    origin = None if described is None else others.origin_from_json(described)
+    origin = None if described is None else origin_of(described, described)
     background = background_of({} if described is None else {"origin": described})
     model = Model(gaussians, background=background, origin=origin)
     check_model(model)
