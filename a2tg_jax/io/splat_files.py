@@ -154,16 +154,16 @@ def _marked(data: bytes, kind: str, offset: np.ndarray) -> bytes:
 # .ksplat
 
 HEADER_BYTES, SECTION_BYTES = 4096, 1024
-HEADER = struct.Struct("<2B2x4IH2x5f")
+KSPLAT_HEADER = struct.Struct("<2B2x4IH2x5f")
 """Version, largest and present number of sections, of splats, level, centre of the scene, least and largest number of
 the spherical harmonics of level 2."""
-SECTION = struct.Struct("<4IfH2x4IH")
+KSPLAT_SECTION = struct.Struct("<4IfH2x4IH")
 """Present and largest number of splats, bucket size, number of buckets, their side, bytes of a bucket's centre, range
 of positions, bytes, numbers of full and partially filled buckets, degree of spherical harmonics."""
-VERSION = (0, 1)
+KSPLAT_VERSION = (0, 1)
 BUCKET_BYTES = 12
 DEFAULT_RANGE, DEFAULT_ENDS = 32767, (-1.5, 1.5)
-HIGHEST_DEGREE = 2
+KSPLAT_DEGREE = 2
 
 
 def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
@@ -179,8 +179,8 @@ def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
         raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
     check_model(Model(gaussians))
     splats = others.splats_of(Model(gaussians))
-    degree = min(gaussians.sh_degree, HIGHEST_DEGREE)
-    rows = np.zeros(gaussians.num, _row_type(0, degree))
+    degree = min(gaussians.sh_degree, KSPLAT_DEGREE)
+    rows = np.zeros(gaussians.num, _ksplat_rows(0, degree))
     rows["means"], rows["scales"], rows["quats"] = splats.means, splats.scales, splats.quats
     colors = np.concatenate([0.5 + SH_C0 * splats.sh[:, 0], splats.opacities[:, None]], axis=1)
     rows["colors"] = np.rint(255 * np.clip(colors, 0, 1))
@@ -188,8 +188,10 @@ def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
     if bands:
         rows["rest"] = np.concatenate([band.transpose(0, 2, 1).reshape(len(rows), -1) for band in bands], axis=1)
     num = gaussians.num
-    header = HEADER.pack(*VERSION, 1, 1, num, num, 0, 0.0, 0.0, 0.0, *DEFAULT_ENDS).ljust(HEADER_BYTES, b"\0")
-    section = SECTION.pack(num, num, 0, 0, 0.0, 0, 0, rows.nbytes, 0, 0, degree).ljust(SECTION_BYTES, b"\0")
+    header = KSPLAT_HEADER.pack(*KSPLAT_VERSION, 1, 1, num, num, 0, 0.0, 0.0, 0.0, *DEFAULT_ENDS).ljust(
+        HEADER_BYTES, b"\0"
+    )
+    section = KSPLAT_SECTION.pack(num, num, 0, 0, 0.0, 0, 0, rows.nbytes, 0, 0, degree).ljust(SECTION_BYTES, b"\0")
     with replacing(path) as temporary:
         temporary.write_bytes(header + section + rows.tobytes())
     others.warn_of_offset("ksplat", offset, path)
@@ -205,20 +207,20 @@ def load_ksplat(path: str | os.PathLike[str]) -> Gaussians:
     data = existing_bytes(path, "file")
     with reading(path):
         with np.errstate(over="ignore", invalid="ignore"):  # What is not finite is left out.
-            splats = _read(data)
+            splats = _ksplat_splats(data)
         gaussians = others.gaussians_of(splats, path, is_flat=False)
         check_model(Model(gaussians))
     return gaussians
 
 
-def _read(data: bytes) -> others.Ellipsoids:
+def _ksplat_splats(data: bytes) -> others.Ellipsoids:
     """Return the splats of all sections."""
     if len(data) < HEADER_BYTES:
         raise ValueError(
             f"is no .ksplat file, or is cut off: its header has {HEADER_BYTES} bytes, the file {len(data)}"
         )
-    major, minor, num_sections, _, _, _, level, *_, low, high = HEADER.unpack_from(data)
-    if (major, minor) != VERSION or level > 2:
+    major, minor, num_sections, _, _, _, level, *_, low, high = KSPLAT_HEADER.unpack_from(data)
+    if (major, minor) != KSPLAT_VERSION or level > 2:
         raise ValueError(
             f"is no .ksplat file of version 0.1 and compression level 0 to 2; got {major}.{minor}, level {level}"
         )
@@ -228,8 +230,8 @@ def _read(data: bytes) -> others.Ellipsoids:
     ends = (low or DEFAULT_ENDS[0], high or DEFAULT_ENDS[1])
     found = []
     for index in range(num_sections):
-        section = SECTION.unpack_from(data, HEADER_BYTES + index * SECTION_BYTES)
-        splats, start = _read_section(data, start, section, level, ends)
+        section = KSPLAT_SECTION.unpack_from(data, HEADER_BYTES + index * SECTION_BYTES)
+        splats, start = _ksplat_section(data, start, section, level, ends)
         found.append(splats)
     num_bases = max((splats.sh.shape[1] for splats in found), default=1)
     padded = [
@@ -240,7 +242,7 @@ def _read(data: bytes) -> others.Ellipsoids:
     return others.Ellipsoids(*(np.concatenate(columns) for columns in zip(*padded, strict=True)))
 
 
-def _read_section(
+def _ksplat_section(
     data: bytes, start: int, section: tuple[Any, ...], level: int, ends: tuple[float, float]
 ) -> tuple[others.Ellipsoids, int]:
     """Return the splats of a section that begins at a byte, and the byte after it."""
@@ -252,7 +254,7 @@ def _read_section(
         )
     if num_buckets and centre_bytes != BUCKET_BYTES:
         raise ValueError(f"is damaged: a section has bucket centres of {centre_bytes} bytes, not {BUCKET_BYTES}")
-    dtype = _row_type(level, degree)
+    dtype = _ksplat_rows(level, degree)
     first = start + 4 * num_partial + BUCKET_BYTES * num_buckets
     stop = first + most * dtype.itemsize
     if stop > len(data):
@@ -281,7 +283,7 @@ def _read_section(
     return others.Ellipsoids(*(values.astype(np.float32) for values in numbers)), stop
 
 
-def _row_type(level: int, degree: int) -> np.dtype:
+def _ksplat_rows(level: int, degree: int) -> np.dtype:
     """Return the bytes of one splat."""
     mean, number, rest = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))[level]
     return np.dtype(
