@@ -213,9 +213,9 @@ def origin_of(data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Origin:
         kinds, what, dtype = ORIGIN_KINDS.get(name, ("iuf", "numbers", np.float64))
         array = np.asarray(arrays[name])
         array = array if array.size else array.reshape(shape).astype(dtype)  # An empty list has no type.
-        check_shape(ORIGIN + name, array, shape)
         if array.dtype.kind not in kinds:
             raise ValueError(f"{ORIGIN}{name} must be {what}; got {array.dtype}")
+        check_shape(ORIGIN + name, array, shape)
         found[name] = array.astype(dtype)
     viewmats, Ks, sizes, is_test, scale, rotation, translation = found.values()
     learned = {name.removeprefix(CORRECTIONS): rows for name, rows in arrays.items() if name.startswith(CORRECTIONS)}
