@@ -7,8 +7,8 @@ black. LPIPS takes its network from a weights file, which this package does not 
 import dataclasses
 import functools
 import os
-import pathlib
 from collections.abc import Mapping
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -82,7 +82,7 @@ def load_lpips(path: str | os.PathLike[str]) -> LpipsWeights:
       FileNotFoundError: if there is no such file.
       ValueError: if it does not hold LPIPS weights of AlexNet or SqueezeNet.
     """
-    return _load_lpips(pathlib.Path(path).resolve())
+    return _load_lpips(Path(path).resolve())
 
 
 def lpips(
@@ -152,7 +152,7 @@ def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[
 
 
 @functools.lru_cache(maxsize=4)
-def _load_lpips(path: pathlib.Path) -> LpipsWeights:
+def _load_lpips(path: Path) -> LpipsWeights:
     if not is_regular(path):
         raise FileNotFoundError(f"there are no LPIPS weights at {path}: give the path of an .npz file")
     try:

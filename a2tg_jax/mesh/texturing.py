@@ -47,8 +47,7 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
     Raises:
       ValueError: if xatlas is not installed (`pip install 'a2tg-jax[mesh]'`), or the size is out of range.
     """
-    mesh = _unwrapped(mesh, size)
-    texels = _texels_of(mesh, size)
+    mesh, texels = _unwrapped(mesh, size)
     total = np.zeros((len(texels.place), 3), np.float32)
     weight = np.zeros(len(texels.place), np.float32)
     for camera, picture, mask in pictures:
@@ -81,19 +80,6 @@ def check_texture(size: int) -> ModuleType:
         raise ValueError("a texture needs xatlas, which is not installed: pip install 'a2tg-jax[mesh]'") from None
 
 
-def _unwrapped(mesh: Mesh, size: int) -> Mesh:
-    """Return the mesh with positions in a square atlas, by xatlas; vertices at seams are repeated."""
-    xatlas = check_texture(size)
-    atlas = xatlas.Atlas()
-    atlas.add_mesh(np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
-    pack = xatlas.PackOptions()
-    pack.resolution, pack.padding, pack.bruteForce = size, PADDING, False
-    atlas.generate(xatlas.ChartOptions(), pack)
-    source, faces, uv = atlas.get_mesh(0)
-    colors = None if mesh.colors is None else mesh.colors[source]
-    return Mesh(mesh.vertices[source], faces.astype(np.int32), colors, np.asarray(uv, np.float32))
-
-
 class Texels(NamedTuple):
     """Texels that charts cover."""
 
@@ -107,20 +93,30 @@ class Texels(NamedTuple):
     """[T, 3] float32 colour in [0, 1] between those of the vertices; grey without them."""
 
 
-def _texels_of(mesh: Mesh, size: int) -> Texels:
-    """Return the texels of a square atlas of `size` that the charts of an unwrapped mesh cover."""
-    assert mesh.uv is not None
-    corners = (mesh.uv * (size, -size) + (0, size)).astype(np.float32)[mesh.faces]
+def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Texels]:
+    """Return the mesh with positions in a square atlas of `size`, by xatlas, and the texels that its charts cover.
+
+    Vertices at the seams of charts are repeated.
+    """
+    xatlas = check_texture(size)
+    atlas, pack = xatlas.Atlas(), xatlas.PackOptions()
+    atlas.add_mesh(np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
+    pack.resolution, pack.padding, pack.bruteForce = size, PADDING, False
+    atlas.generate(xatlas.ChartOptions(), pack)
+    source, faces, uv = atlas.get_mesh(0)
+    own = None if mesh.colors is None else mesh.colors[source]
+    mesh = Mesh(mesh.vertices[source], faces.astype(np.int32), own, uv := np.asarray(uv, np.float32))
+    corners = (uv * (size, -size) + (0, size)).astype(np.float32)[mesh.faces]
     drawn = _draw(corners, np.ones(mesh.faces.shape, np.float32), size, size)
     place = np.flatnonzero(drawn.face >= 0)
     hit, weights = drawn.face.reshape(-1)[place], drawn.weights.reshape(-1, 3)[place]
-    faces, normals = mesh.faces[hit], mesh.face_normals[hit]
+    normals = mesh.face_normals[hit]
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    colors = np.full((mesh.num_vertices, 3), 128, np.uint8) if mesh.colors is None else mesh.colors
+    colors = np.full((mesh.num_vertices, 3), 128, np.uint8) if own is None else own
     position, color = (
-        np.einsum("tk,tkc->tc", weights, rows[faces].astype(np.float32)) for rows in (mesh.vertices, colors)
+        np.einsum("tk,tkc->tc", weights, rows[mesh.faces[hit]].astype(np.float32)) for rows in (mesh.vertices, colors)
     )
-    return Texels(place, position, normals.astype(np.float32), color / 255)
+    return mesh, Texels(place, position, normals.astype(np.float32), color / 255)
 
 
 def _seen(
@@ -180,8 +176,14 @@ def _draw(points: np.ndarray, depths: np.ndarray, width: int, height: int) -> Ra
     nearest = np.full(width * height, np.inf, np.float32)
     weights = np.zeros((width * height, 3), np.float32)
     for faces, pixels in _candidates(points, width, height):
-        at = np.stack([pixels % width, pixels // width], -1) + np.float32(0.5)
-        own = _barycentric(points[faces], at)
+        a, b, c = points[faces].transpose(1, 0, 2)
+        along, across = b - a, c - a
+        place = np.stack([pixels % width, pixels // width], -1) + np.float32(0.5) - a
+        area = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):  # Triangles without an area have NaN, and no pixels.
+            second = (place[:, 0] * across[:, 1] - place[:, 1] * across[:, 0]) / area
+            third = (along[:, 0] * place[:, 1] - along[:, 1] * place[:, 0]) / area
+            own = np.stack([1 - second - third, second, third], -1)  # Barycentric coordinates.
         depth = 1 / np.sum(own / depths[faces], axis=1)  # Inverse depths are linear in the image.
         shows = np.flatnonzero((own >= 0).all(axis=1) & (depth < nearest[pixels]))
         shows = shows[np.argsort(-depth[shows], kind="stable")]  # The nearest is written last.
@@ -210,14 +212,3 @@ def _candidates(points: np.ndarray, width: int, height: int) -> Iterator[tuple[n
         x, y = low[rows, 0] + index % span[rows, 0], low[rows, 1] + index // span[rows, 0]
         yield order[rows], y * width + x
         start, done = end, int(ends[end - 1])
-
-
-def _barycentric(corners: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return barycentric coordinates [P, 3] of points [P, 2] in triangles [P, 3, 2]; NaN in those without an area."""
-    a, b, c = corners.transpose(1, 0, 2)
-    along, across, own = b - a, c - a, at - a
-    area = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        second = (own[:, 0] * across[:, 1] - own[:, 1] * across[:, 0]) / area
-        third = (along[:, 0] * own[:, 1] - along[:, 1] * own[:, 0]) / area
-        return np.stack([1 - second - third, second, third], -1)

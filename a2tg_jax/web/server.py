@@ -174,7 +174,7 @@ def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tupl
     except ImportError as error:
         raise ValueError("the viewer's server needs waitress: pip install 'a2tg-jax[viewer]'") from error
     try:
-        listening = socket.create_server((host, port))
+        listening = socket.create_server((host, port))  # It may reuse a port of a program that has just ended.
     except (OSError, OverflowError, UnicodeError) as error:
         place, remedy = f"port {port}", "leave out --port for a free one"
         if host != LOOPBACK:
