@@ -262,7 +262,7 @@ def test_a_replacement_that_was_stopped_keeps_the_old_run_and_goes_on(tmp_path, 
     assert cli.main(["info", str(run.path)]) == 0
     assert f"kept in {kept.path}" in capsys.readouterr().out
     assert cli.main(["train", "--out", str(run.path), "--resume"]) == 0
-    assert old_run(run) is None and read_record(run).system.seed == 5
+    assert old_run(run) is None and read_record(run).options.seed == 5
 
 
 @pytest.mark.parametrize("after", range(7))
@@ -444,7 +444,7 @@ class Always(StepEvent):
 
 
 def trapped_run(scene, folder, on_nan, always=False) -> RunFolder:
-    view = scene.train[BatchOrder(scene.train, 1, RECORD.system.seed * 2 + 1).indices(12)[0]]
+    view = scene.train[BatchOrder(scene.train, 1, RECORD.options.seed * 2 + 1).indices(12)[0]]
     x = float(np.asarray(view.camera.viewmat)[0, 0])
     system = Trapped(stage1_iterations=20, x=x, always=always, **SIZES)
     run = create_run(folder)
