@@ -32,7 +32,7 @@ from a2tg_jax.training import Session, fit_stage
 SECONDS = 0.3
 
 
-@pytest.mark.filterwarnings("ignore:.*PruneFloaters changed nothing")
+@pytest.mark.filterwarnings("ignore:.*floaters changed nothing")
 def test_two_processes_train_as_one(tmp_path):
     """The command line trains two stages, with a pruning and the growth of textures. The first is compared."""
     run = RunFolder(tmp_path / "run")

@@ -130,7 +130,7 @@ def test_a_toy_of_one_file_does_all_that_the_others_do(scene, tmp_path):
     assert found.psnr == pytest.approx(a2tg.evaluate(scene.test, result.model).psnr, abs=1e-6)
 
 
-@pytest.mark.filterwarnings("ignore:stage 'textures'. Upscale changed nothing")  # Of a share of 0.
+@pytest.mark.filterwarnings("ignore:stage 'textures'. texture changed nothing")  # Of a share of 0.
 def test_textures_of_one_texel_that_do_not_learn_change_nothing(scene):
     """They stay (0, 0, 0, 1), and the Gaussians are those of a stage without textures."""
     plain, textured = tiny("gaussians-2d-mcmc"), tiny("a2tg", texture={"fraction": 0.0}, single_texel_rate=0.0)

@@ -174,6 +174,8 @@ def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tupl
     except ImportError as error:
         raise ValueError("the viewer's server needs waitress: pip install 'a2tg-jax[viewer]'") from error
     try:
+        if not 0 <= port < 2**16:  # `create_server` would leave the socket open.
+            raise OverflowError("ports are 0 to 65535")
         listening = socket.create_server((host, port))  # It may reuse a port of a program that has just ended.
     except (OSError, OverflowError, UnicodeError) as error:
         place, remedy = f"port {port}", "leave out --port for a free one"
