@@ -168,7 +168,7 @@ def test_model_is_a_short_table():
     [
         (a2tg.Model, "num_live", "int32 number of rows that exist; None if all do."),
         (a2tg.Camera, "K", "[3, 3] intrinsics in pixels, last row (0, 0, 1)."),
-        (a2tg.Appearance, "given_colors", "[N, 3] colours instead of spherical harmonics, for rendering; None otherwise."),
+        (a2tg.Appearance, "given_colors", "[N, 3] colours instead of spherical harmonics, for rendering; "),
         (a2tg.A2tg, "batch_size", "Views per iteration."),
         (type(a2tg.A2tg().floaters), "min_views", "Least number of training views in which a Gaussian must show"),
     ],
