@@ -69,11 +69,10 @@ def cameras_around(distance: float) -> list[a2tg.Camera]:
     return cameras
 
 
-def test_both_readers_find_the_same_numbers():
-    """What the page's own tests compare with."""
-    data = (WEB / "test" / "small.a2tgw").read_bytes()
+def test_the_pages_own_tests_compare_with_what_is_written_today():
+    source = Source(small_model(), "small", "a note")
     wanted = json.loads((WEB / "test" / "small.json").read_text(encoding="utf-8"))
-    found = small_numbers(data)
+    found = small_numbers(source.model)
     assert set(found) == set(wanted)
     for name, numbers in wanted.items():
         np.testing.assert_allclose(found[name], numbers, rtol=1e-4, atol=2e-5)
