@@ -54,7 +54,7 @@ def forward(settings: CompositingSettings, inputs: PassInputs) -> tuple[Array, A
       settings: static options, with the number G of tiles of a group.
       inputs: arrays of the pass.
     """
-    on_blocks = _Pass(settings, inputs)
+    on_blocks = _TracedPass(settings, inputs)
     return on_blocks.front_to_back(on_blocks.block, jax.lax.while_loop)
 
 
@@ -74,7 +74,7 @@ def composite_in_any_mode(settings: CompositingSettings, inputs: PassInputs) -> 
         # JAX differentiates loops of a fixed length only.
         return jax.lax.scan(jax.checkpoint(step_or_skip), carry, length=num_blocks)[0]
 
-    on_blocks = _Pass(settings, inputs)
+    on_blocks = _TracedPass(settings, inputs)
     return on_blocks.front_to_back(on_blocks.block_in_any_mode, repeat, each_group=jax.checkpoint)
 
 
@@ -89,7 +89,7 @@ def backward(
       g: [tiles, D, P] cotangents of the channels.
       suffix_sum: [tiles, P] B of the whole list (`rasterize.pixel.absorb_vjp`).
     """
-    on_blocks, splats = _Pass(settings, inputs), inputs.splats
+    on_blocks, splats = _TracedPass(settings, inputs), inputs.splats
     widths = [math.prod(leaf.shape[1:]) for leaf in splats]
     # One row per splat: one scatter adds a block, where each field would need its own.
     packed = jnp.zeros((splats.M.shape[0], sum(widths)), splats.M.dtype)
@@ -123,7 +123,7 @@ def backward(
     return d_splats, d_texels, d_probe
 
 
-class _Pass:
+class _TracedPass:
     """A pass over groups of tiles, block by block."""
 
     def __init__(self, settings: CompositingSettings, inputs: PassInputs):
@@ -395,7 +395,7 @@ def _values_of(lookup: Lookup | None) -> tuple[Array, ...]:
 def _absorbed(
     alphas: Array, channels: tuple[Array, ...], transmittance: Array, is_live: Array
 ) -> tuple[Array, Array, Array]:
-    """Composite alphas [B, P] and channels [B, P] of a block; the rest is as for `_Pass.block`."""
+    """Composite alphas [B, P] and channels [B, P] of a block; the rest is as for `_TracedPass.block`."""
 
     def add_splat(carry: tuple[Array, Array], alpha: Array) -> tuple[tuple[Array, Array], Array]:
         weight, transmittance, is_live = pixel.absorb(alpha, *carry)

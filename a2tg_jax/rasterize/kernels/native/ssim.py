@@ -116,7 +116,7 @@ def _in_spans(part: Callable[[int, int, int], None], num_rows: int, num_pixels: 
     ffi.run_spans(part, ffi.even_spans(num_rows, max(1, num_rows * LEAST_PIXELS // num_pixels)))
 
 
-class _Rows(Writer):
+class _ImageRows(Writer):
     """Base of the writers of both functions."""
 
     def __init__(self, module: ir.Module, name: str, buffers: Sequence[str], score: Score, dtype: str):
@@ -164,7 +164,7 @@ class _Rows(Writer):
         return [self.vector(base, place) for place in places]
 
 
-class _ScoreRows(_Rows):
+class _ScoreRows(_ImageRows):
     """Writer of `score`."""
 
     def write(self, dtype: str) -> None:
@@ -202,7 +202,7 @@ class _ScoreRows(_Rows):
                 self.store(self.weighed(numbers, self.score.taps), self.at(mean, start, self.real), 0)
 
 
-class _PullBackRows(_Rows):
+class _PullBackRows(_ImageRows):
     """Writer of `pull_back`."""
 
     def write(self) -> None:
