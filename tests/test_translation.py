@@ -89,7 +89,10 @@ INTEGERS = [
     Op("b to integer", lambda x, y: x.astype(y.dtype), "bi", "i"),
 ]  # fmt: skip
 ELEMENTARY = [
-    *(Op(name, getattr(lax, name), "f", "f", False) for name in ("exp", "log", "logistic", "sin", "cos", "sqrt")),
+    *(
+        Op(name, getattr(lax, name), "f", "f", False)
+        for name in ("exp", "log", "logistic", "sin", "cos", "tanh", "sqrt")
+    ),
     *(Op(name, getattr(lax, name), "ff", "f", False) for name in ("pow", "div")),
     Op("negative power", lambda x: x**-3, "f", "f", False),
     Op("gradient", jax.grad(lambda x, y: jnp.exp(x * 0.125) * jnp.cos(y)), "ff", "f", False),

@@ -168,7 +168,7 @@ def _logistic(x: list[str], equation: Equation) -> str:
 
 
 PRIMITIVES: dict[str, Emitter] = {
-    **{name: _call(name) for name in ("ceil", "cos", "exp", "floor", "log", "pow", "sin", "sqrt")},
+    **{name: _call(name) for name in ("ceil", "cos", "exp", "floor", "log", "pow", "sin", "sqrt", "tanh")},
     **{"add": _infix("+"), "add_any": _infix("+"), "sub": _infix("-"), "mul": _infix("*")},
     **{"eq": _infix("=="), "ne": _infix("!="), "lt": _infix("<"), "le": _infix("<="), "gt": _infix(">")},
     **{"ge": _infix(">="), "and": _infix("&"), "or": _infix("|"), "max": _extreme(">"), "min": _extreme("<")},

@@ -307,5 +307,6 @@ PRIMITIVES: dict[str, Emitter] = {
     "square": lambda lanes, operands, equation: _multiply(lanes, operands * 2, equation),
     "stop_gradient": lambda lanes, operands, _: operands[0],
     "sub": _binary("fsub", "sub"),
+    "tanh": _libm("tanh"),
 }
 """Emitters by the name of the primitive."""
