@@ -329,7 +329,7 @@ def select(
 def reallocate(
     textures: Textures,
     new_sizes: ArrayLike,
-    moments: Any = None,
+    moments: object = None,
     known: Sequence[Shape] = (),
     kept: ArrayLike | None = None,
     room: Shape | None = None,

@@ -40,7 +40,7 @@ class Times(NamedTuple):
     last: Any
     every: Any
 
-    def is_due(self, iteration: Any) -> Array:
+    def is_due(self, iteration: object) -> Array:
         """Return whether the event follows this iteration."""
         return (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
 
@@ -269,7 +269,7 @@ def iterations_at(fractions: tuple[float, ...], num_iterations: int, *, with_end
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
 
 
-def keep_rows(model: Model, moments: AdamState, state: Any, is_kept: Array | np.ndarray) -> Change:
+def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | np.ndarray) -> Change:
     """Return the change by an event on the host that removes Gaussians, so that no step is compiled again (host).
 
     All shapes stay: the rows of the Gaussians that are kept come first, in their order, and `Model.num_live` falls.

@@ -152,7 +152,7 @@ class Appearance:
         traceable."""
         return self
 
-    def rates(self, rate: Any) -> Any:
+    def rates(self, rate: object) -> Any:
         """Return Adam's learning rates, a prefix of the tree of floats, from the rates of a stage.
 
         A number holds for all floats. A mapping has rates by field; a field that it lacks does not learn.

@@ -110,7 +110,7 @@ class Billboards(Appearance):
         """Return pictures with alpha clamped to [0, the upper limit]: above it nothing would ever fade again."""
         return self._with_alpha(lambda alpha: jnp.clip(alpha, 0.0, self.alpha_limit))
 
-    def rates(self, rate: Any) -> Any:
+    def rates(self, rate: object) -> Any:
         """Return the rates of RGB and alpha, given as a pair, or one rate."""
         if not isinstance(rate, tuple):
             return rate

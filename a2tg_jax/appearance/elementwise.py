@@ -182,7 +182,9 @@ def check_shading(static: StaticShading, arguments: Arguments) -> None:
             )
 
 
-def _traced(static: StaticShading, function: str, functions: dict[str, tuple[Any, ...]], arguments: Arguments) -> Any:
+def _traced(
+    static: StaticShading, function: str, functions: dict[str, tuple[object, ...]], arguments: Arguments
+) -> Any:
     """Return what a function of an appearance returns for scalars, without values."""
     try:
         return jax.eval_shape(getattr(static.functions, function), *functions[function])
@@ -196,7 +198,7 @@ def _traced(static: StaticShading, function: str, functions: dict[str, tuple[Any
         raise
 
 
-def _sizes(values: Any) -> tuple[tuple[int, ...], ...] | None:
+def _sizes(values: object) -> tuple[tuple[int, ...], ...] | None:
     """Return the shapes of several numbers, or of the entries of an array of them; None for anything else."""
     if hasattr(values, "shape"):
         return (tuple(values.shape[1:]),) * values.shape[0] if values.shape else None
@@ -239,7 +241,7 @@ def elementwise_functions(static: StaticShading, arguments: Arguments) -> Elemen
     )
 
 
-def _mapped(function: Callable[..., Any], *given: Any) -> Any:
+def _mapped(function: Callable[..., object], *given: object) -> Any:
     """Call a function of scalars for each entry of arrays that broadcast."""
     leaves, structure = jax.tree.flatten(given)
     shape = jnp.broadcast_shapes(*(jnp.shape(leaf) for leaf in leaves))

@@ -37,7 +37,7 @@ class Part:
         """Return the part with its numbers moved to where they are allowed, after an update; traceable."""
         return self
 
-    def rates(self, rate: Any) -> Any:
+    def rates(self, rate: object) -> Any:
         """Return Adam's learning rates, a prefix of the part's tree of floats."""
         return rate
 
@@ -121,7 +121,7 @@ class Texture(Part):
         check_textures(self.texels, gaussians.num)
         check_places(self.texels)
 
-    def rates(self, rate: Any) -> Any:
+    def rates(self, rate: object) -> Any:
         """Return one rate for all texels, or `TexelRates`."""
         if not isinstance(rate, TexelRates):
             return rate

@@ -143,5 +143,5 @@ def _fail(message: str) -> int:
     return 2
 
 
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     print(f"a2tg: warning: {' '.join(str(message).split())}", file=sys.stderr)

@@ -110,7 +110,7 @@ def check_array(name: str, x: object, hint: str = "") -> None:
         raise ValueError(f"{name} must be an array; got {kind_of(x)}{hint and f': {hint}'}")
 
 
-def plain_array(name: str, value: Any, dtype: DTypeLike | None = None) -> Any:
+def plain_array(name: str, value: object, dtype: DTypeLike | None = None) -> Any:
     """Return nested lists of numbers, and NumPy's special arrays, as arrays that JAX takes; other values unchanged.
 
     Special arrays are masked ones without masked entries, and those in foreign byte order. The dtype is that of an

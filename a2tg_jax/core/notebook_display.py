@@ -4,7 +4,6 @@ import base64
 import html
 import io
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ LEAST_WIDTH = 240
 """Width in pixels up to which small pictures are enlarged."""
 
 
-def as_bytes(image: Any) -> np.ndarray | None:
+def as_bytes(image: object) -> np.ndarray | None:
     """Return an image of numbers in [0, 1], clipped, as uint8 [H, W, 3]; None if it has no concrete image's shape."""
     try:
         pixels = np.asarray(image)

@@ -44,7 +44,14 @@ def adam_init(params: object) -> AdamState:
 
 
 def adam_update(
-    params: Any, grads: Any, state: AdamState, rates: Any, *, b1: float = 0.9, b2: float = 0.999, eps: float = 1e-15
+    params: object,
+    grads: object,
+    state: AdamState,
+    rates: object,
+    *,
+    b1: float = 0.9,
+    b2: float = 0.999,
+    eps: float = 1e-15,
 ) -> OptStep:
     """Make one bias-corrected update of Adam (Kingma & Ba, 2015); ε is added after the correction, as in PyTorch.
 

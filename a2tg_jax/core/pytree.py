@@ -55,11 +55,11 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
         own = node.__dict__
         return tuple(own[name] for name in dynamic), tuple(own[name] for name in fixed)
 
-    def flatten_with_keys(node: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def flatten_with_keys(node: object) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         children, values = flatten(node)
         return tuple(zip(keys, children, strict=True)), values
 
-    def unflatten(values: tuple[Any, ...], children: Iterable[Any]) -> Any:
+    def unflatten(values: tuple[object, ...], children: Iterable[object]) -> Any:
         node = object.__new__(made)
         node.__dict__.update(zip(dynamic, children, strict=True))
         node.__dict__.update(zip(fixed, values, strict=True))

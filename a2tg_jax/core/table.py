@@ -287,7 +287,7 @@ class Resized(NamedTuple):
 def resize(
     table: Table,
     sizes: np.ndarray,
-    moments: Any = None,
+    moments: object = None,
     known: Sequence[Shape] = (),
     kept: np.ndarray | None = None,
     room: Shape | None = None,
@@ -311,7 +311,7 @@ def resize(
         whole = own.placed([placed_like(target, table.bucket) for target in targets], places)
         return partition(whole)[0] if old.bucket is None else whole  # Moments are floats only.
 
-    def rebuilt_moments(leaf: Any) -> Any:
+    def rebuilt_moments(leaf: object) -> Any:
         if not isinstance(leaf, own):
             return leaf
         if len(leaf.buckets) != len(table.buckets) or leaf.bucket_sizes != table.bucket_sizes:

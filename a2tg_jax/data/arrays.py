@@ -193,7 +193,7 @@ def _matrices(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarra
     return np.asarray(values, np.float64)
 
 
-def _converted(name: str, kind: Callable[[Any], Any], values: Any, size: tuple[int, int] | None = None) -> Any:
+def _converted(name: str, kind: Callable[[Any], Any], values: object, size: tuple[int, int] | None = None) -> Any:
     """Return what a view has for an array, or raise ValueError, naming it, if it has another kind or size (H, W)."""
     check_unmasked(name, values)
     try:

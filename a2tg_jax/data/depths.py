@@ -52,7 +52,7 @@ class DepthMap:
         height, width = values.shape
         return DepthMap((height, width), lambda: values)
 
-    def __deepcopy__(self, memo: Any) -> "DepthMap":
+    def __deepcopy__(self, memo: object) -> "DepthMap":
         """Return the map itself, which nothing changes."""
         return self
 

@@ -39,7 +39,7 @@ class Division:
     gather: Callable[[bytes], list[bytes]]
     """Function that gives each process the bytes of all, in the order of their numbers."""
 
-    def exchange(self, step: str, value: Any = None) -> list[Any]:
+    def exchange(self, step: str, value: object = None) -> list[Any]:
         """Return the values of all processes, in the order of their numbers.
 
         Raise SharedError in every process if one sends an error, or is at another step, by name.
@@ -59,7 +59,7 @@ class Division:
         if any(own != found[0] for own in found):
             raise SharedError(_difference(found, what))
 
-    def _all(self, own: Any) -> list[Any]:
+    def _all(self, own: object) -> list[Any]:
         """Return the messages of all processes. Raise SharedError if one of them is an error."""
         # The processes of one training run each other's programs anyway, so pickles may be trusted.
         parts = [pickle.loads(part) for part in self.gather(pickle.dumps(own))]
@@ -132,7 +132,7 @@ def _plain(error: Exception) -> Exception:
     return next(kind for kind in ERRORS if isinstance(error, kind))(str(error))
 
 
-def _raise_first(results: Sequence[Any]) -> None:
+def _raise_first(results: Sequence[object]) -> None:
     """Raise SharedError with the first error among results, if there is one."""
     error = next((result for result in results if isinstance(result, Exception)), None)
     if error is not None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path, PurePath, PureWindowsPath
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
@@ -184,7 +184,7 @@ def find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) -
 
 
 def map_in_threads(
-    function: Callable[..., Result], *iterables: Iterable[Any], place: Path | None = None
+    function: Callable[..., Result], *iterables: Iterable[object], place: Path | None = None
 ) -> list[Result]:
     """Return list(map(function, *iterables)), run in several threads.
 

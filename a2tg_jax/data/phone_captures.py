@@ -160,7 +160,7 @@ def _record3d_frames(file: Path) -> Frames:
     return Frames(file, frames)
 
 
-def _rows(value: Any, width: int, what: str) -> np.ndarray:
+def _rows(value: object, width: int, what: str) -> np.ndarray:
     """Return rows [N, width] of finite numbers, or raise ValueError."""
     try:
         rows = np.asarray(value, np.float64)

@@ -73,7 +73,7 @@ class Picture:
             raise ValueError(f"{wanted}; got {pixels.dtype} {[*pixels.shape]}{advice}")
         return Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
 
-    def __deepcopy__(self, memo: Any) -> "Picture":
+    def __deepcopy__(self, memo: object) -> "Picture":
         """Return the picture itself, which nothing changes."""
         return self
 

@@ -239,7 +239,7 @@ def _photo(
     )  # fmt: skip
 
 
-def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
+def _viewmat(transform_matrix: object, what: str) -> np.ndarray:
     """Return world to camera (OpenCV) from camera to world (OpenGL)."""
     try:
         pose = np.asarray(transform_matrix, np.float64)
@@ -252,7 +252,7 @@ def _viewmat(transform_matrix: Any, what: str) -> np.ndarray:
     return np.linalg.inv(rigid_viewmat(camera_to_world, what))
 
 
-def _lens(frame: dict[str, Any], full: tuple[int, int], what: str, use: LensUse) -> Lens:
+def _lens(frame: dict[str, object], full: tuple[int, int], what: str, use: LensUse) -> Lens:
     """Return the camera of a frame; its size defaults to the full image's, the principal point to the centre."""
     width, height = _side(frame, "w", full[0], what), _side(frame, "h", full[1], what)
     fx, fy = _focal_lengths(frame, width, height, what)
@@ -261,7 +261,7 @@ def _lens(frame: dict[str, Any], full: tuple[int, int], what: str, use: LensUse)
     return checked_lens(pycolmap().Camera(model=model, width=width, height=height, params=params), what, use)
 
 
-def _number(frame: dict[str, Any], key: str, default: float, what: str) -> float:
+def _number(frame: dict[str, object], key: str, default: float, what: str) -> float:
     """Return a number of a frame. Raise ValueError for anything else."""
     value = frame.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -269,7 +269,7 @@ def _number(frame: dict[str, Any], key: str, default: float, what: str) -> float
     return float(value)
 
 
-def _side(frame: dict[str, Any], key: str, default: int, what: str) -> int:
+def _side(frame: dict[str, object], key: str, default: int, what: str) -> int:
     """Return a side of the image in pixels; 0 and null stand for the image's own."""
     side = _number(frame, key, default, what) if frame.get(key) else default
     if not 1 <= side <= LONGEST_SIDE:  # False for NaN.
@@ -277,7 +277,7 @@ def _side(frame: dict[str, Any], key: str, default: int, what: str) -> int:
     return int(side)
 
 
-def _focal_lengths(frame: dict[str, Any], width: int, height: int, what: str) -> tuple[float, float]:
+def _focal_lengths(frame: dict[str, object], width: int, height: int, what: str) -> tuple[float, float]:
     """Return (fx, fy) in pixels, from fl_x and fl_y or from the angles of view; one stands for both if alone."""
     lengths = {}
     for axis, size in (("x", width), ("y", height)):
@@ -291,7 +291,7 @@ def _focal_lengths(frame: dict[str, Any], width: int, height: int, what: str) ->
     return lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))
 
 
-def _distortion(frame: dict[str, Any], what: str) -> tuple[str, list[float]]:
+def _distortion(frame: dict[str, object], what: str) -> tuple[str, list[float]]:
     """Return COLMAP's camera model and its distortion parameters; nerfstudio's have the same names and meaning."""
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
     values = {key: _number(frame, key, 0.0, what) for key in PRISM_KEYS}

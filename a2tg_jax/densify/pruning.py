@@ -63,7 +63,7 @@ class Prune(HostEvent):
     def num_programs(self, num_iterations: int) -> int:
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
-    def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
+    def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
         num = model.num
         left = num - round(num * float(self.share)) if self.keep is None else min(num, self.keep)
         if left < LEAST_LEFT:
@@ -205,7 +205,7 @@ class PruneFloaters(HostEvent):
     def num_programs(self, num_iterations: int) -> int:
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
-    def apply(self, due: Due, model: Model, moments: AdamState, state: Any) -> Change:
+    def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
         num, means = model.num, on_host(model.gaussians.means)[: model.num]
         is_kept = np.ones(num, bool)
         if self.min_views:

@@ -3,7 +3,6 @@
 import inspect
 import sys
 import textwrap
-from typing import Any
 
 _known: set[str] = set()
 
@@ -27,7 +26,7 @@ class _WithFields:
         self._text = text
         self._whole: str | None = None
 
-    def __get__(self, instance: Any, owner: type) -> str:
+    def __get__(self, instance: object, owner: type) -> str:
         if self._whole is None:
             from docstring_parser import parse_from_object  # takes longer to import than this whole library
 

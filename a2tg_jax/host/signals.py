@@ -108,7 +108,7 @@ def _send(number: int) -> None:
 
 
 @contextlib.contextmanager
-def _handled_by(handler: Callable[..., Any], numbers: tuple[int, ...]) -> Iterator[None]:
+def _handled_by(handler: Callable[..., object], numbers: tuple[int, ...]) -> Iterator[None]:
     """Install a handler within the block. Ignored signals, such as SIGHUP under nohup, stay ignored; other threads
     install none."""
     before: dict[int, object] = {}

@@ -23,7 +23,11 @@ HEADER = "header"
 
 
 def write_archive(
-    path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, format: str = FORMAT
+    path: str | os.PathLike[str],
+    header: Mapping[str, object],
+    arrays: Mapping[str, np.ndarray],
+    *,
+    format: str = FORMAT,
 ) -> None:
     """Write an archive; an older file of that name is replaced once the new one is whole.
 

@@ -248,7 +248,7 @@ def _encoded(model: Model, choices: CompactChoices, grids: Grids | None) -> tupl
     return _framed(header | writer.layout, writer.body, version), writer.num_unpacked
 
 
-def _framed(header: Mapping[str, Any], body: bytes, version: int = VERSION) -> bytes:
+def _framed(header: Mapping[str, object], body: bytes, version: int = VERSION) -> bytes:
     text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
     coded = encode("zstd", np.frombuffer(text, np.uint8)[None])
     rest = coded + body

@@ -23,7 +23,7 @@ def config_to_dict(config: Any) -> dict[str, Any]:
 
 
 def config_from_dict(
-    kind: type[ConfigT], data: Mapping[str, Any], where: str = "config", *, given: Mapping[str, Any] | None = None
+    kind: type[ConfigT], data: Mapping[str, object], where: str = "config", *, given: Mapping[str, object] | None = None
 ) -> ConfigT:
     """Return the dataclass `kind` that `config_to_dict` was given.
 
@@ -55,7 +55,7 @@ def config_from_dict(
     return kind(**values)
 
 
-def changed_config(config: ConfigT, changes: Mapping[str, Any], where: str) -> ConfigT:
+def changed_config(config: ConfigT, changes: Mapping[str, object], where: str) -> ConfigT:
     """Return a dataclass with some fields changed, fields of nested dataclasses by nested dictionaries.
 
     Raises:
@@ -121,7 +121,7 @@ def _to_json(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-def _from_json(hint: Any, value: Any, where: str) -> Any:
+def _from_json(hint: object, value: Any, where: str) -> Any:
     """Return `value` as the type of the annotation; the contents of a dict are not checked."""
     if dataclasses.is_dataclass(hint):
         return config_from_dict(typing.cast(type, hint), value, where)
@@ -134,7 +134,7 @@ def _from_json(hint: Any, value: Any, where: str) -> Any:
         raise ValueError(f"{where} must be {_type_name(hint)}; got {shortened(repr(value))}") from None
 
 
-def _as(hint: Any, value: Any) -> Any:
+def _as(hint: Any, value: object) -> Any:
     """Return a JSON value as a plain type; an integer is a good float, a truth value is not a number.
 
     Raises:

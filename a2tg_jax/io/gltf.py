@@ -197,7 +197,7 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
     return model
 
 
-def _splats(document: Document, attributes: Mapping[str, Any]) -> others.Ellipsoids:
+def _splats(document: Document, attributes: Mapping[str, object]) -> others.Ellipsoids:
     def numbers(name: str, kind: str) -> np.ndarray:
         if name not in attributes:
             raise ValueError(f"its splats lack {name}")

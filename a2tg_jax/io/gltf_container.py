@@ -73,14 +73,14 @@ class Builder:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
-    def add_bytes(self, data: bytes, **options: Any) -> int:
+    def add_bytes(self, data: bytes, **options: object) -> int:
         """Add bytes, such as an image, and return the index of their buffer view, which has these options."""
         self._views.append({"buffer": 0, "byteOffset": self._num_bytes, "byteLength": len(data), **options})
         self._pieces.append(data + bytes(-len(data) % 4))
         self._num_bytes += len(self._pieces[-1])
         return len(self._views) - 1
 
-    def save(self, path: Path, described: Mapping[str, Any]) -> None:
+    def save(self, path: Path, described: Mapping[str, object]) -> None:
         """Write the file, *.gltf with a *.bin beside it, any other name as one *.glb.
 
         Older files are replaced once the new ones are whole. `described` is the JSON without accessors and buffers.
@@ -134,7 +134,7 @@ class Document:
         self._files: dict[Path, bytes] = {}
         self._room = FREE_ROOM + LARGEST_RATIO * len(data)
 
-    def entry(self, kind: str, index: Any) -> dict[str, Any]:
+    def entry(self, kind: str, index: object) -> dict[str, Any]:
         """Return an object of one of the lists of the file, such as "nodes"."""
         entries = self.json.get(kind, [])
         if type(index) is not int or not isinstance(entries, list) or not 0 <= index < len(entries):
@@ -143,7 +143,7 @@ class Document:
             raise ValueError(f"its {kind}[{index}] is no object")
         return entries[index]
 
-    def numbers(self, index: Any, kind: str, what: str) -> np.ndarray:
+    def numbers(self, index: object, kind: str, what: str) -> np.ndarray:
         """Return the numbers of an accessor as float32 [n, columns]; integers that are normalised become fractions.
 
         Raises:
@@ -255,7 +255,7 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
     return chunks[JSON_CHUNK], chunks.get(BINARY_CHUNK)
 
 
-def _count(described: Mapping[str, Any], name: str, what: str, default: int | None = None) -> int:
+def _count(described: Mapping[str, object], name: str, what: str, default: int | None = None) -> int:
     """Return a field that is a whole number, not negative."""
     value = described.get(name, default)
     if type(value) is not int or not 0 <= value < 1 << 53:
@@ -295,7 +295,7 @@ def mesh_nodes(document: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]
         waiting += [(child, matrix) for child in reversed(_indices(node, "children"))]
 
 
-def _indices(described: Mapping[str, Any], name: str) -> list[Any]:
+def _indices(described: Mapping[str, object], name: str) -> list[Any]:
     indices = described.get(name, [])
     if not isinstance(indices, list):
         raise ValueError(f"{name} must be a list; got {shortened(indices)}")

@@ -40,7 +40,7 @@ ORIGIN_KINDS: dict[str, tuple[str, str, Any]] = {
 """Kinds of arrays of an origin that are no floats, in words, and their type."""
 
 
-def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, Any] | None = None) -> None:
+def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, object] | None = None) -> None:
     """Write a model's live rows, its appearance and its origin.
 
     Args:
@@ -163,7 +163,7 @@ def _options_of(node: Any) -> dict[str, Any]:
 
 
 def _appearance_of(kind: type[Appearance], data: Mapping[str, Any]) -> Appearance:
-    def read(kind: type, options: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
+    def read(kind: type, options: Mapping[str, Any], parts: Mapping[str, object]) -> Any:
         arrays = {field.name: None for field in dataclasses.fields(kind) if not field.metadata.get("static")}
         return config_from_dict(kind, options, f"options of {kind.__name__}", given={**arrays, **parts})
 
@@ -200,7 +200,7 @@ def origin_shapes(num: int) -> dict[str, tuple[int, ...]]:
     return shapes | {"is_test": (num,), "scale": (), "rotation": (3, 3), "translation": (3,)}
 
 
-def origin_of(data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Origin:
+def origin_of(data: Mapping[str, object], arrays: Mapping[str, Any]) -> Origin:
     """Return the origin of `origin_arrays`, which may be nested lists, with data["names"].
 
     Raises:

@@ -2,7 +2,6 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,7 +36,7 @@ def load_views(path: Path) -> list[Camera]:
         raise ValueError(f"{path}: {error}") from error
 
 
-def _camera(view: Any, where: str) -> Camera:
+def _camera(view: object, where: str) -> Camera:
     if not isinstance(view, dict):
         raise ValueError(f"{where} must be an object; got {shortened(view)}")
 

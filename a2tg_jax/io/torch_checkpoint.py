@@ -89,7 +89,7 @@ class _Storage(NamedTuple):
 class _Tensor:
     """A view into a storage."""
 
-    def __init__(self, storage: _Storage, offset: int, size: Any, stride: Any, *rest: Any):
+    def __init__(self, storage: _Storage, offset: int, size: Any, stride: Any, *rest: object):
         self.storage, self.offset, self.size, self.stride = storage, offset, tuple(size), tuple(stride)
 
 
@@ -102,7 +102,7 @@ class _Ignored:
     __setstate__ = __init__
 
 
-def _parameter(data: Any, *rest: Any) -> Any:
+def _parameter(data: object, *rest: Any) -> Any:
     return data
 
 
@@ -168,7 +168,7 @@ def _unpickled(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
     return {name: _array(tensor, archive, folder) for name, tensor in _tensors_of(value).items()}
 
 
-def _tensors_of(value: Any) -> dict[str, _Tensor]:
+def _tensors_of(value: object) -> dict[str, _Tensor]:
     """Return the tensors of Gaussians in a checkpoint by gsplat's names."""
     if isinstance(value, tuple | list) and len(value) == 2 and isinstance(value[0], tuple | list):
         parts = value[0]

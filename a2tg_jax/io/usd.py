@@ -136,13 +136,13 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
             raise ValueError(f"is no USD file, or is damaged ({shortened(str(error))})") from error
 
 
-def _world_of(usd: Any, prim: Any, unit: float) -> np.ndarray:
+def _world_of(usd: Any, prim: object, unit: float) -> np.ndarray:
     """Return the matrix [4, 4] from a particle field to the world, in metres."""
     placed = usd.UsdVol.ParticleField(prim).ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())
     return np.diag([unit, unit, unit, 1.0]) @ np.array(placed, np.float64).T
 
 
-def _model_of(usd: Any, prim: Any, path: Path) -> Model:
+def _model_of(usd: object, prim: Any, path: Path) -> Model:
     """Return the model of a particle field, in the field's own world."""
     kernels = set(prim.GetAppliedSchemas()) & {SURFLET, ELLIPSOID}
     if len(kernels) != 1:

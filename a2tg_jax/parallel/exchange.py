@@ -354,7 +354,9 @@ VIEWS_AXIS = "views_at_once"
 """Axis of `jax.vmap` along which the views are that are drawn at once."""
 
 
-def value_and_grad_of_views(loss: Callable[..., tuple[Array, Any]], num_views: int, axes: Any) -> Callable[..., Any]:
+def value_and_grad_of_views(
+    loss: Callable[..., tuple[Array, object]], num_views: int, axes: object
+) -> Callable[..., Any]:
     """Return what `jax.value_and_grad(loss, (0, 1, 2, 3), has_aux=True)` is for one view, for G views at once.
 
     Results have a leading axis [G, ...], but for the gradient in `appearance`, a mean over the views. The loss is a
@@ -362,12 +364,12 @@ def value_and_grad_of_views(loss: Callable[..., tuple[Array, Any]], num_views: i
     `view`, mapped along `axes`, are of each view; the others are shared.
     """
 
-    def of_views(gaussians: Any, appearance: Any, rows: Any, probe: Any, views: Any) -> tuple[Array, Any]:
+    def of_views(gaussians: Any, appearance: object, rows: object, probe: object, views: object) -> tuple[Array, Any]:
         of_each = jax.vmap(loss, in_axes=(0, None, 0, 0, axes), axis_name=VIEWS_AXIS)
         values, aux = of_each(gaussians, appearance, rows, probe, views)
         return jnp.sum(values), (values, aux)
 
-    def differentiated(gaussians: Any, appearance: Any, rows: Any, probe: Any, views: Any) -> Any:
+    def differentiated(gaussians: object, appearance: object, rows: object, probe: object, views: object) -> Any:
         # Each view has its own copy of what events want the gradient of each view in.
         copy = lambda x: jnp.broadcast_to(x, (num_views, *x.shape))  # noqa: E731
         gaussians, probe = jax.tree.map(copy, (gaussians, probe))
@@ -378,7 +380,7 @@ def value_and_grad_of_views(loss: Callable[..., tuple[Array, Any]], num_views: i
     return differentiated
 
 
-def map_views(function: Callable[[Any], tuple[Any, Any]], views: Any, num_at_once: int) -> tuple[Any, Any]:
+def map_views(function: Callable[[Any], tuple[Any, Any]], views: object, num_at_once: int) -> tuple[Any, Any]:
     """Return what `jax.lax.map` does, of a function of G views [G, ...] at a time, where G divides V.
 
     Each of the G groups of devices draws V/G views in a row, whose photographs alone it needs (`sharding_of_batch`).
@@ -406,7 +408,7 @@ def _own(views: T, index: Array) -> T:
 
 
 @_own.def_vmap
-def _all(size: int, is_batched: Any, views: Any, index: Array) -> tuple[Any, Any]:
+def _all(size: int, is_batched: object, views: object, index: Array) -> tuple[Any, Any]:
     # Indexing would be a gather, for which XLA may bring all views to every device.
     return views, jax.tree.map(lambda _: True, views)
 

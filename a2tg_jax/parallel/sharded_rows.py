@@ -206,7 +206,7 @@ def vary_with(inputs: object, results: T) -> T:
 def cotangent_of(primal: object, cotangent: T) -> T:
     """Sum a cotangent over the devices that share its primal value, leaf by leaf."""
 
-    def total(value: Any, cotangent: Any) -> Any:
+    def total(value: object, cotangent: object) -> Any:
         shared = tuple(sorted(_axes(cotangent) - _axes(value)))
         return lax.psum(cotangent, shared) if shared else cotangent
 

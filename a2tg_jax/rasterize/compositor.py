@@ -158,7 +158,7 @@ def _composite_tiles_bwd(
 _composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
 
 
-def _by_platform(which: str, settings: CompositingSettings, results: Any, *arrays: Any) -> Any:
+def _by_platform(which: str, settings: CompositingSettings, results: Any, *arrays: object) -> Any:
     """Call `forward` or `backward` of the kernels of the platform that JAX compiles for."""
     advice = ADVICE.format(compositor=settings.compositor)
     return by_platform(_pass_on, (which, settings), results, *arrays, advice=advice)
@@ -213,11 +213,11 @@ mlir.register_lowering(_tangent_p, lambda _, tangent, *, compositor: _refuse(com
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _reverse_only(compositor: str, x: Any) -> Any:
+def _reverse_only(compositor: str, x: object) -> Any:
     """Return an input of the compositor unchanged; derivatives in forward mode raise ValueError."""
     return x
 
 
 @_reverse_only.defjvp
-def _reverse_only_jvp(compositor: str, primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+def _reverse_only_jvp(compositor: str, primals: tuple[object], tangents: tuple[object]) -> tuple[Any, Any]:
     return primals[0], _tangent_p.bind(tangents[0], compositor=compositor)

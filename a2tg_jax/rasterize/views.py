@@ -135,7 +135,7 @@ def capacity_for(pairs: int, head_room: float = HEAD_ROOM) -> int:
 
 
 def with_capacity(
-    settings: RenderSettings, gaussians: Gaussians, camera: Camera, appearance: Appearance, num_live: Any = None
+    settings: RenderSettings, gaussians: Gaussians, camera: Camera, appearance: Appearance, num_live: object = None
 ) -> RenderSettings:
     """Return the settings; if they lack a capacity, with one for this view, which an eager call can find.
 
@@ -156,7 +156,7 @@ def with_capacity(
     return dataclasses.replace(settings, capacity=capacity_for(pairs))
 
 
-def _primal_value(x: Any) -> Any:
+def _primal_value(x: object) -> Any:
     """Return the concrete array behind the tracers of `jax.grad`, or the tracer if jit or vmap hides the value."""
     while isinstance(x, jax.core.Tracer):
         try:
@@ -170,7 +170,7 @@ def _primal_value(x: Any) -> Any:
 
 
 def pairs_of_view(
-    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: Any = None
+    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: object = None
 ) -> int:
     """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
     check_is_appearance(appearance)

@@ -5,7 +5,6 @@ import dataclasses
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from a2tg_jax.data import Scene
 from a2tg_jax.finish.polishing import polish
@@ -85,7 +84,7 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     return "\n".join([*aligned(columns), *spoiled])
 
 
-def _is_written(run: RunFolder, content: Mapping[str, Any]) -> bool:
+def _is_written(run: RunFolder, content: Mapping[str, object]) -> bool:
     """Return whether a process was killed in a folder after it had done the same, as finish.json says, and written the
     model. Unless the same was begun there, the folder must be free."""
     is_begun = not run.report.is_file() and run.finish.name in run.written() and is_regular(run.finish)

@@ -313,7 +313,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         temporary.write_text(text + tomli_w.dumps(table), encoding="utf-8")
 
 
-def _without_none(table: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:
+def _without_none(table: dict[str, object], start: dict[str, Any]) -> dict[str, Any]:
     """Leave out None, which TOML lacks, or write "None", as on the command line, if `start` has another value."""
     kept: dict[str, Any] = {}
     for name, value in table.items():

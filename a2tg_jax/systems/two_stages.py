@@ -47,7 +47,7 @@ class TwoStages(System):
         self,
         events: tuple[Event, ...],
         appearance: Appearance = Appearance(),  # noqa: B008 - frozen
-        appearance_rate: Any = None,
+        appearance_rate: object = None,
         name: str = "gaussians",
     ) -> Stage:
         """Return a first stage, in which the degree of spherical harmonics rises and floaters are pruned."""
@@ -68,12 +68,12 @@ class TwoStages(System):
         return self._stage(0, name, appearance, events, appearance_rate)
 
     def later_stage(
-        self, name: str, appearance: Appearance, events: tuple[Event, ...] = (), appearance_rate: Any = None
+        self, name: str, appearance: Appearance, events: tuple[Event, ...] = (), appearance_rate: object = None
     ) -> Stage:
         """Return a second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
         return self._stage(1, name, appearance, events, appearance_rate)
 
-    def _stage(self, index: int, name: str, appearance: Appearance, events: tuple[Event, ...], rate: Any) -> Stage:
+    def _stage(self, index: int, name: str, appearance: Appearance, events: tuple[Event, ...], rate: object) -> Stage:
         return Stage(
             name=name,
             appearance=appearance,

@@ -267,7 +267,7 @@ def _named_arrays(tree: object, *, only_names: bool = False) -> dict[str, Any]:
     return {jax.tree_util.keystr(path): None if only_names else np.asarray(leaf) for path, leaf in paths}
 
 
-def _filled(template: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _filled(template: object, arrays: dict[str, np.ndarray]) -> Any:
     """Return a tree of the template's structure with the array of its name at each leaf."""
     leaves = [arrays[name] for name in _named_arrays(template, only_names=True)]
     return jax.tree.unflatten(jax.tree.structure(template), leaves)

@@ -57,7 +57,7 @@ def _spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:
     return rest._replace(views=rest.views._replace(grads=grads, statistic=statistic))
 
 
-def what_diverged(arguments: tuple[Any, ...], names: Sequence[str]) -> str:
+def what_diverged(arguments: tuple[object, ...], names: Sequence[str]) -> str:
     """Return the views and parameters whose numbers are not finite, or the loss if all of them are finite.
 
     Args:
@@ -73,7 +73,7 @@ def what_diverged(arguments: tuple[Any, ...], names: Sequence[str]) -> str:
     return "; ".join(found) or f"the loss of {', '.join(names)} is {np.mean(losses):.4g}"
 
 
-def _not_finite(parameters: tuple[Any, ...]) -> Iterator[str]:
+def _not_finite(parameters: tuple[object, ...]) -> Iterator[str]:
     """Yield each leaf of (gaussians, appearance, corrections) with such numbers, and their rows."""
     for prefix, part in zip(("", "appearance", "corrections"), parameters, strict=True):
         for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:

@@ -110,12 +110,12 @@ def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callab
       has_aux: whether the loss returns (scalar, anything) instead.
     """
 
-    def of_floats(floats: Model, rest: Model, *args: Any, **kwargs: Any) -> Any:
+    def of_floats(floats: Model, rest: Model, *args: object, **kwargs: object) -> Any:
         return loss(combine(floats, rest), *args, **kwargs)
 
     differentiate = jax.value_and_grad(of_floats, has_aux=has_aux)
 
-    def of_model(model: Model, *args: Any, **kwargs: Any) -> tuple[Any, Model]:
+    def of_model(model: Model, *args: object, **kwargs: object) -> tuple[Any, Model]:
         check_kind("model", model, Model, "jax.value_and_grad differentiates in arrays")
         return differentiate(*partition(model), *args, **kwargs)
 
@@ -166,7 +166,7 @@ class Differentiated(NamedTuple):
 
 
 def differentiate(
-    loss: Callable[[Model, TracedView, RenderOutput], tuple[Array, Any]],
+    loss: Callable[[Model, TracedView, RenderOutput], tuple[Array, object]],
     model: Model,
     view: TracedView,
     settings: RenderSettings,

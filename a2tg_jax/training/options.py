@@ -241,7 +241,7 @@ class System:
         raise NotImplementedError(f"{type(self).__name__} must compose its stages")
 
     @classmethod
-    def preset(cls, name: str, **options: Any) -> Self:
+    def preset(cls, name: str, **options: object) -> Self:
         """Return the options of a preset, some of them changed.
 
             A2tg.preset("quick", stage1_iterations=10, texture={"cap": 8})
@@ -412,7 +412,7 @@ def like(kind: type[System] | System, other: System) -> System:
     return _like(kind() if isinstance(kind, type) else kind, other)
 
 
-def own_options(system: Any, other: Any) -> dict[str, Any]:
+def own_options(system: object, other: object) -> dict[str, Any]:
     """Return the options of a system, or of a group of options, that `like` does not take from another, nested as in a
     configuration file."""
     hints, other_hints = (typing.get_type_hints(type(config)) for config in (system, other))
@@ -427,7 +427,7 @@ def own_options(system: Any, other: Any) -> dict[str, Any]:
     return found
 
 
-def _like(value: Any, other: Any) -> Any:
+def _like(value: Any, other: object) -> Any:
     hints, other_hints = (typing.get_type_hints(type(config)) for config in (value, other))
     changes = {}
     for field in dataclasses.fields(value):

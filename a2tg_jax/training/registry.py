@@ -119,7 +119,7 @@ def differences(system: System) -> dict[str, object]:
     return _differences(config_to_dict(system), config_to_dict(type(system)()))
 
 
-def _differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, object]:
+def _differences(values: Mapping[str, object], defaults: Mapping[str, Any]) -> dict[str, object]:
     changed: dict[str, object] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):

@@ -390,7 +390,7 @@ def _events(
 
 
 def _applied(
-    stage_name: str, event: StepEvent, now: Now, carry: tuple[Model, AdamState, Any]
+    stage_name: str, event: StepEvent, now: Now, carry: tuple[Model, AdamState, object]
 ) -> tuple[Model, AdamState, Any, EventInfo]:
     """Return the model, moments and state after an event, which must keep all shapes."""
     model, moments, state = carry

@@ -42,7 +42,7 @@ def example(dtype: DTypeLike) -> Any:
     return jax.ShapeDtypeStruct((), dtype)
 
 
-def trace(function: Callable[..., Any], *examples: Any) -> tuple[core.ClosedJaxpr, Any]:
+def trace(function: Callable[..., object], *examples: object) -> tuple[core.ClosedJaxpr, Any]:
     """Return the jaxpr of a function of scalars, and the tree structure of its result.
 
     The jaxpr does not depend on what is being traced around it, such as the axes of a `shard_map` or a mesh.
@@ -55,7 +55,7 @@ def trace(function: Callable[..., Any], *examples: Any) -> tuple[core.ClosedJaxp
     return closed, jax.tree.structure(shape)
 
 
-def in_clean_context(work: Callable[[], Any]) -> Any:
+def in_clean_context(work: Callable[[], object]) -> Any:
     """Return work(), run on a thread of its own, because JAX's tracing is per thread, with the caller's dtype rules."""
     config: Any = jax.config
     is_x64, promotion = config.jax_enable_x64, config.jax_numpy_dtype_promotion
@@ -190,7 +190,7 @@ def _planes_vjp(M: pixel.Rows, tile: pixel.TileNumbers, d_planes: pixel.Planes) 
     return jax.vjp(lambda M: pixel.planes_of(M, tile), M)[1](d_planes)[0]
 
 
-def refusal_of(spec: KernelSpec, translate: Callable[[KernelSpec], Any]) -> str | None:
+def refusal_of(spec: KernelSpec, translate: Callable[[KernelSpec], object]) -> str | None:
     """Return why a kind of kernels cannot be made for a spec; None if `translate` makes them."""
     try:
         translate(spec)

@@ -131,7 +131,11 @@ def has_cuda() -> bool:
 
 
 def by_platform(
-    code_of: CodeOf, static: tuple[Hashable, ...], results: Any, *arrays: Any, advice: str = "it has no derivative"
+    code_of: CodeOf,
+    static: tuple[Hashable, ...],
+    results: object,
+    *arrays: object,
+    advice: str = "it has no derivative",
 ) -> Any:
     """Call `code_of(platform, *static)(*arrays)`, for the platform that JAX compiles for.
 
@@ -153,7 +157,7 @@ def by_platform(
     return vary_with(flat, jax.tree.unflatten(structure_of_results, found))
 
 
-def _lower(platform: str, context: Any, *operands: Any, **parameters: Any) -> Any:
+def _lower(platform: str, context: Any, *operands: object, **parameters: Any) -> Any:
     # Without the axes of a `shard_map`, for XLA's loops do not say along which of them their carries vary.
     avals = [ShapedArray(aval.shape, aval.dtype) for aval in context.avals_in]
     run = functools.partial(_run, platform, **parameters)
@@ -161,7 +165,7 @@ def _lower(platform: str, context: Any, *operands: Any, **parameters: Any) -> An
 
 
 def _run(
-    platform: str, *flat: Array, code_of: CodeOf, static: Any, structure: Any, shapes: Any, axes: Any, advice: str
+    platform: str, *flat: Array, code_of: CodeOf, static: Any, structure: object, shapes: object, axes: Any, advice: str
 ) -> list[Array]:
     def function(*flat: Array) -> list[Array]:
         return jax.tree.leaves(code_of(platform, *static)(*jax.tree.unflatten(structure, flat)))
@@ -173,7 +177,7 @@ def _run(
 
 
 def _batched(
-    arrays: Any, of_arrays: Any, *, shapes: Any, axes: Any, **parameters: Any
+    arrays: Any, of_arrays: Any, *, shapes: Any, axes: Any, **parameters: object
 ) -> tuple[list[Array], list[int]]:
     mapped = zip(arrays, of_arrays, strict=True)
     size = next(array.shape[axis] for array, axis in mapped if axis is not None)
@@ -182,7 +186,7 @@ def _batched(
     return found, [0] * len(found)
 
 
-def _refuse(*_: Any, advice: str, **parameters: Any) -> NoReturn:
+def _refuse(*_: object, advice: str, **parameters: object) -> NoReturn:
     raise ValueError(advice)
 
 
@@ -191,7 +195,7 @@ def _compiled(parameters: frozenset[tuple[str, Hashable]]) -> jax.stages.Wrapped
     return jax.jit(functools.partial(by_platform_p.bind, **dict(parameters)))
 
 
-def _now(*arrays: Array, **parameters: Any) -> list[Array]:
+def _now(*arrays: Array, **parameters: object) -> list[Array]:
     # Eagerly too, the platform is known only when JAX compiles; under `jax.disable_jit` as well.
     with jax.disable_jit(False):
         found: list[Array] = _compiled(frozenset(parameters.items()))(*arrays)

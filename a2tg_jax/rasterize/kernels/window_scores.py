@@ -120,7 +120,7 @@ def _shape(images: Any, *, taps: tuple[float, ...]) -> Any:
     return images.update(shape=(*leading, height - len(taps) + 1, width - len(taps) + 1))
 
 
-def _transposed(cotangent: Array, _: Any, *, taps: tuple[float, ...]) -> list[Array]:
+def _transposed(cotangent: Array, _: object, *, taps: tuple[float, ...]) -> list[Array]:
     """Return the same mean of the padded cotangent, as the window is symmetric; that of slices would be slow."""
     margin = len(taps) - 1
     padded = jnp.pad(cotangent, [(0, 0)] * (cotangent.ndim - 2) + [(margin, margin)] * 2)

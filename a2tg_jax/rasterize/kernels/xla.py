@@ -67,8 +67,8 @@ def composite_in_any_mode(settings: CompositingSettings, inputs: PassInputs) -> 
     # No list is longer than this; blocks behind the end of all lists of a group are skipped.
     num_blocks = -(-min(inputs.lists.ids.shape[0], inputs.splats.M.shape[0]) // BLOCK)
 
-    def repeat(is_unfinished: Any, step: Any, carry: Any) -> Any:
-        def step_or_skip(carry: Any, _: None) -> tuple[Any, None]:
+    def repeat(is_unfinished: Any, step: Any, carry: object) -> Any:
+        def step_or_skip(carry: object, _: None) -> tuple[Any, None]:
             return jax.lax.cond(is_unfinished(carry), step, lambda carry: carry, carry), None
 
         # JAX differentiates loops of a fixed length only.
@@ -135,8 +135,8 @@ class _TracedPass:
         self.ids = jnp.concatenate([self.lists.ids, jnp.zeros(BLOCK, self.lists.ids.dtype)])
 
     def front_to_back(
-        self, block: Callable[..., Any], repeat: Callable[..., Any],
-        each_group: Callable[..., Any] = lambda group: group,
+        self, block: Callable[..., object], repeat: Callable[..., Any],
+        each_group: Callable[..., object] = lambda group: group,
     ) -> tuple[Array, Array]:  # fmt: skip
         """Composite all tiles.
 
@@ -194,7 +194,7 @@ class _TracedPass:
         is_inside = (tiles.x[:, None] + x < self.grid.width) & (tiles.y[:, None] + y < height)
         return jnp.ones_like(is_inside, self.dtype), is_inside
 
-    def over_tiles(self, function: Callable[..., Any]) -> Callable[..., Any]:
+    def over_tiles(self, function: Callable[..., object]) -> Callable[..., Any]:
         """Map a function of one tile over a leading axis of G tiles; a single one needs no vmap."""
         if self.settings.tile_batch > 1:
             return jax.vmap(function)
@@ -323,7 +323,7 @@ class _TracedPass:
         splats, regions = rows
         x, y = self.pixel_offsets(tile)
 
-        def spread(tree: Any) -> Any:
+        def spread(tree: object) -> Any:
             return jax.tree.map(lambda entry: jnp.broadcast_to(entry[:, None], (BLOCK, x.shape[1])), tree)
 
         splat = _split(splats, self.spec.has_geometry)

@@ -65,7 +65,7 @@ def _key(device: Any) -> str:
     return hashlib.sha256(repr(text).encode()).hexdigest()[:16]
 
 
-def largest_difference(device: Any) -> float:
+def largest_difference(device: object) -> float:
     """Return the largest difference between kernels and XLA, of the arrays of a textured view and of its gradient.
 
     Args:

@@ -8,7 +8,6 @@ the results.
 
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +71,7 @@ def capability() -> str:
 
 
 def launch(
-    spec: KernelSpec, name: str, num_tiles: int, inputs: Sequence[Array], results: Sequence[Any],
+    spec: KernelSpec, name: str, num_tiles: int, inputs: Sequence[Array], results: Sequence[object],
     totals: Sequence[Array] = (),
 ) -> list[Array]:  # fmt: skip
     """Run a kernel of `source.source` on a GPU.
