@@ -167,6 +167,11 @@ class PhotoStore:
         self._keeps_rays, self.num_ahead = plan.keeps_rays, plan.num_ahead
         self._rays: dict[tuple[int, int, int], Array] = {}
         self._stacks: dict[tuple[int, int, int], Photographs] = {}
+        self._of_kind: dict[tuple[int, int, int], list[int]] = {}
+        """Views of each kind, in the order of its stack."""
+        for index, kind in enumerate(order.kinds):
+            self._of_kind.setdefault(kind, []).append(index)
+        self._places = {index: place for found in self._of_kind.values() for place, index in enumerate(found)}
         is_waiting = any(view.picture.is_remote for view in views)
         self._ahead = Ahead(self._read, self.num_ahead, is_waiting=is_waiting)
         self.is_resident = not asked_by_any(self._mesh, not plan.is_resident)
@@ -178,20 +183,14 @@ class PhotoStore:
         Raises:
           ValueError, OSError: if a photograph that was not copied has gone, has changed or cannot be read.
         """
-        indices, kinds = self._order.indices(iteration), self._order.kinds
-        kind = kinds[indices[0]]
-        batch = self._stacks.get(kind)
-        if batch is None:
-            if self.is_resident:
-                batch = self._stacked([index for index, own in enumerate(kinds) if own == kind])
-            else:
-                following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
-                batch = self._ahead.first({key: self._order.indices(key) for key in following})
-            batch = self._placed(kind, batch)
+        indices = self._order.indices(iteration)
+        kind = self._order.kinds[indices[0]]
         if not self.is_resident:
-            return batch, None
-        self._stacks[kind] = batch
-        return batch, np.asarray([kinds[:index].count(kind) for index in indices], np.int32)
+            following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
+            return self._placed(kind, self._ahead.first({key: self._order.indices(key) for key in following})), None
+        if kind not in self._stacks:
+            self._stacks[kind] = self._placed(kind, self._stacked(self._of_kind[kind]))
+        return self._stacks[kind], np.asarray([self._places[index] for index in indices], np.int32)
 
     def _placed(self, kind: tuple[int, int, int], batch: Photographs) -> Photographs:
         """Return photographs of a kind on the devices, with the rays of their lens, which stay there if the rays of
