@@ -54,7 +54,7 @@ class Upscale(HostEvent):
     """Smallest average gradient that is upscaled (k_G); needed by select="threshold"."""
     budget_mb: float | None = None
     """Largest reported memory in MB (10^6 bytes); for select="budget" only, which needs it. It bounds the textures
-    alone, beside the Gaussians; a memory_budget chooses both."""
+    alone, without the Gaussians; a memory_budget chooses both."""
     anisotropic: bool = static(default=True)
     """Whether thin Gaussians double one axis only; off: always both."""
     axes: Axes = static(default="paper")

@@ -59,7 +59,7 @@ class Appearance:
     exponents: Exponents | None = None
     """Shapes of the kernels; None: all are Gaussians."""
     bands: Bands | None = None
-    """Spherical harmonics with a degree per Gaussian, beyond those of the Gaussians; None: none."""
+    """Spherical harmonics with a degree per Gaussian, above the degree that all Gaussians have; None: none."""
     given_colors: Array | None = None
     """[N, 3] colours instead of spherical harmonics, for rendering; None otherwise."""
     features: Array | None = None
@@ -231,7 +231,7 @@ class Appearance:
 
     @property
     def coefficients(self) -> Coefficients | None:
-        """Spherical harmonics beyond those of the Gaussians; None without."""
+        """Spherical harmonics above the degree that all Gaussians have; None without."""
         return None if self.bands is None else self.bands.coefficients
 
     @property
