@@ -19,8 +19,7 @@ from test_rays import write_fisheye
 from a2tg_jax import load_scene
 from a2tg_jax.data import decoding, load, photo_reading, photo_store
 from a2tg_jax.data.division import Division, sharing_errors
-from a2tg_jax.results import record
-from a2tg_jax.results.record import SYNTHETIC, SceneSource
+from a2tg_jax.data.load import SYNTHETIC, SceneSource
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*random points")
 
@@ -49,8 +48,7 @@ def together(monkeypatch):
     """Function that calls others, one in each process, and returns their results or errors. A process that waits for
     another in vain gets a BrokenBarrierError."""
     own = threading.local()
-    for module in (load, record):
-        monkeypatch.setattr(module, "among_processes", lambda: own.division)
+    monkeypatch.setattr(load, "among_processes", lambda: own.division)
 
     def call(*functions, seconds=60):
         barrier, told, found = threading.Barrier(len(functions), timeout=seconds), {}, {}

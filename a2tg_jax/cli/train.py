@@ -15,6 +15,7 @@ from tyro.conf import arg
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli.arguments import LpipsWeights, check_path, defaulting_to
 from a2tg_jax.cli.scenes import in_browser
+from a2tg_jax.data.load import SYNTHETIC, SceneSource
 from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.host.text import counted
 from a2tg_jax.mcmc import Mcmc
@@ -24,9 +25,7 @@ from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs
 from a2tg_jax.results.history import check_tensorboard
 from a2tg_jax.results.record import (
     DEFAULT_SYSTEM,
-    SYNTHETIC,
     RunRecord,
-    SceneSource,
     contradictions,
     read_record,
     read_run_file,

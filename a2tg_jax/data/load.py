@@ -5,11 +5,14 @@ import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
 
 from a2tg_jax.core.checks import check_literal
-from a2tg_jax.data.assembly import check_test_every
+from a2tg_jax.data.assembly import check_test_every, with_validation_views
 from a2tg_jax.data.colmap import find_models, load_colmap
-from a2tg_jax.data.division import Division, among_processes, divided, sharing_errors
+from a2tg_jax.data.division import among_processes, divided, sharing_errors
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.masks import AlphaMeaning, Mask, check_left
 from a2tg_jax.data.phone_captures import polycam, record3d
@@ -17,14 +20,56 @@ from a2tg_jax.data.photo_folder import check_no_video, holds_photos, told_of_cap
 from a2tg_jax.data.photo_reading import Options
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.photogrammetry import metashape, realityscan
-from a2tg_jax.data.scene import Scene, View, warn_of_lenses
+from a2tg_jax.data.scene import Scene, View, scene_name, warn_of_lenses
+from a2tg_jax.data.synthetic import synthetic_scene
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, Frames, load_blender, load_frames, load_transforms
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.remote_files import RemotePath, check_reachable, is_remote, located
+from a2tg_jax.host.remote_files import RemotePath, check_reachable, is_remote, is_url, located
 from a2tg_jax.host.text import as_argument
 
+SYNTHETIC = "synthetic"
+"""Name of the built-in scene."""
+SYNTHETIC_SIZE = (208, 156)
+"""Its width and height in runs, small enough to train in minutes on two cores."""
+HeldOut = Literal["test", "validation"]
 OTHER_PROGRAMS: tuple[Callable[[Path], Callable[[], Frames] | None], ...] = (polycam, record3d, metashape, realityscan)
 """Functions that recognise a folder of another program, in order of preference, and return what reads its frames."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneSource:
+    """Source of a scene: what `a2tg train` parses, what run.toml keeps, and what `load` needs."""
+
+    path: Annotated[Positional[str], arg(metavar="SCENE")] = ""
+    """Scene folder with photographs and cameras, its URL such as s3://bucket/scene, or "synthetic"; not needed with
+    --config or --resume."""
+    downscale: int = 1
+    """Factor k by which images are downscaled."""
+    test_every: int = 8
+    """Hold out every k-th image for testing."""
+    alpha: AlphaMeaning = "transparency"
+    """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
+    lens: LensUse = "undistort"
+    """Photographs of distorted cameras, such as fisheyes: undistort them to pinholes, or keep them as they are."""
+    validation: bool = False
+    """Hold out every eighth training image instead of the test images, to choose options without using these."""
+
+    @property
+    def held_out(self) -> HeldOut:
+        """Kind of the views that are held out."""
+        return "validation" if self.validation else "test"
+
+    @property
+    def name(self) -> str:
+        """Name of the scene in titles."""
+        if self.path == SYNTHETIC:
+            return SYNTHETIC
+        folder = os.path.dirname(self.path) if Path(self.path).suffix == ".json" else self.path
+        return scene_name(folder if is_url(folder) else Path(folder))
+
+    def load(self, room: int | None = None, *, is_divided: bool = False) -> Scene:
+        """Return the scene, which may be the built-in one. Arguments and errors are those of `load_scene`."""
+        return _load(self, room, is_divided, is_built_in=self.path == SYNTHETIC)
 
 
 def load_scene(
@@ -44,7 +89,7 @@ def load_scene(
     nerfstudio's `colmap/sparse/0`, Polycam's raw data, Record3D's frames with their metadata, Metashape's cameras
     (.xml), RealityScan's XMP files. Of several COLMAP models, the one with the most images is read.
     Photographs of distorted cameras are undistorted to pinholes unless `lens` keeps them. Images in the folder without
-    a pose are ignored. Masks, black at excluded pixels, are in `masks` beside `images`, or at `mask_path`.
+    a pose are ignored. Masks, black at excluded pixels, are in `masks` next to `images`, or at `mask_path`.
 
     Args:
       path: the scene folder, a transforms.json, or an XML file of Metashape's cameras; or a URL, such as s3://bucket/x,
@@ -60,7 +105,7 @@ def load_scene(
       lens: "undistort" photographs to pinholes, which crops wide angles; or "keep" them and draw through the lens,
         with a ray for each pixel (`Camera.rays`). Pixels more than 80° off the direction of view do not count.
       is_divided: whether the processes of `jax.distributed` call this together. Each then reads an equal share of the
-        photographs, and of the others those that have room in its memory. An error of one is raised in all.
+        photographs, plus as many of the others as its memory has room for. An error of one is raised in all.
 
     Returns:
       The scene in its normalised world; `Scene.transform` leads there from the input's.
@@ -71,24 +116,8 @@ def load_scene(
       ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left,
         or processes that load it together have other options or photographs than the first.
     """
-    division = among_processes() if is_divided else None
-    with sharing_errors(division):
-        if division is not None:
-            options = {"downscale": downscale, "test_every": test_every, "alpha": alpha, "lens": lens}
-            division.check_same([f"{name}={value}" for name, value in options.items()], "options of the scene")
-        check_literal("alpha", alpha, AlphaMeaning)
-        check_literal("lens", lens, LensUse)
-        if downscale < 1 or downscale != int(downscale):
-            raise ValueError(f"downscale must be a whole number of at least 1; got {downscale}")
-        check_test_every(test_every)
-        if room is not None and room < 0:
-            raise ValueError(f"room must be at least 0 bytes; got {room}")
-        try:
-            scene = _load(located(path), Options(int(downscale), test_every, lens, Shelf(room), division))
-        finally:
-            forget_rays()
-        warn_of_lenses(scene)
-        return _alpha_as_mask(scene, str(path), division) if alpha == "mask" else scene
+    source: SceneSource = SceneSource(path, downscale, test_every, alpha, lens)  # type: ignore[arg-type]
+    return _load(source, room, is_divided)
 
 
 def is_scene(folder: Path) -> bool:
@@ -96,11 +125,40 @@ def is_scene(folder: Path) -> bool:
     return _loader(folder) is not None or _frames(folder) is not None
 
 
-def _load(path: Path, options: Options) -> Scene:
-    """Load the scene as it is on disk or in a store."""
+def _load(source: SceneSource, room: int | None, is_divided: bool, is_built_in: bool = False) -> Scene:
+    division = among_processes() if is_divided else None
+    with sharing_errors(division):
+        if division is not None:
+            options = [f"scene={SYNTHETIC if is_built_in else 'from files'}"]
+            options += [f"{name}={value}" for name, value in vars(source).items() if name != "path"]
+            division.check_same(options, "options of the scene")
+        check_literal("alpha", source.alpha, AlphaMeaning)
+        check_literal("lens", source.lens, LensUse)
+        if source.downscale < 1 or source.downscale != int(source.downscale):
+            raise ValueError(f"downscale must be a whole number of at least 1; got {source.downscale}")
+        check_test_every(source.test_every)
+        if room is not None and room < 0:
+            raise ValueError(f"room must be at least 0 bytes; got {room}")
+        if is_built_in:
+            sizes = dict(zip(("width", "height"), SYNTHETIC_SIZE, strict=True))
+            scene = synthetic_scene(downscale=source.downscale, test_every=source.test_every, **sizes)
+        else:
+            options_of_readers = Options(int(source.downscale), source.test_every, source.lens, Shelf(room), division)
+            try:
+                scene = _read(located(source.path), options_of_readers)
+            finally:
+                forget_rays()
+            warn_of_lenses(scene)
+            if source.alpha == "mask":
+                scene = _alpha_as_mask(scene, str(source.path), options_of_readers)
+        return with_validation_views(scene) if source.validation else scene
+
+
+def _read(path: Path, options: Options) -> Scene:
+    """Read the scene at a path, or raise FileNotFoundError that says what is there instead."""
     is_here = not is_remote(path)
     if is_here and not path.exists():
-        built_in = "; the built-in scene is synthetic_scene()" if str(path) == "synthetic" else ""
+        built_in = "; the built-in scene is synthetic_scene()" if str(path) == SYNTHETIC else ""
         raise FileNotFoundError(f"{path}: no such scene folder{built_in}")
     is_json = path.suffix.lower() == ".json"
     if is_here:
@@ -127,7 +185,7 @@ def _load(path: Path, options: Options) -> Scene:
         )
         raise FileNotFoundError(f"{path}: {told or nothing}")
     if told is not None:
-        again = f"; or find cameras anew: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
+        again = f"; or find cameras again: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
         raise FileNotFoundError(f"{path}: {told}{again}")
     scene = next((parent for parent in path.resolve().parents[:2] if _loader(parent) is not None), None)
     if scene is not None:
@@ -155,7 +213,7 @@ def _frames(path: Path) -> Callable[[], Frames] | None:
     return next(filter(None, (recognise(path) for recognise in OTHER_PROGRAMS)), None)
 
 
-def _alpha_as_mask(scene: Scene, source: str, division: Division | None) -> Scene:
+def _alpha_as_mask(scene: Scene, source: str, options: Options) -> Scene:
     """Return the scene with the alpha of its photographs as masks, of which only opaque pixels count."""
     views = [*scene.train, *scene.test]
 
@@ -168,14 +226,12 @@ def _alpha_as_mask(scene: Scene, source: str, division: Division | None) -> Scen
         check_left(mask, view.name, source)
         return mask
 
-    masks = divided(division, [view.name for view in views], mask_of, "views")
-    masked = [_opaque(view, mask) for view, mask in zip(views, masks, strict=True)]
+    def opaque(view: View, mask: Mask | None) -> View:
+        picture, (height, width) = view.picture, view.picture.size
+        if view.has_alpha:
+            picture = dataclasses.replace(picture, shape=(height, width, 3), read=lambda: view.picture.read()[..., :3])
+        return dataclasses.replace(view, picture=picture, mask=mask)
+
+    masks = divided(options.division, [view.name for view in views], mask_of, "views")
+    masked = [opaque(view, mask) for view, mask in zip(views, masks, strict=True)]
     return dataclasses.replace(scene, train=tuple(masked[: len(scene.train)]), test=tuple(masked[len(scene.train) :]))
-
-
-def _opaque(view: View, mask: Mask | None) -> View:
-    """Return a view without its alpha, and with a mask."""
-    picture, (height, width) = view.picture, view.picture.size
-    if view.has_alpha:
-        picture = dataclasses.replace(picture, shape=(height, width, 3), read=lambda: view.picture.read()[..., :3])
-    return dataclasses.replace(view, picture=picture, mask=mask)

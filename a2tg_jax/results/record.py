@@ -25,18 +25,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tomli_w
-from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
+from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 
-from a2tg_jax.data import Scene, load_scene, synthetic_scene
-from a2tg_jax.data.assembly import with_validation_views
-from a2tg_jax.data.division import among_processes, sharing_errors
-from a2tg_jax.data.lenses import LensUse
-from a2tg_jax.data.masks import AlphaMeaning
-from a2tg_jax.data.scene import scene_name
+from a2tg_jax.data.load import SYNTHETIC, SceneSource
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
-from a2tg_jax.host.remote_files import checked_url, is_url, path_here
+from a2tg_jax.host.remote_files import checked_url, path_here
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.results.folder import RunFolder, read_json
@@ -46,70 +41,10 @@ from a2tg_jax.training import System, find_system, like
 from a2tg_jax.training.options import own_options
 from a2tg_jax.training.registry import differences, with_changes
 
-SYNTHETIC = "synthetic"
-SYNTHETIC_SIZE = (208, 156)
-"""Width and height, small enough to train in minutes on two cores."""
 DEFAULT_SYSTEM = "a2tg"
 LONGEST_REASON = 500
 OnNan = Literal["stop", "restore"]
 """Action on divergence: end with an error, or restore the newest checkpoint and reorder the views."""
-HeldOut = Literal["test", "validation"]
-
-
-@dataclasses.dataclass(frozen=True)
-class SceneSource:
-    """Source of a scene, from which it can be loaded again."""
-
-    path: Annotated[Positional[str], arg(metavar="SCENE")] = ""
-    """Scene folder with photographs and cameras, its URL such as s3://bucket/scene, or "synthetic"; not needed with
-    --config or --resume."""
-    downscale: int = 1
-    """Factor k by which images are downscaled."""
-    test_every: int = 8
-    """Hold out every k-th image for testing."""
-    alpha: AlphaMeaning = "transparency"
-    """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
-    lens: LensUse = "undistort"
-    """Photographs of distorted cameras, such as fisheyes: undistort them to pinholes, or keep them as they are."""
-    validation: bool = False
-    """Hold out every eighth training image instead of the test images, to choose options without using these."""
-
-    @property
-    def held_out(self) -> HeldOut:
-        """Kind of the views that are held out."""
-        return "validation" if self.validation else "test"
-
-    @property
-    def name(self) -> str:
-        """Name of the scene in titles."""
-        if self.path == SYNTHETIC:
-            return SYNTHETIC
-        folder = os.path.dirname(self.path) if Path(self.path).suffix == ".json" else self.path
-        return scene_name(folder if is_url(folder) else Path(folder))
-
-    def load(self, room: int | None = None, *, is_divided: bool = False) -> Scene:
-        """Return the scene in its normalised world.
-
-        Args:
-          room: bytes of memory for photographs that are read from files, as in `load_scene`.
-          is_divided: whether the processes of a training call this together, as in `load_scene`.
-
-        Raises:
-          FileNotFoundError, ValueError: as `load_scene` does.
-        """
-        division = among_processes() if is_divided else None
-        if division is not None:  # `load_scene` compares the other options.
-            kind = SYNTHETIC if self.path == SYNTHETIC else "from files"
-            with sharing_errors(division):
-                division.check_same([f"scene={kind}", f"validation={self.validation}"], "options of the scene")
-        every = self.test_every
-        if self.path == SYNTHETIC:
-            width, height = SYNTHETIC_SIZE
-            scene = synthetic_scene(width=width, height=height, downscale=self.downscale, test_every=every)
-        else:
-            given: Any = {"downscale": self.downscale, "alpha": self.alpha, "lens": self.lens}
-            scene = load_scene(self.path, test_every=every, room=room, is_divided=is_divided, **given)
-        return with_validation_views(scene) if self.validation else scene
 
 
 @dataclasses.dataclass(frozen=True)

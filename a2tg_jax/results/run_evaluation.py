@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.data import Scene, View, view_image
+from a2tg_jax.data.load import HeldOut
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model
@@ -40,7 +41,7 @@ from a2tg_jax.results.images import (
 )
 from a2tg_jax.results.model_source import settings_of
 from a2tg_jax.results.plan import RunPlan
-from a2tg_jax.results.record import HeldOut, read_record
+from a2tg_jax.results.record import read_record
 from a2tg_jax.results.report import Comparison, ModelResult, RunResult, metrics_json, per_view_json, write_report
 from a2tg_jax.training import System
 from a2tg_jax.training.corrections import learned

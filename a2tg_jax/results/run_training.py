@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from a2tg_jax.data import Scene
+from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import Devices, this_machine
@@ -33,7 +34,7 @@ from a2tg_jax.results.forecast import print_forecast, room_for_photographs
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.init_file import check_init, write_first_stage
 from a2tg_jax.results.plan import PlannedStage
-from a2tg_jax.results.record import SYNTHETIC, OnNan, RunRecord, read_record, write_record
+from a2tg_jax.results.record import OnNan, RunRecord, read_record, write_record
 from a2tg_jax.results.report import RunResult
 from a2tg_jax.results.run_evaluation import evaluate_run
 from a2tg_jax.results.several_processes import check_alike, send_stage

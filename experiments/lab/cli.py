@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import a2tg_jax as a2tg
+from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import write_json
-from a2tg_jax.results.record import SYNTHETIC
 from lab import machine, spreadsheet, tables, versions
 from lab.grid import Grid, read_grid
 from lab.grid_file import SCALES

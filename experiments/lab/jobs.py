@@ -19,9 +19,9 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian, no_rows
 from a2tg_jax.core.origin import WHITE
 from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.data.load import SceneSource
 from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.results.folder import read_json, write_json
-from a2tg_jax.results.record import SceneSource
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.registry import differences, reference_of
 from lab.fingerprint import fingerprint, is_same_so_far

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.host.text import did_you_mean
-from a2tg_jax.results.record import SYNTHETIC
 from lab.grid_file import Block
 from lab.toml_tables import table_as
 
