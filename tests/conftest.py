@@ -26,16 +26,24 @@ SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 READERS = pathlib.Path(__file__).resolve().parents[1] / "docs" / "reference"
 
 
-def pytest_addoption(parser):
-    parser.addoption("--long", action="store_true", help="run the tests marked `long`, too")
-
-
 LONGEST = {"test_bytewise", "test_experiments", "test_systems", "test_viewer_browser"}
 """Files that come first, so that no process is left with one of them while the others have nothing to do."""
 
 
+def pytest_addoption(parser):
+    parser.addoption("--long", action="store_true", help="run the tests marked `long` as well")
+
+
+def pytest_xdist_auto_num_workers(config):
+    """One file runs in this process. Otherwise there is one worker more than cores, since tests wait for processes."""
+    args = config.args if config.args_source == pytest.Config.ArgsSource.ARGS else []
+    if len(args) == 1 and ".py" in args[0]:
+        return 0
+    return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 7) + 1
+
+
 def pytest_collection_modifyitems(config, items):
-    """Skips tests that take long and have shorter kin, unless they are asked for; the longest files come first."""
+    """Skips the tests marked `long` without --long; the longest files come first."""
     items.sort(key=lambda item: item.path.stem not in LONGEST)
     if not config.getoption("--long"):
         for item in items:

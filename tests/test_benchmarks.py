@@ -33,6 +33,7 @@ def test_operations_of_a_jaxpr_are_its_arithmetic():
     assert bounds.operations(jax.make_jaxpr(function)(1.0, 2.0)) == 3 + 2
 
 
+@pytest.mark.long
 def test_pairs_beyond_the_last_visible_splat_are_not_taken(monkeypatch):
     seen = []
     monkeypatch.setattr(bounds.View, "taken", lambda view, lists: seen.append((view, lists)) or np.zeros(1))
@@ -51,6 +52,7 @@ def test_pairs_beyond_the_last_visible_splat_are_not_taken(monkeypatch):
     assert (taken > 0).any() and (transmittance(fewer) != whole).any(axis=1)[taken > 0].all()
 
 
+@pytest.mark.long
 def test_bounds_add_up(counted):
     work, spec = counted
     assert 0 < work.textured < work.composited <= work.taken * bounds.TILE_SIZE**2 and work.taken <= work.listed
@@ -63,6 +65,7 @@ def test_bounds_add_up(counted):
     assert "| 300, textured |" in bounds_table({"bounds": [case]})
 
 
+@pytest.mark.long
 def test_devices_share_the_pairs_of_an_image_with_a_sky():
     found = scaling.counted(3000, 4, 1, has_sky=True)
     assert found["fullest_band"] < 1.15 < 1.5 < found["fullest_of_even_bands"] < 4
@@ -72,6 +75,7 @@ def test_devices_share_the_pairs_of_an_image_with_a_sky():
     assert alone["fullest_band"] == 1 and alone["pixel_bytes"] == 0, "a view for each device"
 
 
+@pytest.mark.long
 def test_normals_of_splats_on_the_built_in_scene_are_those_of_its_shapes():
     for shape, _ in still_life(np.random.default_rng(0)):
         points, normals = shape.place(*np.random.default_rng(1).uniform(0.2, 0.8, (2, 50)).astype(np.float32))

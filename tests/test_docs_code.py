@@ -76,6 +76,7 @@ def test_textures_are_read_edited_and_put_back():
     np.testing.assert_allclose(after, before[:, ::-1], atol=1e-4)
 
 
+@pytest.mark.long
 def test_examples_run_and_learn():
     names = run("examples", {"__name__": "examples"})
     views = [a2tg.photometric_loss(names[model].render(names["cameras"][0]).color, names["photo"])
@@ -85,6 +86,7 @@ def test_examples_run_and_learn():
     assert names["gradient"].shape == (200, 5) and abs(names["gradient"]).max() > 0
 
 
+@pytest.mark.long
 def test_library_runs(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(a2tg, "fit", untrained)

@@ -24,12 +24,18 @@ from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.training.terms import Term
 
 NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("methods", "scales"))
-SCALES = ("full", "small", "smoke")
 LONG = sorted(name for name in NAMES if has_scale(name, "long"))
 """Grids of the paper's length on small photographs."""
 
 
-@pytest.mark.parametrize(("name", "scale"), [*itertools.product(NAMES, SCALES), *((name, "long") for name in LONG)])
+@pytest.mark.parametrize(
+    ("name", "scale"),
+    [
+        *itertools.product(NAMES, ("smoke", "small")),
+        *(pytest.param(name, "full", marks=pytest.mark.long) for name in NAMES),
+        *(pytest.param(name, "long", marks=pytest.mark.long) for name in LONG),
+    ],
+)
 def test_every_grid_names_runs_that_can_be_trained(name, scale):
     grid = read_grid(name, scale)
     first = {job.key: job for job in grid.jobs({})}
@@ -78,6 +84,7 @@ def test_methods_of_a_cell_differ_in_what_their_names_say_only():
     assert starts == {jobs["2DGS*-MCMC, first stage"].key}, "the first stage is trained once"
 
 
+@pytest.mark.long
 def test_anisotropy_acts_at_the_smoke_scale():
     """Only a Gaussian that is elongated and thin gets a texture that is not square."""
     grid = read_grid("ablation", "smoke")
@@ -240,6 +247,8 @@ def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
     [
         (["clam"], "no experiment 'clam'; did you mean claim?"),
         (["claim", "--scale", "smal"], "no --scale smal; did you mean small?"),
+        (["efficiency", "--only", "dog"], "no scene 'dog'"),
+        (["efficiency", "--scale", "small", "--scenes", "nowhere"], "nowhere"),
         (["claim", "--only", "legoo"], "no scene 'legoo' at this scale; did you mean lego?"),
         (["nowhere/mine.toml"], "no grid file nowhere/mine.toml"),
         (["claim", "--plan", "--scenes", "nowhere"], "no folder --scenes nowhere"),
@@ -369,6 +378,7 @@ print(*[job.key for name in {names} for job in read_grid(name, "small").jobs({{}
 """
 
 
+@pytest.mark.long
 def test_keys_are_the_same_in_every_process():
     script = KEYS.format(folder=str(EXPERIMENTS), names=NAMES)
     told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()

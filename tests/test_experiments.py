@@ -25,6 +25,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.training import fit_stage
 
 
+@pytest.mark.long
 def test_a_stage_stopped_under_one_system_goes_on_under_another(tmp_path):
     scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30)
     plain, textured = (a2tg.find_system(name).preset("smoke") for name in ("gaussians-2d-mcmc", "textured-gaussians"))
@@ -60,6 +61,7 @@ def _is_alive(pid):
     return _processes().get(pid, ("Z", 0))[0] != "Z"
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not pathlib.Path("/proc/self/stat").is_file(), reason="needs /proc to see processes")
 def test_an_experiment_is_killed_goes_on_and_is_not_run_again(tmp_path):
     """The claim on the built-in scene, at a tiny scale."""
@@ -92,6 +94,7 @@ def test_an_experiment_is_killed_goes_on_and_is_not_run_again(tmp_path):
     assert again.returncode == 0 and ".npz" not in told and " dB;" not in told
 
 
+@pytest.mark.long
 def test_submitit_sends_jobs_out(tmp_path):
     """By its executor for processes of this machine."""
     pytest.importorskip("submitit")
@@ -103,18 +106,6 @@ def test_submitit_sends_jobs_out(tmp_path):
     assert process.returncode == 0, told
     assert len(json.loads((out / "records.json").read_text())) == 2
     assert list((work / "submitit").iterdir())
-
-
-@pytest.mark.parametrize(
-    "arguments, words",
-    [(["--only", "dog"], "no scene 'dog'"), (["--scale", "small", "--scenes", "nowhere"], "nowhere")],
-)
-def test_what_cannot_be_run_is_an_error_that_says_what(arguments, words, tmp_path):
-    command = [sys.executable, str(EXPERIMENTS / "run.py"), "efficiency", "--out", str(tmp_path)]
-    done = subprocess.run(
-        [*command, "--work", str(tmp_path / "w"), *arguments], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 2 and words in done.stderr and "Traceback" not in done.stderr
 
 
 def test_ctrl_c_is_one_line_and_says_how_to_continue(capsys, monkeypatch):

@@ -56,6 +56,7 @@ def _draws_nothing(monkeypatch, tmp_path):
     matplotlib.pyplot.close("all")
 
 
+@pytest.mark.long
 def test_training_by_hand_learns_and_grows_textures(monkeypatch):
     names = run("training_by_hand", monkeypatch)
     assert names["losses_after"][-4:].mean() < 0.9 * names["losses_after"][:4].mean()
@@ -65,6 +66,7 @@ def test_training_by_hand_learns_and_grows_textures(monkeypatch):
     assert names["value"] < 0.95 * disturbed, "the camera descends"
 
 
+@pytest.mark.long
 def test_a_system_of_your_own_trains_beside_others_and_is_loaded_again(monkeypatch):
     names = run("a_system_of_your_own", monkeypatch)
     models = names["models"]
@@ -73,6 +75,7 @@ def test_a_system_of_your_own_trains_beside_others_and_is_loaded_again(monkeypat
     assert names["model"].num == models["edges"].num and len(names["frames"]) == 4
 
 
+@pytest.mark.long
 def test_one_image_is_fitted(monkeypatch):
     names = run("fitting_one_image", monkeypatch)
     losses = {name: losses for name, (_, losses) in names["fits"].items()}
@@ -81,6 +84,7 @@ def test_one_image_is_fitted(monkeypatch):
     assert names["starts"]["plain, equal bytes"].num_bytes == pytest.approx(names["textured"].num_bytes, rel=0.05)
 
 
+@pytest.mark.long
 def test_poses_descend(monkeypatch):
     """So short a training and descent find no pose; they take cameras nearer in the picture."""
     names = run("refining_poses", monkeypatch)
@@ -99,6 +103,7 @@ def test_gradients_agree_with_differences(monkeypatch):
     assert min(names["curves"]["float64"]) < 1e-3 * min(names["curves"]["float32"])
 
 
+@pytest.mark.long
 def test_a_sweep_goes_on_with_the_runs_that_are_left(monkeypatch):
     names = run("a_sweep_and_its_table", monkeypatch)
     results = json.loads((names["folder"] / "results.json").read_text(encoding="utf-8"))

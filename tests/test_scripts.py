@@ -41,8 +41,8 @@ RANDOM = {"num": 40, "width": 24, "height": 16, "textures": "mixed"}
     [
         {"case": "limit", "multiply_adds": 20, "pairs": 1e4},
         {"case": "render", **RANDOM},
-        {"case": "ratios", **RANDOM, "rounds": 2},
-        {"case": "stages", **RANDOM},
+        pytest.param({"case": "ratios", **RANDOM, "rounds": 2}, marks=pytest.mark.long),
+        pytest.param({"case": "stages", **RANDOM}, marks=pytest.mark.long),
     ],
     ids=lambda case: case["case"],
 )
@@ -70,6 +70,7 @@ SMALLEST = {
 """Arguments of the scripts of `benchmarks`."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SMALLEST)
 def test_it_runs(name, tmp_path):
     arguments = SMALLEST[name].format(out=tmp_path / "found.json", folder=tmp_path).split()
