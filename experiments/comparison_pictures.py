@@ -40,7 +40,7 @@ def _save_sheets(lab: Lab, stem: str, views: Sequence[a2tg.View], models: dict[s
     images, captions = [target, first, second, *others], ["photograph", *models]
     save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}.png", pictures.sheet(images, captions))
     crop = largest_gain(target, second, first)
-    close = [pictures.enlarged(crop.of(image), ZOOM) for image in images]
+    close = [pictures.enlarged(image[crop], ZOOM) for image in images]
     save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}-close.png", pictures.sheet(close, captions))
 
 

@@ -16,7 +16,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import combine, num_compiled, partition
 from a2tg_jax.results.forecast import forecast_run
-from a2tg_jax.results.plan import plan_run
+from a2tg_jax.results.record import plan_run
 from a2tg_jax.training.reports import StageEffects
 from a2tg_jax.training.step import initial_state, jitted_step
 from a2tg_jax.training.terms import l1

@@ -28,8 +28,7 @@ from a2tg_jax.results.forecast import (
     quick_flags,
     room_for_photographs,
 )
-from a2tg_jax.results.plan import plan_run
-from a2tg_jax.results.record import RunRecord, SceneSource
+from a2tg_jax.results.record import RunRecord, SceneSource, plan_run
 from a2tg_jax.training import SYSTEMS, cost, reports
 from a2tg_jax.training.corrections import BilateralGrid, sliced
 from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes

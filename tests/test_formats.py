@@ -35,10 +35,9 @@ from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
 from a2tg_jax.io.model_file import number_in_file
 from a2tg_jax.io.splat_files import KINDS
-from a2tg_jax.results import init_file, run_training
+from a2tg_jax.results import model_source, run_training
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.results.init_file import check_init, write_first_stage
-from a2tg_jax.results.model_source import open_source
+from a2tg_jax.results.model_source import check_init, open_source, write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.results.run_training import RunOptions, begin_run
 
@@ -288,7 +287,7 @@ def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, m
     def trained(*_, **options):
         raise RuntimeError("the second stage")
 
-    for module in (init_file, run_training):
+    for module in (model_source, run_training):
         monkeypatch.setattr(module, "load_splats", read_and_noted)
     monkeypatch.setattr(SceneSource, "load", lambda self, room, **options: scene)
     monkeypatch.setattr(run_training, "print_forecast", lambda *args: counts.append(args[4]))

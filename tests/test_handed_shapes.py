@@ -22,7 +22,7 @@ from a2tg_jax import (
 )
 from a2tg_jax.appearance import Appearance, Exponents, Texture, allocate_appearance, template_of
 from a2tg_jax.appearance.parts import nearest_gaussians
-from a2tg_jax.results.init_file import check_init, write_first_stage
+from a2tg_jax.results.model_source import check_init, write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.start import padded

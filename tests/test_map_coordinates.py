@@ -17,7 +17,7 @@ from a2tg_jax.cli.main import main
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.ply import read_ply_points
-from a2tg_jax.results.init_file import write_first_stage
+from a2tg_jax.results.model_source import write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource
 
 UTM = np.array([431234.5, 5411222.25, 312.0])

@@ -23,7 +23,7 @@ from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.parallel import processes, sharded_rows
 from a2tg_jax.parallel.processes import LOST, Liveness, accept, connect, is_of_collectives, listen
-from a2tg_jax.results import several_processes
+from a2tg_jax.results import run_training
 from a2tg_jax.results.folder import RunFolder, resuming_command
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
@@ -190,9 +190,7 @@ def test_digests_differ_where_training_would():
     view, *others = scene.train
 
     def digests(record=record, session=session, view=view, **changes):
-        return several_processes.digests_of(
-            record, dataclasses.replace(scene, train=(view, *others), **changes), session
-        )
+        return run_training.digests_of(record, dataclasses.replace(scene, train=(view, *others), **changes), session)
 
     def changed(**values):
         return dataclasses.replace(view, **values)

@@ -10,6 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from a2tg_jax.results.checks import check_held_out
 from run_folders import create_run
 
 from a2tg_jax.adapt import Upscale
@@ -25,16 +26,15 @@ from a2tg_jax.measure.evaluation import Evaluation, ViewMetrics, evaluate
 from a2tg_jax.measure.metrics import psnr
 from a2tg_jax.model import Model
 from a2tg_jax.render import render_image
-from a2tg_jax.results.checks import check_held_out
 from a2tg_jax.results.figures import curves_figure, level_colors, save_figure, sizes_figure
 from a2tg_jax.results.folder import OLD, RunFolder, check_free, drop_old, open_run, set_aside
 from a2tg_jax.results.history import read_history, write_history
 from a2tg_jax.results.images import error_picture, largest_gain, side_by_side, to_uint8
-from a2tg_jax.results.plan import plan_run
 from a2tg_jax.results.record import (
     RunRecord,
     SceneSource,
     contradictions,
+    plan_run,
     read_record,
     read_run_file,
     repeating_command,

@@ -13,8 +13,7 @@ from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.core.gaussians import SH_C0, rotation_matrices
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.densify.pruning import shown_in
-from a2tg_jax.results.plan import plan_run
-from a2tg_jax.results.record import RunRecord, SceneSource
+from a2tg_jax.results.record import RunRecord, SceneSource, plan_run
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.registry import with_changes

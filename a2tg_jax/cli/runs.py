@@ -10,10 +10,18 @@ from a2tg_jax.cli.arguments import LastModel, LpipsWeights, RunFolderPath, defau
 from a2tg_jax.cli.train import tell_result
 from a2tg_jax.host.text import counted
 from a2tg_jax.mesh.files import mesh_files
-from a2tg_jax.results.checks import check_apart, check_export, check_not_source, check_output, check_weights
 from a2tg_jax.results.compression import compress
 from a2tg_jax.results.finishing import finish_run
-from a2tg_jax.results.folder import RunFolder, json_text, open_run, opened
+from a2tg_jax.results.folder import (
+    RunFolder,
+    check_apart,
+    check_export,
+    check_not_source,
+    check_output,
+    json_text,
+    open_run,
+    opened,
+)
 from a2tg_jax.results.frames import (
     FRAMES_PER_SECOND,
     FrameFolder,
@@ -29,7 +37,7 @@ from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import FinishOptions
 from a2tg_jax.results.report import metrics_json
-from a2tg_jax.results.run_training import measure
+from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +60,7 @@ class Eval:
     def run(self) -> None:
         check_weights(self.lpips_weights)
         with opened(self.folder) as run:
-            result = measure(run, lpips_weights=self.lpips_weights)
+            result = evaluate_run(run, lpips_weights=self.lpips_weights)
             if self.json:
                 print(json_text(metrics_json(result)))
             else:

@@ -11,8 +11,8 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import LastModel, RunOrFile
 from a2tg_jax.data import Scene
 from a2tg_jax.host.operating_system import has_display
-from a2tg_jax.results.checks import check_apart, check_new, check_not_source, check_output
 from a2tg_jax.results.conversion import BakeOptions, check_ply, convert, export_ply
+from a2tg_jax.results.folder import check_apart, check_new, check_not_source, check_output
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.viewing import check_page, export_web, routes_of, shown_live
 from a2tg_jax.training.loop import Watch

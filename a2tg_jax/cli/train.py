@@ -32,8 +32,7 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.report import RunResult, summary_text
-from a2tg_jax.results.run_training import RunOptions, begin_run, resume_run, unseen
-from a2tg_jax.results.several_processes import follow_first_process
+from a2tg_jax.results.run_training import RunOptions, begin_run, follow_first_process, resume_run, unseen
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import Session
 

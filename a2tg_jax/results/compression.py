@@ -25,8 +25,7 @@ from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.results.checks import check_export, check_output
-from a2tg_jax.results.folder import RunFolder
+from a2tg_jax.results.folder import RunFolder, check_export, check_output
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.report import aligned, loss_text
 from a2tg_jax.results.run_evaluation import refined_views
@@ -47,20 +46,20 @@ def compress(
 ) -> str:
     """Write the smallest compact file of a model within a given loss, and return a table of the choices tried.
 
-    Losses are losses of PSNR on the training views of a run. If the photographs are missing, or a model's file is
-    given, they are estimated from renders, for a model with `ASSUMED_PSNR`.
+    Losses are in PSNR on the training views of a run. Without photographs they are estimated from renders, for a model
+    with `ASSUMED_PSNR`.
 
     Args:
-      source: a run folder, of which the last model is taken; or a model, *.npz.
+      source: a run folder, whose last model is taken; or a model, *.npz.
       out: the file, *.a2tgz; None: next to the model.
-      max_loss: in dB.
-      tune_iterations: iterations of training with rounding for each choice of bits that is tried with it
+      max_loss: largest loss in dB.
+      tune_iterations: iterations of training with rounding for each choice of bits that is tuned
         (`finish.tuning.smallest_tuned`); 0: the model's numbers are only rounded.
-      overwrite: whether an existing file is replaced that this function did not write into the run's folder.
+      overwrite: whether to replace an existing file that this function did not write into the run's folder.
 
     Raises:
-      ValueError, OSError: if the model or the photographs to tune it with are missing, the file exists, a compact file
-        cannot hold the model, or nothing loses so little.
+      ValueError, OSError: if the model or the photographs for tuning are missing, the file exists, a compact file
+        cannot hold the model, or no file is within the loss.
     """
     name = source.name.lower()
     if not source.is_dir() and name.endswith(tuple(FORMATS)) and not name.endswith(".npz"):

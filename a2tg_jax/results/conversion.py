@@ -1,4 +1,4 @@
-"""Conversion of models between formats of files, and export of their Gaussians as PLY."""
+"""Conversion of models between file formats, and export of their Gaussians as PLY."""
 
 import dataclasses
 import math
@@ -21,7 +21,7 @@ from a2tg_jax.io.formats import (
 )
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
-from a2tg_jax.results.checks import check_new, check_output
+from a2tg_jax.results.folder import check_new, check_output
 from a2tg_jax.results.model_source import Source, open_source
 
 
@@ -55,7 +55,7 @@ def convert(
       source: a run folder or a file of any known format.
       out: the file.
       name: which model of a run; None: the last of its main system.
-      baking: how textures become plain splats; None leaves them as they are.
+      baking: how textured splats become plain ones; None: they are not baked.
       float64: write the positions of a PLY as float64, as `save_ply` does.
       overwrite: whether an existing file is replaced.
 
@@ -70,7 +70,7 @@ def convert(
         if file.is_dir():
             raise ValueError(f"{file} is a folder; give the path of a file")
         if file.resolve() in sources:
-            whole = "the source" if file == out else f"part of the source and would be written beside {out}"
+            whole = "the source" if file == out else f"part of the source and would be written together with {out}"
             raise ValueError(f"{file} is {whole}: choose another name")
         check_new(file, "OUT", overwrite=overwrite)
     check_output(out)
@@ -83,9 +83,8 @@ def convert(
         save_ply(out, model, float64=True)
     else:
         save_splats(out, model)
-    ratio = file_bytes(out) / max(opened.num_bytes, 1)
-    sizes = f"{in_bytes(file_bytes(out))} from {in_bytes(opened.num_bytes)} ({ratio:.2f} times)"
-    seconds = time.perf_counter() - start
+    before, after, seconds = file_bytes(opened.path), file_bytes(out), time.perf_counter() - start
+    sizes = f"{in_bytes(after)} from {in_bytes(before)} ({after / max(before, 1):.2f} times)"
     lines = [baked] if baked else []
     lines.append(f"{out}: {counted(model.num, 'Gaussian')}, {sizes}, {seconds:.1f} s")
     if lost := lost_by(model, out):
@@ -98,7 +97,7 @@ def convert(
 
 
 def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str]:
-    """Return a plain model, and what was done in words."""
+    """Return a plain model, and a line about the baking."""
     if model.origin is None or not model.origin.cameras:
         raise ValueError(f"--bake needs a model with cameras; {source} has none")
     shown = model.appearance
@@ -119,9 +118,9 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
 
 
 def cameras_apart(origin: Origin) -> tuple[list[Camera], list[Camera]]:
-    """Return the cameras of training and those held out. If all are held out, all of them train, and none are left."""
-    training = [camera for camera, is_test in zip(origin.cameras, origin.is_test, strict=True) if not is_test]
-    held_out = [camera for camera, is_test in zip(origin.cameras, origin.is_test, strict=True) if is_test]
+    """Return the training cameras and the held-out ones. If all are held out, all are used for training."""
+    cameras = list(zip(origin.cameras, origin.is_test, strict=True))
+    training, held_out = ([camera for camera, is_test in cameras if is_test == kind] for kind in (False, True))
     return (training, held_out) if training else (held_out, [])
 
 
@@ -132,10 +131,8 @@ def check_ply(out: Path) -> None:
 
 
 def export_ply(source: Source, out: Path, *, float64: bool = False) -> str:
-    """Write the Gaussians of a model as programs for 3DGS read them, and return a summary, with what PLY does not keep.
-
-    `float64` is as in `save_ply`.
-    """
+    """Write the Gaussians of a model as programs for 3DGS read them (`save_ply`), and return a summary, with what PLY
+    does not keep."""
     out.parent.mkdir(parents=True, exist_ok=True)
     save_ply(out, source.model, float64=float64)
     lines = [f"file: {out}: {source.model.num:,} Gaussians"]

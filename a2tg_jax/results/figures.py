@@ -1,6 +1,6 @@
-"""Figures of a run as the report shows them: curves, texture sizes, pictures of the model; and cameras of a scene.
+"""Figures of a run for its report (curves, texture sizes, pictures of the model), and a plot of a scene's cameras.
 
-They are drawn with matplotlib's object interface, without windows or global state.
+They use matplotlib's object interface, without windows or global state.
 """
 
 import dataclasses
@@ -47,73 +47,75 @@ NUM_TEXTURES, TEXTURE_SIDE, TEXTURE_MARGIN, TEXTURES_PER_ROW = 24, 64, 8, 8
 LEAST_ALPHA = 0.5
 """Smallest alpha that shows a depth and a normal."""
 DEPTH_RANGE = 5, 95
-"""Percentiles of the inverse depths that colours reach from and to."""
+"""Percentiles of the inverse depths at the ends of the colour scale."""
 DEPTH_STOPS = 5
 """Number of depths in the legend."""
 NUM_CHECKERS = 60
-"""Squares across a picture, of the ground where nothing is hit."""
+"""Squares across a picture where nothing is hit."""
 FLIGHT_FRAMES, FLIGHT_PER_SECOND, FLIGHT_SIDE = 60, 15, 480
 MOST_CLOUD_POINTS = 20_000
-"""Number of points drawn at most."""
+"""Largest number of points drawn."""
 WIDEST = 3.0
-"""Largest half of the side of the picture, in distances of the farthest camera from the middle."""
+"""Largest half-width of the plot, in distances of the farthest camera from the middle."""
 NOT_HIT = "chequered where nothing is hit and the background shows"
 
 
 @dataclasses.dataclass(frozen=True)
 class ReportFigure:
-    """A file in the run folder, as the report shows it."""
+    """File in the run folder, with its caption in the report."""
 
     path: Path
     caption: str
     kind: str = ""
-    """Class of the report's style."""
+    """Class in the report's style sheet."""
     legend: Sequence[tuple[str, str]] = ()
-    """Colours, as CSS names them, and what they mean."""
+    """CSS colours and their meanings."""
 
 
 def write_figures(
     run: RunFolder, model: Model, camera: Camera, settings: RenderSettings, histories: Mapping[str, History],
     starts: Mapping[str, int],
 ) -> dict[str, list[ReportFigure]]:  # fmt: skip
-    """Write the figures of a run's main model as a camera shows it, and return them by their places in the report.
-
-    `starts` has the number of iterations before each stage.
-    """
+    """Write the figures of a run's main model, some of them from one camera, and return them by their places in the
+    report. `starts` has the number of iterations before each stage."""
     found: dict[str, list[ReportFigure]] = {"curves": [], "textures": [], "maps": [], "geometry": [], "flight": []}
 
-    def own(name: str) -> Path:
-        return run.own(run.figures / name)
+    def add(
+        place: str, name: str, content: Figure | np.ndarray | bytes, caption: str, kind: str = "",
+        legend: Sequence[tuple[str, str]] = (),
+    ) -> None:  # fmt: skip
+        path = run.own(run.figures / name)
+        if isinstance(content, Figure):
+            save_figure(path, content)
+        elif isinstance(content, bytes):
+            with replacing(path) as temporary:
+                temporary.write_bytes(content)
+        else:
+            save_picture(path, content)
+        found[place].append(ReportFigure(path, caption, kind, legend))
 
-    save_figure(curves := own("curves.png"), curves_figure(histories, starts))
     caption = "Loss and PSNR of the training views seen, with running means."
-    found["curves"].append(ReportFigure(curves, caption, "chart"))
+    add("curves", "curves.png", curves_figure(histories, starts), caption, "chart")
     if model.textures is not None and (model.textures.sizes.prod(axis=1) > 1).any():
         learned = learned_textures(model)
         if learned is not None:
-            save_picture(textures := own("textures.png"), learned)
-            caption = "Some textures that add much to the picture, in their Gaussians' colours; chequered where "
-            found["textures"].append(ReportFigure(textures, f"{caption}transparent.", "texels"))
-        save_figure(sizes := own("sizes.png"), sizes_figure(model.textures.sizes))
-        caption = "How many Gaussians have a texture of each resolution."
-        found["textures"].append(ReportFigure(sizes, caption, "chart"))
+            caption = "Some of the most visible textures, in their Gaussians' colours; chequered where transparent."
+            add("textures", "textures.png", learned, caption, "texels")
+        caption = "Number of Gaussians with a texture of each resolution."
+        add("textures", "sizes.png", sizes_figure(model.textures.sizes), caption, "chart")
     for shown in level_maps(model):
-        save_picture(path := own(shown.file), level_picture(model, shown.levels, camera, settings))
         legend = list(zip(map(to_hex, level_colors(len(shown.names))), shown.names, strict=True))
         caption = f"The first view, every Gaussian by {shown.varying}; {NOT_HIT}."
-        found["maps"].append(ReportFigure(path, caption, legend=legend))
+        add("maps", shown.file, level_picture(model, shown.levels, camera, settings), caption, legend=legend)
     output = Renderer(model, settings=settings)(camera)
     picture, stops = depth_picture(output)
-    save_picture(depth := own("depth.png"), picture)
     legend = [(to_hex(tuple(color)), f"{distance:.3g}") for distance, color in stops]
-    caption = "Depth in units of the normalised world; nearer and farther depths take the colours of the ends; "
-    save_picture(normals := own("normals.png"), normal_picture(output, camera))
-    facing = f"Normals: red to the right, green up, blue to the camera; {NOT_HIT}."
-    found["geometry"] += [ReportFigure(depth, f"{caption}{NOT_HIT}.", legend=legend), ReportFigure(normals, facing)]
+    caption = "Depth in units of the normalised world; nearer and farther depths have the colours of the ends"
+    add("geometry", "depth.png", picture, f"{caption}; {NOT_HIT}.", legend=legend)
+    caption = f"Normals: red to the right, green up, blue to the camera; {NOT_HIT}."
+    add("geometry", "normals.png", normal_picture(output, camera), caption)
     if (moving := flight(model, settings)) is not None:
-        with replacing(animation := own("flight.webp")) as temporary:
-            temporary.write_bytes(moving)
-        found["flight"].append(ReportFigure(animation, "A flight past the cameras.", "figure"))
+        add("flight", "flight.webp", moving, "A flight past the cameras.", "figure")
     return found
 
 
@@ -150,14 +152,13 @@ def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -
 
 
 def _thinned(column: np.ndarray) -> np.ndarray:
-    """Return a column of at most `MOST_POINTS` numbers, each the mean of as many rows; what is left over at the end
-    goes."""
+    """Return means of equally many rows of a column, at most `MOST_POINTS` of them; a remainder at the end is dropped."""
     rows = -(-len(column) // MOST_POINTS)
     return column if rows < 2 else column[: len(column) // rows * rows].reshape(-1, rows).mean(axis=1)
 
 
 def sizes_figure(sizes: np.ndarray) -> Figure:
-    """Plot how many Gaussians have a texture of each resolution, as a map of Tv × Tu; sizes are [N, 2] integers."""
+    """Plot the number of Gaussians by the resolution of their textures, sizes [N, 2], as a map of Tv × Tu."""
     sides = 2 ** np.arange(int(np.log2(max(4, sizes.max()))) + 1)
     counts = np.array([[np.sum((sizes == (tv, tu)).all(axis=1)) for tu in sides] for tv in sides])
     figure = Figure(figsize=(1.2 + 0.95 * len(sides), 0.9 + 0.75 * len(sides)), layout="constrained")
@@ -181,10 +182,8 @@ def sizes_figure(sizes: np.ndarray) -> Figure:
 
 
 def learned_textures(model: Model) -> np.ndarray | None:
-    """Return a sheet of some textures of a model, as opaque as they are, on a chequered ground, in their Gaussians'
-    colours and own proportions.
-
-    They are those that add most to the picture: by the spread of their texels times the area of the Gaussian.
+    """Return a sheet of the most visible textures of a model (largest variance of texels times area of the Gaussian), in
+    their Gaussians' colours and proportions, over a chequered background.
 
     Returns:
       uint8 [H, W, 4], transparent between the textures; None if no Gaussian has more than one texel.
@@ -214,16 +213,15 @@ def learned_textures(model: Model) -> np.ndarray | None:
 
 
 class DepthPicture(NamedTuple):
-    """Depths as colours, evenly in inverse depth: what is far behind the scene takes few colours."""
+    """Depths as colours, evenly in inverse depth, so that a far background uses few colours."""
 
     picture: np.ndarray
     """uint8 [H, W, 3], near bright; chequered where little or nothing is hit."""
     stops: list[tuple[float, np.ndarray]]
-    """Some depths, nearest first, and their colours, [3] in [0, 1]. Depths beyond the first and last are clipped."""
+    """Depths in the legend, nearest first, and their colours, [3] in [0, 1]. Depths beyond the ends are clipped."""
 
 
 def depth_picture(output: RenderOutput) -> DepthPicture:
-    """Return the picture of the depths of a render."""
     is_hit = _is_hit(output)
     inverse = np.asarray(output.alpha) / np.where(is_hit, np.asarray(output.depth), 1.0)
     far, near = np.percentile(inverse[is_hit], DEPTH_RANGE) if is_hit.any() else (1.0, 1.0)
@@ -234,8 +232,7 @@ def depth_picture(output: RenderOutput) -> DepthPicture:
 
 
 def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
-    """Return uint8 [H, W, 3] of the normals seen from the camera: red to the right, green up, blue towards it;
-    chequered as in `depth_picture`."""
+    """Return uint8 [H, W, 3] of the normals in camera axes, chequered as in `depth_picture`."""
     normal = np.asarray(output.normal) @ np.asarray(camera.viewmat)[:3, :3].T * (1, -1, -1)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     is_seen = _is_hit(output) & (length[..., 0] > 0)
@@ -243,19 +240,19 @@ def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
 
 
 class LevelMap(NamedTuple):
-    """Level of each Gaussian in a property that varies, such as its degree."""
+    """Levels of the Gaussians in a varying property, such as their degree."""
 
     file: str
     varying: str
     """The property in words."""
     levels: np.ndarray
-    """[N] integers, each of which has a colour."""
+    """[N] integers, each with its own colour."""
     names: Sequence[str]
-    """Meaning of levels 0, 1, …"""
+    """Meanings of levels 0, 1, …"""
 
 
 def level_maps(model: Model) -> list[LevelMap]:
-    """Return the texels of each Gaussian and its degree, each only if it varies."""
+    """Return the maps of numbers of texels and of degrees, each only if it varies."""
     maps = []
     if model.textures is not None and model.appearance.texture_options is not None:
         levels = np.rint(np.log2(np.maximum(model.textures.sizes.prod(axis=1), 1))).astype(int)
@@ -273,8 +270,8 @@ def level_colors(num_levels: int) -> np.ndarray:
 
 
 def level_picture(model: Model, levels: np.ndarray, camera: Camera, settings: RenderSettings) -> np.ndarray:
-    """Return uint8 [H, W, 3] of the Gaussians in the colours of their levels [N], from any direction, on a chequered
-    ground. Alpha textures stay, RGB residuals and view dependence go."""
+    """Return uint8 [H, W, 3] of the Gaussians in the colours of their levels [N], without RGB residuals and view
+    dependence, over a chequered background."""
     colors = (level_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
     if model.textures is not None:
         buckets = tuple(bucket.at[..., :3].set(0.0) for bucket in model.textures.buckets)
@@ -331,7 +328,15 @@ def save_camera_picture(scene: Path, path: Path) -> None:
     viewmats, cloud = read_cameras_and_points(scene)
     rotations = viewmats[:, :3, :3]
     centers = -np.einsum("vij,vi->vj", rotations, viewmats[:, :3, 3])
-    axes = _upright_axes(rotations)
+    # Right, ahead and up of the picture; up is the mean upper side of the photographs.
+    up = -rotations[:, 1].mean(axis=0)
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    right = rotations[:, 0].mean(axis=0)
+    right = right - up * (right @ up)
+    if np.linalg.norm(right) < 1e-6:  # Cameras all around have no common right side.
+        right = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    right = right / np.linalg.norm(right)
+    axes = np.stack([right, np.cross(up, right), up])
     middle = np.median(np.concatenate([centers, cloud.points]), axis=0)
     # Half the side of the picture: all cameras, and most of the points.
     far_cameras = float(np.abs(centers - middle).max())
@@ -353,15 +358,3 @@ def save_camera_picture(scene: Path, path: Path) -> None:
         panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
         panel.set_title(f"{len(centers)} cameras {title}", fontsize=10)
     save_figure(path, figure)
-
-
-def _upright_axes(rotations: np.ndarray) -> np.ndarray:
-    """Return rows right, ahead and up [3, 3] of the picture; up is the mean upper side of the photographs."""
-    up = -rotations[:, 1].mean(axis=0)
-    up = up / max(float(np.linalg.norm(up)), 1e-9)
-    right = rotations[:, 0].mean(axis=0)
-    right = right - up * (right @ up)
-    if np.linalg.norm(right) < 1e-6:  # Cameras all around have no common right side.
-        right = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    right = right / np.linalg.norm(right)
-    return np.stack([right, np.cross(up, right), up])

@@ -16,8 +16,7 @@ from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
 from a2tg_jax.results.folder import RunFolder, check_free, claimed, read_json, write_json
 from a2tg_jax.results.model_source import finished_stage, settings_of
-from a2tg_jax.results.plan import PlannedStage
-from a2tg_jax.results.record import FinishOptions, write_record
+from a2tg_jax.results.record import FinishOptions, PlannedStage, write_record
 from a2tg_jax.results.report import aligned
 from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, refined_views
 from a2tg_jax.training.registry import system_to_dict

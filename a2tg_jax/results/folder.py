@@ -1,8 +1,8 @@
-"""The run folder: its layout, and when an existing one may be used.
+"""The run folder: its layout, and which existing files and folders may be replaced.
 
     RUN/
       .a2tg-run                  the marker: this program made the folder, and what it wrote there
-      run.toml                   the scene, the system with every number, the systems compared: repeats the run
+      run.toml                   the scene, the system with every number, the systems compared (`results.record`)
       checkpoints/NAME-*.npz     the newest two of the stage that is being trained, to resume from
       models/NAME.npz            what each finished stage left behind, with cameras, world and background
       corrections/NAME.json      exposure and pose of each training view, if they were learned
@@ -14,11 +14,11 @@
       point_cloud.ply            the Gaussians in the original world
       viewer.html                the model in a browser, on one page
       report.html                all of it on one page
-      finish.json                from which run and how a2tg finish made the main model
-      diverged/NAME-*.npz        the state before a step whose numbers were not finite, a checkpoint
+      finish.json                the run that a2tg finish started from, and its options
+      diverged/NAME-*.npz        checkpoint before a step whose numbers were not finite
       .a2tg-old/                 the run that this one replaces, until this one has its report
 
-NAME is a stage's name in the run, such as `a2tg-gaussians` or `a2tg-textures` (`plan`).
+NAME is a stage's name in the run, such as `a2tg-gaussians` or `a2tg-textures`.
 """
 
 import contextlib
@@ -26,7 +26,9 @@ import glob
 import json
 import os
 import shlex
-from collections.abc import Iterator, Sequence
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +44,12 @@ KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
 DAMAGED = ".damaged"
 OLD = ".a2tg-old"
+EXPORTS = (".a2tgz", ".glb")
+"""Suffixes of files that `a2tg compress` and `a2tg mesh` write into a run folder, which the run does not need."""
 IN_USE = "is not empty; add --resume to continue it, --overwrite to start again, or choose another --out"
 """Error text of training for a folder that already holds a run."""
 MOST_NAMES = 100_000
-"""Largest number of files that a marker may list."""
+"""Largest number of files in a marker."""
 MOST_MARKER_BYTES = 1 << 24
 
 
@@ -67,12 +71,12 @@ class RunFolder:
         self.test = path / "test"
 
     def own(self, path: Path) -> Path:
-        """Return the path after noting it in the marker. Only noted paths are ever replaced or deleted."""
+        """Return the path after listing it in the marker. Only listed paths are ever replaced or deleted."""
         self.own_all([path.relative_to(self.path).as_posix()])
         return path
 
     def own_all(self, names: Sequence[str]) -> None:
-        """Note several files in the marker at once, by names relative to the folder."""
+        """List several files in the marker at once, by names relative to the folder."""
         known = set(self.written())
         lines = [f"{name}\n" for name in dict.fromkeys(names) if name not in known]
         if not lines:
@@ -84,11 +88,8 @@ class RunFolder:
             os.fsync(file.fileno())
 
     def written(self) -> list[str]:
-        """Return the paths listed in the marker, relative to the folder; none without a marker.
-
-        Raises:
-          ValueError: if the marker is not this program's, or lists more than `MOST_NAMES` files.
-        """
+        """Return the paths listed in the marker, relative to the folder; none without a marker. Raises ValueError if it
+        is not this program's, or lists more than `MOST_NAMES` files."""
         if not is_regular(self.marker) or not self.marker.stat().st_size:
             return []
         data = read_regular(self.marker, MOST_MARKER_BYTES)
@@ -103,11 +104,14 @@ class RunFolder:
         return names
 
     def own_files(self, names: list[str]) -> list[Path]:
-        """Return the names that are files within the folder, except the marker."""
-        paths = [self.path / name for name in dict.fromkeys(names)]
-        root = self.path.resolve()
-        # A line that a crash has cut off may name a folder.
-        return [p for p in paths if p != self.marker and _is_file(p) and p.resolve().is_relative_to(root)]
+        """Return the paths of names that are files within the folder, except the marker."""
+        root, found = self.path.resolve(), []
+        for path in (self.path / name for name in dict.fromkeys(names)):
+            # A line that a crash has cut off may name a folder, and a damaged one what no file can be called.
+            with contextlib.suppress(OSError):
+                if path != self.marker and path.is_file() and path.resolve().is_relative_to(root):
+                    found.append(path)
+        return found
 
     def clear(self) -> None:
         """Delete what runs wrote into their folder, and folders left empty. The marker stays, empty."""
@@ -120,7 +124,7 @@ class RunFolder:
 
     @property
     def is_begun(self) -> bool:
-        """Whether a run wrote more into it than its record."""
+        """Whether a run wrote more than its record."""
         return any(path != self.record for path in self.own_files(self.written()))
 
     @property
@@ -148,14 +152,8 @@ class RunFolder:
         """Return the checkpoints of a stage, oldest first."""
         return sorted((self.path / "checkpoints").glob(f"{glob.escape(name)}-{'[0-9]' * 10}.npz{ending}"))
 
-    def set_damaged_aside(self, checkpoint: Path) -> Path:
-        """Rename an unreadable checkpoint, so that it no longer counts as one."""
-        aside = checkpoint.with_name(checkpoint.name + DAMAGED)
-        os.replace(checkpoint, self.own(aside))
-        return aside
-
     def drop_old_checkpoints(self, name: str, keep: int = KEPT_CHECKPOINTS) -> None:
-        """Delete all checkpoints of a stage but the newest `keep`; with keep=0, damaged ones too."""
+        """Delete all checkpoints of a stage except the newest `keep`; with keep=0, damaged ones as well."""
         old = self.checkpoints(name)[: -keep or None]
         for path in old if keep else [*old, *self.checkpoints(name, DAMAGED)]:
             path.unlink()
@@ -170,13 +168,8 @@ def iteration_of(checkpoint: Path) -> int:
 
 
 def check_free(path: Path, *, overwrite: bool = False, in_use: str = IN_USE) -> None:
-    """Raise FileExistsError if there is something at `path` already that must not be lost. The folder is not touched.
-
-    Args:
-      path: the folder, which may hold the run.toml of a run that never began.
-      overwrite: whether a run that is in it may be replaced.
-      in_use: error text for a folder that holds a run.
-    """
+    """Raise FileExistsError if `path` is anything but a free folder, which may hold the run.toml of a run that never
+    began, or a run that may be replaced (`overwrite`). `in_use` is the error text for a run."""
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"{path} is a file; choose another folder with --out")
     run = RunFolder(path)
@@ -199,8 +192,7 @@ def open_run(path: Path) -> RunFolder:
 
 
 def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
-    """Return the command line that continues the training of a run on these devices; None: as its newest
-    checkpoint was made."""
+    """Return the command line that continues a training on these devices; None: on those of its newest checkpoint."""
     if devices is None:
         devices = ALONE
         found = sorted((run.path / "checkpoints").glob("*.npz"), key=lambda path: path.stat().st_mtime_ns)
@@ -215,14 +207,6 @@ def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
     return shlex.join(words)
 
 
-def _is_file(path: Path) -> bool:
-    """Return whether the file exists; False for names that no file can have."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
-
-
 def remove_if_empty(folder: Path, root: Path) -> None:
     """Remove a folder below another, if it is empty."""
     if folder != root and folder.is_dir() and not any(folder.iterdir()):
@@ -234,13 +218,13 @@ def remove_if_empty(folder: Path, root: Path) -> None:
 
 @contextlib.contextmanager
 def claimed(run: RunFolder) -> Iterator[None]:
-    """Keep other processes from training and measuring in a run folder. The folder is made if it does not exist.
+    """Keep other processes from training and measuring in a run folder, which is made if it does not exist.
 
-    The lock is the operating system's, on the marker: it ends with the process, however that ends. Some file systems
-    have no locks. Partial files of a killed process are removed, and a run that it was about to replace is put back.
+    The lock is the operating system's, on the marker, and ends with the process. Some file systems have no locks.
+    Partial files of a killed process are removed, and a run that it was about to replace is put back.
 
     Raises:
-      FileExistsError: if another process is at it.
+      FileExistsError: if another process has claimed it.
       ValueError: if the marker is not this program's.
     """
     run.written()
@@ -270,8 +254,8 @@ def opened(path: Path) -> Iterator[RunFolder]:
         yield open_run(path)
 
 
-# Replacement of a run. The old one waits in RUN/.a2tg-old, a run folder too, until the new one has its report. Until
-# the new one has a checkpoint, the old one can be put back. Its record moves first and returns last, so that a folder
+# Replacement of a run. The old one is kept in RUN/.a2tg-old, which is a run folder, until the new one has its report.
+# Until the new one has a checkpoint, the old one can be put back. Its record moves first and returns last, so a folder
 # without a record is one in which a process was killed between two of the files.
 
 
@@ -282,18 +266,15 @@ def old_run(run: RunFolder) -> RunFolder | None:
 
 
 def set_aside(run: RunFolder) -> None:
-    """Move what runs wrote into a folder, as its marker lists it, to RUN/.a2tg-old.
-
-    If there is a run already, because the one that was to replace it never ended, that one is kept and this one is
-    deleted.
-    """
+    """Move the files of a run to RUN/.a2tg-old. If an earlier run is still there, because its replacement never ended,
+    that one is kept and this one is deleted."""
     if old_run(run) is None:
         _move(run, RunFolder(run.path / OLD), is_record_first=True)
     run.clear()
 
 
 def put_back_old(run: RunFolder) -> bool:
-    """Put back the run that this one replaces, unless this one has a checkpoint or a model. Return whether it did."""
+    """Put back the run that this one replaces, unless this one has a checkpoint or a model. Return whether it was."""
     old = old_run(run)
     if old is None:
         return False
@@ -311,7 +292,7 @@ def put_back_old(run: RunFolder) -> bool:
 
 
 def drop_old(run: RunFolder) -> None:
-    """Delete the run that was set aside, if there is one, and its folder unless there is anything else in it."""
+    """Delete the run that was set aside, if any, and its folder unless it holds other files."""
     old = old_run(run)
     if old is not None:
         old.clear()
@@ -332,6 +313,72 @@ def _move(source: RunFolder, target: RunFolder, *, is_record_first: bool) -> Non
     flush_folder(target.path)
 
 
+# Checks of output paths, before any work
+
+
+def check_output(path: Path) -> None:
+    """Raise ValueError if a file or folder cannot be made, naming what is in the way.
+
+    New folders on more than one level outside the current folder, such as at a misspelt drive, are reported on stderr.
+    """
+    place = Path(os.path.abspath(path))
+    missing = [folder for folder in (place, *place.parents) if not folder.exists()]
+    existing = missing[-1].parent if missing else place if place.is_dir() else place.parent
+    if not existing.exists():
+        raise ValueError(f"{path} cannot be made, for there is no {existing}")
+    if not existing.is_dir():
+        raise ValueError(f"{path} cannot be made, for {existing} is a file")
+    try:
+        os.rmdir(tempfile.mkdtemp(dir=existing))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be made, for nothing can be written in {existing}: {error.strerror}") from None
+    if len(missing) > 1 and not existing.is_relative_to(os.getcwd()):
+        print(f"a2tg: {missing[-1]} does not exist and will be made", file=sys.stderr)
+
+
+def check_apart(out: Path, other: Path) -> None:
+    """Raise ValueError if one of two paths, at least one of which is written, is in the other."""
+    one, two = out.resolve(), other.resolve()
+    if one.is_relative_to(two) or two.is_relative_to(one):
+        raise ValueError(f"{out} and {other} overlap: choose an output folder outside it")
+
+
+def check_new(path: Path, option: str, *, overwrite: bool) -> None:
+    """Raise if a file must not be replaced, naming it and the option that it comes from.
+
+    Raises:
+      FileExistsError: if it exists, and `overwrite` is not set.
+      ValueError: if a run, and no export, wrote it into its folder.
+    """
+    if not path.is_file():
+        return
+    run = _run_that_wrote(path)
+    if run is not None and path.suffix.lower() not in EXPORTS:
+        raise ValueError(f"{path} belongs to the run in {run}; choose another {option}")
+    if not overwrite:
+        raise FileExistsError(f"{path} exists; add --overwrite to replace it, or choose another {option}")
+
+
+def check_export(path: Path, default: Path, option: str, *, overwrite: bool) -> None:
+    """Call `check_new`, unless the path is the default and the same command wrote it into a run folder before."""
+    if path.resolve() != default.resolve() or _run_that_wrote(path) is None:
+        check_new(path, option, overwrite=overwrite)
+
+
+def _run_that_wrote(path: Path) -> Path | None:
+    """Return the folder of the run that lists a file as its own, or None."""
+    path = path.resolve()
+    names = {folder: path.relative_to(folder).as_posix() for folder in path.parents}
+    return next((folder for folder, name in names.items() if name in RunFolder(folder).written()), None)
+
+
+def check_not_source(files: Iterable[Path], source: Path, option: str) -> None:
+    """Raise ValueError if one of the files to write is the file that is read, naming it and its option."""
+    for file in files:
+        if file.exists() and source.exists() and file.samefile(source):
+            raise ValueError(f"{file} is the model itself; choose another {option}")
+
+
 # JSON
 
 
@@ -341,17 +388,12 @@ def json_text(data: object) -> str:
 
 
 def write_json(path: Path, data: object) -> None:
-    """Write indented JSON atomically."""
     with replacing(path) as temporary:
         temporary.write_text(f"{json_text(data)}\n", encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-      ValueError: if the file is damaged, or too large for one of this program's.
-    """
+    """Return the content of a JSON file. Raises ValueError if it is damaged, or too large for one of this program's."""
     data = read_regular(path, MOST_BYTES)
     try:
         return parse_json(data, allow_nan=True)  # The PSNR of equal images is infinite.

@@ -1,4 +1,4 @@
-"""Forecast of a run's memory, disk and time, and the refusal of runs that cannot fit."""
+"""Forecast of a run's memory and disk space, and errors for runs that cannot fit."""
 
 import dataclasses
 import math
@@ -12,10 +12,9 @@ import jax
 from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.data import Scene
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
-from a2tg_jax.host.machine import default_platform, memory_limit, num_threads
-from a2tg_jax.host.text import counted, in_bytes
-from a2tg_jax.results.plan import RunPlan
-from a2tg_jax.results.record import RunRecord
+from a2tg_jax.host.machine import default_platform, memory_limit
+from a2tg_jax.host.text import in_bytes
+from a2tg_jax.results.record import RunPlan, RunRecord
 from a2tg_jax.training.cost import (
     COMPILER,
     FIRST_PROGRAM,
@@ -39,16 +38,8 @@ KEPT_STATES = 3
 """Number of checkpoints on disk while a new one is written."""
 PICTURE_PER_PIXEL = 2
 """Bytes on disk of each picture of a sheet."""
-ROUGHLY = 2.0
-"""Factor by which the time may be shorter or longer."""
-PROGRAM_SECONDS = 6.0
-"""Time to compile a step on CPUs: 3 to 11 s on two cores, by system."""
-LONG = 1800
-"""Seconds beyond which a forecast names a quicker way to train."""
-QUICK = "quick"
-"""Preset of short runs."""
 QUICK_SIDE = 640
-"""Longer side of the photographs, in pixels, with which `quick` takes minutes on two cores."""
+"""Longer side of the photographs, in pixels, with which the preset quick takes minutes on two cores."""
 OPTIONS = {
     "photographs": ("--downscale", "batch_size"),
     "model": ("memory_budget", "sh_degree"),
@@ -67,16 +58,10 @@ class RunForecast:
     """Memory at the peak of each stage, by name, and of the evaluation."""
     disk_bytes: float
     """Bytes in the run folder."""
-    seconds: float
-    """Training time on CPUs; 0 if it cannot be estimated."""
     limits: tuple[str, ...] = ()
-    """Names of what limits the number of Gaussians."""
+    """Options that limit the number of Gaussians."""
     whole: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Bytes that one of several devices must have room for, by stage (`StageForecast.whole_bytes`)."""
-    num_programs: int = 0
-    """Steps that are compiled, as far as events say."""
-    quicker: str = ""
-    """Flags with which the run takes less time; empty if there are none."""
 
     @property
     def peak(self) -> tuple[str, Bytes]:
@@ -86,20 +71,10 @@ class RunForecast:
     def text(self, limit: float) -> str:
         """Return the forecast as lines of text."""
         phase, needed = self.peak
-        lines = [
+        return (
             f"memory: about {in_bytes(needed.total)} at the peak ({phase}: {_parts(needed)}); {in_bytes(limit)} may be "
-            "used",
-            f"disk: about {in_bytes(self.disk_bytes)} in the run folder",
-        ]
-        if self.seconds:
-            seconds = self.seconds + PROGRAM_SECONDS * self.num_programs
-            lines.append(
-                f"time: very roughly {_duration(seconds / ROUGHLY)} to {_duration(seconds * ROUGHLY)} on "
-                f"{counted(num_threads(), 'core')}; the first steps of each stage give a better estimate"
-            )
-            if seconds * ROUGHLY > LONG and self.quicker:
-                lines.append(f"quicker: {self.quicker} takes minutes")
-        return "\n".join(lines)
+            f"used\ndisk: about {in_bytes(self.disk_bytes)} in the run folder"
+        )
 
     def check_memory(self, limit: float) -> None:
         """Raise ValueError, naming the options to change, if the run needs more bytes than it may use."""
@@ -117,7 +92,7 @@ class RunForecast:
         )
 
     def check_one_device(self, limit: float) -> None:
-        """Raise ValueError if one of several devices has no room for the finished model besides its share of the
+        """Raise ValueError if one of several devices has no room for the whole finished model and its share of the
         state."""
         phase, needed = max(self.whole.items(), key=lambda item: item[1], default=("", 0.0))
         if needed > limit:
@@ -144,12 +119,12 @@ class RunForecast:
 
 
 def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_devices: int = 1) -> RunForecast:
-    """Return a forecast of what the run will take (host; nothing is compiled).
+    """Return a forecast of the bytes that a run will take (host; nothing is compiled).
 
     Args:
       scene: the run's scene.
       plan: its stages.
-      num_given: number of Gaussians of the file instead of the main system's first stage; None without one.
+      num_given: number of Gaussians of the file that replaces the main system's first stage; None without one.
       num_devices: number of devices that train together; memory is the sum over all of them.
     """
     is_host = default_platform() == "cpu"
@@ -179,11 +154,8 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     return RunForecast(
         phases,
         disk_bytes=sum(model_bytes) + KEPT_STATES * STATES * max(model_bytes) + pictures,
-        seconds=sum(stage.seconds for stage in stages.values()) if is_host else 0,
         limits=tuple(dict.fromkeys(limits)),
         whole={name: stage.whole_bytes for name, stage in stages.items()},
-        num_programs=len({view.picture.size for view in scene.train})
-        * sum(stage.num_programs for stage in stages.values()),
     )
 
 
@@ -194,9 +166,9 @@ def print_forecast(
     """Print the forecast of a run. Arguments as in `forecast_run`, and:
 
     Args:
-      record: its systems and the downscale of its photographs.
+      record: its systems.
       max_memory: bytes that the run may use; None: what the machine has available.
-      out: folder of a new run, whose disk must have room for it; None: the run is resumed.
+      out: folder of a new run, whose disk must have room for it; None for a resumed run.
 
     Raises:
       ValueError: if the run cannot fit, naming the options to change.
@@ -207,20 +179,17 @@ def print_forecast(
         found.check_one_device(allowed_memory(max_memory))
     if out is not None:
         found.check_disk(out)
-        side = max(max(view.camera.width, view.camera.height) for view in scene.train)
-        if QUICK in type(record.options).presets() and (record.preset != QUICK or side > QUICK_SIDE):
-            found = dataclasses.replace(found, quicker=quick_flags(side, record.scene.downscale))
     print(found.text(limit), flush=True)
 
 
 def quick_flags(longest_side: int, downscale: int = 1) -> str:
     """Return the flags of a quick training with photographs of this longer side, already downscaled by a factor."""
     downscale *= max(1, math.ceil(longest_side / QUICK_SIDE))
-    return f"--preset {QUICK}" + (f" --downscale {downscale}" if downscale > 1 else "")
+    return "--preset quick" + (f" --downscale {downscale}" if downscale > 1 else "")
 
 
 def bytes_allowed(max_memory: float | str | None) -> int | None:
-    """Return the bytes of a memory limit, written like a memory budget. Raises ValueError if it is not."""
+    """Return the bytes of a memory limit, written like a memory budget. Raises ValueError if it is invalid."""
     megabytes = megabytes_of(max_memory, "--max-memory")
     return None if megabytes is None else bytes_of(megabytes)
 
@@ -242,9 +211,3 @@ def _parts(needed: Bytes) -> str:
     """Return the parts of the memory in words; corrections only if there are any."""
     parts = needed._asdict()
     return ", ".join(f"{name} {in_bytes(size)}" for name, size in parts.items() if size or name != "corrections")
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{math.ceil(seconds)} s"
-    return f"{round(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

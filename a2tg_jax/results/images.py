@@ -1,10 +1,9 @@
-"""Pictures made from renders: errors, crops, side-by-side sheets, animations, and their files.
+"""Pictures made from renders (errors, crops, side-by-side sheets, animations) and their files.
 
 Images are uint8 [H, W, 3] unless said otherwise.
 """
 
 import base64
-import dataclasses
 import hashlib
 import io
 import itertools
@@ -29,7 +28,7 @@ MARGIN, CAPTION_HEIGHT = 6, 22
 FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
 """Font of captions; Pillow's own lacks × and ²."""
 LONGEST_STEM = 190
-"""Largest number of bytes of a view's name in a file name. File systems allow 255; `replacing` and numbers add some."""
+"""Largest number of bytes of a view's name in a file name; file systems allow 255, partial files' names are longer."""
 LONGEST_SIDE = 1280
 """Longest side of a picture in the report, in pixels."""
 
@@ -40,7 +39,7 @@ def to_uint8(image: ArrayLike) -> np.ndarray:
 
 
 def checkered(shape: tuple[int, ...], side: int) -> np.ndarray:
-    """Return the ground [H, W, 1] behind what is transparent or not hit, in squares of `side` pixels."""
+    """Return a chequered background [H, W, 1] with squares of `side` pixels."""
     y, x = np.indices(shape) // side
     return np.where((x + y) % 2, *CHECKER)[..., None]
 
@@ -51,22 +50,10 @@ def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.minimum(ERROR_GAIN * difference, 255).astype(np.uint8)
 
 
-@dataclasses.dataclass(frozen=True)
-class Crop:
-    """A square part of an image."""
-
-    top: int
-    left: int
-    side: int
-
-    def of(self, image: np.ndarray) -> np.ndarray:
-        return image[self.top : self.top + self.side, self.left : self.left + self.side]
-
-
-def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> Crop:
+def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> tuple[slice, slice]:
     """Return the square, a quarter of the shorter side, in which the squared error falls most from `before` to `after`.
 
-    Squares whose error is above the picture's mean afterwards are left out, unless all are: there, both fail.
+    Squares whose error stays above the picture's mean are left out, unless all are.
     """
     height, width = target.shape[:2]
     side = max(8, min(height, width) // 4)
@@ -78,15 +65,13 @@ def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> C
 
     gain, is_good = in_squares(errors[0] - errors[1]), in_squares(errors[1]) <= errors[1].mean()
     best = np.where(is_good, gain, -np.inf) if is_good.any() else gain
-    top, left = np.unravel_index(int(best.argmax()), best.shape)
-    return Crop(int(top), int(left), side)
+    top, left = map(int, np.unravel_index(int(best.argmax()), best.shape))
+    return slice(top, top + side), slice(left, left + side)
 
 
 def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
-    """Return one sheet of images in a row, each under its caption, which is cut off where the image ends.
-
-    Small images are enlarged, so that captions fit.
-    """
+    """Return images in a row, each under its caption, which is cut off at the image's width. Small images are enlarged
+    to make room for captions."""
     images = [enlarged(image) for image in images]
     height, width = images[0].shape[:2]
     sheet = Image.new("RGB", ((width + MARGIN) * len(images) - MARGIN, height + CAPTION_HEIGHT), "white")
@@ -101,10 +86,10 @@ def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image
 
 
 def picture_names(view_names: Iterable[str]) -> dict[str, str]:
-    """Return unique file names of the views' pictures, regardless of case; folders become part of the name.
+    """Return file names of the views' pictures, unique regardless of case; folders become part of the name.
 
-    Long names are cut and end in a hash. If a name is taken, as with a/b.png and a_b.jpg, a number follows; names count
-    in their sorted order.
+    Long names are cut and end in a hash. Where two names would be the same, as for a/b.png and a_b.jpg, the later one in
+    sorted order gets a number.
     """
     names: dict[str, str] = {}
     taken: set[str] = set()
@@ -127,13 +112,12 @@ def save_picture(path: str | os.PathLike[str], picture: Image.Image | np.ndarray
 
 
 def write_png(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -> None:
-    """Write a PNG to a path that a caller then moves."""
     picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
     picture.save(path, format="PNG", optimize=True)
 
 
 def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
-    """Return an image as a data: URI, enlarged `zoom` times without smoothing, or reduced if it is very large."""
+    """Return an image as a data: URI, enlarged `zoom` times without smoothing, and reduced if it is very large."""
     picture = Image.fromarray(np.ascontiguousarray(image))
     picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
     picture.thumbnail((LONGEST_SIDE, LONGEST_SIDE))
@@ -150,6 +134,6 @@ def file_uri(path: Path) -> str:
 def save_animation(
     file: Path | BinaryIO, pictures: Iterator[Image.Image], frames_per_second: float, **options: int
 ) -> None:
-    """Write pictures as an animated WebP that loops. Memory holds one of them at a time."""
+    """Write pictures as a looping animated WebP, with one of them in memory at a time."""
     duration = round(1000 / frames_per_second)
     next(pictures).save(file, "WEBP", save_all=True, append_images=pictures, duration=duration, loop=0, **options)

@@ -1,4 +1,5 @@
-"""Models to show, export, convert, mesh, render or compress: the last of a run, another of its stages, or a file."""
+"""Models to show, export, mesh, render or compress: the last of a run, another of its stages, or a file; and the splats
+of a file as the first stage of a run."""
 
 import dataclasses
 import functools
@@ -7,20 +8,28 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.similarity import transform_gaussians
 from a2tg_jax.data import Scene
 from a2tg_jax.data.load import is_scene
+from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.io.formats import FORMATS, file_bytes, load_splats
-from a2tg_jax.io.model_file import load_model
+from a2tg_jax.host.text import in_bytes
+from a2tg_jax.io.formats import FORMATS, format_of, load_splats
+from a2tg_jax.io.model_file import load_model, save_model
+from a2tg_jax.io.other_programs import plain_gaussians
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
-from a2tg_jax.results.plan import PlannedStage
-from a2tg_jax.results.record import RunRecord, read_record
-from a2tg_jax.training import System
+from a2tg_jax.results.history import write_history
+from a2tg_jax.results.record import PlannedStage, RunRecord, read_record
+from a2tg_jax.training import History, System
+from a2tg_jax.training.fitting import BACKGROUNDS
+from a2tg_jax.training.start import new_appearance
 
 SHOWN = f"a run folder, or a file *{', *'.join(FORMATS)}"
 MOST_LISTED = 5
@@ -36,7 +45,6 @@ class Source:
     note: str = ""
     """Note that the viewer shows."""
     settings: RenderSettings = RenderSettings()
-    """Render settings."""
     load_scene: Callable[[], Scene | None] = lambda: None
     """Loader of the photographs; None if they are missing. Raises ValueError or OSError if they cannot be read."""
     path: Path = Path()
@@ -56,13 +64,8 @@ class Source:
 
     @functools.cached_property
     def encoded(self) -> bytes:
-        """Return the scene for browsers. Raises ValueError if they cannot show it."""
+        """Scene for browsers. Raises ValueError if they cannot show it."""
         return encode_web_scene(self.model, title=self.title, note=self.note, near_plane=self.near_plane)
-
-    @property
-    def num_bytes(self) -> int:
-        """Size of its file, and of those that belong to it."""
-        return file_bytes(self.path)
 
     def load_scene_or_warn(self) -> Scene | None:
         """Return the scene; None if the photographs are missing or, with a warning, if they cannot be read."""
@@ -89,7 +92,7 @@ def open_source(path: Path, name: str | None = None) -> Source:
 
     Args:
       path: a run folder, or a file of any format that `load_splats` reads.
-      name: which model of a run, by the name that `a2tg info` prints; None is the last of its main system.
+      name: model of a run, by the name that `a2tg info` prints; None: the last one of its main system.
 
     Raises:
       FileNotFoundError: if there is no such file, or the run's stage is not finished.
@@ -129,7 +132,7 @@ def settings_of(system: System) -> RenderSettings:
 
 
 def _run_at(folder: Path) -> RunFolder:
-    """Return the run folder; if the folder is none, raise FileNotFoundError with what is in it instead."""
+    """Return the run folder, or raise FileNotFoundError with what the folder holds instead."""
     if is_regular(RunFolder(folder).record):
         return open_run(folder)
     if is_scene(folder):
@@ -140,3 +143,65 @@ def _run_at(folder: Path) -> RunFolder:
         raise FileNotFoundError(f"{folder} is not a run folder (it has no run.toml); give {SHOWN}")
     listed = [shlex.quote(str(run)) for run in runs[:MOST_LISTED]] + ["…"] * (len(runs) > MOST_LISTED)
     raise FileNotFoundError(f"{folder} holds run folders; give one of them: {', '.join(listed)}")
+
+
+# Splats of a file instead of the first stage of a run
+
+
+def check_init(file: Path, out: Path, system: System) -> Model:
+    """Return the splats of a file that can replace the first stage of a run, with a warning about what is left out.
+
+    Args:
+      file: of any format that `load_splats` reads; plain splats in the original world of the photographs, or a model.
+      out: the run folder.
+      system: the system that continues with them.
+
+    Raises:
+      ValueError: if there is no such file, the folder holds a run, or the splats exceed the system's memory budget.
+    """
+    if not is_regular(file):
+        raise ValueError(f"init: there is no file {file}")
+    format_of(file)
+    if RunFolder(out).is_begun:
+        raise ValueError(f"init begins a new run, and {out} holds one: choose another --out")
+    splats, degree = load_splats(file), system.initial_sh_degree
+    needed, budget = splats.num * system.initial_bytes, system.budget_bytes
+    if budget is not None and needed > budget:
+        raise ValueError(
+            f"init: {file} holds {splats.num:,} Gaussians, {in_bytes(needed)} at degree {degree}, which is more than "
+            f"the memory_budget of {in_bytes(budget)}: raise it, or leave it out"
+        )
+    shown, lost = splats.appearance, []
+    has_shapes = shown.exponents is not None
+    if has_shapes and system.stages()[0].appearance.exponents is None:
+        lost.append("the shapes of its kernels (the nearest Gaussians take their place)")
+    if not shown.is_portable or shown.texture is not None:
+        lost.append("what its splats show besides " + ("kernels" if has_shapes else "Gaussians"))
+    if splats.sh.shape[1] > NUM_BASES[degree]:
+        lost.append(f"its spherical harmonics above degree {degree}")
+    if lost:
+        warnings.warn(f"--init {file} leaves out {' and '.join(lost)}", stacklevel=2)
+    return splats
+
+
+def write_first_stage(run: RunFolder, record: RunRecord, splats: Model, scene: Scene) -> None:
+    """Write splats as the model of the first stage of the main system, in the scene's normalised world, with an empty
+    history."""
+    plan = record.plan
+    planned = plan[plan.main[0]]
+    splats, appearance, system = splats.live, planned.stage.appearance, planned.system
+    has_shapes = splats.appearance.exponents is not None and appearance.exponents is not None
+    shapes = splats.appearance.shapes if has_shapes else None
+    to_scene = scene.transform if splats.origin is None else splats.origin.transform.inverse().then(scene.transform)
+    gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=shapes is not None), to_scene)
+    # Spherical harmonics are cut off, or filled with zeros, to the degree that training begins with.
+    sh = np.zeros((gaussians.num, NUM_BASES[system.initial_sh_degree], 3), np.float32)
+    num = min(sh.shape[1], gaussians.sh.shape[1])
+    sh[:, :num] = np.asarray(gaussians.sh)[:, :num]
+    gaussians = dataclasses.replace(gaussians, sh=jnp.asarray(sh))
+    shown = new_appearance(appearance, gaussians, system)
+    if shapes is not None:
+        shown = shown.with_shapes(shapes)
+    model = Model(gaussians, shown, background=BACKGROUNDS[system.background], origin=origin_of_scene(scene))
+    save_model(run.own(run.model(planned.name)), model, {"init": record.init})
+    write_history(run.own(run.history(planned.name)), History.empty())

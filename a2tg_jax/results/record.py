@@ -1,6 +1,6 @@
-"""Record of a run: the scene, a system with all its options, systems to compare. Kept as run.toml.
+"""Record of a run (the scene, a system with all its options, systems to compare), and the plan of its stages.
 
-A configuration file has the same keys; what it leaves out has the value that the command line gives it:
+The record is kept as run.toml. A configuration file has the same keys; missing ones take the command line's values:
 
     scene = "../scenes/fox"              # relative to the file's folder; or s3://bucket/fox, or "synthetic"
     downscale = 2
@@ -24,6 +24,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import jax
+import numpy as np
 import tomli_w
 from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 
@@ -35,9 +37,8 @@ from a2tg_jax.host.remote_files import checked_url, path_here
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.results.folder import RunFolder, read_json
-from a2tg_jax.results.plan import RunPlan, plan_run
 from a2tg_jax.systems.a2tg import A2tg
-from a2tg_jax.training import System, find_system, like
+from a2tg_jax.training import Stage, System, find_system, like
 from a2tg_jax.training.options import own_options
 from a2tg_jax.training.registry import differences, with_changes
 
@@ -45,6 +46,10 @@ DEFAULT_SYSTEM = "a2tg"
 LONGEST_REASON = 500
 OnNan = Literal["stop", "restore"]
 """Action on divergence: end with an error, or restore the newest checkpoint and reorder the views."""
+LONGEST_WITHOUT_CHECKPOINT = 500
+"""Largest number of iterations between checkpoints."""
+STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
+"""Options of every system that reach training only through its stages."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,16 +74,13 @@ class RunRecord:
     compare_options: Annotated[Mapping[str, Mapping[str, Any]], Fixed, Suppress] = dataclasses.field(
         default_factory=dict, compare=False
     )
-    """Options of the compared systems, nested, by name. Those that are left out have the main system's values, or the
-    preset's if it lacks them. A record that is written and read again has all that the main system lacks."""
+    """Options of the compared systems, nested, by name. Missing ones take the main system's values, or the preset's if
+    it lacks them. run.toml keeps all those that the main system lacks."""
 
     @property
     def systems(self) -> dict[str, System]:
-        """Main system and then those compared with it, by label.
-
-        Raises:
-          ValueError: if a system is not found, or two have one label, or an option of a compared one is wrong.
-        """
+        """Main system and then the compared ones, by label. Raises ValueError if a system is not found, two have one
+        label, or an option of a compared one is wrong."""
         found = {label_of(self.system): self.options}
         for name in self.compare:
             if label_of(name) in found:
@@ -88,16 +90,12 @@ class RunRecord:
         return found
 
     @property
-    def plan(self) -> RunPlan:
+    def plan(self) -> "RunPlan":
         """Plan of the stages to train."""
         return plan_run(self.systems)
 
     def check(self) -> None:
-        """Raise if the run cannot be trained.
-
-        Raises:
-          ValueError: naming the option, what was wanted and what came.
-        """
+        """Raise ValueError if the run cannot be trained, naming the option."""
         for name in self.compare_options:
             if name not in self.compare:
                 reason = f"compare_options.{shortened(name)}: the run does not compare this system"
@@ -109,32 +107,20 @@ class RunRecord:
                 if system is self.options:
                     raise
                 raise ValueError(f"compare {label}, with the options of {self.system}: {error}") from error
-        plan = plan_run(self.systems)
-        if self.init is not None and len(plan.main) < 2:
+        if self.init is not None and len(self.plan.main) < 2:
             raise ValueError(f"init replaces a first stage, and {self.system} has no second one")
         if self.init is not None and self.options.sky_gaussians:
             raise ValueError("init replaces a first stage, and sky_gaussians start in one: leave one out")
 
     def placed(self, folder: Path = Path()) -> "RunRecord":
-        """Return the record with full paths.
-
-        Args:
-          folder: folder that relative paths start from.
-
-        Raises:
-          ValueError: as `scene_place` does.
-        """
+        """Return the record with full paths; relative ones start from a folder. Raises as `scene_place`."""
         path = self.scene.path
         path = path if path in ("", SYNTHETIC) else scene_place(path, folder)
         init = None if self.init is None else os.path.realpath(folder / self.init)
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, path=path), init=init)
 
     def with_system(self, name: str, preset: str | None) -> "RunRecord":
-        """Return the record of another system, or another preset, with its options.
-
-        Raises:
-          ValueError: if there is no such system or preset.
-        """
+        """Return the record of another system or preset. Raises ValueError if there is no such system or preset."""
         options = chosen_system(name, preset)
         return dataclasses.replace(self, system=name, preset=preset, options=options, compare_options={})
 
@@ -151,26 +137,15 @@ def label_of(name: str) -> str:
 
 def chosen_system(name: str, preset: str | None = None) -> System:
     """Return a system by name, with the options of a preset. Options that an instance sets itself take precedence.
-
-    Raises:
-      ValueError: if there is no such system or preset.
-    """
+    Raises ValueError if there is no such system or preset."""
     found = find_system(name)
     return found if preset is None else with_changes(type(found).preset(preset), differences(found), name)
 
 
 def compared_system(name: str, other: System, preset: str | None = None) -> System:
-    """Return a system by name, with another's options of the same names. Options that an instance sets itself take
-    precedence.
-
-    Args:
-      name: as `find_system` takes it.
-      other: the system that it is compared with.
-      preset: preset of its further options, if it has one of that name.
-
-    Raises:
-      ValueError: if there is no such system.
-    """
+    """Return a system by name with the options of another that have the same names; all others come from the preset, if
+    it has one of that name. Options that an instance sets itself take precedence. Raises ValueError if there is no such
+    system."""
     found = find_system(name)
     kind = type(found)
     start = kind() if preset is None else kind.presets().get(preset, kind())
@@ -178,25 +153,19 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
 
 
 def scene_place(scene: str, folder: Path = Path()) -> str:
-    """Return the place of a scene as run.toml keeps it: a URL, or a full path without links.
-
-    Args:
-      scene: URL or path; file:// is a path.
-      folder: folder that a relative path starts from.
-
-    Raises:
-      ValueError: if a URL holds a secret, or names no place.
-    """
+    """Return the place of a scene (URL or path) as run.toml keeps it: a URL, or a full path without links. Relative
+    paths start from a folder. Raises ValueError if a URL holds a secret, or names no place."""
     here = path_here(scene)
-    return checked_url(scene) if here is None else os.path.realpath(folder / here)  # Also of links in a circle.
+    # Unlike Path.resolve, realpath accepts circular links.
+    return checked_url(scene) if here is None else os.path.realpath(folder / here)
 
 
 def read_run_file(path: Path) -> RunRecord:
     """Read a configuration file, in which the scene may be missing. Relative paths in it start from its folder.
 
     Raises:
-      FileNotFoundError: if there is none.
-      ValueError: if it is no TOML, or a key is unknown or of another type; key and file are named.
+      FileNotFoundError: if there is no such file.
+      ValueError: naming file and key, if it is no TOML, or a key is unknown or of another type.
     """
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such configuration file")
@@ -226,7 +195,7 @@ def read_run_file(path: Path) -> RunRecord:
 def write_record(run: RunFolder, record: RunRecord) -> None:
     """Write run.toml with every option, so that later versions with other defaults repeat the same run."""
     preset, scene, compared = chosen_system(record.system, record.preset), config_to_dict(record.scene), {}
-    for name in record.compare:  # All that they do not take from the main system, and what was given.
+    for name in record.compare:  # Options that they do not take from the main system, and those that were given.
         start = compared_system(name, record.options, record.preset)
         own = own_options(record.systems[label_of(name)], record.options)
         compared[name] = _without_none(merged(own, record.compare_options.get(name, {})), config_to_dict(start))
@@ -249,7 +218,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
 
 
 def _without_none(table: dict[str, object], start: dict[str, Any]) -> dict[str, Any]:
-    """Leave out None, which TOML lacks, or write "None", as on the command line, if `start` has another value."""
+    """Drop None, which TOML lacks, but write "None", as on the command line, if `start` has another value."""
     kept: dict[str, Any] = {}
     for name, value in table.items():
         if isinstance(value, dict):
@@ -260,11 +229,10 @@ def _without_none(table: dict[str, object], start: dict[str, Any]) -> dict[str, 
 
 
 def read_record(run: RunFolder) -> RunRecord:
-    """Read run.toml. If the system is a custom one, its module is imported.
+    """Read run.toml. The module of a custom system is imported.
 
     Raises:
-      ValueError: if it is damaged or of another version, its system is not found, or an option is unknown, of another
-        type or out of range.
+      ValueError: if it is damaged or of another version, its system is not found, or an option is invalid.
     """
     try:
         record = read_run_file(run.record)
@@ -279,8 +247,8 @@ def read_record(run: RunFolder) -> RunRecord:
 
 
 def contradictions(asked: RunRecord, kept: RunRecord) -> list[str]:
-    """Return the options, named as in run.toml, in which a record differs from the one of the run to resume: all but
-    the path of the scene, the systems to compare and `on_nan`."""
+    """Return the options, named as in run.toml, in which a record differs from the record of the run to resume, except
+    those that may differ: the path of the scene, the systems to compare and `on_nan`."""
     before, now = (
         {"system": one.system, "preset": one.preset, "init": one.init, **flatten_config(one.scene)}
         | flatten_config(one.options)
@@ -291,16 +259,16 @@ def contradictions(asked: RunRecord, kept: RunRecord) -> list[str]:
 
 def repeating_command(run: RunFolder) -> str:
     """Return the command line that repeats a run, and its finishing if it was finished."""
+    is_finished, again = is_regular(run.finish), f"{run.path}-again"
+    trained = f"{run.path}-trained" if is_finished else again
+    training = shlex.join(["a2tg", "train", "--config", str(run.record), "--out", trained])
+    if not is_finished:
+        return training
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in config_to_dict(read_finish(run)).items()]
+    return f"{training} && {shlex.join(['a2tg', 'finish', trained, '--out', again, *flags])}"
 
-    def training(out: str) -> str:
-        return shlex.join(["a2tg", "train", "--config", str(run.record), "--out", out])
 
-    if not is_regular(run.finish):
-        return training(f"{run.path}-again")
-    trained = f"{run.path}-trained"
-    options = config_to_dict(read_finish(run))
-    flags = [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
-    return f"{training(trained)} && {shlex.join(['a2tg', 'finish', trained, '--out', f'{run.path}-again', *flags])}"
+# Finishing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -308,10 +276,10 @@ class FinishOptions:
     """Options of `a2tg finish`, as finish.json of a finished run keeps them."""
 
     max_loss: float = 0.02
-    """Largest loss of PSNR in dB by smaller textures, on training views; 0 leaves textures as they are."""
+    """Largest loss of PSNR in dB by smaller textures, on training views; 0 leaves textures unchanged."""
     polish_steps: int = 5
-    """Steps of least squares, each of which draws every training view; many fit these views too closely, and 0 leaves
-    colours as they are."""
+    """Steps of least squares, each of which draws every training view; too many overfit these views, and 0 leaves
+    colours unchanged."""
 
     def check(self) -> None:
         """Raise ValueError if a number is out of range."""
@@ -322,12 +290,104 @@ class FinishOptions:
 
 
 def read_finish(run: RunFolder) -> FinishOptions:
-    """Return the options with which a run was finished.
-
-    Raises:
-      ValueError: if finish.json is damaged or of another version.
-    """
+    """Return the options with which a run was finished. Raises ValueError if finish.json is damaged or of another
+    version."""
     data = read_json(run.finish)
     names = [field.name for field in dataclasses.fields(FinishOptions)]
     own = {name: data[name] for name in names if name in data} if isinstance(data, dict) else data
     return config_from_dict(FinishOptions, own, f"{run.finish}:")
+
+
+# Plan
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedStage:
+    """Stage of a system, shared by all systems that begin in the same way."""
+
+    name: str
+    """Name of its files, columns and captions, unique in the run."""
+    system: System
+    """First system that has the stage."""
+    index: int
+    """Index of the stage in its system, from 0."""
+    start: str | None
+    """Name of the stage whose model it starts from; None for a first stage."""
+    stage: Stage = dataclasses.field(repr=False, compare=False)
+
+    @property
+    def checkpoint_every(self) -> int:
+        """Number of iterations between its checkpoints."""
+        return max(1, min(LONGEST_WITHOUT_CHECKPOINT, self.stage.iterations // 10))
+
+
+@dataclasses.dataclass(frozen=True)
+class RunPlan:
+    """The stages of a run in the order in which they are trained."""
+
+    stages: tuple[PlannedStage, ...]
+    chains: Mapping[str, tuple[str, ...]]
+    """The stages of each system, by its label; the main system's first."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(planned.name for planned in self.stages)
+
+    @property
+    def main(self) -> tuple[str, ...]:
+        """The stages of the main system."""
+        return next(iter(self.chains.values()))
+
+    def __getitem__(self, name: str) -> PlannedStage:
+        """Return the stage of a name. Raises ValueError if the run has none."""
+        for planned in self.stages:
+            if planned.name == name:
+                return planned
+        raise ValueError(f"the run has the models {', '.join(self.names)}; got {name!r}")
+
+    def first_iteration(self, name: str) -> int:
+        """Return the number of iterations in the stages before a stage."""
+        start = self[name].start
+        return 0 if start is None else self.first_iteration(start) + self[start].stage.iterations
+
+
+def plan_run(systems: Mapping[str, System]) -> RunPlan:
+    """Return the stages of systems by label, the main one first. Two systems share their stages up to the first one
+    that differs. Raises ValueError if two stages would have one name."""
+    planned: list[PlannedStage] = []
+    chains: dict[str, tuple[str, ...]] = {}
+    for label, system in systems.items():
+        chain: list[str] = []
+        for index, stage in enumerate(system.stages()):
+            wanted = PlannedStage(f"{label}-{stage.name}", system, index, chain[-1] if chain else None, stage)
+            # Training both would give the same model, bit for bit.
+            shared = next(
+                (
+                    known
+                    for known in planned
+                    if (known.index, known.start) == (wanted.index, wanted.start)
+                    and common_options(known.system) == common_options(system)
+                    and is_equal(known.stage, stage)
+                ),
+                None,
+            )
+            if shared is None:
+                if wanted.name in {known.name for known in planned}:
+                    raise ValueError(f"two stages of the run are called {wanted.name!r}")
+                planned.append(wanted)
+            chain.append((shared or wanted).name)
+        chains[label] = tuple(chain)
+    return RunPlan(tuple(planned), chains)
+
+
+def common_options(system: System) -> list[Any]:
+    """Return the options that training reads from the system itself."""
+    return [getattr(system, each.name) for each in dataclasses.fields(System) if each.name not in STAGE_OPTIONS]
+
+
+def is_equal(a: Stage, b: Stage) -> bool:
+    """Return whether two stages are equal in everything, arrays and classes included."""
+    (leaves, structure), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
+    if structure != other:  # type: ignore[operator]
+        return False
+    return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in zip(leaves, others, strict=True))

@@ -1,7 +1,4 @@
-"""Results of a run: values, metrics.json, the headline table, and report.html, one page with everything.
-
-The page has its pictures, style and script inlined and needs no network.
-"""
+"""Results of a run: values, metrics.json, the summary table, and report.html, one page that needs no network."""
 
 import base64
 import dataclasses
@@ -25,9 +22,8 @@ from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.measure.evaluation import Evaluation
 from a2tg_jax.results.figures import ReportFigure
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.results.images import Crop, file_uri, jpeg_uri
-from a2tg_jax.results.plan import RunPlan
-from a2tg_jax.results.record import RunRecord, repeating_command
+from a2tg_jax.results.images import file_uri, jpeg_uri
+from a2tg_jax.results.record import RunPlan, RunRecord, repeating_command
 
 QUALITIES = ("PSNR (dB)", "SSIM", "LPIPS")
 WAYS = {
@@ -41,7 +37,7 @@ EQUAL_BYTES = 0.01
 CROP_ZOOM = 3
 HIGHER_IS_BETTER = ("PSNR", "SSIM", "frames a second")
 LOWER_IS_BETTER = ("LPIPS", "memory")
-"""Words in the names of metrics whose best value is marked."""
+"""Words in the names of metrics whose best value is highlighted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,8 +45,8 @@ class ModelResult:
     """Measurements of one stage's model."""
 
     splits: Mapping[str, Evaluation]
-    """Metrics by their names in metrics.json: of the held-out views, "test" or "validation", if there are any; of the
-    "train" views; then those up to exposure and pose, if a system of the run learns these."""
+    """Metrics by their names in metrics.json: "test" or "validation" if views are held out; "train"; then metrics up to
+    exposure and pose, if a system of the run learns these."""
     num_gaussians: int
     num_texels: int
     """Number of texels; 0 without textures."""
@@ -71,7 +67,7 @@ class ModelResult:
 
     @property
     def shown(self) -> Evaluation:
-        """Evaluation of the held-out views, or of the training views if there are none."""
+        """Evaluation of the held-out views, if any, or else of the training views."""
         return next(iter(self.splits.values()))
 
 
@@ -80,7 +76,6 @@ class RunResult:
     """Results of all finished models of a run."""
 
     scene: str
-    """Name of the scene."""
     record: RunRecord
     plan: RunPlan
     models: Mapping[str, ModelResult]
@@ -163,9 +158,9 @@ def versions() -> dict[str, str]:
     }
 
 
-def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
-    """Return titles and rows of the headline table: a column for each model, a row for each metric present."""
-    models = list(result.models.values())
+def summary_table(result: RunResult, names: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """Return titles and rows of the summary table: a column for each model, a row for each metric present."""
+    models = [result.models[name] for name in names]
     rows = []
     for split in dict.fromkeys(split for measured in models for split in measured.splits):
         views, _, way = split.partition("_")
@@ -187,17 +182,13 @@ def summary_table(result: RunResult) -> tuple[list[str], list[list[str]]]:
         for found in models
     ]
     rows += [[name, *(column[name] for column in figures)] for name in figures[0]]
-    return ["", *result.models], [row for row in rows if any(row[1:])]
+    return ["", *names], [row for row in rows if any(row[1:])]
 
 
 def summary_text(result: RunResult, width: int | None = None) -> str:
-    """Return the headline table for a terminal, followed by warnings and gains.
-
-    Args:
-      result: the run.
-      width: in characters; models that do not fit next to each other follow below. None: the terminal's.
-    """
-    titles, rows = summary_table(result)
+    """Return the summary table, warnings and gains as text. Models that do not fit next to each other in `width`
+    characters (None: the terminal's width) follow below."""
+    titles, rows = summary_table(result, list(result.models))
     names, *columns = zip(titles, *rows, strict=True)
     width = width or shutil.get_terminal_size().columns
     blocks = [[names]]
@@ -221,7 +212,7 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
 
 
 def bytes_compared(result: RunResult, name: str) -> str:
-    """Return the bytes of the main model against another's, for the line of its gain."""
+    """Return the bytes of the main model compared with another's, for the line about its gain."""
     own, other = result.models[result.main].num_bytes, result.models[name].num_bytes
     if abs(own - other) <= EQUAL_BYTES * other:
         return f"at equal bytes ({megabytes(own)} MB)"
@@ -241,7 +232,7 @@ def learning_lines(result: RunResult) -> list[str]:
 
 
 def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return the lines of a table: first column left-aligned, the others right-aligned; empty rows are left out."""
+    """Return the lines of a table with its first column left-aligned, all others right-aligned, without empty rows."""
     name_width, *widths = (max(map(len, column)) for column in columns)
     lines = []
     for name, *cells in (line for line in zip(*columns, strict=True) if any(line[1:])):
@@ -256,7 +247,7 @@ def megabytes(num_bytes: int) -> str:
 
 
 def loss_text(loss: float) -> str:
-    """Return a loss of PSNR in dB as "0.067 dB of PSNR lost", and a negative one as gained."""
+    """Return a loss of PSNR in dB as "0.067 dB of PSNR lost", or a negative one as gained."""
     return f"{abs(loss):.3f} dB of PSNR {'gained' if loss < 0 else 'lost'}"
 
 
@@ -294,14 +285,11 @@ class Comparison(NamedTuple):
     """Width and height of the render in pixels."""
 
     @staticmethod
-    def of(name: str, images: Sequence[np.ndarray], captions: Sequence[str], crop: Crop | None) -> "Comparison":
-        """Args:
-        name: of the view.
-        images: uint8 [H, W, 3], the photograph first.
-        captions: of the images.
-        crop: the part to show enlarged.
-        """
-        crops = [] if crop is None else [jpeg_uri(crop.of(image), zoom=CROP_ZOOM) for image in images]
+    def of(
+        name: str, images: Sequence[np.ndarray], captions: Sequence[str], crop: tuple[slice, slice] | None
+    ) -> "Comparison":
+        """Compress pictures [H, W, 3] uint8 of a view, its photograph first; `crop` is the part to show enlarged."""
+        crops = [] if crop is None else [jpeg_uri(image[crop], zoom=CROP_ZOOM) for image in images]
         height, width = images[-1].shape[:2]
         return Comparison(name, captions, [jpeg_uri(image) for image in images], crops, (width, height))
 
@@ -309,15 +297,13 @@ class Comparison(NamedTuple):
 def write_report(
     run: RunFolder, result: RunResult, views: Sequence[Comparison], figures: Mapping[str, Sequence[ReportFigure]]
 ) -> None:
-    """Write report.html from the results, some views, and the figures in the run folder.
-
-    Browsers take its own style and script only, by their hashes: no text of a scene becomes one.
-    """
+    """Write report.html from the results, some views, and the figures in the run folder."""
     from jinja2 import Environment, PackageLoader, StrictUndefined  # Its import is slow, and few commands need it.
     from markupsafe import Markup
 
     loader = PackageLoader("a2tg_jax.results")
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    # The browser accepts only this style and script, by their hashes, so no text from a scene can act as one.
     policy, inlined = "default-src 'none'; img-src data:", {}
     for name, suffix in (("style", "css"), ("script", "js")):
         text = loader.get_source(pages, f"report.{suffix}")[0]
@@ -326,9 +312,7 @@ def write_report(
     main, held_out = result.models[result.main], result.record.scene.held_out
     # The main model comes first, where a phone shows it.
     names = sorted(result.models, key=lambda name: name != result.main)
-    titles, rows = summary_table(result)
-    order = [0, *(titles.index(name) for name in names)]
-    rows = [[row[at] for at in order] for row in rows]
+    titles, rows = summary_table(result, names)
     best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
     leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.options)
@@ -346,7 +330,7 @@ def write_report(
         own_time=minutes(own),
         other_time=minutes(sum(measured.seconds for measured in result.models.values()) - own),
         megabytes=megabytes,
-        summary=([titles[at] for at in order], rows, best),
+        summary=(titles, rows, best),
         rows_shown=[row[0] for row in rows],
         corrections={split.partition("_")[2] for split in main.splits},
         comparisons=views,
@@ -366,7 +350,7 @@ def write_report(
 
 
 def _best(row: Sequence[str]) -> list[int]:
-    """Return the cells that hold a metric's best value; none if it has no best, or all are equal."""
+    """Return the columns with a metric's best value; none if neither direction is better, or all are equal."""
     is_higher = any(word in row[0] for word in HIGHER_IS_BETTER)
     if not is_higher and not any(word in row[0] for word in LOWER_IS_BETTER):
         return []
@@ -377,7 +361,7 @@ def _best(row: Sequence[str]) -> list[int]:
 
 
 def _views(result: RunResult, names: Sequence[str], split: str) -> Table:
-    """Return PSNR and SSIM of each view by each model, with its bytes next to its name."""
+    """Return PSNR and SSIM of each view and model, with the model's size next to its name."""
     sizes = [f"{name} ({megabytes(result.models[name].num_bytes)} MB)" for name in names]
     found = zip(*(result.models[name].splits[split].per_view for name in names), strict=True)
     rows, best = [], set()

@@ -1,16 +1,15 @@
 """Evaluation of a run's finished models: metrics, pictures, figures, point cloud, report.
 
-A photograph's exposure and the exact pose of its camera cannot be learned from other photographs. Runs that learn these
-of the training views are therefore scored twice: as they are, and up to exposure and pose. `color_fit`: each render's
-colours are mapped to the photograph's by the affine map of least squares. `aligned`: test cameras are moved to where
-the model looks most like the photograph (`measure.alignment.align_poses`), training cameras to where training moved
-them.
+A photograph's exposure and the exact pose of its camera cannot be learned from other photographs. Runs that learn them
+for the training views are therefore scored twice: directly, and up to exposure and pose. `color_fit`: each render's
+colours are mapped to the photograph's by the least-squares affine map. `aligned`: test cameras are moved to where the
+model looks most like the photograph (`measure.alignment.align_poses`), training cameras to where training moved them.
 """
 
 import dataclasses
 import functools
-import os
 from collections.abc import Mapping
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,16 +18,17 @@ from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.data.load import HeldOut
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import sha256_of
+from a2tg_jax.host.text import counted
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.measure.alignment import align_poses
 from a2tg_jax.measure.evaluation import Evaluation, evaluate
+from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
-from a2tg_jax.results.checks import check_held_out
 from a2tg_jax.results.figures import write_figures
-from a2tg_jax.results.folder import RunFolder, read_json, resuming_command, write_json
+from a2tg_jax.results.folder import RunFolder, drop_old, read_json, resuming_command, write_json
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.images import (
     ERROR_GAIN,
@@ -40,8 +40,7 @@ from a2tg_jax.results.images import (
     to_uint8,
 )
 from a2tg_jax.results.model_source import settings_of
-from a2tg_jax.results.plan import RunPlan
-from a2tg_jax.results.record import read_record
+from a2tg_jax.results.record import RunPlan, read_record
 from a2tg_jax.results.report import Comparison, ModelResult, RunResult, metrics_json, per_view_json, write_report
 from a2tg_jax.training import System
 from a2tg_jax.training.corrections import learned
@@ -50,15 +49,14 @@ from a2tg_jax.web.page import viewer_html_with
 REPORTED_VIEWS = 4
 
 
-def evaluate_run(
-    run: RunFolder, scene: Scene | None = None, *, lpips_weights: str | os.PathLike[str] | None = None
-) -> RunResult:
-    """Measure the finished models of a run, and write the run folder's metrics, pictures and report.
+def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path | None = None) -> RunResult:
+    """Measure the finished models of a run, and write the run folder's metrics, pictures and report. A replaced run is
+    deleted once all stages are trained.
 
     Args:
-      run: an opened run folder with one finished stage at least.
+      run: an opened run folder with at least one finished stage.
       scene: its scene, if it is loaded already.
-      lpips_weights: a weights file for LPIPS; None keeps what was measured of the same models earlier, if anything.
+      lpips_weights: weights file for LPIPS; None keeps earlier values of the same models.
 
     Raises:
       FileNotFoundError: as `finished_stages` does, or if the scene or the weights are missing.
@@ -101,15 +99,35 @@ def evaluate_run(
     starts = {name: plan.first_iteration(name) for name in models}
     figures = write_figures(run, main, (*scene.test, *scene.train)[0].camera, settings, histories, starts)
     write_report(run, result, _write_sheets(run, result, models, scene), figures)
+    if len(models) == len(plan.names):
+        drop_old(run)
     return result
 
 
-def finished_stages(run: RunFolder, plan: RunPlan) -> list[str]:
-    """Return the names of the stages that have their models.
+def check_weights(lpips_weights: Path | None) -> None:
+    """Raise ValueError or FileNotFoundError unless these are LPIPS weights, or None."""
+    if lpips_weights is not None:
+        load_lpips(lpips_weights)
 
-    Raises:
-      FileNotFoundError: if there are none, or a model is missing from which a later stage was trained.
-    """
+
+def check_held_out(model: Model, scene: Scene, path: Path) -> None:
+    """Raise ValueError if the model in a file was trained on views that its scene now holds out, which would make their
+    metrics too good. The views of a model without an origin are unknown, and it passes."""
+    if model.origin is None:
+        return
+    trained = {name for name, is_test in zip(model.origin.names, model.origin.is_test, strict=True) if not is_test}
+    leaked = sorted(trained & {view.name for view in scene.test} - {view.name for view in scene.train})
+    if leaked:
+        raise ValueError(
+            f"{path} was trained on {counted(len(leaked), 'view')} that {scene.name} now holds out, such as "
+            f"{leaked[0]}: the photographs have changed, or views of panoramas, which are held out together since, are "
+            "among them; train in a new folder"
+        )
+
+
+def finished_stages(run: RunFolder, plan: RunPlan) -> list[str]:
+    """Return the names of the stages that have their models. Raises FileNotFoundError if there are none, or a model is
+    missing from which a later stage was trained."""
     names = [name for name in plan.names if run.model(name).is_file()]
     if not names:
         raise FileNotFoundError(f"{run.path} has no finished stage yet; continue with: {resuming_command(run)}")
@@ -136,14 +154,9 @@ def refined_views(views: tuple[View, ...], model: Model) -> tuple[View, ...]:
 
 
 def _evaluations(
-    model: Model,
-    scene: Scene,
-    plan: RunPlan,
-    system: System,
-    lpips_weights: str | os.PathLike[str] | None,
-    held_out: HeldOut,
+    model: Model, scene: Scene, plan: RunPlan, system: System, lpips_weights: Path | None, held_out: HeldOut
 ) -> dict[str, Evaluation]:
-    """Return the metrics of a model by split. Those up to exposure and pose are of all models of a run if any of its
+    """Return the metrics of a model by split. All models of a run get metrics up to exposure and pose if any of its
     systems learns these."""
     settings = settings_of(system)
     measure = functools.partial(evaluate, settings=settings, lpips_weights=lpips_weights)
@@ -184,8 +197,8 @@ def _with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dic
 
 
 def _write_sheets(run: RunFolder, result: RunResult, models: Mapping[str, Model], scene: Scene) -> list[Comparison]:
-    """Write a sheet of photograph, renders and error for each view, and return some for the report. Memory holds the
-    pictures of one view at a time."""
+    """Write a sheet of photograph, renders and error for each view, and return some for the report. Only one view's
+    pictures are in memory at a time."""
     views, names = scene.test or scene.train, [*(result.compared or result.before), result.main]
     # With the cameras of `evaluate`, nothing is compiled again.
     cameras = [view.camera for view in (*scene.test, *scene.train)]

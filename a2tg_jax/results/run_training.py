@@ -1,15 +1,27 @@
-"""Runs in their folders: begun or resumed, trained stage after stage with checkpoints, and measured."""
+"""Runs in their folders: begun or resumed, trained stage after stage with checkpoints, and measured.
+
+If several processes train a run, the first one decides and writes files. Before each stage it sends the others the
+checkpoint or model that the stage starts from, so that they need no file of the run folder.
+"""
 
 import contextlib
 import dataclasses
 import functools
+import hashlib
+import json
+import tempfile
 import warnings
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC
+from a2tg_jax.data.scene import views_by_kind
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import Devices, this_machine
@@ -18,13 +30,14 @@ from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.io.model_file import FORMAT, load_model, number_in_file, save_model
-from a2tg_jax.parallel.processes import team
-from a2tg_jax.results.checks import check_apart, check_held_out, check_output, check_weights
+from a2tg_jax.parallel.processes import broadcast, team
 from a2tg_jax.results.folder import (
+    DAMAGED,
     RunFolder,
+    check_apart,
     check_free,
+    check_output,
     claimed,
-    drop_old,
     iteration_of,
     put_back_old,
     resuming_command,
@@ -32,12 +45,10 @@ from a2tg_jax.results.folder import (
 )
 from a2tg_jax.results.forecast import print_forecast, room_for_photographs
 from a2tg_jax.results.history import EventWriter, write_history
-from a2tg_jax.results.init_file import check_init, write_first_stage
-from a2tg_jax.results.plan import PlannedStage
-from a2tg_jax.results.record import OnNan, RunRecord, read_record, write_record
+from a2tg_jax.results.model_source import check_init, write_first_stage
+from a2tg_jax.results.record import OnNan, PlannedStage, RunRecord, read_record, write_record
 from a2tg_jax.results.report import RunResult
-from a2tg_jax.results.run_evaluation import evaluate_run
-from a2tg_jax.results.several_processes import check_alike, send_stage
+from a2tg_jax.results.run_evaluation import check_held_out, check_weights, evaluate_run
 from a2tg_jax.training import (
     Checkpoint,
     DivergedError,
@@ -58,6 +69,8 @@ LESS_MEMORY = (
 """Advice of the command line for trainings that have run out of memory."""
 MOST_RESTORED = 5
 """Largest number of times a diverged stage is restored, each time with another order of the views."""
+DIFFERING = ("options", "--devices", "views, cameras or points")
+"""Facts that several processes compare with the first one."""
 Watched = Callable[[Scene], AbstractContextManager[Watch]]
 """Function that gives the watcher of a scene's training."""
 
@@ -69,7 +82,7 @@ def unseen(scene: Scene) -> AbstractContextManager[Watch]:
 
 @dataclasses.dataclass(frozen=True)
 class RunOptions:
-    """How a run is carried out. The model depends on none of it, except for last bits on other devices."""
+    """Options of how a run is carried out. The model does not depend on them, except for last bits on other devices."""
 
     overwrite: bool = False
     """Replace the run that is in the folder; it is deleted once the new run has its report."""
@@ -78,7 +91,7 @@ class RunOptions:
     max_memory: int | None = None
     """Bytes that the process may take; None: what the machine has available."""
     tensorboard: bool = False
-    """Write the histories for TensorBoard too, at each checkpoint."""
+    """Write the histories for TensorBoard as well, at each checkpoint."""
     progress: bool = True
     """Show progress bars."""
     watched: Watched = unseen
@@ -86,16 +99,11 @@ class RunOptions:
 
 
 def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
-    """Train and measure a new run, after checking everything about it.
-
-    Args:
-      record: what is trained.
-      out: the run folder; made if it is not there.
-      options: how it is trained.
+    """Train and measure a new run in a folder, which is made if needed, after all checks.
 
     Raises:
       ValueError, OSError: if the run cannot be trained, naming the option, weights, folder, scene, disk or memory; if
-        another process is at that folder; or as `train_run`.
+        another process has claimed the folder; or as `train_run`.
       Stopped: if a signal ends the training; its `advice` says how to continue.
     """
     record.check()
@@ -140,8 +148,8 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
 
 
 def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options: RunOptions) -> RunResult:
-    """Train and measure. Whatever ends the training says how to continue it; without a checkpoint, a replaced run is
-    put back."""
+    """Train and measure. Errors and signals come with advice on how to continue; a run that this one replaces is put
+    back if there is no checkpoint yet."""
 
     def advice() -> str:
         if put_back_old(run):
@@ -157,7 +165,7 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
             train_run(run, scene, options, is_stopped=is_stopped, watch=watch)
         if others is not None:
             others.leave()
-        return measure(run, scene, lpips_weights=options.lpips_weights)
+        return evaluate_run(run, scene, lpips_weights=options.lpips_weights)
     except KeyboardInterrupt as stop:
         number = getattr(stop, "number", signals.CTRL_C)
         raise signals.Stopped(number, advice()) from None
@@ -170,24 +178,12 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
         raise ValueError(f"{text}; {advice()}") from error
 
 
-def measure(run: RunFolder, scene: Scene | None = None, *, lpips_weights: Path | None = None) -> RunResult:
-    """Call `evaluate_run`, and delete a replaced run once all stages are trained."""
-    result = evaluate_run(run, scene, lpips_weights=lpips_weights)
-    if len(result.models) == len(result.plan.names):
-        drop_old(run)
-    return result
-
-
 def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
-    """Return the path of the newest checkpoint, and the command that resumes, as `resuming_command`."""
-    names, last = read_record(run).plan.names, "there is no checkpoint yet"
-    for name in names:
-        if run.model(name).is_file():
-            last = f"the last model is {run.model(name)}"
-    for name in names:
-        for path in run.checkpoints(name):
-            last = f"the last checkpoint is {path}"
-    return f"{last}; continue with: {resuming_command(run, devices)}"
+    """Return the path of the newest checkpoint, or else model, and the command that resumes, as `resuming_command`."""
+    names = read_record(run).plan.names
+    found = [f"the last model is {run.model(name)}" for name in names if run.model(name).is_file()]
+    found += [f"the last checkpoint is {path}" for name in names for path in run.checkpoints(name)]
+    return f"{['there is no checkpoint yet', *found][-1]}; continue with: {resuming_command(run, devices)}"
 
 
 def train_run(
@@ -206,8 +202,14 @@ def train_run(
         fit_stage, scene, progress=options.progress, is_stopped=is_stopped, watch=watch, session=options.session
     )
     for planned in record.plan.stages:
-        if run.model(planned.name).is_file():
-            _check_model(run.model(planned.name), planned)
+        path = run.model(planned.name)
+        if path.is_file():
+            try:
+                made = read_archive_header(path, format=FORMAT).get("system")
+            except ValueError as error:
+                raise ValueError(f"{error}; delete it to train {planned.name} again") from error
+            if made is not None:  # The first stage may be from a file.
+                _check_options(path, system_from_dict(made, str(path), type(planned.system)), planned.system)
         else:
             events = EventWriter(run, planned.name) if options.tensorboard else None
             result = _train_stage(run, planned, scene, fit, events, record.on_nan)
@@ -215,9 +217,9 @@ def train_run(
                 events.add(result.history)
                 events.close()
             write_history(run.own(run.history(planned.name)), result.history)
-            save_model(run.own(run.model(planned.name)), result.model, {"system": system_to_dict(planned.system)})
+            save_model(run.own(path), result.model, {"system": system_to_dict(planned.system)})
         run.drop_old_checkpoints(planned.name, keep=0)
-    send_stage(None)
+    _send_stage(None)
 
 
 def _train_stage(
@@ -228,8 +230,7 @@ def _train_stage(
     events: EventWriter | None,
     on_nan: OnNan,
 ) -> StageResult:
-    """Train a stage from its newest checkpoint or from its beginning; after a divergence, restore if that is
-    allowed."""
+    """Train a stage from its newest checkpoint or its beginning; after a divergence, restore it if allowed."""
 
     def keep(checkpoint: Checkpoint) -> None:
         if checkpoint.iteration == 0:
@@ -249,7 +250,7 @@ def _train_stage(
         if start is not None:
             model = load_model(start)
             check_held_out(model, scene, start)
-        send_stage(planned.name, [resumed, start], num_restored)
+        _send_stage(planned.name, [resumed, start], num_restored)
         try:
             return fit(
                 planned.system,
@@ -262,37 +263,24 @@ def _train_stage(
                 num_restored=num_restored,
             )
         except DivergedError as error:
-            num_restored = _number_of_next_order(run, planned, error, on_nan)
-
-
-def _number_of_next_order(run: RunFolder, planned: PlannedStage, error: DivergedError, on_nan: OnNan) -> int:
-    """Save the state before the diverged step, and return the number of the next order of views.
-
-    Raises:
-      ValueError: if the run is to stop then, or has gone back often enough.
-    """
-    before, checkpoints = error.checkpoint, run.checkpoints(planned.name)
-    path = run.own(run.diverged(planned.name, before.iteration))
-    save_checkpoint(path, before)
-    text, count = f"{error}, in {path}", before.num_restored + 1
-    if on_nan == "stop":
-        raise ValueError(f"{text}; --on-nan restore continues with the views in another order") from error
-    if count > MOST_RESTORED:
-        raise ValueError(f"{text}; the stage was restored {MOST_RESTORED} times already") from error
-    back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"
-    warnings.warn(
-        f"{text}; the stage restarts from {back} with the views in another order ({count} of {MOST_RESTORED} times)",
-        stacklevel=4,
-    )
-    return count
+            before, checkpoints = error.checkpoint, run.checkpoints(planned.name)
+            path = run.own(run.diverged(planned.name, before.iteration))
+            save_checkpoint(path, before)
+            text, num_restored = f"{error}, in {path}", before.num_restored + 1
+            if on_nan == "stop":
+                raise ValueError(f"{text}; --on-nan restore continues with the views in another order") from error
+            if num_restored > MOST_RESTORED:
+                raise ValueError(f"{text}; the stage was restored {MOST_RESTORED} times already") from error
+            back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"
+            order = f"({num_restored} of {MOST_RESTORED} times)"
+            warnings.warn(
+                f"{text}; the stage restarts from {back} with the views in another order {order}", stacklevel=3
+            )
 
 
 def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | None:
-    """Return the newest readable checkpoint of a stage, made with the same options; None without one.
-
-    Raises:
-      ValueError: if there are some, and none can be read.
-    """
+    """Return the newest readable checkpoint of a stage, made with the same options; None without one. Raises ValueError
+    if there are some, and none can be read."""
     damaged: list[tuple[Path, ValueError]] = []
     for path in reversed(run.checkpoints(planned.name)):
         try:
@@ -302,7 +290,7 @@ def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | No
             continue
         _check_options(path, checkpoint.system, planned.system)
         for damaged_path, damage in damaged:
-            aside = run.set_damaged_aside(damaged_path)
+            aside = damaged_path.replace(run.own(damaged_path.with_name(damaged_path.name + DAMAGED)))
             warnings.warn(
                 f"{damage}; it was renamed to {aside.name}, and training continues from {path.name}", stacklevel=2
             )
@@ -320,20 +308,93 @@ def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | No
     return None
 
 
-def _check_model(path: Path, planned: PlannedStage) -> None:
-    """Raise ValueError if a finished model is damaged or was made with other options than the record's."""
-    try:
-        made = read_archive_header(path, format=FORMAT).get("system")
-    except ValueError as error:
-        raise ValueError(f"{error}; delete it to train {planned.name} again") from error
-    if made is not None:  # The first stage may be from a file.
-        _check_options(path, system_from_dict(made, str(path), type(planned.system)), planned.system)
-
-
 def _check_options(path: Path, made: System, wanted: System) -> None:
+    """Raise ValueError if a checkpoint or model was made with other options than the record's."""
     before, now = flatten_config(made), flatten_config(wanted)
     names = ", ".join(name for name, value in now.items() if before.get(name) != value)
     if names:
         raise ValueError(
             f"{path} was made with another {names} than in run.toml: restore that, or train in a new folder"
         )
+
+
+# Several processes
+
+
+def check_alike(record: RunRecord, scene: Scene, session: Session) -> None:
+    """Compare options, devices and the scene with the first process; all processes call it together. Raises ValueError
+    if they differ."""
+    others = team()
+    if others is None:
+        return
+    own = digests_of(record, scene, session)
+    first = broadcast(b"".join(own))
+    differing = [name for place, name in enumerate(DIFFERING) if first[32 * place : 32 * (place + 1)] != own[place]]
+    if differing:
+        raise ValueError(f"this process has other {' and '.join(differing)} than the first: start all with the same")
+    others.has_met = True
+
+
+def digests_of(record: RunRecord, scene: Scene, session: Session) -> list[bytes]:
+    """Return 32 bytes for each of `DIFFERING` that differ if training would. Paths and the pixels of photographs, masks
+    and depth maps are not compared."""
+
+    def checksum(x: Any) -> tuple[tuple[int, ...], int]:
+        return np.shape(x), zlib.crc32(np.ascontiguousarray(x).tobytes())
+
+    systems = [(label, repr(system)) for label, system in record.systems.items()]
+    devices = [] if session.mesh is None else [(one.process_index, one.id) for one in session.mesh.devices.flat]
+    views = []
+    for view in scene.train:
+        has = view.has_alpha, view.mask is not None, view.depth is not None
+        arrays = view.camera.viewmat, view.camera.K, *(() if view.points is None else view.points)
+        views.append((view.name, view.picture.size, has, *map(checksum, arrays)))
+    lenses = [own[0].camera.rays for own in views_by_kind(scene.train)]
+    rays = [None if lens is None else checksum(lens) for lens in lenses]
+    compared = views, rays, checksum(scene.points), checksum(scene.colors), float(scene.scale)
+    return [hashlib.sha256(repr(value).encode()).digest() for value in (systems, devices, compared)]
+
+
+def _send_stage(name: str | None, files: Sequence[Path | None] = (), num_restored: int | None = None) -> None:
+    """Send the other processes the name of the stage that is trained next, with the checkpoint and the model that it
+    starts from, and None at the end."""
+    if team() is not None:
+        broadcast(json.dumps({"name": name, "num_restored": num_restored}).encode())
+        for file in files:
+            broadcast(b"" if file is None else file.read_bytes())
+
+
+def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> None:
+    """Train what the first process sends until its end.
+
+    Raises:
+      ValueError: as `fit_stage` does.
+      Stopped: if a signal ends one of the processes.
+    """
+    check_alike(record, scene, session)
+    plan = record.plan
+
+    def received(path: Path) -> Path | None:
+        data = broadcast(b"")
+        path.write_bytes(data)
+        return path if data else None
+
+    with warnings.catch_warnings(), signals.noted() as is_stopped, tempfile.TemporaryDirectory() as folder:
+        warnings.simplefilter("ignore")
+        while (header := json.loads(broadcast(b"")))["name"] is not None:
+            planned = plan[header["name"]]
+            resume, start = (received(Path(folder) / name) for name in ("resume.npz", "start.npz"))
+            with contextlib.suppress(DivergedError):  # The first process restores the stage, or gives up.
+                fit_stage(
+                    scene,
+                    planned.system,
+                    planned.index,
+                    None if start is None else load_model(start),
+                    resume=None if resume is None else load_checkpoint(resume, system=type(planned.system)),
+                    on_checkpoint=lambda checkpoint: None,
+                    checkpoint_every=planned.checkpoint_every,
+                    progress=False,
+                    is_stopped=is_stopped,
+                    num_restored=header["num_restored"],
+                    session=session,
+                )

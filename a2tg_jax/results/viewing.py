@@ -27,8 +27,7 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.web_scene import encode_web_scene, rounded_model
 from a2tg_jax.model import Model
-from a2tg_jax.results.checks import check_new
-from a2tg_jax.results.folder import read_json, remove_if_empty
+from a2tg_jax.results.folder import check_new, read_json, remove_if_empty
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
 from a2tg_jax.results.report import loss_text
