@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from a2tg_jax.results.checks import check_apart
 from run_folders import create_run
 
 from a2tg_jax import Change, StepEvent
@@ -32,7 +31,7 @@ from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results import forecast, run_evaluation, run_training
-from a2tg_jax.results.folder import OLD, RunFolder, claimed, old_run, opened, put_back_old, set_aside
+from a2tg_jax.results.folder import OLD, RunFolder, check_apart, claimed, old_run, opened, put_back_old, set_aside
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.results.run_training import MOST_RESTORED, RunOptions, train_run
 from a2tg_jax.systems.baselines import Gaussians2dMcmc

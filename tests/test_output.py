@@ -15,7 +15,7 @@ from a2tg_jax.appearance import MovableKernels, allocate_appearance
 from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.host.text import in_bytes
-from a2tg_jax.results.checks import check_export, check_new, check_output
+from a2tg_jax.results.folder import check_export, check_new, check_output
 from a2tg_jax.results.forecast import RunForecast
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
@@ -56,7 +56,7 @@ def test_a_budget_for_few_gaussians_is_said():
 
 
 def test_a_limit_below_the_program_itself_says_so():
-    forecast = RunForecast({"evaluation": Bytes(program=1.1e9, pixels=1e6)}, 1e6, 0)
+    forecast = RunForecast({"evaluation": Bytes(program=1.1e9, pixels=1e6)}, 1e6)
     with pytest.raises(
         ValueError, match=r"20.0 MB may be used: the program itself takes about 1.10 GB of it: allow more"
     ):

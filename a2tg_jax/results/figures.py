@@ -152,7 +152,7 @@ def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -
 
 
 def _thinned(column: np.ndarray) -> np.ndarray:
-    """Return means of equally many rows of a column, at most `MOST_POINTS` of them; a remainder at the end is dropped."""
+    """Return means of equally many rows of a column, at most `MOST_POINTS`; a remainder at the end is dropped."""
     rows = -(-len(column) // MOST_POINTS)
     return column if rows < 2 else column[: len(column) // rows * rows].reshape(-1, rows).mean(axis=1)
 
@@ -182,7 +182,7 @@ def sizes_figure(sizes: np.ndarray) -> Figure:
 
 
 def learned_textures(model: Model) -> np.ndarray | None:
-    """Return a sheet of the most visible textures of a model (largest variance of texels times area of the Gaussian), in
+    """Return a sheet of the most visible textures of a model (by variance of texels times area of the Gaussian), in
     their Gaussians' colours and proportions, over a chequered background.
 
     Returns:

@@ -88,7 +88,7 @@ def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image
 def picture_names(view_names: Iterable[str]) -> dict[str, str]:
     """Return file names of the views' pictures, unique regardless of case; folders become part of the name.
 
-    Long names are cut and end in a hash. Where two names would be the same, as for a/b.png and a_b.jpg, the later one in
+    Long names are cut and end in a hash. Where two names would be the same, as for a/b.png and a_b.jpg, the later in
     sorted order gets a number.
     """
     names: dict[str, str] = {}
