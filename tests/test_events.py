@@ -15,8 +15,7 @@ from toy_system import Rings
 import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import combine, num_compiled, partition
-from a2tg_jax.results.forecast import forecast_run
-from a2tg_jax.results.record import plan_run
+from a2tg_jax.training.cost import forecast_stages
 from a2tg_jax.training.reports import StageEffects
 from a2tg_jax.training.step import initial_state, jitted_step
 from a2tg_jax.training.terms import l1
@@ -133,7 +132,7 @@ def test_programs_are_counted_before_and_while_it_trains(scene):
     """An event is believed to cause a program each time until it has happened, and then what it did."""
     event = PruneFaint(last=156)
     system = Own(events=(event,), sh_degree=0, iterations=160)
-    assert forecast_run(scene, plan_run({"a": system})).num_programs == 40
+    assert next(forecast_stages(scene, system)).num_programs == 40
     stage = system.stages()[0]
     state = initial_state(stage, dataclasses.replace(some_model("plain"), num_live=jnp.int32(NUM + 2)))
     arguments = state.model, state.moments, ()

@@ -314,10 +314,10 @@ def test_a_folder_and_a_single_file(tmp_path):
     text, page = export_web(source, tmp_path / "site"), tmp_path / "site" / "index.html"
     assert page.read_text(encoding="utf-8") == viewer_html()
     scene = (tmp_path / "site" / "scene.a2tgw").read_bytes()
-    assert f"whose scene takes {in_bytes(len(scene))}, " in text and "dB of PSNR lost, were it a model of 30 dB" in text
+    assert f"whose scene takes {in_bytes(len(scene))}, " in text and "dB of PSNR lost, for a model of 30 dB" in text
     assert web_header(scene)["num"] == source.model.num
     total = sum(file.stat().st_size for file in page.parent.iterdir())
-    assert text.endswith(f"{page}: {in_bytes(total)} with 2 files beside it")
+    assert text.endswith(f"{page}: {in_bytes(total)} with 2 files next to it")
     assert (tmp_path / "site" / "photographs.json").read_bytes() == b"[]"
     one = tmp_path / "one.html"
     for _ in range(2):  # The second time, it replaces the first.
@@ -394,4 +394,4 @@ def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkey
     with warned:
         assert json.loads(routes_of(source)["/photographs.json"].read()) == []
     with warned:
-        assert list(losses_of(source)) == ["were it a model of 30 dB"]
+        assert list(losses_of(source)) == ["for a model of 30 dB"]

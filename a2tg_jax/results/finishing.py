@@ -1,7 +1,8 @@
-"""Finishing of a trained run in a new run folder: textures shrink, and colours move towards the least squared error."""
+"""Finishing of a trained run in a new run folder: textures shrink, and colours move to the least squared error."""
 
 import contextlib
 import dataclasses
+import functools
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,7 +23,7 @@ from a2tg_jax.results.run_evaluation import evaluate_run, finished_stages, refin
 from a2tg_jax.training.registry import system_to_dict
 
 MOST_VIEWS = 16
-"""Largest number of training views that the loss of shrinking is measured on, evenly chosen."""
+"""Largest number of training views for measuring the loss of shrinking, evenly chosen."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +38,10 @@ class Measured:
 
 
 def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_weights: Path | None = None) -> str:
-    """Finish the last model of a run's main system, evaluate it in a new run folder, and return a table of each step.
+    """Finish the last model of a run's main system, evaluate it in a new run folder, and return a table of the steps.
 
-    Choices are made on training views; held-out views are only measured. If the same finishing was killed in that
-    folder, it goes on: with the evaluation if the model was written, otherwise from its beginning.
+    Choices depend on training views only. If the same finishing was killed in that folder, it continues: with the
+    evaluation if the model was written, otherwise from the beginning.
 
     Raises:
       FileNotFoundError: if the stage is not finished, or an earlier model or the photographs are missing.
@@ -54,7 +55,11 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     content = {**origin, **dataclasses.asdict(options)}
     _is_written(run, content)
     model, scene = load_model(path), record.scene.load()
-    _check(model, planned, options)
+    can_polish = options.polish_steps > 0 and model.appearance.is_linear
+    if can_polish and planned.system.exposure:  # Photographs of changing exposure would pull at the colours.
+        raise ValueError("the run learned exposures, which polishing does not support: add --polish-steps 0")
+    if not can_polish and not (options.max_loss and can_shrink(model)):
+        raise ValueError(f"{planned.name} shows nothing that these options can shrink or polish")
     finished_stages(source, record.plan)
     with claimed(run):
         is_written = _is_written(run, content)  # Another process may have been here meanwhile.
@@ -84,8 +89,8 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
 
 
 def _is_written(run: RunFolder, content: Mapping[str, object]) -> bool:
-    """Return whether a process was killed in a folder after it had done the same, as finish.json says, and written the
-    model. Unless the same was begun there, the folder must be free."""
+    """Return whether a process was killed in a folder after the same finishing, as finish.json says, had written its
+    model. Otherwise the folder must be free, unless the same finishing was begun there."""
     is_begun = not run.report.is_file() and run.finish.name in run.written() and is_regular(run.finish)
     with contextlib.suppress(ValueError):
         if is_begun and read_json(run.finish) == content:
@@ -112,19 +117,6 @@ def kept_step(steps: Mapping[str, Measured]) -> str:
     return before[-1] if is_worse else last
 
 
-def _check(model: Model, planned: PlannedStage, options: FinishOptions) -> None:
-    """Raise ValueError if nothing can be done, or photographs of changing exposure would pull at the colours."""
-    can_polish = options.polish_steps > 0 and model.appearance.is_linear
-    if can_polish and planned.system.exposure:
-        raise ValueError("the run learned exposures, which polishing does not know: add --polish-steps 0")
-    if not can_polish and not (options.max_loss and can_shrink(model)):
-        raise ValueError(f"{planned.name} shows nothing that these options can shrink or polish")
-
-
 def _measured(model: Model, scene: Scene, planned: PlannedStage) -> Measured:
-    psnrs = [
-        evaluate(views, model, settings=settings_of(planned.system)).psnr if views else None
-        for views in (scene.train, scene.test)
-    ]
-    assert psnrs[0] is not None
-    return Measured(model.num_bytes, psnrs[0], psnrs[1])
+    measure = functools.partial(evaluate, gaussians=model, settings=settings_of(planned.system))
+    return Measured(model.num_bytes, measure(scene.train).psnr, measure(scene.test).psnr if scene.test else None)

@@ -1,6 +1,6 @@
 """Frames of a finished run, and a video: its test views, or a path past the cameras, around the subject or by hand.
 
-Their folder has a list of what renders wrote there. Nothing else is replaced or deleted without `overwrite`.
+The folder has a list of the files that renders wrote. No other file is replaced without `overwrite`, or deleted.
 """
 
 import contextlib
@@ -41,7 +41,7 @@ FRAME = re.compile(r"frame_\d{4,}\.png")
 
 
 class FrameFolder:
-    """Folder into which frames and videos are rendered, with a list of their names."""
+    """Folder for rendered frames and videos, with a list of their names."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -55,20 +55,20 @@ class FrameFolder:
         return list(dict.fromkeys(lines))
 
     def check(self, names: Iterable[str], *, overwrite: bool) -> None:
-        """Raise FileExistsError if a file would be replaced, without `overwrite`, that no render wrote."""
+        """Raise FileExistsError if a file exists that no render wrote, unless `overwrite` is set."""
         for name in set(names) - set(self.listed):
             check_new(self.path / name, "--out", overwrite=overwrite)
 
     @contextlib.contextmanager
     def writing(self, name: str) -> Iterator[Path]:
-        """Yield a temporary path, as `replacing` does, for a file of the folder, and list the file."""
+        """Yield a temporary path for a file of the folder, as `replacing` does, and list the file."""
         with replacing(self.path / name) as temporary:
             yield temporary
             with open(self.path / LIST, "a", encoding="utf-8", errors="surrogateescape") as file:
                 file.write(f"{name}\n")
 
     def tidy(self, rendered: Collection[str], *, drops_frames: bool) -> None:
-        """List each file once, and delete the frames of flights that this render did not write if `drops_frames`."""
+        """List each file once; with `drops_frames`, delete frames of flights that this render did not write."""
         names = self.listed
         if drops_frames:
             for name in names:
@@ -80,7 +80,7 @@ class FrameFolder:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Return width and height of a text such as 1280x720. Raises ValueError if it is not, or a side is out of range."""
+    """Return width and height of a text such as 1280x720. Raises ValueError if it is invalid."""
     match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", text)
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(1 <= side <= LARGEST_SIDE for side in size):
@@ -105,15 +105,15 @@ def render_frames(
 
     Args:
       run: the run folder.
-      out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views. What earlier
-        renders wrote there is replaced, and frames that a longer path left are deleted.
-      route: the test views, a smooth path past all cameras, an orbit around the subject, or a file of views that the
-        viewer saved, through which a path goes.
+      out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views. Files of earlier
+        renders are replaced, and frames of a longer path deleted.
+      route: the test views, a smooth path past all cameras, an orbit around the subject, or a path through the views of
+        a file that the viewer saved.
       num_frames: length of the path.
-      name: whose model is drawn; None: the last stage of the run's main system.
-      size: width and height of the frames, to which views of another aspect are cropped; None: the cameras' own.
+      name: model to render; None: the last one of the run's main system.
+      size: width and height of the frames, to which views of another aspect are cropped; None: the cameras' sizes.
       supersample: factor by which frames are drawn larger and averaged (`RenderSettings.supersample`).
-      overwrite: whether files are replaced that no render wrote.
+      overwrite: whether to replace files that no render wrote.
 
     Raises:
       ValueError, OSError: if that stage is not finished, there are no such views or path, or a file is in the way.
@@ -174,28 +174,25 @@ def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER
 
 
 def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tuple[str, Camera]]:
-    """Return file names and cameras of the frames."""
+    """Return file names and cameras of the frames; frames of a path are named as `write_video` expects."""
+
+    def numbered(path: Sequence[Camera]) -> Iterator[tuple[str, Camera]]:
+        return ((FRAME_NAME % index, camera) for index, camera in enumerate(path))
+
     if isinstance(route, Path):
         try:
             saved = load_views(route)
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{error}{did_you_mean(str(route), get_args(Route))}") from None
-        yield from _numbered(path_through(saved, num_frames))
-        return
+        return numbered(path_through(saved, num_frames))
     if model.origin is None:
         raise ValueError("the model has no cameras to render")
     views = sorted(zip(model.origin.names, model.origin.is_test, model.origin.cameras, strict=True), key=lambda v: v[0])
     if route != "test":
         path = smooth_path if route == "smooth" else turntable
-        yield from _numbered(path([camera for _, _, camera in views], num_frames))
-        return
+        return numbered(path([camera for _, _, camera in views], num_frames))
     if not model.origin.is_test.any():
         raise ValueError("the run has no test views; render a path instead with --path smooth")
     tests = {name: camera for name, is_test, camera in views if is_test}
     names = picture_names(tests)
-    yield from ((names[name], camera) for name, camera in tests.items())
-
-
-def _numbered(path: Sequence[Camera]) -> Iterator[tuple[str, Camera]]:
-    """Return the cameras of a flight by the names that `write_video` looks for."""
-    return ((FRAME_NAME % index, camera) for index, camera in enumerate(path))
+    return ((names[name], camera) for name, camera in tests.items())

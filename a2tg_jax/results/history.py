@@ -1,4 +1,4 @@
-"""History of a stage: as CSV, one line per logged iteration, and as files of TensorBoard (extra [tensorboard])."""
+"""History of a stage as CSV, one line per logged iteration, and as TensorBoard files (extra [tensorboard])."""
 
 import csv
 import importlib
@@ -24,12 +24,9 @@ LARGEST = 1e15
 MOST_BYTES = 1 << 26
 """Largest file; about a million rows."""
 LIBRARY = "tensorboardX"
-LEFT_OUT = ("stage", "iteration")
-"""Columns of a history that are not written."""
 
 
 def write_history(path: Path, history: History) -> None:
-    """Write the columns of a history, named in the first line."""
     columns = history.to_dict()
     rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
@@ -37,12 +34,12 @@ def write_history(path: Path, history: History) -> None:
 
 
 def read_history(path: Path) -> History:
-    """Return the history that `write_history` wrote.
+    """Return the history in a file.
 
     Raises:
       FileNotFoundError: if there is none.
-      ValueError: naming the file, if it has other columns, or a row is not one of numbers, of which only PSNR may be
-        infinite and only loss terms NaN.
+      ValueError: naming the file, if it has other columns, or values that are not numbers. Only PSNR may be infinite,
+        and only loss terms NaN.
     """
     if not is_regular(path):
         raise FileNotFoundError(f"{path} is missing: put it back, or train the stage again")
@@ -76,7 +73,7 @@ def check_tensorboard() -> None:
 
 
 class EventWriter:
-    """Writer of a stage's history. Each call adds the rows that the last one did not have."""
+    """Writer of a stage's history for TensorBoard. Each call adds the rows that the last one did not have."""
 
     def __init__(self, run: RunFolder, name: str):
         self._run, self._name = run, name
@@ -84,31 +81,29 @@ class EventWriter:
         self._written = 0
 
     def skip(self, history: History) -> None:
-        """Take the rows of a history for written: those that an earlier process wrote."""
+        """Mark the rows of a history as written by an earlier process."""
         self._written = len(history.iteration)
 
     def add(self, history: History) -> None:
-        """Write the rows that are new, as LOSS/NAME and so on, by iteration of the stage."""
+        """Write the new rows, as LOSS/NAME and so on, by iteration of the stage."""
         rows = range(self._written, len(history.iteration))
-        columns = {name: column for name, column in history.to_dict().items() if name not in LEFT_OUT}
-        for row in rows:
-            for name, column in columns.items():
-                if not np.isnan(column[row]):
-                    self._writer().add_scalar(f"{name}/{self._name}", float(column[row]), int(history.iteration[row]))
-        if rows:
-            self._writer().flush()
-            self._written = rows.stop
-
-    def close(self) -> None:
-        if self._file is not None:
-            self._file.close()
-
-    def _writer(self) -> Any:
-        """Return the writer, whose file is noted as the run's own when it is made."""
+        if not rows:
+            return
         if self._file is None:
             folder = self._run.tensorboard
             before = set(folder.glob("events.*"))
             library: Any = importlib.import_module(LIBRARY)
             self._file = library.SummaryWriter(str(folder), filename_suffix=f".{len(before)}.{self._name}")
             self._run.own_all([f"{folder.name}/{path.name}" for path in sorted(set(folder.glob("events.*")) - before)])
-        return self._file
+        columns = history.to_dict()
+        for row in rows:
+            for name in columns.keys() - {"stage", "iteration"}:
+                if not np.isnan(columns[name][row]):
+                    value, iteration = float(columns[name][row]), int(history.iteration[row])
+                    self._file.add_scalar(f"{name}/{self._name}", value, iteration)
+        self._file.flush()
+        self._written = rows.stop
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()

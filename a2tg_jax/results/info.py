@@ -17,10 +17,8 @@ SPLITS = ("test", "validation", "train")
 
 
 def describe_run(run: RunFolder) -> str:
-    """Return the scene, the systems, the progress of each stage, its model, and the metrics if there are any.
-
-    Damaged metrics and models are named instead of their content. Raises ValueError if run.toml is damaged.
-    """
+    """Return the scene, the systems, and the progress, model and metrics of each stage as text. Damaged metrics and
+    models are named. Raises ValueError if run.toml is damaged."""
     facts, old = run_facts(run), old_run(run)
     stages, damage = facts["stages"], facts["damage"]
     compared = f", compared with {', '.join(facts['compare'])}" if facts["compare"] else ""
@@ -29,7 +27,7 @@ def describe_run(run: RunFolder) -> str:
         f"scene    {facts['scene']} (downscale {facts['downscale']})",
         f"system   {facts['system']}{compared}",
         f"repeat   {repeating_command(run)}",
-        *(f"model    {stage['name']:<{width}}  {_told_stage(stage)}" for stage in stages),
+        *(f"model    {stage['name']:<{width}}  {_stage_text(stage)}" for stage in stages),
         f"report   {facts['report'] or 'none yet: a2tg eval writes it'}",
         *([f"damaged  {damage}: {shlex.join(['a2tg', 'eval', str(run.path)])} rewrites it"] if damage else []),
     ]
@@ -43,8 +41,7 @@ def describe_run(run: RunFolder) -> str:
 
 
 def run_facts(run: RunFolder) -> dict[str, Any]:
-    """Return what a run folder holds as JSON values, a dictionary for each stage. Raises ValueError if run.toml is
-    damaged."""
+    """Return the content of a run folder as JSON values. Raises ValueError if run.toml is damaged."""
     record, measured, damage = read_record(run), dict[str, dict[str, float]](), None
     try:
         measured = read_psnrs(run.metrics) if is_regular(run.metrics) else {}
@@ -65,8 +62,7 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
 
 
 def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
-    """Return the PSNR in a metrics.json: model → test or validation, train → dB. Raises ValueError if there is anything
-    else."""
+    """Return the PSNR in a metrics.json: model → test or validation, train → dB. Raises ValueError if it is damaged."""
     data, psnrs = read_json(path), dict[str, dict[str, float]]()
     try:
         for name, model in data["models"].items():
@@ -79,7 +75,7 @@ def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
 
 
 def _stage_facts(run: RunFolder, name: str) -> dict[str, Any]:
-    """Return the model of a stage, what is wrong with it, or how far its training has come."""
+    """Return facts of a stage's model, or the progress of its training."""
     path = run.model(name)
     if not is_regular(path):
         checkpoints = run.checkpoints(name)
@@ -100,8 +96,7 @@ def _stage_facts(run: RunFolder, name: str) -> dict[str, Any]:
     return facts
 
 
-def _told_stage(stage: Mapping[str, Any]) -> str:
-    """Return what is known of a stage in words."""
+def _stage_text(stage: Mapping[str, Any]) -> str:
     match stage["state"]:
         case "in training":
             return f"at iteration {stage['iteration']} ({stage['checkpoint']})"

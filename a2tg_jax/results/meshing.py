@@ -1,4 +1,4 @@
-"""A mesh of a run or a model, written as a file."""
+"""Mesh of a run or a model, written as a file."""
 
 import dataclasses
 import time
@@ -30,13 +30,13 @@ from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.model_source import Source
 
 GRID_SHARE = 0.5
-"""Share of the free memory that voxels may take by default."""
+"""Default share of the free memory for voxels."""
 TEXTURED_FACES = 100_000
 """Default number of faces of a mesh with a texture."""
 GRID_FULL = "lower --resolution or --radius, or raise --max-memory"
 NO_SURFACE = "give a larger --radius, or --unbounded"
 SMALL_PARTS = "raise --resolution or lower --voxel, or train longer or from more views"
-"""Advice of the command line, by what went wrong."""
+"""Advice of the command line for each kind of error."""
 TextureSource = Literal["none", "renders", "photographs"]
 
 
@@ -143,11 +143,8 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
 
 
 def _photographs(source: Source, origin: Origin) -> Iterator[Picture]:
-    """Return an iterator over the photographs of the training views, which are looked for at once.
-
-    Raises:
-      ValueError: if they are missing, or kept behind their lens.
-    """
+    """Return an iterator over the photographs of the training views. Raises ValueError at once if they are missing, or
+    distorted by their lens."""
     scene = source.load_scene()
     if scene is None:
         raise ValueError(
@@ -156,7 +153,7 @@ def _photographs(source: Source, origin: Origin) -> Iterator[Picture]:
         )
     if any(view.camera.rays is not None for view in scene.train):
         raise ValueError(
-            f"the photographs of {source.title} are kept behind their lens (--lens keep), and a texture needs "
+            f"the photographs of {source.title} are distorted by their lens (--lens keep), and a texture needs "
             "pinhole photographs: choose --texture renders"
         )
     cameras = dict(zip(origin.names, origin.cameras, strict=True))

@@ -1,7 +1,7 @@
-"""Content of the viewer: a model or a training as it runs, and photographs; served, or exported as files.
+"""Content of the viewer: a model or a running training, and photographs; served, or exported as files.
 
-A training is shown by a snapshot every few seconds. Between steps the state is copied to the host; a thread makes a
-scene of it. Both together take no more than `SHARE` of the time: the slower they are, the rarer snapshots become.
+A training is shown by a snapshot every few seconds. Between steps the state is copied to the host, and a thread makes a
+scene of it. Both together take at most `SHARE` of the time, so slow snapshots are rare.
 """
 
 import contextlib
@@ -38,14 +38,14 @@ from a2tg_jax.web.server import Route, served
 
 JPEG_QUALITY = 90
 SECONDS = 3.0
-"""Shortest time between two snapshots in seconds."""
+"""Shortest time between two snapshots, in seconds."""
 NOTED_SECONDS = 0.5
-"""Time between two updates of the figures."""
+"""Time between two updates of the metrics."""
 SHARE = 0.03
-"""Largest share of the time that snapshots take."""
+"""Largest share of the time for snapshots."""
 WAIT = 0.1
 MOST_VIEWS = 8
-"""Largest number of views that the loss of an exported scene is measured on, evenly chosen."""
+"""Largest number of views for measuring the loss of an exported scene, evenly chosen."""
 QUICK = 1
 """Compression level; a scene viewed once need not be small."""
 
@@ -56,23 +56,23 @@ class ServedPhotographs:
     def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None], background: Color = BLACK):
         """Args:
         origin: the cameras; None without cameras.
-        load_scene: finds the photographs, or None.
-        background: RGB behind photographs that are transparent.
+        load_scene: loader of the photographs; None if there are none.
+        background: RGB behind transparent photographs.
         """
-        self._origin, self._load_scene, self._background = origin, load_scene, background
-        self._lock = threading.Lock()
-        self._views: dict[int, View] | None = None
+        self._names, self._background = () if origin is None else origin.names, background
+        self._load_scene, self._lock = load_scene, threading.Lock()
 
     @property
     def views(self) -> dict[int, View]:
         """Views by the index of their cameras."""
-        with self._lock:
-            if self._views is None:
-                scene = None if self._origin is None else self._load_scene()
-                by_name = {} if scene is None else {view.name: view for view in (*scene.train, *scene.test)}
-                names = () if self._origin is None else self._origin.names
-                self._views = {index: by_name[name] for index, name in enumerate(names) if name in by_name}
-            return self._views
+        with self._lock:  # The server's threads ask at the same time.
+            return self._found
+
+    @functools.cached_property
+    def _found(self) -> dict[int, View]:
+        scene = self._load_scene() if self._names else None
+        by_name = {} if scene is None else {view.name: view for view in (*scene.train, *scene.test)}
+        return {index: by_name[name] for index, name in enumerate(self._names) if name in by_name}
 
     def jpeg(self, index: int) -> bytes | None:
         """Return a photograph over the model's background, of its camera's size."""
@@ -87,13 +87,10 @@ class ServedPhotographs:
     @property
     def routes(self) -> dict[str, Route]:
         """Routes of the viewer's server."""
-        names = () if self._origin is None else self._origin.names
-        listed = Route("application/json", lambda: json.dumps(sorted(self.views)).encode())
-        each = {
-            f"/{photograph_name(index)}": Route("image/jpeg", functools.partial(self.jpeg, index))
-            for index in range(len(names))
-        }
-        return {f"/{PHOTOGRAPHS_NAME}": listed, **each}
+        routes = {f"/{PHOTOGRAPHS_NAME}": Route("application/json", lambda: json.dumps(sorted(self.views)).encode())}
+        for index in range(len(self._names)):
+            routes[f"/{photograph_name(index)}"] = Route("image/jpeg", functools.partial(self.jpeg, index))
+        return routes
 
 
 def routes_of(source: Source) -> dict[str, Route]:
@@ -110,9 +107,9 @@ class LiveView:
 
     def __init__(self, scene: Scene, title: str, now: Callable[[], float] = time.perf_counter):
         """Args:
-        scene: the scene that is trained on.
+        scene: the training's scene.
         title: title of the page.
-        now: a clock in seconds.
+        now: clock in seconds.
         """
         self._scene, self._title, self._now = scene, title, now
         self._due = self._noted = -np.inf
@@ -182,8 +179,7 @@ class LiveView:
 
 @contextlib.contextmanager
 def shown_live(scene: Scene, title: str, on_start: Callable[[str], None]) -> Iterator[LiveView]:
-    """Serve the view of a training within the block. `on_start` is called with the address. Raises ValueError as
-    `serve`."""
+    """Serve the view of a training within the block, after a call of `on_start` with its address. Raises as `serve`."""
     live = LiveView(scene, title)
     with served(live.routes) as address:
         on_start(address)
@@ -194,7 +190,7 @@ def shown_live(scene: Scene, title: str, on_start: Callable[[str], None]) -> Ite
 
 
 def check_page(out: Path, *, single_file: bool, photographs: bool, overwrite: bool) -> list[Path]:
-    """Return the files of a page, photographs left out: one, or several in a folder. Arguments and errors as in
+    """Return the files of a page except photographs: one, or several in a folder. Arguments and errors as in
     `export_web`."""
     single_file = single_file or (out.suffix.lower() == ".html" and not out.is_dir())
     if single_file and photographs:
@@ -219,21 +215,29 @@ def export_web(
 
     Args:
       source: the model.
-      out: the folder, which is made; or the file. A name that ends in .html is a file's, unless there is such a folder.
-      single_file: one file, whatever its name.
-      photographs: into the folder go the cameras' photographs too.
-      overwrite: whether existing files are replaced. Photographs of an earlier page that this one lacks are deleted.
+      out: the folder, which is made if needed; or one file, if its name ends in .html and no such folder exists.
+      single_file: write one file, whatever its name.
+      photographs: add the cameras' photographs to the folder.
+      overwrite: whether to replace existing files. Photographs of an earlier page that this one lacks are deleted.
 
     Raises:
-      FileExistsError: if a folder is where a file is to be written, or a file where a folder is, or a file exists.
-      ValueError: if browsers cannot show the model, or photographs are requested but missing, or requested in one file.
+      FileExistsError: if a file exists, or is in the place of a folder or the reverse.
+      ValueError: if browsers cannot show the model, or photographs are missing or requested in one file.
     """
     page, *others = check_page(out, single_file=single_file, photographs=photographs, overwrite=overwrite)
     data, old = source.encoded, set()
     if not others:
         files = {page: viewer_html_with(data).encode()}
     else:
-        files = _files_of(source, out, photographs)
+        files, views = {out / SCENE_NAME: data}, list[int]()
+        if photographs:
+            found = ServedPhotographs(source.model.origin, source.load_scene, source.model.background)
+            views = sorted(found.views)
+            if not views:
+                raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
+            files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in views}
+        files[out / PHOTOGRAPHS_NAME] = json.dumps(views).encode()
+        files[page] = viewer_html().encode()  # Last, so that it never shows files that are not there yet.
         for path in files:
             check_new(path, "--web", overwrite=overwrite)
         with contextlib.suppress(OSError, ValueError, TypeError):  # There may be no page.
@@ -248,38 +252,23 @@ def export_web(
     ratio = f"1/{model.num_bytes / max(size, 1):.1f} of the model's {in_bytes(model.num_bytes)}"
     lines = [f"{model.num:,} Gaussians, whose scene takes {in_bytes(size)}, {ratio}"]
     lines += [f"{loss_text(loss)}, {measure}" for measure, loss in losses_of(source).items()]
-    others_text = f" with {counted(len(files) - 1, 'file')} beside it" if others else ""
+    others_text = f" with {counted(len(files) - 1, 'file')} next to it" if others else ""
     return "\n".join([*lines, f"{page}: {in_bytes(total)}{others_text}"])
-
-
-def _files_of(source: Source, out: Path, photographs: bool) -> dict[Path, bytes]:
-    """Return the content of the files of a folder, the page last, so that it never shows what is not there yet."""
-    files = {out / SCENE_NAME: source.encoded}
-    views: list[int] = []
-    if photographs:
-        found = ServedPhotographs(source.model.origin, source.load_scene, source.model.background)
-        if not found.views:
-            raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
-        files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in found.views}
-        views = sorted(found.views)
-    return {**files, out / PHOTOGRAPHS_NAME: json.dumps(views).encode(), out / "index.html": viewer_html().encode()}
 
 
 def losses_of(source: Source) -> dict[str, float]:
     """Return the loss of a scene file in dB of PSNR: on photographs, or else on renders; empty without cameras."""
-    if not source.model.num:
+    model = source.model
+    if not model.num:
         return {}
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
-    again = rounded_model(source.model)
-    scene = source.load_scene_or_warn()
+    again, scene = rounded_model(model), source.load_scene_or_warn()
     if scene is not None:
         views = {"training views": scene.train, "test views": scene.test}
         chosen = {name: found[:: -(-len(found) // MOST_VIEWS)] for name, found in views.items() if found}
-        model = source.model
         return {name: loss_on_views(model, found, settings=settings)(again) for name, found in chosen.items()}
-    cameras = [] if source.model.origin is None else source.model.origin.cameras
-    if not cameras:
+    if model.origin is None or not model.origin.cameras:
         return {}
-    cameras = cameras[:: -(-len(cameras) // MOST_VIEWS)]
-    loss = loss_beside_renders(source.model, cameras, settings=settings)(again)
-    return {f"were it a model of {ASSUMED_PSNR:g} dB": loss}
+    cameras = model.origin.cameras[:: -(-len(model.origin.cameras) // MOST_VIEWS)]
+    loss = loss_beside_renders(model, cameras, settings=settings)(again)
+    return {f"for a model of {ASSUMED_PSNR:g} dB": loss}
