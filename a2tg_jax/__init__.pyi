@@ -84,15 +84,16 @@ from .measure.metrics import (
     psnr as psnr,
     ssim as ssim,
 )
-from .mesh.distance import (
-    SurfaceDistance as SurfaceDistance,
-    sample_surface as sample_surface,
-    surface_distance as surface_distance,
-)
 from .mesh.extract import MeshResult as MeshResult, extract_mesh as extract_mesh
 from .mesh.files import save_mesh as save_mesh
 from .mesh.texturing import texture_mesh as texture_mesh
-from .mesh.triangles import Mesh as Mesh, simplify_mesh as simplify_mesh
+from .mesh.triangles import (
+    Mesh as Mesh,
+    SurfaceDistance as SurfaceDistance,
+    sample_surface as sample_surface,
+    simplify_mesh as simplify_mesh,
+    surface_distance as surface_distance,
+)
 from .model import Model as Model, concatenate as concatenate
 from .rasterize.render_types import RenderOutput as RenderOutput, RenderSettings as RenderSettings
 from .render import (

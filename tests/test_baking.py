@@ -94,11 +94,11 @@ def test_a_splat_per_texel_looks_like_the_texture(split):
 def test_small_splats_are_as_opaque_as_the_kernel_at_their_centres(shape):
     """Their optical depths add up to those of the kernel, but at corners, where some would have to be negative."""
     parent = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.asarray([1.0]))
-    axis = kernels(4, "texel-centre")
+    means, scales = axis = kernels(4, "texel-centre")
     found = baking._grid(parent, np.asarray([shape]), np.ones((1, 4, 4, 4)), axis, axis)
-    mixed = np.exp(-0.5 * ((axis.means[:, None] - axis.means[None]) / axis.scales[None]) ** 2)
+    mixed = np.exp(-0.5 * ((means[:, None] - means[None]) / scales[None]) ** 2)
     depths = mixed @ -np.log1p(-np.asarray(found.opacities, np.float64)).reshape(4, 4) @ mixed.T
-    rho = axis.means[:, None] ** 2 + axis.means[None] ** 2
+    rho = means[:, None] ** 2 + means[None] ** 2
     kernel = falloff_of(curves_of(jnp.asarray([[shape]])), jnp.asarray(rho))
     np.testing.assert_allclose(1 - np.exp(-depths), parent.opacities[0] * kernel, atol=3e-3)
 

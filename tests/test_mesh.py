@@ -13,7 +13,7 @@ import surface_quality
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_points
 from a2tg_jax.io.other_programs import upright
-from a2tg_jax.mesh import distance
+from a2tg_jax.mesh import triangles
 from a2tg_jax.mesh.extract import common_sphere, surface_of
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.mesh.fusion import BlockGrid, RenderedDepth, Space, fuse
@@ -151,7 +151,7 @@ def test_distances_of_two_planes():
 
 def test_points_are_drawn_in_parts_and_bounded(sphere, monkeypatch):
     whole = a2tg.sample_surface(sphere, 0.05)
-    monkeypatch.setattr(distance, "CHUNK", 100)
+    monkeypatch.setattr(triangles, "CHUNK", 100)
     np.testing.assert_array_equal(a2tg.sample_surface(sphere, 0.05), whole)
     assert len(whole) > 1000
     with pytest.raises(ValueError, match=r"spacing 1e-06 takes 3\.\d+e\+12 points"):
@@ -355,7 +355,7 @@ def test_a_simplified_mesh_is_not_empty(sphere, monkeypatch):
     empty = (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     library = types.SimpleNamespace(simplify=lambda *arguments, **options: empty)
     monkeypatch.setitem(sys.modules, "fast_simplification", library)
-    with pytest.raises(ValueError, match=r"no faces are left of [0-9,]*: ask for more faces than 4"):
+    with pytest.raises(ValueError, match=r"no faces are left of [0-9,]*: choose more faces than 4"):
         a2tg.simplify_mesh(sphere, 4)
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.core.camera_paths import look_at, path_through
+from a2tg_jax.core.camera_paths import central_camera, look_at, path_through, turntable, vertical_of
 from a2tg_jax.core.cameras import Camera, looking
-from a2tg_jax.core.capture_geometry import central_camera, turntable, vertical_of
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.io.path_file import load_views
 
@@ -142,7 +141,7 @@ def test_cameras_without_one_subject_have_no_turntable():
     views = [
         Camera(np.eye(4, k=0) + 0.1 * np.eye(4, k=3) * index, view.K, 64, 48) for index, view in enumerate(ring(6))
     ]
-    with pytest.raises(ValueError, match="choose --path smooth"):
+    with pytest.raises(ValueError, match="look at one subject to orbit"):
         turntable(views, 10)
 
 

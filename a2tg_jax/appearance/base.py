@@ -136,7 +136,7 @@ class Appearance:
     def cutoff(self, opacities: Array) -> Array:
         """Return the squared distance rho [N] beyond which alpha is below 1/255; not positive if it always is.
 
-        These are bounds without gradient. Too large a bound costs time, too small a one cuts the splat off.
+        A bound without gradient: one that is too large costs time, one that is too small cuts the splat off.
         """
         return gaussian_cutoff(opacities if self.texture is None else opacities * self.texture.peaks())
 
@@ -159,17 +159,13 @@ class Appearance:
         """
         if not isinstance(rate, Mapping):
             return rate
-        floats = [field.name for field in array_fields(self) if getattr(self, field.name) is not None]
-        if unknown := [*rate.keys() - set(floats)]:
-            raise ValueError(f"rates must be by the fields {', '.join(floats)}; got {unknown[0]!r}")
-        own = {name: getattr(self, name) for name in floats}
-        return dataclasses.replace(
-            self,
-            **{
-                name: value.rates(rate.get(name, 0.0)) if isinstance(value, Part) else rate.get(name, 0.0)
-                for name, value in own.items()
-            },
-        )
+        own = {name: value for name in array_fields(self) if (value := getattr(self, name)) is not None}
+        if unknown := [*rate.keys() - own.keys()]:
+            raise ValueError(f"rates must be by the fields {', '.join(own)}; got {unknown[0]!r}")
+        rates = {name: rate.get(name, 0.0) for name in own} | {
+            name: value.rates(rate.get(name, 0.0)) for name, value in own.items() if isinstance(value, Part)
+        }
+        return dataclasses.replace(self, **rates)
 
     def opacities(self, gaussians: Gaussians) -> Array:
         """Return the opacities [N] that densification compares with its thresholds; traceable."""
@@ -257,11 +253,7 @@ class Appearance:
 
 
 def appearance_for(
-    options: TextureOptions,
-    *,
-    has_textures: bool,
-    has_degrees: bool = False,
-    has_shapes: bool = False,
+    options: TextureOptions, *, has_textures: bool, has_degrees: bool = False, has_shapes: bool = False
 ) -> Appearance:
     """Return the template of plain Gaussians with some parts; without textures, only `options.max_alpha` counts."""
     return Appearance(
@@ -275,8 +267,7 @@ def appearance_for(
 def in_words(appearance: Appearance) -> str:
     """Return an appearance in words, such as "Rings with texture and bands"; "plain Gaussians" without anything."""
     kind = "Gaussians" if type(appearance) is Appearance else type(appearance).__name__
-    parts = [name for name in PARTS if getattr(appearance, name) is not None]
-    if not parts:
+    if not (parts := [*_parts_of(appearance)]):
         return "plain Gaussians" if kind == "Gaussians" else kind
     *first, last = parts
     return f"{kind} with {', '.join(first)} and {last}" if first else f"{kind} with {last}"
@@ -285,9 +276,15 @@ def in_words(appearance: Appearance) -> str:
 PARTS = ("texture", "exponents", "bands")
 
 
-def array_fields(node: Any) -> list[dataclasses.Field[Any]]:
-    """Return the fields of an appearance, or of a part, that are not static."""
-    return [field for field in dataclasses.fields(node) if not field.metadata.get("static")]
+def array_fields(node: Any) -> list[str]:
+    """Return the names of the fields of an appearance, or of a part, that are not static."""
+    return [field.name for field in dataclasses.fields(node) if not field.metadata.get("static")]
+
+
+def own_fields(appearance: Any) -> list[str]:
+    """Return the names of the array fields that a subclass adds."""
+    shared = {field.name for field in dataclasses.fields(Appearance)}
+    return [name for name in array_fields(appearance) if name not in shared]
 
 
 def gaussian_cutoff(peak: Array) -> Array:
@@ -299,7 +296,7 @@ def gaussian_cutoff(peak: Array) -> Array:
 
 
 def color_sums(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:
-    """Return the sums of spherical harmonics [N, 3] behind the colours, of either sign; linear in the coefficients."""
+    """Return the sums of spherical harmonics [N, 3], from which 0.5 leads to colours; linear in the coefficients."""
     own = sh_sum(gaussians.sh, gaussians.means, camera.center, degree)
     bands = appearance.bands
     return own if bands is None else own + bands.color_sums(gaussians, camera.center, degree)
@@ -347,11 +344,11 @@ def without_arrays(node: Any, instead: Callable[[str], Any], name: str = "") -> 
     field that is not None."""
     changes = {}
     for field in array_fields(node):
-        value, path = getattr(node, field.name), f"{name}.{field.name}" if name else field.name
+        value, path = getattr(node, field), f"{name}.{field}" if name else field
         if isinstance(value, Part):
-            changes[field.name] = without_arrays(value, instead, path)
+            changes[field] = without_arrays(value, instead, path)
         elif value is not None:
-            changes[field.name] = instead(path)
+            changes[field] = instead(path)
     return dataclasses.replace(node, **changes) if changes else node
 
 
@@ -360,23 +357,25 @@ def template_of(appearance: A) -> A:
     return without_arrays(appearance, lambda path: None)
 
 
+def _parts_of(appearance: Appearance) -> dict[str, Part]:
+    return {name: part for name in PARTS if (part := getattr(appearance, name)) is not None}
+
+
 def allocate_appearance(template: A, key: Array, gaussians: Gaussians) -> A:
     """Return an appearance of the options of a template, with initial arrays for N Gaussians (host)."""
-    parts = {name: part.allocate(gaussians) for name in PARTS if (part := getattr(template, name)) is not None}
+    parts: Any = {name: part.allocate(gaussians) for name, part in _parts_of(template).items()}
     return dataclasses.replace(template, **parts).allocate(key, gaussians)
 
 
 def projected(appearance: A) -> A:
     """Return the appearance with all numbers moved to where they are allowed, after an update; traceable."""
-    parts = {name: part.project() for name in PARTS if (part := getattr(appearance, name)) is not None}
+    parts: Any = {name: part.project() for name, part in _parts_of(appearance).items()}
     return dataclasses.replace(appearance, **parts).project()
 
 
 def count_floats(appearance: Appearance, num: int) -> int:
-    """Return the trained floats of the first `num` Gaussians besides their own, without padding (host).
-
-    An opacity that is not trained counts as -1.
-    """
+    """Return the trained floats of the first `num` Gaussians besides their own, without padding (host). An opacity that
+    is not trained counts as -1."""
     total = -appearance.replaced_floats * num
     for leaf in jax.tree.leaves(appearance, is_leaf=is_table):
         total += leaf.count_floats(num) if isinstance(leaf, Table) else int(np.prod(leaf.shape[1:], dtype=int)) * num
@@ -385,49 +384,37 @@ def count_floats(appearance: Appearance, num: int) -> int:
 
 def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
     """Raise ValueError, naming the field, unless the arrays of an appearance are there and fit the Gaussians (host)."""
-    kind = type(appearance).__name__
+    kind, dtypes = type(appearance).__name__, " or ".join(FLOATS)
     check_arrays_given(appearance)
     for path, leaf in jax.tree_util.tree_leaves_with_path(partition(appearance)[0]):
         if str(leaf.dtype) not in FLOATS:
-            where = f"{kind}{jax.tree_util.keystr(path)}"
-            raise ValueError(f"{where} must be floats, {' or '.join(FLOATS)}; got {leaf.dtype}")
-    for name in PARTS:
-        if (part := getattr(appearance, name)) is not None:
-            part.check(gaussians)
+            raise ValueError(f"{kind}{jax.tree_util.keystr(path)} must be floats, {dtypes}; got {leaf.dtype}")
+    for part in _parts_of(appearance).values():
+        part.check(gaussians)
     for field in array_fields(appearance):
-        if field.name in PARTS:
-            continue
-        for leaf in jax.tree.leaves(getattr(appearance, field.name), is_leaf=is_table):
+        name = f"{kind}.{field}"
+        for leaf in () if field in PARTS else jax.tree.leaves(getattr(appearance, field), is_leaf=is_table):
             if isinstance(leaf, Table):
-                check_table(leaf, gaussians.num, f"{kind}.{field.name}")
-                check_places(leaf, f"{kind}.{field.name}")
-                continue
-            if str(leaf.dtype) not in FLOATS:
-                raise ValueError(f"{kind}.{field.name} must be floats, {' or '.join(FLOATS)}; got {leaf.dtype}")
-            if leaf.shape[:1] != (gaussians.num,):
-                raise ValueError(
-                    f"{kind}.{field.name} must have a row for each of {gaussians.num} Gaussians; got {described(leaf)}"
-                )
+                check_table(leaf, gaussians.num, name)
+                check_places(leaf, name)
+            elif str(leaf.dtype) not in FLOATS:
+                raise ValueError(f"{name} must be floats, {dtypes}; got {leaf.dtype}")
+            elif leaf.shape[:1] != (gaussians.num,):
+                raise ValueError(f"{name} must have a row for each of {gaussians.num} Gaussians; got {described(leaf)}")
     appearance.check_arrays(gaussians)
 
 
 def check_arrays_given(appearance: Appearance) -> None:
     """Raise ValueError if a subclass or a part is a template without its arrays."""
-    common = {field.name for field in dataclasses.fields(Appearance)}
-    own = [field.name for field in array_fields(appearance) if field.name not in common]
-    if own and all(getattr(appearance, name) is None for name in own):
+    own = own_fields(appearance)
+    missing = own[:1] if all(getattr(appearance, name) is None for name in own) else []
+    for name, part in _parts_of(appearance).items():
+        missing += [f"{name}.{field}" for field in array_fields(part) if getattr(part, field) is None]
+    if missing:
         raise ValueError(
-            f"model.appearance.{own[0]} is None: this {type(appearance).__name__} is a template, without arrays; say "
+            f"model.appearance.{missing[0]} is None: this appearance is a template, without arrays; say "
             "Model(gaussians, allocate_appearance(appearance, key, gaussians))"
         )
-    for name in PARTS:
-        part = getattr(appearance, name)
-        for field in [] if part is None else array_fields(part):
-            if getattr(part, field.name) is None:
-                raise ValueError(
-                    f"model.appearance.{name}.{field.name} is None: this appearance is a template, without arrays; say "
-                    "Model(gaussians, allocate_appearance(appearance, key, gaussians))"
-                )
 
 
 # Rows, of Gaussians and appearances alike: every array has a row for each Gaussian, every table a block
@@ -437,7 +424,7 @@ def clear_rows(tree: T, is_cleared: Array) -> T:
     """Return moments with the rows of marked Gaussians [N] at zero; traceable. Tables must have their places."""
 
     def cleared(leaf: Any) -> Any:
-        if isinstance(leaf, Table):
+        if is_table(leaf):
             return leaf.clear(is_cleared)
         return jnp.where(is_cleared.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.zeros_like(leaf), leaf)
 

@@ -149,8 +149,8 @@ class Billboards(Appearance):
 
     def _bucket(self) -> tuple[Array]:
         """Return the one bucket of pictures. Raise ValueError if there are several sizes."""
-        if self.pictures is None or self.pictures.bucket_sizes != ((self.side, self.side),):
-            found = None if self.pictures is None else self.pictures.bucket_sizes
+        found = None if self.pictures is None else self.pictures.bucket_sizes
+        if self.pictures is None or found != ((self.side, self.side),):
             raise ValueError(f"pictures must all have {self.side} × {self.side} texels; got sizes {found}")
         return self.pictures.buckets  # type: ignore[return-value]
 

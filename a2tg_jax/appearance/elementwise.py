@@ -41,18 +41,14 @@ def check_is_appearance(appearance: Any, gaussians: Gaussians | None = None) -> 
 
 
 class Elementwise(NamedTuple):
-    """What pixels read of an appearance."""
+    """What pixels read of an appearance: its methods, composed with its parts."""
 
     texel_position: Callable[[TextureRegion, Array, Array], tuple[Array, Array]]
-    """Position (x, y) of a texture lookup in texels, from region, u and v."""
     shade: Callable[[tuple[Array, ...], tuple[Array, ...], Array, Array], tuple[Residual, Factor]]
-    """Colour residual and alpha factor, from numbers, texture values, u and v."""
     falloff: Callable[[tuple[Array, ...], Array], Array]
-    """Kernel, from numbers and squared distance."""
     max_alpha: float
     has_low_pass: bool
-    empty: tuple[float, ...]
-    """Values of a splat without a texture; () if all splats have one."""
+    empty: tuple[float, ...]  # Values of a splat without a texture; () if all splats have one.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,10 +76,7 @@ class StaticShading:
 
         def shade(numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array) -> tuple[Residual, Factor]:
             shaded = own.shade(numbers[:-CURVE] if has_curve else numbers, values, u, v)
-            if not has_features:
-                return shaded
-            _, factor = shaded
-            return None, factor
+            return (None, shaded[1]) if has_features else shaded
 
         def falloff(numbers: tuple[Array, ...], rho: Array) -> Array:
             return falloff_of(Curve(*numbers[-CURVE:]), rho) if has_curve else own.falloff(numbers, rho)
@@ -130,14 +123,10 @@ class _LeftOut:
 class Arguments:
     """Numbers and dtype of the arguments of an appearance's element-wise functions."""
 
-    num_numbers: int
-    """Number K of numbers of a splat."""
-    num_values: int
-    """Number C of values of a texture; 0 without textures."""
-    num_colors: int
-    """Number D of colours of a splat."""
-    dtype: Any
-    """Dtype of all floats."""
+    num_numbers: int  # K, of a splat.
+    num_values: int  # C, of a texture; 0 without textures.
+    num_colors: int  # D, of a splat.
+    dtype: Any  # Of all floats.
 
     def of(self, shape: tuple[int, ...]) -> dict[str, tuple[Any, ...]]:
         """Return the arguments of each function, as arrays of one shape without values."""
@@ -161,41 +150,34 @@ def check_shading(static: StaticShading, arguments: Arguments) -> None:
       ValueError: if a result has another form than it must have.
       Exception: what the appearance's own code raises, with a note that names it and the arguments.
     """
-    name, functions = static.name, arguments.of(())
-    shaded = _traced(static, "shade", functions, arguments)
-    wanted = f"(residual, factor): {arguments.num_colors} colours that are added, or None, and a factor, or None"
+    name, functions, num_colors = static.name, arguments.of(()), arguments.num_colors
+
+    def traced(function: str) -> Any:
+        """Return what a function of an appearance returns for scalars, without values."""
+        try:
+            return jax.eval_shape(getattr(static.functions, function), *functions[function])
+        except Exception as error:
+            error.add_note(
+                f"This happened in {name}.{function}, which is called with scalars of {arguments.dtype}: "
+                f"K = {arguments.num_numbers} numbers, and C = {arguments.num_values} texture values."
+            )
+            if isinstance(error, jax.errors.TracerBoolConversionError):
+                error.add_note("Its numbers have no values yet: use jnp.where instead of if.")
+            raise
+
+    shaded = traced("shade")
+    wanted = f"(residual, factor): {num_colors} colours that are added, or None, and a factor, or None"
     if not isinstance(shaded, tuple | list) or len(shaded) != 2:
         raise ValueError(f"{name}.shade must return {wanted}; it returned {described(shaded)}")
     residual, factor = shaded
-    if residual is not None and _sizes(residual) != ((),) * arguments.num_colors:
+    if residual is not None and _sizes(residual) != ((),) * num_colors:
         raise ValueError(f"{name}.shade must return {wanted}; the residual is {described(residual)}")
     if factor is not None and _sizes((factor,)) != ((),):
         raise ValueError(f"{name}.shade must return {wanted}; the factor is {described(factor)}")
-    weight = _traced(static, "falloff", functions, arguments)
-    if _sizes((weight,)) != ((),):
+    if _sizes((weight := traced("falloff"),)) != ((),):
         raise ValueError(f"{name}.falloff must return one number for one rho; it returned {described(weight)}")
-    if "texel_position" in functions:
-        position = _traced(static, "texel_position", functions, arguments)
-        if _sizes(position) != ((), ()):
-            raise ValueError(
-                f"{name}.texel_position must return (x, y), two numbers; it returned {described(position)}"
-            )
-
-
-def _traced(
-    static: StaticShading, function: str, functions: dict[str, tuple[object, ...]], arguments: Arguments
-) -> Any:
-    """Return what a function of an appearance returns for scalars, without values."""
-    try:
-        return jax.eval_shape(getattr(static.functions, function), *functions[function])
-    except Exception as error:
-        error.add_note(
-            f"This happened in {static.name}.{function}, which is called with scalars of {arguments.dtype}: "
-            f"K = {arguments.num_numbers} numbers, and C = {arguments.num_values} texture values."
-        )
-        if isinstance(error, jax.errors.TracerBoolConversionError):
-            error.add_note("Its numbers have no values yet: use jnp.where instead of if.")
-        raise
+    if "texel_position" in functions and _sizes(position := traced("texel_position")) != ((), ()):
+        raise ValueError(f"{name}.texel_position must return (x, y), two numbers; it returned {described(position)}")
 
 
 def _sizes(values: object) -> tuple[tuple[int, ...], ...] | None:

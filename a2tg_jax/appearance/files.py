@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance.base import Appearance, allocate_appearance, array_fields
+from a2tg_jax.appearance.base import Appearance, allocate_appearance, own_fields
 from a2tg_jax.appearance.parts import (
     MAX_DEGREE,
     Bands,
@@ -46,8 +46,8 @@ def arrays_of(appearance: Appearance, sh_degree: int) -> dict[str, np.ndarray]:
         arrays["shapes"] = np.asarray(appearance.exponents.shapes)
     if appearance.texture is not None and (texels := appearance.texture.texels) is not None:
         arrays |= {"sizes": texels.sizes, "texels": texels.flat()}
-    for field, value in _own_arrays(appearance).items():
-        for path, leaf in jax.tree_util.tree_leaves_with_path(value, is_leaf=is_table):
+    for field in own_fields(appearance):
+        for path, leaf in jax.tree_util.tree_leaves_with_path(getattr(appearance, field), is_leaf=is_table):
             name = field + jax.tree_util.keystr(path)
             if isinstance(leaf, Table):
                 arrays |= {f"{name}.sizes": leaf.sizes, f"{name}.elements": leaf.flat()}
@@ -70,28 +70,21 @@ def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degre
         changes["exponents"] = Exponents(jnp.asarray(shapes))
     if template.texture is not None:
         changes["texture"] = dataclasses.replace(template.texture, texels=_textures(arrays, "sizes", "texels"))
-    wanted = _own_arrays(allocate_appearance(template, jax.random.key(0), no_rows(2, 1)))
-    for field, value in wanted.items():
+    example = allocate_appearance(template, jax.random.key(0), no_rows(2, 1))
+    for field in own_fields(template):
 
         def read(path: Any, leaf: Any, field: str = field) -> Any:
             name = field + jax.tree_util.keystr(path)
             if isinstance(leaf, Table):
-                old = f"{name}.sizes" not in arrays  # Version 0.2 called those of billboards so.
+                old = f"{name}.sizes" not in arrays  # Version 0.2, of the pictures of billboards.
                 return _textures(arrays, *(("sizes", "texels") if old else (f"{name}.sizes", f"{name}.elements")))
             array = _found(arrays, name)
             if array.shape[1:] != leaf.shape[1:]:
                 raise ValueError(f"{name} must be [N, …] with rows {leaf.shape[1:]}; got {array.shape}")
             return jnp.asarray(array)
 
-        changes[field] = jax.tree_util.tree_map_with_path(read, value, is_leaf=is_table)
+        changes[field] = jax.tree_util.tree_map_with_path(read, getattr(example, field), is_leaf=is_table)
     return dataclasses.replace(template, **changes)
-
-
-def _own_arrays(appearance: Appearance) -> dict[str, Any]:
-    """Return the fields of a subclass that hold arrays, or pytrees of them."""
-    names = [field.name for field in array_fields(appearance)]
-    shared = {field.name for field in dataclasses.fields(Appearance)}
-    return {name: value for name in names if name not in shared and (value := getattr(appearance, name)) is not None}
 
 
 def _found(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:

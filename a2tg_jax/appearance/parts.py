@@ -94,10 +94,8 @@ class TextureOptions:
 class TexelRates(NamedTuple):
     """Learning rates of texels by the size of their texture."""
 
-    larger: Any
-    """Rate of textures of more than one texel."""
-    single: Any
-    """Rate of textures of one texel, which only change the colour and opacity of their Gaussian."""
+    larger: Any  # Of textures of more than one texel.
+    single: Any  # Of textures of one texel, which only change the colour and opacity of their Gaussian.
 
 
 @pytree
@@ -131,25 +129,19 @@ class Texture(Part):
         return dataclasses.replace(self, texels=dataclasses.replace(self.texels, buckets=buckets))
 
     def project(self) -> "Texture":
-        """Return textures with alpha factors clamped to [0, 1], and RGB too if it is unsigned.
-
-        Alpha that is divided by its maximum has no upper bound. What `shown` would clip is clipped here as well, which
-        changes no image: beyond the bounds, where gradients are 0, texels would stay for ever.
-        """
+        """Return textures with alpha factors clamped to [0, 1], and RGB as well if it is unsigned."""
+        # What `shown` would clip is clipped here as well, which changes no image: beyond the bounds, where gradients
+        # are 0, texels would stay forever. Alpha that is divided by its maximum has no upper bound.
         options = self.options
         most_alpha = jnp.inf if options.alpha == "global-maximum" else 1.0
         least, most = (0.0, 1.0) if options.rgb == "unit" else (-jnp.inf, jnp.inf)
-
         assert self.texels is not None
         bounds = jnp.asarray([[least] * 3 + [0.0], [most] * 3 + [most_alpha]], self.texels.buckets[0].dtype)
         buckets = tuple(jnp.clip(texels, *bounds[:, None, None, None]) for texels in self.texels.buckets)
         return dataclasses.replace(self, texels=dataclasses.replace(self.texels, buckets=buckets))
 
     def shown(self) -> Textures:
-        """Return RGB residuals and alpha factors as they are shown, from the trained texels.
-
-        Buckets and rows out of range are clamped.
-        """
+        """Return RGB residuals and alpha factors as they are shown. Buckets and rows out of range are clamped."""
         assert self.texels is not None
         textures, options = self.texels.nearest_places(), self.options
         if options.rgb == "signed" and options.alpha == "projected":
@@ -173,10 +165,7 @@ class Texture(Part):
         return dataclasses.replace(textures, buckets=tuple(map(shown, textures.buckets)))
 
     def atlas(self) -> tuple[Array, TextureRegion]:
-        """Return all texels [T, 4], and the N places of the textures among them.
-
-        An empty texture has a region of no texels and changes nothing.
-        """
+        """Return all texels [T, 4], and the N places of the textures among them; an empty texture has no texels."""
         textures = self.shown()
         # Buckets lie one after the other; a texture begins at its bucket's start plus its row times the area.
         areas = [height * width for height, width in textures.bucket_sizes]
@@ -266,12 +255,9 @@ class Exponents(Part):
 class Curve(NamedTuple):
     """The exponent of the falloff as a function of ρ: scale·((ρ + δ)^β − start)."""
 
-    exponents: Array
-    """β [N]."""
-    scales: Array
-    """[N] inverse of its increase from ρ = 0 to 2, so that it is 1 there."""
-    starts: Array
-    """[N] δ^β."""
+    exponents: Array  # β [N].
+    scales: Array  # [N] inverse of its increase from ρ = 0 to 2, so that it is 1 there.
+    starts: Array  # [N] δ^β.
 
 
 def log_exponents_of(shapes: np.ndarray) -> np.ndarray:
@@ -417,10 +403,8 @@ def dense_bands(coefficients: Coefficients, base_degree: int) -> np.ndarray:
     (host)."""
     dtype = coefficients.buckets[0].dtype if coefficients.buckets else np.float32
     dense = np.zeros((coefficients.num, NUM_BASES[MAX_DEGREE] - NUM_BASES[base_degree], 3), dtype)
-    for blocks, owners in zip(coefficients.buckets, coefficients.owners, strict=True):
-        rows = on_host(owners)
-        is_used = rows < coefficients.num
-        dense[rows[is_used], : blocks.shape[1]] = on_host(blocks)[is_used]
+    for ids, blocks in coefficients.groups():
+        dense[ids, : blocks.shape[1]] = blocks
     return dense
 
 
@@ -428,13 +412,7 @@ def bands_of_dense(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> 
     """Invert `dense_bands`, given the degrees [N]: coefficients above a Gaussian's degree are dropped (host)."""
     dense = np.asarray(dense)
     table = empty_bands(degrees, base_degree, dense.dtype)
-    filled = []
-    for blocks, owners in zip(table.buckets, table.owners, strict=True):
-        rows, values = np.asarray(owners), np.zeros(blocks.shape, dense.dtype)
-        is_used = rows < table.num
-        values[is_used] = dense[rows[is_used], : blocks.shape[1]]
-        filled.append(jnp.asarray(values))
-    return dataclasses.replace(table, buckets=tuple(filled))
+    return Coefficients.of_groups((ids, dense[ids, : blocks.shape[1]]) for ids, blocks in table.groups())
 
 
 # The Gaussian nearest to a kernel, for files that have Gaussians only. Of all Gaussians a·exp(−ρ/2k) it has the least

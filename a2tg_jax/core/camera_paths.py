@@ -1,11 +1,13 @@
-"""Smooth camera paths: past the cameras of a scene, or through chosen views."""
+"""Geometry of a capture, and smooth camera paths: around its subject, past its cameras, or through chosen views (host).
+
+c is a camera centre, d its optical axis (unit); all of it in float64.
+"""
 
 from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -21,10 +23,96 @@ from a2tg_jax.core.cameras import (
 from a2tg_jax.core.checks import check_int
 from a2tg_jax.core.similarity import camera_centers
 
+MIN_AXIS_SPREAD = 1e-3
+"""Smallest eigenvalue of the mean of I - d·dᵀ (about the squared angle between axes) that fixes a point."""
+LEAST_FACING = 0.5
+"""Smallest median cosine between optical axes and the directions to the subject."""
+LARGEST_ELEVATION = np.radians(80)
+FEWEST = 4
+"""Smallest number of cameras whose right axes say more than their mean up."""
+LEAST_SPREAD = 0.025
+"""Smallest second eigenvalue of the right axes' moments: headings that spread by 9°."""
+LARGEST_RATIO = 0.25
+"""Largest ratio of their first to their second eigenvalue."""
+LEAST_COSINE = 0.5
+"""Smallest cosine between the vertical and the cameras' mean up."""
 SMOOTHING = 0.06
 """Standard deviation of the smoothing, as a fraction of the path."""
 TURN_WEIGHT = 0.5
 """Weight of a change of direction relative to a change of position when cameras are ordered."""
+
+
+def nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return argmin_x Σ |(I - d·dᵀ)(x - c)|² for lines through `centers` along unit `axes`, or the mean centre."""
+    projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal_matrix = projections.mean(axis=0)
+    if np.linalg.eigvalsh(normal_matrix)[0] < MIN_AXIS_SPREAD:
+        return centers.mean(axis=0)
+    return np.linalg.solve(normal_matrix, np.einsum("vij,vj->i", projections, centers) / len(centers))
+
+
+def vertical_of(viewmats: np.ndarray) -> np.ndarray:
+    """Return the vertical [3] of cameras [V, 4, 4], as the viewer estimates it (web/src/vertical.ts).
+
+    It is the axis closest to perpendicular to all right axes in least squares, or the cameras' mean up if the right
+    axes do not determine it.
+    """
+    up: np.ndarray = -viewmats[:, 1, :3].mean(axis=0)
+    up /= max(float(np.linalg.norm(up)), 1e-12)
+    rights = viewmats[:, 0, :3]
+    (least, middle, _), vectors = np.linalg.eigh(rights.T @ rights / len(rights))
+    axis: np.ndarray = vectors[:, 0]
+    is_open = middle < LEAST_SPREAD or least > LARGEST_RATIO * middle
+    if len(viewmats) < FEWEST or is_open or abs(axis @ up) < LEAST_COSINE:
+        return up
+    return np.asarray(axis * np.sign(axis @ up))
+
+
+def central_camera(viewmats: np.ndarray) -> int:
+    """Return the index of the camera [V, 4, 4] whose axis passes nearest to the subject and which is nearest to the
+    median camera; both count alike."""
+    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    subject = nearest_point(centers, axes)
+    misses = np.linalg.norm(np.cross(subject - centers, axes), axis=1)
+    remote = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    return int(np.argmin(misses + remote))
+
+
+def turntable(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
+    """Return a closed orbit around the subject, the point nearest to all optical axes, about the capture's vertical.
+
+    It keeps the cameras' mean distance and elevation, looks at the subject with a level horizon, and begins at the side
+    of the first camera, whose intrinsics and image size are used throughout.
+
+    Raises:
+      ValueError: if there are no cameras or frames, or the cameras do not look at one subject.
+    """
+    if not cameras or num_frames < 1:
+        raise ValueError(f"an orbit needs a camera and a frame; got {len(cameras)} cameras, {num_frames} frames")
+    viewmats = _viewmats(cameras)
+    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    subject, up = nearest_point(centers, axes), vertical_of(viewmats)
+    offsets = centers - subject
+    distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
+    if np.median(-np.sum(offsets * axes, axis=1) / distances) < LEAST_FACING:
+        raise ValueError("cameras must look at one subject to orbit, and these do not: use smooth_path")
+    elevation = np.clip(
+        np.arcsin(np.clip(offsets @ up / distances, -1, 1)).mean(), -LARGEST_ELEVATION, LARGEST_ELEVATION
+    )
+    # The unit direction of the first offset perpendicular to the vertical; any such one if the offset is vertical.
+    for vector in (offsets[0], *np.eye(3)):
+        across = vector - (vector @ up) * up
+        if np.linalg.norm(across) > 1e-3 * np.linalg.norm(vector):
+            break
+    side = across / np.linalg.norm(across)
+    first, place = cameras[0], distances.mean()
+    frames = []
+    for angle in np.arange(num_frames) * (2 * np.pi / num_frames):
+        heading = np.cos(angle) * side + np.sin(angle) * np.cross(up, side)
+        outward = np.cos(elevation) * heading + np.sin(elevation) * up
+        viewmat = jnp.asarray(looking(subject + place * outward, -outward, -up), first.viewmat.dtype)
+        frames.append(Camera(viewmat, first.K, first.width, first.height))
+    return frames
 
 
 def look_at(
@@ -40,10 +128,10 @@ def look_at(
 
     Args:
       position: [3] position of the camera in the world.
-      target: [3] point that it looks at, another than its position.
+      target: [3] point to look at, different from the position.
       width, height: size of the image in pixels.
       fov: angle of view in degrees along the longer side of the image, between 0 and 180.
-      up: [3] vertical of the world; the cameras of a scene have it near +z.
+      up: [3] vertical of the world, near +z for the cameras of a scene.
 
     Raises:
       ValueError: if the target is at the position or along the vertical, or the angle of view is out of range.
@@ -55,10 +143,10 @@ def look_at(
     center, seen, up = vectors.values()
     forward = seen - center
     if np.linalg.norm(np.cross(forward, up)) <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(up):
-        wanted = f"target must lie in a direction that is not along up; it lies at {forward} from the camera"
-        raise ValueError(f"{wanted}, and up is {up}: say another up=")
+        wanted = f"target must be in a direction that is not along up; it is at {forward} from the camera"
+        raise ValueError(f"{wanted}, and up is {up}: pass another up")
     if not 0 < fov < 180:
-        raise ValueError(f"fov must lie between 0 and 180 degrees; got {fov}")
+        raise ValueError(f"fov must be between 0 and 180 degrees; got {fov}")
     viewmat, K = looking(center, forward, -up), intrinsics(width, height, np.radians(fov))
     camera = Camera(jnp.asarray(viewmat, float), jnp.asarray(K, float), width, height)
     check_camera(camera)
@@ -82,12 +170,25 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     cameras = checked_cameras(cameras)
     if len(cameras) < 2:
         raise ValueError(f"a path needs two cameras; got {len(cameras)}")
-    viewmats = np.stack([np.asarray(camera.viewmat, np.float64) for camera in cameras])
-    centers = camera_centers(viewmats)
-    forwards, downs = viewmats[:, 2, :3], viewmats[:, 1, :3]
-    tour = _short_tour(centers, forwards)
+    viewmats = _viewmats(cameras)
+    centers, forwards, downs = camera_centers(viewmats), viewmats[:, 2, :3], viewmats[:, 1, :3]
+    # The tour begins at an end of the set, and always goes to the nearest camera that it has not visited.
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() or 1.0
+    features = np.concatenate([centers / spread, TURN_WEIGHT * forwards], axis=1)
+    tour = [int(np.linalg.norm(features - features.mean(axis=0), axis=1).argmax())]
+    left = np.delete(np.arange(len(centers)), tour)
+    while len(left):
+        nearest = int(np.linalg.norm(features[left] - features[tour[-1]], axis=1).argmin())
+        tour.append(int(left[nearest]))
+        left = np.delete(left, nearest)
     knots = np.concatenate([centers, forwards, downs], axis=1)[tour]
-    curve = _smoothed(knots, num_frames)
+    # The polyline through the cameras is smoothed, and then passed at constant speed.
+    along = _lengths(knots, 1e-9)
+    num_fine = max(20 * num_frames, 1000)
+    dense = _interpolated(np.linspace(0.0, along[-1], num_fine), along, knots)
+    dense = gaussian_filter1d(dense, SMOOTHING * num_fine, axis=0, mode="nearest")
+    travelled = _lengths(dense, 1e-12)
+    curve = _interpolated(np.linspace(0.0, travelled[-1], num_frames), travelled, dense)
     first = cameras[0]
     return [
         Camera(jnp.asarray(looking(*np.split(row, 3)), first.viewmat.dtype), first.K, first.width, first.height)
@@ -107,6 +208,8 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     Raises:
       ValueError: if there are no views or no frames.
     """
+    from scipy.interpolate import CubicSpline  # Not at import, which would take 0.1 s longer.
+
     check_int("num_frames", num_frames, 1)
     views = checked_cameras(views, "views")
     if not views:
@@ -115,7 +218,7 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     views = [resize_camera(view, first.width, first.height) for view in views]
     if len(views) == 1:
         return [first] * num_frames
-    viewmats = np.stack([np.asarray(view.viewmat, np.float64) for view in views])
+    viewmats = _viewmats(views)
     rotations = Rotation.from_matrix(viewmats[:, :3, :3])
     centers = camera_centers(viewmats)
     # Time grows with distance and turn, so that the flight does not rush through a view.
@@ -126,7 +229,7 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     times = np.linspace(0.0, knots[-1], num_frames)
     places, turned = CubicSpline(knots, centers, bc_type="natural")(times), Slerp(knots, rotations)(times).as_matrix()
     Ks = np.stack([np.asarray(view.K, np.float64).ravel() for view in views])
-    lenses = np.stack([np.interp(times, knots, column) for column in Ks.T], axis=1).reshape(-1, 3, 3)
+    lenses = _interpolated(times, knots, Ks).reshape(-1, 3, 3)
     dtype, size = first.viewmat.dtype, (first.width, first.height)
     return [
         Camera(jnp.asarray(viewmat_of_axes(R, c), dtype), jnp.asarray(K, dtype), *size)
@@ -134,28 +237,17 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     ]
 
 
-def _short_tour(centers: np.ndarray, forwards: np.ndarray) -> list[int]:
-    """Return an order of the cameras that always goes to the nearest unvisited one, from an end of the set."""
-    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() or 1.0
-    features = np.concatenate([centers / spread, TURN_WEIGHT * forwards], axis=1)
-    start = int(np.linalg.norm(features - features.mean(axis=0), axis=1).argmax())
-    tour, left = [start], set(range(len(centers))) - {start}
-    while left:
-        candidates = sorted(left)
-        distances = np.linalg.norm(features[candidates] - features[tour[-1]], axis=1)
-        tour.append(candidates[int(distances.argmin())])
-        left.remove(tour[-1])
-    return tour
+def _viewmats(cameras: Sequence[Camera]) -> np.ndarray:
+    return np.stack([np.asarray(camera.viewmat, np.float64) for camera in cameras])
 
 
-def _smoothed(knots: np.ndarray, num_frames: int) -> np.ndarray:
-    """Return points [num_frames, C] at constant speed on a smoothed polyline through knots [n, C] (positions first)."""
-    steps = np.linalg.norm(np.diff(knots[:, :3], axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps + 1e-9)])
-    fine = max(20 * num_frames, 1000)
-    places = np.linspace(0.0, along[-1], fine)
-    dense = np.stack([np.interp(places, along, column) for column in knots.T], axis=1)
-    dense = gaussian_filter1d(dense, SMOOTHING * fine, axis=0, mode="nearest")
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(dense[:, :3], axis=0), axis=1) + 1e-12)])
-    wanted = np.linspace(0.0, travelled[-1], num_frames)
-    return np.stack([np.interp(wanted, travelled, column) for column in dense.T], axis=1)
+def _lengths(points: np.ndarray, least: float) -> np.ndarray:
+    """Return the lengths [n] of a polyline up to each of its points [n, C] (positions first); each edge counts `least`
+    more, so that they increase."""
+    steps = np.linalg.norm(np.diff(points[:, :3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps + least)])
+
+
+def _interpolated(wanted: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return rows of values [n, C] interpolated at the wanted places [m] among the known ones [n]."""
+    return np.stack([np.interp(wanted, known, column) for column in values.T], axis=1)

@@ -34,10 +34,7 @@ def fields_of(path: str) -> Iterator[None]:
 
 
 def check_kind(name: str, value: object, kind: type | tuple[type, ...], hint: str = "") -> None:
-    """Raise ValueError, with an optional hint, unless a value is an instance of a class, or of one of several.
-
-    Without a hint, the error of a class instead of its instance says so.
-    """
+    """Raise ValueError, with an optional hint, unless a value is an instance of a class, or of one of several."""
     if isinstance(value, kind):
         return
     if not hint and isinstance(value, type) and issubclass(value, kind):
@@ -111,21 +108,16 @@ def check_array(name: str, x: object, hint: str = "") -> None:
 
 
 def plain_array(name: str, value: object, dtype: DTypeLike | None = None) -> Any:
-    """Return nested lists of numbers, and NumPy's special arrays, as arrays that JAX takes; other values unchanged.
-
-    Special arrays are masked ones without masked entries, and those in foreign byte order. The dtype is that of an
-    array that is made of a list; None: JAX's default float.
-
-    Raises:
-      ValueError: if an entry is masked, or the rows of a list differ in length.
-    """
+    """Return nested lists of numbers, masked arrays without masked entries, and arrays of foreign byte order or of
+    other libraries as arrays that JAX takes; other values unchanged. Lists become arrays of `dtype`; None: JAX's
+    default float. ValueError: an entry is masked, or the rows of a list differ in length."""
     check_unmasked(name, value)
     if isinstance(value, np.ma.MaskedArray):
         value = np.ma.getdata(value)
     first = value
     while isinstance(first, list | tuple) and first:
         first = first[0]
-    # JAX puts no nested sequences of numbers into a pytree, but other things in the place of an array.
+    # JAX puts no nested sequences of numbers into a pytree, but other things instead of arrays.
     if type(value) in (list, tuple) and isinstance(first, numbers.Number) and not isinstance(first, bool):
         try:
             value = np.asarray(value, jnp.result_type(float) if dtype is None else dtype)
@@ -157,7 +149,7 @@ def make_plain(instance: object, name: str, *fields: str) -> None:
 
 
 def kind_of(value: object) -> str:
-    """Return the class of a value in errors; a class itself by its name."""
+    """Return what a value is, for errors."""
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
@@ -167,7 +159,10 @@ def check_shape(name: str, x: Any, wanted: Wanted) -> None:
     x is an array, a tracer, or nested sequences of numbers.
     """
     shape = np.shape(x)
-    if len(shape) != len(wanted) or not _fits(shape, wanted):
+    sizes: dict[int | str, int] = {}
+    pairs = zip(shape, wanted, strict=False)
+    fits = all(sizes.setdefault(side, side if isinstance(side, int) else own) == own for own, side in pairs)
+    if len(shape) != len(wanted) or not fits:
         is_array = hasattr(x, "shape") or isinstance(x, numbers.Number | list | tuple)
         raise ValueError(f"{name} must be {_written(wanted)}; got {_written(shape) if is_array else kind_of(x)}")
 
@@ -212,11 +207,6 @@ def short_tuple_repr(value: Any) -> str:
     """Return the `repr` of a named tuple, with arrays by dtype and shape."""
     fields = ", ".join(f"{name}={described(field)}" for name, field in zip(value._fields, value, strict=True))
     return f"{type(value).__name__}({fields})"
-
-
-def _fits(shape: tuple[int, ...], wanted: Wanted) -> bool:
-    sizes: dict[int | str, int] = {}
-    return all(sizes.setdefault(side, side if isinstance(side, int) else n) == n for n, side in zip(shape, wanted))  # noqa: B905
 
 
 def _written(shape: tuple[int | str, ...]) -> str:

@@ -19,7 +19,11 @@ FILTER_VARIANCE = 0.5
 """Variance in pixels² of the low-pass filter: ρ₂ = 2·|(x, y) − c|²."""
 NEAR_PLANE = 0.2
 """Default depth from which splats are drawn."""
-
+POLYGON_SIDES = 8
+BOUND_SLACK = 1e-2
+"""Margin of every bound for rounding, in squared pixels."""
+Box = tuple[Array, Array, Array, Array]
+"""Left, top, right and bottom edge, in pixels."""
 Floats = Array | np.ndarray
 
 
@@ -28,14 +32,6 @@ def pixel_sizes(means: Floats, scales: Floats, viewmat: Floats, K: Floats) -> Fl
     depths = means @ viewmat[2, :3] + viewmat[2, 3]
     focal = (K[0, 0] * K[1, 1]) ** 0.5
     return (depths > NEAR_PLANE).astype(depths.dtype) * scales.min(axis=1) * focal / depths.clip(NEAR_PLANE)
-
-
-POLYGON_SIDES = 8
-BOUND_SLACK = 1e-2
-"""Margin of every bound for rounding, in squared pixels."""
-Triple = tuple[Array, Array, Array]
-Box = tuple[Array, Array, Array, Array]
-"""Left, top, right and bottom edge, in pixels."""
 
 
 def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
@@ -56,26 +52,20 @@ def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
 
 
 class Outline(NamedTuple):
-    """Outline of all that a splat shows: an ellipse, or a circle around the mean, which the low-pass filter reaches."""
+    """Outline of all that a splat shows: an ellipse, or a circle around the mean, which the low-pass filter reaches.
+
+    Inside the ellipse, (x − e)ᵀS⁻¹(x − e) <= 1 with S = [[xx, xy], [xy, yy]]. Lengths are in pixels.
+    """
 
     ellipse_x: Array
-    """Centre of the ellipse, in pixels."""
     ellipse_y: Array
-    """Vertical coordinate of that centre."""
     xx: Array
-    """Entry of the matrix S = [[xx, xy], [xy, yy]], with (x − e)ᵀS⁻¹(x − e) <= 1 inside the ellipse."""
     xy: Array
-    """Entry of S off the diagonal."""
     yy: Array
-    """Second diagonal entry of S."""
-    mean_x: Array
-    """Centre of the circle: the projected mean."""
+    mean_x: Array  # Centre of the circle: the projected mean.
     mean_y: Array
-    """Vertical coordinate of that centre."""
     radius: Array
-    """Radius of the circle, in pixels."""
-    is_clipped: Array
-    """Whether the disc reaches behind the near plane: only the box is then valid."""
+    is_clipped: Array  # Whether the disc reaches behind the near plane: only the box is then valid.
 
 
 class ScreenBounds(NamedTuple):
@@ -83,8 +73,7 @@ class ScreenBounds(NamedTuple):
 
     left: Array
     top: Array
-    right: Array
-    """Right edge; less than `left` if the splat is invisible, as `bottom` is then less than `top`."""
+    right: Array  # Less than `left` if the splat is invisible, as `bottom` is then less than `top`.
     bottom: Array
     outline: Outline
 
@@ -95,6 +84,7 @@ def screen_bounds(M: Array, cutoff: Array, near_plane: float) -> ScreenBounds:
     The cutoff [N] is r² = 2·ln(255·o·max T_A); a splat with r² <= 0 is invisible. Hits have depths from `near_plane`
     on.
     """
+    # The box is found for both cases, since one branch for all splats would have to be the slow one.
     rows = tuple(tuple(M[:, i, k] for k in range(3)) for i in range(3))
     bounds = unclipped_bounds(rows, cutoff, near_plane)
     clipped = clipped_box(rows, bounds.outline, cutoff, near_plane)
@@ -137,12 +127,11 @@ def unclipped_bounds(M: Sequence[Sequence[Array]], cutoff: Array, near_plane: fl
 
 
 def clipped_box(M: Sequence[Sequence[Array]], outline: Outline, cutoff: Array, near_plane: float) -> Box:
-    """Return left, top, right and bottom of the polygon around a disc, cut at the near plane; element-wise.
-
-    The result is valid only if the outline is clipped.
-    """
+    """Return the box of the polygon around a disc, cut at the near plane; element-wise. It is valid only if the
+    outline is clipped."""
     angles = np.arange(POLYGON_SIDES) * (2 * np.pi / POLYGON_SIDES)
     reach = jnp.sqrt(jnp.maximum(cutoff, 0.0)) / math.cos(math.pi / POLYGON_SIDES)
+    # The disc lies within a regular polygon whose sides touch it, of reach r / cos(π/n).
     points = []
     for cosine, sine in zip(np.cos(angles).tolist(), np.sin(angles).tolist(), strict=True):
         u, v = reach * cosine, reach * sine
@@ -157,6 +146,7 @@ def clipped_box(M: Sequence[Sequence[Array]], outline: Outline, cutoff: Array, n
         x, y = jnp.where(is_valid, x / depth, mean_x), jnp.where(is_valid, y / depth, mean_y)
         return jnp.minimum(box[0], x), jnp.minimum(box[1], y), jnp.maximum(box[2], x), jnp.maximum(box[3], y)
 
+    # As Sutherland and Hodgman clip polygons: corners before the plane count, and edges where they cross it.
     for point, following in zip(points, points[1:] + points[:1], strict=True):
         is_before = point[2] >= near_plane
         box = joined(box, is_before, point)

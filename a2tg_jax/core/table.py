@@ -8,7 +8,8 @@ only a change of these, on the host, compiles a step again.
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
@@ -22,6 +23,8 @@ from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved
 
 Size = tuple[int, ...]
+Group = tuple[np.ndarray, np.ndarray]
+"""Indices [n] of Gaussians, and their blocks [n, T₁, …, C], all of one size."""
 KNOWN_SLACK = 1.25
 """Largest number of elements of a known shape, as a multiple of a new one's, for which it is taken."""
 
@@ -80,22 +83,8 @@ class Table:
         """Return blocks of the given sizes [N, D] that hold the C `values` everywhere (host); one of sides 0 takes no
         bytes."""
         places, capacities = plan_places(np.asarray(sizes))
-        value = jnp.asarray(values, dtype)
-        shapes = zip(capacities, places.bucket_sizes, strict=True)
-        return cls.placed(
-            [jnp.broadcast_to(value, (capacity, *size, len(values))) for capacity, size in shapes], places
-        )
-
-    @classmethod
-    def of_blocks(cls, blocks: Sequence[np.ndarray]) -> Self:
-        """Return the table of N arrays [T₁, …, C] of one dtype; the inverse of `blocks` (host)."""
-        sizes = np.array([block.shape[:-1] for block in blocks], np.int64).reshape(-1, cls.num_sides)
-        places, capacities = plan_places(sizes)
-        dtype = np.result_type(*blocks) if blocks else np.float32
-        shapes = zip(capacities, places.bucket_sizes, strict=True)
-        buckets = [cls._padded(capacity, size, dtype) for capacity, size in shapes]
-        for block, bucket, row in zip(blocks, np.asarray(places.bucket), np.asarray(places.row), strict=True):
-            buckets[bucket][row] = block
+        value, shapes = jnp.asarray(values, dtype), zip(capacities, places.bucket_sizes, strict=True)
+        buckets = [jnp.broadcast_to(value, (capacity, *size, len(values))) for capacity, size in shapes]
         return cls.placed(buckets, places)
 
     @classmethod
@@ -107,6 +96,68 @@ class Table:
     def _padded(cls, capacity: int, size: Size, dtype: DTypeLike, padding: Sequence[float] | None = None) -> np.ndarray:
         values = np.asarray(cls.padding if padding is None else padding, dtype)
         return np.broadcast_to(values, (capacity, *size, len(values))).copy()
+
+    @classmethod
+    def of_groups(cls, groups: Iterable[Group]) -> Self:
+        """Return the table of groups that together have each of N Gaussians once; the inverse of `groups` (host)."""
+        groups = [group for group in groups if len(group[0])]
+        sizes = np.zeros((sum(len(ids) for ids, _ in groups), cls.num_sides), np.int64)
+        for ids, blocks in groups:
+            sizes[ids] = blocks.shape[1:-1]
+        places, capacities = plan_places(sizes)
+        dtype = np.result_type(*(blocks for _, blocks in groups)) if groups else np.float32
+        shapes = zip(capacities, places.bucket_sizes, strict=True)
+        buckets, rows = [cls._padded(capacity, size, dtype) for capacity, size in shapes], np.asarray(places.row)
+        for ids, blocks in groups:
+            buckets[int(places.bucket[ids[0]])][rows[ids]] = blocks
+        return cls.placed(buckets, places)
+
+    def groups(self) -> list[Group]:
+        """Return a group for each bucket, its Gaussians ascending (host)."""
+        bucket, row = on_host(self.bucket), on_host(self.row)
+        ids = [np.flatnonzero(bucket == index) for index in range(len(self.buckets))]
+        return [(own, on_host(blocks)[row[own]]) for own, blocks in zip(ids, self.buckets, strict=True)]
+
+    @classmethod
+    def of_blocks(cls, blocks: Sequence[np.ndarray]) -> Self:
+        """Return the table of N arrays [T₁, …, C] of one dtype; the inverse of `blocks` (host)."""
+        sizes = np.array([block.shape[:-1] for block in blocks], np.int64).reshape(-1, cls.num_sides)
+        empty = np.zeros((0, len(cls.padding)), blocks[0].dtype if blocks else np.float32)
+        return cls.of_flat(sizes, np.concatenate([empty, *(block.reshape(-1, block.shape[-1]) for block in blocks)]))
+
+    def blocks(self) -> list[np.ndarray]:
+        """Return the N blocks as NumPy arrays [T₁, …, C], in the order of the Gaussians (host)."""
+        found = {
+            index: block for ids, blocks in self.groups() for index, block in zip(ids.tolist(), blocks, strict=True)
+        }
+        return [found[index] for index in range(self.num)]
+
+    @classmethod
+    def of_flat(cls, sizes: np.ndarray, elements: np.ndarray) -> Self:
+        """Return the table of sizes [N, D] and of what `flat` returned, which fits them (host)."""
+        places, _ = plan_places(sizes)
+        ends, groups = np.cumsum(sizes.prod(axis=1)), []
+        for index, size in enumerate(places.bucket_sizes):
+            ids = np.flatnonzero(np.asarray(places.bucket) == index)
+            rows = ends[ids, None] + np.arange(-math.prod(size), 0)
+            groups.append((ids, elements[rows].reshape(len(ids), *size, elements.shape[1])))
+        return cls.of_groups(groups)
+
+    def flat(self) -> np.ndarray:
+        """Return the elements [M, C] of all blocks, block after block, each row by row (host)."""
+        ends, dtype = np.cumsum(self.sizes.prod(axis=1)), self.buckets[0].dtype if self.buckets else np.float32
+        elements = np.zeros((ends[-1] if self.num else 0, len(self.padding)), dtype)
+        for ids, blocks in self.groups():
+            area = math.prod(blocks.shape[1:-1])
+            elements[ends[ids, None] + np.arange(-area, 0)] = blocks.reshape(len(ids), area, len(self.padding))
+        return elements
+
+    @classmethod
+    def joined(cls, tables: Sequence[Self]) -> Self:
+        """Return the blocks of several tables, one after the other (host)."""
+        starts = itertools.accumulate((table.num for table in tables), initial=0)
+        own = zip(tables, starts, strict=False)
+        return cls.of_groups((ids + start, blocks) for table, start in own for ids, blocks in table.groups())
 
     @property
     def num(self) -> int:
@@ -136,23 +187,6 @@ class Table:
         """Return the number of floats of the first `num` Gaussians, without padding (host)."""
         return len(self.padding) * self.count_elements(num)
 
-    def blocks(self) -> list[np.ndarray]:
-        """Return the N blocks as NumPy arrays [T₁, …, C], in the order of the Gaussians (host)."""
-        buckets = [on_host(bucket) for bucket in self.buckets]
-        places = zip(on_host(self.bucket), on_host(self.row), strict=True)
-        return [buckets[bucket][row] for bucket, row in places]
-
-    def flat(self) -> np.ndarray:
-        """Return the elements [M, C] of all blocks, block after block, each row by row (host)."""
-        blocks = [block.reshape(-1, block.shape[-1]) for block in self.blocks()]
-        return np.concatenate(blocks) if blocks else np.zeros((0, len(self.padding)), np.float32)
-
-    @classmethod
-    def of_flat(cls, sizes: np.ndarray, elements: np.ndarray) -> Self:
-        """Return the table of sizes [N, D] and of what `flat` returned, which fits them (host)."""
-        pieces = np.split(elements, np.cumsum(sizes.prod(axis=1))[:-1]) if len(sizes) else []
-        return cls.of_blocks([piece.reshape(*size, piece.shape[1]) for piece, size in zip(pieces, sizes, strict=True)])
-
     # Rows
 
     def gather(self, rows: Array | np.ndarray) -> Self:
@@ -180,24 +214,25 @@ class Table:
         """Return the blocks of the Gaussians `rows` [M], which may repeat, in buckets as small as they need (host).
         Padding is `padding` of the class, or C given numbers, such as zeros for moments."""
         places, capacities = plan_places(self.sizes[rows])
-        old = on_host(self.bucket)[rows], on_host(self.row)[rows]
-        moves = _moves_between(old, (np.asarray(places.bucket), np.asarray(places.row)))
-        padding = self.padding if padding is None else padding
-        return self.placed(_moved(type(self), self.buckets, moves, places.bucket_sizes, capacities, padding), places)
-
-    @classmethod
-    def joined(cls, tables: Sequence[Self]) -> Self:
-        """Return the blocks of several tables, one after the other (host)."""
-        return cls.of_blocks([block for table in tables for block in table.blocks()])
+        old, new = ((on_host(own.bucket), on_host(own.row)) for own in (self, places))
+        ends, padding = ((old[0][rows], old[1][rows]), new), padding or self.padding
+        return self.placed(_moved(type(self), self.buckets, ends, places.bucket_sizes, capacities, padding), places)
 
     def nearest_places(self) -> Self:
         """Return the table with int32 buckets and rows, each moved to the nearest one that exists; traced.
 
         `check_table` refuses such places where it can read them. Traced ones have no values to check.
         """
-        bucket = jnp.clip(_as_int32(self.bucket), 0, len(self.buckets) - 1)
+
+        def clipped(index: Array, last: Any) -> Array:
+            # Clipped to int32 first, which a negative uint or an int64 beyond it would wrap around in.
+            own, wanted = np.iinfo(index.dtype), np.iinfo(np.int32)
+            index = jnp.clip(index, max(wanted.min, own.min), min(wanted.max, own.max)).astype(jnp.int32)
+            return jnp.clip(index, 0, last)
+
+        bucket = clipped(self.bucket, len(self.buckets) - 1)
         last_rows = jnp.asarray([max(len(blocks) - 1, 0) for blocks in self.buckets], jnp.int32)
-        return dataclasses.replace(self, bucket=bucket, row=jnp.clip(_as_int32(self.row), 0, last_rows[bucket]))
+        return dataclasses.replace(self, bucket=bucket, row=clipped(self.row, last_rows[bucket]))
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -208,13 +243,11 @@ def is_table(leaf: object) -> bool:
     return isinstance(leaf, Table)
 
 
-def _as_int32(index: Array) -> Array:
-    """Return integers of any type as int32, clipped to its range."""
-    wanted, own = np.iinfo(np.int32), np.iinfo(index.dtype)
-    return jnp.clip(index, max(wanted.min, own.min), min(wanted.max, own.max)).astype(jnp.int32)
-
-
 # Places
+
+
+_Ends = tuple[np.ndarray, np.ndarray]
+"""Buckets and rows of blocks that move."""
 
 
 class Places(NamedTuple):
@@ -242,10 +275,9 @@ def plan_places(
     at most `KNOWN_SLACK` times the elements. The places are spread over the devices of an array `like`; None: they are
     on one.
     """
-    for shape in known:
-        check_kind("known", shape, Shape)
-    if room is not None:
-        check_kind("room", room, Shape)
+    for name, shape in [*(("known", own) for own in known), ("room", room)]:
+        if shape is not None:
+            check_kind(name, shape, Shape)
     # Codes of sizes ascend as the sizes do.
     weights = 64 ** np.arange(sizes.shape[1])[::-1]
     codes, bucket, counts = np.unique(sizes @ weights, return_inverse=True, return_counts=True)
@@ -253,9 +285,8 @@ def plan_places(
     starts = np.repeat(np.cumsum(counts) - counts, counts)
     row = np.empty(len(sizes), np.int32)
     row[order] = np.arange(len(sizes)) - starts
-    needed = {
-        tuple(int(code // weight % 64) for weight in weights): int(n) for code, n in zip(codes, counts, strict=True)
-    }
+    sides = map(tuple, (codes[:, None] // weights % 64).tolist())
+    needed: dict[Size, int] = dict(zip(sides, counts.tolist(), strict=True))
     # Without Gaussians, one bucket of no blocks keeps the number of sides and the dtype.
     new = Shape(tuple(needed), tuple(map(bucket_capacity, needed.values())))
 
@@ -276,12 +307,10 @@ def plan_places(
 
 
 class Resized(NamedTuple):
-    """Result of `resize`."""
+    """Result of `resize`: a table of the given class, and the moments with their tables rebuilt as it was."""
 
     table: Any
-    """The blocks at their new sizes, a `Table` of the given class."""
     moments: Any
-    """Moments as given, their tables rebuilt as the blocks were."""
 
 
 def resize(
@@ -299,15 +328,14 @@ def resize(
     stay. Of blocks that are not `kept` [N] they become 0. `known` and `room` are as for `plan_places`.
     """
     places, capacities = plan_places(sizes, known, like=table.bucket, room=room)
-    ends = (on_host(table.bucket), on_host(table.row)), (on_host(places.bucket), on_host(places.row))
-    moves = kept_moves = _moves_between(*ends)
+    ends = [(on_host(own.bucket), on_host(own.row)) for own in (table, places)]
     if kept is not None:
         check_mask("kept", kept, (table.num,))
-        kept_moves = _moves_between(*((bucket[kept], row[kept]) for bucket, row in ends))
-    own = type(table)
+    own, chosen = type(table), slice(None) if kept is None else kept
+    kept_ends = [(bucket[chosen], row[chosen]) for bucket, row in ends]
 
-    def rebuilt(old: Table, moves: list[_Move], padding: Sequence[float]) -> Table:
-        targets = _moved(own, old.buckets, moves, places.bucket_sizes, capacities, padding)
+    def rebuilt(old: Table, ends: list[_Ends], padding: Sequence[float]) -> Table:
+        targets = _moved(own, old.buckets, ends, places.bucket_sizes, capacities, padding)
         whole = own.placed([placed_like(target, table.bucket) for target in targets], places)
         return partition(whole)[0] if old.bucket is None else whole  # Moments are floats only.
 
@@ -318,42 +346,28 @@ def resize(
             raise ValueError(f"moments must have the buckets of the table; got {leaf}")
         for index, (moment, blocks) in enumerate(zip(leaf.buckets, table.buckets, strict=True)):
             check_shape(f"moments.buckets[{index}]", moment, blocks.shape)
-        return rebuilt(leaf, kept_moves, (0.0,) * len(own.padding))
+        return rebuilt(leaf, kept_ends, (0.0,) * len(own.padding))
 
     moments = jax.tree.map(rebuilt_moments, moments, is_leaf=lambda leaf: isinstance(leaf, own))
-    return Resized(rebuilt(table, moves, own.padding), moments)
-
-
-_Move = tuple[int, int, np.ndarray, np.ndarray]
-"""Old bucket and new bucket, old rows and new rows of the blocks that go from one to the other."""
-
-
-def _moves_between(old: tuple[np.ndarray, np.ndarray], new: tuple[np.ndarray, np.ndarray]) -> list[_Move]:
-    """Return the moves between (bucket, row) of blocks before and after, one for each pair of buckets; old ones
-    ascend."""
-    (old_bucket, old_row), (new_bucket, new_row) = old, new
-    base = int(new_bucket.max(initial=0)) + 1
-    pairs = old_bucket.astype(np.int64) * base + new_bucket
-    order = np.argsort(pairs, kind="stable")
-    codes, starts = np.unique(pairs[order], return_index=True)
-    groups = np.split(order, starts[1:]) if len(codes) else []
-    found = zip(codes.tolist(), groups, strict=True)
-    return [(code // base, code % base, old_row[group], new_row[group]) for code, group in found]
+    return Resized(rebuilt(table, ends, own.padding), moments)
 
 
 def _moved(
-    kind: type[Table], buckets: Sequence[Any], moves: list[_Move], sizes: Sequence[Size], capacities: Sequence[int],
-    padding: Sequence[float],
+    kind: type[Table], buckets: Sequence[Any], ends: Sequence[_Ends], sizes: Sequence[Size],
+    capacities: Sequence[int], padding: Sequence[float],
 ) -> list[np.ndarray]:  # fmt: skip
-    """Return new buckets of given sizes and capacities, with the blocks that moves bring from the old ones."""
+    """Return new buckets of given sizes and capacities, with blocks moved from old to new (bucket, row)."""
     dtype = buckets[0].dtype if buckets else np.float32
     targets = [kind._padded(capacity, size, dtype, padding) for capacity, size in zip(capacities, sizes, strict=True)]
-    # Each old bucket is read once, one after the other.
-    for old_bucket, own in itertools.groupby(moves, key=lambda move: move[0]):
-        if buckets[old_bucket].size:
-            source = on_host(buckets[old_bucket])
-            for _, new_bucket, old_rows, new_rows in own:
-                targets[new_bucket][new_rows] = kind.resized(source[old_rows], sizes[new_bucket])
+    (old_bucket, old_row), (new_bucket, new_row) = ends
+    for index, bucket in enumerate(buckets):
+        from_here = np.flatnonzero(old_bucket == index)
+        if not bucket.size or not len(from_here):
+            continue
+        source = on_host(bucket)  # Each old bucket is read once, one after the other.
+        for target in np.unique(new_bucket[from_here]).tolist():
+            own = from_here[new_bucket[from_here] == target]
+            targets[target][new_row[own]] = kind.resized(source[old_row[own]], sizes[target])
     return targets
 
 
@@ -374,12 +388,12 @@ def check_table(table: Table, num: int | None = None, name: str = "textures") ->
     if len(table.buckets) != len(table.bucket_sizes):
         counts = f"{len(table.buckets)} buckets and {len(table.bucket_sizes)} sizes"
         raise ValueError(f"{name} must have one bucket for each of bucket_sizes; they have {counts}")
-    for index, (bucket, size) in enumerate(zip(table.buckets, table.bucket_sizes, strict=True)):
-        check_array(f"{name}.buckets[{index}]", bucket)
-        check_floats(f"{name}.buckets[{index}]", bucket, ("capacity", *size, len(table.padding)))
-    for field in ("bucket", "row"):
-        if not jnp.issubdtype(getattr(table, field).dtype, jnp.integer):
-            raise ValueError(f"{name}.{field} must be integers; got {getattr(table, field).dtype}")
+    for number, (bucket, size) in enumerate(zip(table.buckets, table.bucket_sizes, strict=True)):
+        check_array(f"{name}.buckets[{number}]", bucket)
+        check_floats(f"{name}.buckets[{number}]", bucket, ("capacity", *size, len(table.padding)))
+    for field, index in (("bucket", table.bucket), ("row", table.row)):
+        if not jnp.issubdtype(index.dtype, jnp.integer):
+            raise ValueError(f"{name}.{field} must be integers; got {index.dtype}")
     if table.num and not any(len(bucket) for bucket in table.buckets):
         raise ValueError(f"{name} must have a row for each of {table.num} Gaussians; all buckets are empty")
     if not table.num or any(isinstance(leaf, jax.core.Tracer) for leaf in (table.bucket, table.row)):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from a2tg_jax.core.capture_geometry import nearest_point
+from a2tg_jax.core.camera_paths import nearest_point
 from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, check_test_every, every_kth, rigid_viewmat

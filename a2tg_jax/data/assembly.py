@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.core.camera_paths import LEAST_FACING, nearest_point
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
-from a2tg_jax.core.capture_geometry import LEAST_FACING, nearest_point
 from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.depths import DepthMap

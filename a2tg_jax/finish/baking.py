@@ -3,22 +3,20 @@
 Textures shrink where that changes pictures least, until a splat per texel makes few enough splats. Each textured
 Gaussian then becomes a grid of smaller ones in its plane: texel j of an axis takes the Gaussian with the mass, mean and
 variance of w_j(u)·exp(−u²/2), w_j being the texel's bilinear kernel. The kernels add up to 1, so that the smaller
-Gaussians add up to about the large one. Their opacities are such that their optical depths −log(1 − alpha) add up to
-that of the textured splat at each of their centres, with the kernel that it has; a splat of one texel becomes the
-Gaussian nearest to its kernel. Splats smaller than a pixel are still drawn a pixel wide. Training on pictures of the
-textured model, without photographs, therefore follows.
+Gaussians add up to about the large one. At each of their centres, their optical depths −log(1 − alpha) add up to the
+depth of the textured splat with its kernel; a splat of one texel becomes the Gaussian nearest to its kernel. Splats
+smaller than a pixel are still drawn a pixel wide. Training on pictures of the textured model, without photographs,
+therefore follows.
 """
 
 import dataclasses
 import functools
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from a2tg_jax.appearance.parts import MAX_DEGREE, curves_of, falloff_of, nearest_gaussians, texel_coordinates
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
@@ -29,7 +27,7 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.assembly import scene_scale
 from a2tg_jax.data.scene import Scene, View
-from a2tg_jax.finish.shrinking import Tables, fewest_texels, texel_weights
+from a2tg_jax.finish.shrinking import fewest_texels, texel_weights
 from a2tg_jax.io.other_programs import plain_gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
@@ -44,7 +42,7 @@ ITERATIONS = 500
 MOST_VIEWS = 12
 """Largest number of views, evenly chosen, by which it is judged where texels and spherical harmonics matter."""
 LEAST_ALPHA, MOST_ALPHA = 1 / 255, 0.99
-"""Alphas of splats: fainter ones are left out, others are at most so opaque."""
+"""Alphas of splats: fainter ones are left out, others are at most this opaque."""
 SAME_PSNR = 38.0
 """PSNR in dB against the whole model above which higher degrees of spherical harmonics are left out."""
 
@@ -100,7 +98,17 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
     weights = texel_weights(model, cameras, model.background)
     tables = fewest_texels(model.appearance.texture.shown(), weights, most)
     whole = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh[:, : NUM_BASES[degree]]))
-    return as_plain(_split(whole, model.appearance.shapes, tables, options.uv), model)
+    pieces, shapes, uv = [], model.appearance.shapes, options.uv
+    for ids, texels in tables:
+        parents, own, size = whole[ids], None if shapes is None else np.asarray(shapes)[ids], texels.shape[1:3]
+        if own is not None and size == (1, 1):
+            parents, own = nearest_gaussians(parents, own), None
+        axes = [kernels(side, uv) for side in size]
+        at_centers = [_weights(means, side, uv) for (means, _), side in zip(axes, size, strict=True)]
+        pieces.append(_grid(parents, own, np.einsum("ntsc,tv,su->nvuc", texels, *at_centers), *axes))
+    joined: Gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *pieces)
+    is_seen = np.asarray(joined.opacities) >= LEAST_ALPHA
+    return as_plain(joined[is_seen if is_seen.any() else slice(None)], model)
 
 
 def as_plain(gaussians: Gaussians, model: Model) -> Model:
@@ -120,11 +128,8 @@ def least_degree(model: Model, cameras: Sequence[Camera]) -> int:
     return highest
 
 
-class Kernels(NamedTuple):
-    """Gaussians along an axis that add up to exp(−u²/2), one for each of n texels."""
-
-    means: np.ndarray
-    scales: np.ndarray
+Kernels = tuple[np.ndarray, np.ndarray]
+"""Means and scales of Gaussians along an axis that add up to exp(−u²/2), one for each of n texels."""
 
 
 @functools.cache
@@ -134,29 +139,13 @@ def kernels(num: int, convention: str) -> Kernels:
     weights = _weights(u, num, convention) * np.exp(-0.5 * u * u)
     masses = weights.sum(axis=1)
     means = weights @ u / masses
-    return Kernels(means, np.sqrt(weights @ (u * u) / masses - means**2))
+    return means, np.sqrt(weights @ (u * u) / masses - means**2)
 
 
 def _weights(u: np.ndarray, num: int, convention: str) -> np.ndarray:
     """Return the bilinear weights [num, Q] of texels at points of an axis."""
     place = np.asarray(texel_coordinates(jnp.asarray(u), jnp.asarray(float(num)), convention), np.float64)
     return np.maximum(0.0, 1 - np.abs(place[None] - np.arange(num)[:, None]))
-
-
-def _split(gaussians: Gaussians, shapes: Array | None, tables: Tables, convention: str) -> Gaussians:
-    """Return the Gaussians of all splats, given the shapes [N] of their kernels if they are not Gaussians."""
-    pieces = []
-    for ids, texels in tables:
-        parents, own, size = gaussians[ids], None if shapes is None else np.asarray(shapes)[ids], texels.shape[1:3]
-        if own is not None and size == (1, 1):
-            parents, own = nearest_gaussians(parents, own), None
-        axes = [kernels(side, convention) for side in size]
-        weights = [_weights(axis.means, side, convention) for axis, side in zip(axes, size, strict=True)]
-        shown = np.einsum("ntsc,tv,su->nvuc", texels, *weights)  # At the centres of the splats.
-        pieces.append(_grid(parents, own, shown, *axes))
-    joined: Gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *pieces)
-    is_seen = np.asarray(joined.opacities) >= LEAST_ALPHA
-    return joined[is_seen if is_seen.any() else slice(None)]
 
 
 def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: Kernels, u: Kernels) -> Gaussians:
@@ -166,7 +155,7 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
         np.stack(np.broadcast_arrays(own_u[None, :], own_v[:, None]), -1).reshape(-1, 2)
         for own_u, own_v in zip(u, v, strict=True)
     )
-    rho = v.means[:, None] ** 2 + u.means[None, :] ** 2
+    rho = v[0][:, None] ** 2 + u[0][None, :] ** 2
     if shapes is None:
         falloff = np.exp(-0.5 * rho)
     else:
@@ -175,8 +164,8 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
     depths = -np.log1p(-np.clip(shown, 0, MOST_ALPHA))
     # Each Gaussian reaches the centres of the others: the inverse of these shares, axis by axis, gives its own depth.
     unmixed = [
-        np.linalg.inv(np.exp(-0.5 * ((axis.means[:, None] - axis.means[None, :]) / axis.scales[None, :]) ** 2))
-        for axis in (v, u)
+        np.linalg.inv(np.exp(-0.5 * ((means[:, None] - means[None, :]) / widths[None, :]) ** 2))
+        for means, widths in (v, u)
     ]
     own = np.einsum("vw,nwx,xu->nvu", unmixed[0], depths, unmixed[1].T)
     alphas = np.clip(1 - np.exp(-np.maximum(own, 0)), 1e-6, MOST_ALPHA).reshape(-1)
@@ -202,16 +191,10 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
 def distill(
     model: Model, wanted: Model, cameras: Sequence[Camera], *, iterations: int, progress: bool = False
 ) -> Model:
-    """Return a plain model after training on pictures of another one; the number of Gaussians stays.
+    """Return a plain model after training on pictures of another one in its world; the number of Gaussians stays.
 
-    Both are drawn over black or white, whichever is nearer to the other model's background.
-
-    Args:
-      model: of plain Gaussians, in the world of the other.
-      wanted: any model.
-      cameras: views to draw, at least one.
-      iterations: each draws one view.
-      progress: show a progress bar.
+    Both are drawn over black or white, whichever is nearer to the other model's background. Each iteration draws one of
+    the cameras' views.
     """
     highest = model.gaussians.sh_degree
     behind: Background = "white" if np.mean(wanted.background) > 0.5 else "black"
@@ -228,7 +211,7 @@ def drawn_scene(model: Model, cameras: Sequence[Camera], background: Color) -> S
     points = np.asarray(model.gaussians.means, np.float32)
     world = Similarity(1.0, np.eye(3), np.zeros(3)) if model.origin is None else model.origin.transform
     centers = camera_centers(np.array([camera.viewmat for camera in cameras], np.float64))
-    # Cameras in one place have no extent: the distance of what they see takes its place.
+    # Cameras in one place have no extent: the distance of the points is used instead.
     scale = scene_scale(centers) or float(np.median(np.linalg.norm(points - centers[0], axis=1)))
     return Scene("drawn", views, (), points, np.zeros_like(points), world, scale)
 

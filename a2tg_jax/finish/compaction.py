@@ -50,12 +50,9 @@ class Trial:
     """A file, measured."""
 
     choices: CompactChoices
-    num_bytes: int
-    """Bytes on disk."""
-    losses: tuple[float, ...]
-    """dB, by each measure of loss."""
-    group: str = ""
-    """Group that is coarser than the rest, if any."""
+    num_bytes: int  # On disk.
+    losses: tuple[float, ...]  # dB, by each measure of loss.
+    group: str = ""  # Group that is coarser than the rest, if any.
 
     @property
     def precision(self) -> Precision:
@@ -141,7 +138,7 @@ def try_choices(model: Model, choices: CompactChoices, losses: Sequence[Loss], g
 
 
 def finest_choices(ladder: Ladder = LADDER) -> CompactChoices:
-    """Return the last of each group."""
+    """Return the last step of each group."""
     return CompactChoices().keeping({group: steps[-1] for group, steps in ladder.items()})
 
 
@@ -167,7 +164,7 @@ def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDE
 
 
 class TooMuchLostError(ValueError):
-    """No file loses as little as is asked for."""
+    """No file loses as little as allowed."""
 
 
 def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trials: Sequence[Trial]) -> Trial:

@@ -34,12 +34,9 @@ HIGHEST_DEGREE = 3
 class Colors(NamedTuple):
     """Colours, in which a picture is linear."""
 
-    sh: Array
-    """[N, K, 3] of the Gaussians."""
-    bands: Any
-    """Coefficients of higher degrees, or ()."""
-    rgb: tuple[Array, ...]
-    """[capacity, Tv, Tu, 3] of each bucket of textures."""
+    sh: Array  # [N, K, 3] of the Gaussians.
+    bands: Any  # Coefficients of higher degrees, or ().
+    rgb: tuple[Array, ...]  # [capacity, Tv, Tu, 3] of each bucket of textures.
 
 
 class Targets(NamedTuple):
@@ -47,12 +44,9 @@ class Targets(NamedTuple):
 
     viewmats: Array
     Ks: Array
-    images: Array
-    """[V, H, W, 3] over the background."""
-    weights: Array
-    """[V, H, W, 1]: 1 where a pixel counts, else 0; [V, 1, 1, 1] if all do."""
-    rays: Array | None = None
-    """[H, W, 2] rays of the lens; None of a pinhole."""
+    images: Array  # [V, H, W, 3] over the background.
+    weights: Array  # [V, H, W, 1]: 1 where a pixel counts, else 0; [V, 1, 1, 1] if all do.
+    rays: Array | None = None  # [H, W, 2] rays of the lens; None for a pinhole.
 
 
 def polish(
@@ -99,12 +93,7 @@ def polish(
 
 
 def _solve(
-    model: Model,
-    groups: list[Targets],
-    background: Array,
-    settings: RenderSettings,
-    num_steps: int,
-    ridge: ArrayLike,
+    model: Model, groups: list[Targets], background: Array, settings: RenderSettings, num_steps: int, ridge: ArrayLike
 ) -> Colors:
     """Return the changes of the colours."""
     nothing = jax.tree.map(jnp.zeros_like, colors_of(model))

@@ -23,11 +23,11 @@ from a2tg_jax.appearance import in_words
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.origin import Color
+from a2tg_jax.core.table import Group
 from a2tg_jax.data import View
 from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.finish.compaction import loss_on_views
 from a2tg_jax.model import Model, check_is_model
-from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, Textures
@@ -87,14 +87,10 @@ def can_shrink(model: Model) -> bool:
 class Step(NamedTuple):
     """One step for each texture, of N."""
 
-    gaussians: Gaussians
-    """Gaussians after absorbing their 1×1 textures."""
-    texels: list[np.ndarray]
-    """N textures [Tv, Tu, 4]."""
-    cost: np.ndarray
-    """[N] estimated growth of the squared error."""
-    saved: np.ndarray
-    """[N] bytes."""
+    gaussians: Gaussians  # After absorbing their 1×1 textures.
+    textures: Textures  # [2N] before all steps, and after them.
+    cost: np.ndarray  # [N] estimated growth of the squared error.
+    saved: np.ndarray  # [N] bytes.
 
 
 def _cheapest(model: Model, step: Step, is_allowed: Callable[[Model], bool]) -> Model:
@@ -105,9 +101,7 @@ def _cheapest(model: Model, step: Step, is_allowed: Callable[[Model], bool]) -> 
     least, most, best = 0, len(order), model
     while least < most:
         middle = (least + most + 1) // 2
-        is_chosen = np.zeros(model.num, bool)
-        is_chosen[order[:middle]] = True
-        found = taken(model, step, is_chosen)
+        found = taken(model, step, np.isin(np.arange(model.num), order[:middle]))
         if is_allowed(found):
             least, best = middle, found
         else:
@@ -126,40 +120,37 @@ def halve_textures(model: Model, weights: Textures) -> Step:
     """
     assert model.textures is not None
     textures, gaussians = model.textures, model.gaussians
-    halved, cost = textures.blocks(), np.zeros(textures.num)
-    single = np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
-    for index, size in enumerate(textures.bucket_sizes):
-        ids, rows = _rows_of(textures, index)
-        old, own = (np.asarray(tree.buckets[index])[rows] for tree in (textures, weights))
-        if size == (1, 1):
-            single[ids] = old[:, 0, 0]
-            for gaussian in ids:
-                halved[gaussian] = old[0, :0, :0]
-        axes = [axis for axis, side in enumerate(size, 1) if side > 1 and side % 2 == 0]
-        for chosen, smaller, _, costs in _halved(ids, old, own + LEAST_WEIGHT, axes):
+    halved: list[Group] = []
+    cost, single = np.zeros(textures.num), np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
+    for (ids, texels), (_, own) in zip(textures.groups(), weights.groups(), strict=True):
+        axes = [axis for axis in (1, 2) if texels.shape[axis] > 1 and texels.shape[axis] % 2 == 0]
+        for chosen, smaller, _, costs in _halved(ids, texels, own + LEAST_WEIGHT, axes):
             cost[chosen] = costs
-            for gaussian, texels in zip(chosen, smaller, strict=True):
-                halved[gaussian] = texels
+            halved.append((chosen, smaller))
+        if texels.shape[1:3] == (1, 1):
+            single[ids] = texels[:, 0, 0]
+            halved.append((ids, texels[:, :0, :0]))
+        elif not axes:
+            halved.append((ids, texels))
     sh = np.array(gaussians.sh, np.float64)
     sh[:, 0] += single[:, :3] / SH_C0
     opacities = np.clip(np.asarray(gaussians.opacities, np.float64) * single[:, 3], LEAST_OPACITY, 1 - LEAST_OPACITY)
     logits = np.where(single[:, 3] == 1, np.asarray(gaussians.logit_opacities), np.log(opacities / (1 - opacities)))
     dtype = gaussians.means.dtype
     absorbed = dataclasses.replace(gaussians, sh=jnp.asarray(sh, dtype), logit_opacities=jnp.asarray(logits, dtype))
-    areas = np.asarray([texels.shape[0] * texels.shape[1] for texels in halved])
-    return Step(absorbed, halved, cost, BYTES_PER_TEXEL * (textures.sizes.prod(axis=1) - areas))
+    after = Textures.of_groups(halved)
+    saved = BYTES_PER_TEXEL * (textures.sizes.prod(axis=1) - after.sizes.prod(axis=1))
+    return Step(absorbed, Textures.joined([textures, after]), cost, saved)
 
 
 def taken(model: Model, step: Step, is_chosen: np.ndarray) -> Model:
     """Return the model in which the chosen Gaussians [N] have taken their step (host)."""
-    assert model.textures is not None
-    states = zip(is_chosen, model.textures.blocks(), step.texels, strict=True)
-    textures = Textures.of_blocks([after if is_taken else before for is_taken, before, after in states])
 
     def chosen(before: Array, after: Array) -> Array:
         return jnp.where(is_chosen.reshape(-1, *[1] * (before.ndim - 1)), after, before)
 
     gaussians = jax.tree.map(chosen, model.gaussians, step.gaussians)
+    textures = step.textures.take(np.arange(model.num) + model.num * is_chosen)
     return dataclasses.replace(model, gaussians=gaussians).with_textures(textures)
 
 
@@ -168,37 +159,31 @@ def texel_weights(model: Model, cameras: Sequence[Camera], background: ArrayLike
     assert model.textures is not None
     settings = plan_render(model, cameras)
     background = jnp.asarray(background, model.gaussians.means.dtype)
-    total = tuple(map(jnp.zeros_like, model.textures.buckets))
-    weights_in = jax.jit(_weights_in, static_argnums=(4,))
+
+    def weights_in(model: Model, camera: Camera, background: Array, key: Array) -> tuple[Array, ...]:
+        """Return the weights from one view, bucket by bucket."""
+        textures = model.textures
+        assert textures is not None
+
+        def draw(buckets: tuple[Array, ...]) -> Array:
+            shown = model.with_textures(dataclasses.replace(textures, buckets=buckets))
+            drawn = shown.gaussians, camera, shown.appearance, background, settings
+            return render_traced(*drawn, has_geometry=False)[0].color
+
+        color, back = jax.vjp(draw, textures.buckets)
+        (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
+        return tuple(map(jnp.square, slopes))
+
+    total, jitted = tuple(map(jnp.zeros_like, model.textures.buckets)), jax.jit(weights_in)
     for index, camera in enumerate(cameras):
-        total = jax.tree.map(jnp.add, total, weights_in(model, camera, background, jax.random.key(index), settings))
+        total = jax.tree.map(jnp.add, total, jitted(model, camera, background, jax.random.key(index)))
     return dataclasses.replace(model.textures, buckets=total)
-
-
-def _weights_in(
-    model: Model, camera: Camera, background: Array, key: Array, settings: RenderSettings
-) -> tuple[Array, ...]:
-    """Return the weights from one view, bucket by bucket."""
-    textures = model.textures
-    assert textures is not None
-
-    def draw(buckets: tuple[Array, ...]) -> Array:
-        shown = model.with_textures(dataclasses.replace(textures, buckets=buckets))
-        output, _ = render_traced(shown.gaussians, camera, shown.appearance, background, settings, has_geometry=False)
-        return output.color
-
-    color, back = jax.vjp(draw, textures.buckets)
-    (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
-    return tuple(map(jnp.square, slopes))
 
 
 # Textures of few texels in all
 
-Tables = list[tuple[np.ndarray, np.ndarray]]
-"""Indices [n] of Gaussians, and their textures [n, Tv, Tu, C]; one table or more for each size."""
 
-
-def fewest_texels(textures: Textures, weights: Textures, most: int) -> Tables:
+def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Group]:
     """Return textures that have `most` texels at most in all, at least one each, a table for each size (host).
 
     Each texture has a row of halvings down to one texel. Of all rows together, those are taken that change least per
@@ -209,20 +194,19 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> Tables:
       weights: the visibility of each texel, as `texel_weights` gives it.
       most: at least N.
     """
-    start: Tables = []
-    for index, size in enumerate(textures.bucket_sizes):
-        ids, rows = _rows_of(textures, index)
+    start: list[Group] = []
+    for (ids, texels), (_, squares) in zip(textures.groups(), weights.groups(), strict=True):
         own = np.tile(np.asarray([*NEUTRAL_TEXEL, LEAST_WEIGHT]), (len(ids), 1, 1, 1))
-        if min(size) > 0:
-            texels, squares = (np.asarray(tree.buckets[index], np.float64)[rows] for tree in (textures, weights))
+        if texels.size:
             # The visibility becomes a fifth channel, which is added up where texels are joined.
-            own = np.concatenate([texels, squares.sum(axis=-1, keepdims=True) + LEAST_WEIGHT], axis=-1)
+            visible = squares.astype(np.float64).sum(axis=-1, keepdims=True) + LEAST_WEIGHT
+            own = np.concatenate([texels.astype(np.float64), visible], axis=-1)
         start.append((ids, own))
     start = tables = _merged(start)
     steps: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int),) * 4]
     least, number = np.zeros(textures.num), 0
     while tables := [table for table in tables if table[1].shape[1:3] != (1, 1)]:
-        smaller: Tables = []
+        smaller: list[Group] = []
         for ids, texels in tables:
             for chosen, halved, cost in _halved_table(ids, texels):
                 saved = texels[0, ..., 0].size - halved[0, ..., 0].size
@@ -237,7 +221,7 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> Tables:
     count = int(np.searchsorted(np.cumsum(saved_texels[order]), excess)) + 1 if excess > 0 else 0
     rounds, tables = np.bincount(ids[order[:count]], minlength=textures.num), start
     for index in range(int(rounds.max(initial=0))):
-        moved: Tables = []
+        moved: list[Group] = []
         for ids, texels in tables:
             is_own = rounds[ids] > index
             moved.append((ids[~is_own], texels[~is_own]))
@@ -246,9 +230,9 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> Tables:
     return [(ids, texels[..., :4]) for ids, texels in tables]
 
 
-def _merged(tables: Tables) -> Tables:
+def _merged(tables: list[Group]) -> list[Group]:
     """Return one table for each size, ascending."""
-    by_size: dict[Any, Tables] = {}
+    by_size: dict[Any, list[Group]] = {}
     for ids, texels in tables:
         if len(ids):
             by_size.setdefault(texels.shape[1:3], []).append((ids, texels))
@@ -261,15 +245,6 @@ def _halved_table(ids: np.ndarray, texels: np.ndarray) -> Iterator[tuple[np.ndar
     axes = [axis for axis in (1, 2) if texels.shape[axis] > 1]
     for chosen, smaller, weights, cost in _halved(ids, texels[..., :4], texels[..., 4:], axes):
         yield chosen, np.concatenate([smaller, weights], axis=-1), cost
-
-
-# What both share
-
-
-def _rows_of(textures: Textures, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Gaussians of a bucket, and their rows in it."""
-    ids = np.flatnonzero(np.asarray(textures.bucket) == index)
-    return ids, np.asarray(textures.row)[ids]
 
 
 def _halved(

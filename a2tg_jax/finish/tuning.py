@@ -15,12 +15,10 @@ from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import in_words, template_of
 from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MAX_DEGREE, MOST_SHARE
-from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, logit
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
@@ -61,10 +59,8 @@ class Steps(NamedTuple):
 
     first: Any
     size: Any
-    last: Any
-    """Number of the last step, from 0."""
-    contraction: tuple[Any, ...]
-    """Centre and spread, or ()."""
+    last: Any  # Number of the last step, from 0.
+    contraction: tuple[Any, ...]  # Centre and spread, or ().
 
     @classmethod
     def of(cls, ends: Sequence[float], bits: int) -> Self:
@@ -94,12 +90,7 @@ class GridRounding:
 
     @classmethod
     def to(cls, grids: Grids, choices: CompactChoices) -> Self:
-        """Return the rounding to given grids (host).
-
-        Args:
-          grids: ends of the groups that are kept in bits (`io.compact.grids_of`).
-          choices: the bits.
-        """
+        """Return the rounding to grids, the ends of the groups that are kept in bits (`io.compact.grids_of`) (host)."""
         steps: dict[str, Any] = {}
         for name, ends in grids.items():
             bits = choices.of_part(name)
@@ -187,13 +178,8 @@ class GradualRounding(StepEvent):
 
 
 def partly_rounded(rounding: GridRounding, model: Model, is_rounded: Model) -> Model:
-    """Return the model with some numbers rounded; traced.
-
-    Args:
-      rounding: of all numbers.
-      model: as `half_turned` gives it, with numbers that may have changed since.
-      is_rounded: bool, in the shapes of the model's floats; w of a quaternion follows from its other numbers.
-    """
+    """Return a model of `half_turned` with some numbers rounded, given bools in the shapes of its floats; traced. w of
+    a quaternion follows from its other numbers."""
     (rounded, _), (before, rest) = partition(rounding(model)), partition(model)
     chosen: Model = jax.tree.map(jnp.where, is_rounded, rounded, before)
     if "quats" in rounding.steps:
@@ -276,7 +262,7 @@ def tune_compact(
         iterations=iterations,
         rates=dataclasses.replace(stage.rates, means=RATE_OF_MEANS * stage.rates.means),
         events=(GradualRounding(GridRounding.to(grids, choices)),),
-        corrections=tuple(map(_Constant, stage.corrections)),
+        corrections=tuple(_held(type(own))(**own.__dict__) for own in stage.corrections),  # type: ignore[arg-type]
         raises_sh_degree=False,
         cools_down=True,
     )
@@ -299,45 +285,27 @@ class _OneStage(System):
         self.stage.check()
 
 
-@pytree
-class _Constant(Correction):
-    """A correction that no longer learns."""
+@functools.cache
+def _held(kind: type[Correction]) -> type[Correction]:
+    """Return a subclass of a correction whose rows no longer change."""
 
-    learned: Correction
+    @pytree
+    class Held(kind):  # type: ignore[misc, valid-type]
+        penalty, project = Correction.penalty, Correction.project
 
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        return self.learned.name
+        def learning_rate(self, progress: Array) -> Array:
+            return jnp.zeros_like(progress)
 
-    @property
-    def bytes_per_pixel(self) -> float:  # type: ignore[override]
-        return self.learned.bytes_per_pixel
-
-    @property
-    def neutral(self) -> np.ndarray:
-        return self.learned.neutral
-
-    def learning_rate(self, progress: Array) -> Array:
-        return jnp.zeros_like(progress)
-
-    def camera(self, row: Array, camera: Camera) -> Camera:
-        return self.learned.camera(row, camera)
-
-    def color(self, row: Array, color: Array) -> Array:
-        return self.learned.color(row, color)
+    return Held
 
 
 class TunedFiles(NamedTuple):
     """Result of `smallest_tuned`."""
 
-    tried: list[Trial]
-    """All files of tuned models."""
-    chosen: Trial | None = None
-    """The smallest one within the loss; None if there is none."""
-    tuned: Tuned | None = None
-    """The model of that file."""
-    diverged: str | None = None
-    """Error that ended the search; None: it came to its end."""
+    tried: list[Trial]  # All files of tuned models.
+    chosen: Trial | None = None  # The smallest one within the loss; None if there is none.
+    tuned: Tuned | None = None  # The model of that file.
+    diverged: str | None = None  # Error that ended the search; None: it came to its end.
 
 
 Tune = Callable[[Model, CompactChoices, int], Tuned]
@@ -358,7 +326,7 @@ def smallest_tuned(
       model: the model.
       losses: measures of loss.
       max_loss: in dB, by the first measure, of the tuned model's file against `model`.
-      trials: results of `measure_choices`, as with `TUNED_LADDER`.
+      trials: results of `measure_choices`, such as with `TUNED_LADDER`.
       tune: tunes a model for choices.
     """
     found, latest = TunedFiles([]), model

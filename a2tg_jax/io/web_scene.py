@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from a2tg_jax.appearance import TextureOptions, in_words
 from a2tg_jax.appearance.parts import log_exponents_of, shapes_of
-from a2tg_jax.core.capture_geometry import central_camera
+from a2tg_jax.core.camera_paths import central_camera
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.io.columns import (

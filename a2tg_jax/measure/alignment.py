@@ -1,7 +1,7 @@
 """Alignment of test views before they are scored: their colours by least squares, their poses by descent.
 
-A model that was trained with exposures or refined poses is right up to those of a photograph that it has never seen. As
-is the custom, these few numbers of a test photograph are found from itself, with the model held.
+A model that was trained with exposures or refined poses lacks those of a test photograph. As is the custom, these few
+numbers are fitted to the test photograph itself, with the model held.
 """
 
 import dataclasses
@@ -30,8 +30,7 @@ from a2tg_jax.training.losses import SSIM_WINDOW, photometric_loss
 NUM_STEPS = 100
 FIRST_RATE = 2e-3
 LAST_RATE = 2e-5
-"""Learning rate in radians and units of the normalised world; the rate falls
-exponentially, and all steps together lead some 2.5°."""
+"""Learning rate in radians and units of the normalised world, which falls exponentially: 2.5° in all steps together."""
 HEAD_ROOM = 1.5
 
 
@@ -76,11 +75,11 @@ def align_poses(
     so that no loss becomes worse.
 
     Args:
-      views: near their places.
-      model: held.
+      views: views near their true poses.
+      model: the model, which stays fixed.
       background: [3] colour; None is the model's own.
-      settings: all but the capacity, which is found.
-      num_steps: of Adam.
+      settings: static options without a capacity.
+      num_steps: number of Adam's steps.
 
     Raises:
       ValueError: if an argument is of another kind, or there are no views.
@@ -110,15 +109,9 @@ def _aligned(view: View, model: Model, background: Array, settings: RenderSettin
 
 
 def _descent(
-    gaussians: Gaussians,
-    appearance: Appearance,
-    camera: Camera,
-    target: Array,
-    mask: Array | None,
-    background: Array,
-    settings: RenderSettings,
-    num_steps: int,
-) -> tuple[Array, Array]:
+    gaussians: Gaussians, appearance: Appearance, camera: Camera, target: Array, mask: Array | None, background: Array,
+    settings: RenderSettings, num_steps: int,
+) -> tuple[Array, Array]:  # fmt: skip
     """Return the twist of least loss among those that Adam comes to, and whether a render needs more capacity."""
     ssim_weight = 0.2 if min(target.shape[:2]) >= SSIM_WINDOW else 0.0
     shown = target if mask is None else jnp.where(mask, target, 0.0)

@@ -37,7 +37,7 @@ class ViewMetrics:
     lpips: float | None
     """Lower is better; None where no weights were given."""
     flat_psnr: float
-    """PSNR of the best flat colour in place of the render, in dB (`metrics.flat_psnr`)."""
+    """PSNR of the best flat colour instead of the render, in dB."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,31 +50,34 @@ class Evaluation:
     frames_per_second: float
     """Median over all the views evaluated together, compiled and warm."""
     renders: tuple[np.ndarray, ...]
-    """Images of the first views, uint8 [H, W, 3]; as many as were asked for."""
+    """Images of the first `num_renders` views, uint8 [H, W, 3]."""
 
     def __getitem__(self, views: slice) -> "Evaluation":
         """Return the figures of some of the views."""
         return dataclasses.replace(self, per_view=self.per_view[views], renders=self.renders[views])
 
+    def _mean(self, figure: str) -> float:
+        return float(np.mean([getattr(view, figure) for view in self.per_view]))
+
     @property
     def psnr(self) -> float:
         """Mean over the views."""
-        return float(np.mean([view.psnr for view in self.per_view]))
+        return self._mean("psnr")
 
     @property
     def ssim(self) -> float:
         """Mean over the views."""
-        return float(np.mean([view.ssim for view in self.per_view]))
+        return self._mean("ssim")
 
     @property
     def lpips(self) -> float | None:
         """Mean over the views; None without weights."""
-        return None if self.lpips_network is None else float(np.mean([view.lpips for view in self.per_view]))
+        return None if self.lpips_network is None else self._mean("lpips")
 
     @property
     def flat_psnr(self) -> float:
         """Mean over the views."""
-        return float(np.mean([view.flat_psnr for view in self.per_view]))
+        return self._mean("flat_psnr")
 
     @property
     def has_learned(self) -> bool:
@@ -104,13 +107,13 @@ def evaluate(
 
     Args:
       views: at least one.
-      gaussians, textures, settings: what `render_image` takes; the capacity is found here. Or a model, alone.
+      gaussians, textures, settings: as for `render_image`, without a capacity; or a model instead of Gaussians.
       background: RGB behind the Gaussians, and behind photographs with an alpha channel; None is the model's own, or
         black.
       lpips_weights: a weights file for LPIPS; None leaves it out.
-      num_renders: return the images of the first so many views, too.
-      fit_colors: before a render is compared, its colours are mapped to the photograph's by the affine map of least
-        squares (`measure.alignment.color_fit`), for photographs whose exposure the model cannot know.
+      num_renders: number of first views whose images are returned.
+      fit_colors: map the colours of a render to its photograph by least squares (`measure.alignment.color_fit`), for
+        photographs of unknown exposure.
 
     Raises:
       ValueError: if there are no views, or a model is given with textures.

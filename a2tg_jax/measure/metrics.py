@@ -34,7 +34,7 @@ def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
     Args:
       image: [H, W, 3], clipped to [0, 1] first.
       target: [H, W, 3], likewise.
-      mask: the mean is that over the pixels that count, one at least.
+      mask: pixels that count, at least one; the mean is over these.
 
     Raises:
       ValueError: if the shapes differ.
@@ -50,7 +50,7 @@ def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
     Args:
       image: [H, W, 3], sides of at least 11 pixels.
       target: [H, W, 3].
-      mask: the mean is that over the windows in which at least one pixel counts.
+      mask: pixels that count; the mean is over the windows with at least one of them.
 
     Raises:
       ValueError: if the shapes differ or a side is shorter than 11 pixels.
@@ -76,7 +76,7 @@ class LpipsWeights:
 
 
 def load_lpips(path: str | os.PathLike[str]) -> LpipsWeights:
-    """Read LPIPS weights from an .npz file, once per path; the network is told from the arrays in it.
+    """Read LPIPS weights from an .npz file, once per path; the names of the arrays decide the network.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -94,7 +94,7 @@ def lpips(
       image: [H, W, 3], sides of at least 32 pixels.
       target: [H, W, 3].
       weights: from `load_lpips`, or the path of the file.
-      mask: the mean is still that over the whole image.
+      mask: pixels that count; the mean is still over the whole image.
 
     Raises:
       ValueError: if the shapes differ or a side is too short, or as `load_lpips` does.

@@ -13,8 +13,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from a2tg_jax.core.camera_paths import nearest_point
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.capture_geometry import nearest_point
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.host.text import counted
@@ -58,14 +58,14 @@ class NoSurfaceError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeshResult:
-    """A mesh, and how it was made."""
+    """A mesh, and figures of its extraction."""
 
     mesh: Mesh
     """The mesh, in the world of the model."""
     center: np.ndarray
     """[3] centre of the space that was fused."""
     radius: float
-    """Its radius, in units of the model's world."""
+    """Radius of that space, in units of the model's world."""
     voxel: float
     """Side of a voxel within the radius."""
     num_views: int
@@ -194,13 +194,8 @@ def common_sphere(viewmats: ArrayLike) -> tuple[np.ndarray, float]:
 
 
 def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh:
-    """Return the surface where the mean signed distance is zero, with colours.
-
-    Args:
-      grid: fused views.
-      space: the space of its voxels.
-      least_weight: voxels of no larger weight are unknown, and their cells have no surface.
-    """
+    """Return the surface of fused views where the mean signed distance is zero, with colours. Voxels of no larger
+    weight than the least are unknown, and their cells have no surface."""
     parts = list(_parts(grid, least_weight))
     if not parts:
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))

@@ -38,15 +38,15 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     """Write a mesh as GLB, PLY or OBJ, by the suffix of the path.
 
     GLB holds the texture or linear colours of vertices, unlit, as the photographs show them. PLY holds colours of
-    vertices, and no texture. OBJ has its texture in NAME.png and its material in NAME.mtl beside it. PLY and OBJ are in
-    the original world, map coordinates without rounding. GLB stands upright, with +y up and the original lengths, as
-    the splats of `save_gltf` do; of map coordinates, the extras of its node have the transform.
+    vertices, and no texture. OBJ has its texture in NAME.png and its material in NAME.mtl. PLY and OBJ files are in
+    the original world, map coordinates without rounding. GLB is upright, with +y up and the original lengths, like the
+    splats of `save_gltf`; for map coordinates, the extras of its node have the transform.
 
     Args:
       path: the file; an older one is replaced once the new one is whole.
       mesh: a mesh.
-      transform: transform from the original world to that of the mesh, such as `model.origin.transform`. None writes
-        the mesh as it is, in each format.
+      transform: transform from the original world to the mesh's world, such as `model.origin.transform`. None writes
+        the mesh unchanged, in each format.
 
     Returns:
       The files written, the given one first.
@@ -84,11 +84,9 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
 
 
 def _needs_doubles(vertices: np.ndarray) -> bool:
-    """Return whether float32 would round positions by more than 1e-5 of their extent, as far from the origin."""
-    if not len(vertices):
-        return False
-    extent = np.ptp(vertices, axis=0).max()
-    return bool(np.abs(vertices).max() * np.finfo(np.float32).eps > 1e-5 * extent)
+    """Return whether float32 would round positions by more than 1e-5 of their extent, such as far from the origin."""
+    largest, extent = np.abs(vertices).max(initial=0), np.ptp(vertices, axis=0).max() if len(vertices) else 0
+    return bool(largest * np.finfo(np.float32).eps > 1e-5 * extent)
 
 
 def _save_obj(path: Path, mesh: Mesh) -> list[Path]:

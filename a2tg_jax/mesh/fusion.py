@@ -5,7 +5,6 @@ of splats, the spread is large, and the mean lies between surfaces. A view there
 and its depths are sure. The distance is measured from the surface's plane, by the normal of the render.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -15,7 +14,7 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.numerics import normalize
-from a2tg_jax.core.pytree import pytree
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import back_project
 
@@ -49,22 +48,18 @@ CHUNK = 64
 class Space:
     """The space that voxels divide: even within a radius, and coarser with the distance beyond.
 
-    Voxel i [3] lies at y = voxel·i, relative to the centre. Within the radius R, x = y. Beyond it, an unbounded space
-    has |x| = R·exp(|y|/R - 1) in the same direction: voxels grow in proportion to their distance, as pixels do.
+    Voxel i [3] is at y = voxel·i, relative to the centre. Within the radius R, x = y. Beyond it, an unbounded space has
+    |x| = R·exp(|y|/R - 1) in the same direction: voxels grow in proportion to their distance, as pixels do.
     """
 
-    center: Array
-    """[3] position of voxel 0."""
-    radius: Array
-    """[] radius within which voxels are even."""
-    voxel: Array
-    """[] side of a voxel within the radius."""
-    is_unbounded: bool = dataclasses.field(default=False, metadata={"static": True})
-    """Whether the space goes on beyond the radius."""
+    center: Array  # [3] position of voxel 0.
+    radius: Array  # [] radius within which voxels are even.
+    voxel: Array  # [] side of a voxel within the radius.
+    is_unbounded: bool = static(default=False)  # Whether the space continues beyond the radius.
 
     @staticmethod
     def of(center: np.ndarray, radius: float, voxel: float, is_unbounded: bool) -> "Space":
-        """Make a space from numbers of the host."""
+        """Make a space from numbers on the host."""
         return Space(jnp.asarray(center, jnp.float32), jnp.float32(radius), jnp.float32(voxel), is_unbounded)
 
     def positions(self, indices: Array) -> Array:
@@ -112,14 +107,11 @@ class BlockGrid:
     def __init__(self, max_bytes: int):
         """Make an empty grid with a memory budget."""
         self.capacity = max(1, int(max_bytes) // BYTES_PER_BLOCK)
-        self.distance = np.zeros((self.capacity, VOXELS), np.float32)
-        """Weighted sums of distances, in units of the truncation."""
-        self.weight = np.zeros((self.capacity, VOXELS), np.float32)
-        """Sums of weights."""
+        # Weighted sums of distances, in units of the truncation, and sums of their weights.
+        self.distance, self.weight = (np.zeros((self.capacity, VOXELS), np.float32) for _ in range(2))
+        # Mean colours, and sums of their weights.
         self.color = np.zeros((self.capacity, VOXELS, 3), np.float16)
-        """Mean colours."""
         self.color_weight = np.zeros((self.capacity, VOXELS), np.float32)
-        """Sums of the weights of colours."""
         self.coordinates = np.zeros((0, 3), np.int32)
         self._rows: dict[int, int] = {}
 
@@ -134,10 +126,7 @@ class BlockGrid:
 
     def allocate(self, blocks: np.ndarray) -> np.ndarray:
         """Return the rows of the different blocks among blocks [P, 3], after making new ones; far ones are left out.
-
-        Raises:
-          GridFullError: if the memory budget has no room for them.
-        """
+        GridFullError: the memory budget has no room for them."""
         if len(blocks):  # Neighbouring pixels mostly repeat a block, and sorting is slow.
             blocks = blocks[np.r_[True, (blocks[1:] != blocks[:-1]).any(axis=1)]]
         keys = np.unique(_keys_of(blocks[((blocks > -LIMIT) & (blocks < LIMIT)).all(axis=1)]))
@@ -160,17 +149,11 @@ class RenderedDepth(NamedTuple):
     """Depths and colours of one view."""
 
     camera: Camera
-    """The view."""
-    depth: Array
-    """[H, W] along the camera's z axis, at pixel centres; 0 where there is none."""
-    spread: Array
-    """[H, W] standard deviation of the splats' depths, weighted as the depth is."""
-    slant: Array
-    """[H, W] in (0, 1]: distance from the surface's plane for a unit of distance along the z axis, on the ray."""
-    facing: Array
-    """[H, W] cosine between the ray and the surface's normal."""
-    color: Array
-    """[H, W, 3] in [0, 1]."""
+    depth: Array  # [H, W] along the camera's z axis, at pixel centres; 0 where there is none.
+    spread: Array  # [H, W] standard deviation of the splats' depths, weighted as the depth is.
+    slant: Array  # [H, W] in (0, 1]: distance from the surface's plane per distance along the z axis, on the ray.
+    facing: Array  # [H, W] cosine between the ray and the surface's normal.
+    color: Array  # [H, W, 3] in [0, 1].
 
 
 def rendered_depth(output: RenderOutput, camera: Camera) -> RenderedDepth:
@@ -189,11 +172,8 @@ def rendered_depth(output: RenderOutput, camera: Camera) -> RenderedDepth:
 
 
 def fuse(grid: BlockGrid, depths: RenderedDepth, space: Space) -> None:
-    """Fuse one view into the blocks within a truncation of its depths.
-
-    Raises:
-      GridFullError: if the grid's memory budget has no room for the blocks.
-    """
+    """Fuse one view into the blocks within a truncation of its depths. GridFullError: the grid's memory budget has no
+    room for the blocks."""
     rows = grid.allocate(np.asarray(jax.jit(_blocks_near)(depths, space)))
     arrays: tuple[np.ndarray, ...] = grid.distance, grid.weight, grid.color, grid.color_weight
     jitted = jax.jit(_fused)

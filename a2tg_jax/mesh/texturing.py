@@ -32,9 +32,9 @@ Picture = tuple[Camera, np.ndarray, np.ndarray | None]
 def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -> Mesh:
     """Return the mesh with a texture atlas filled from pictures.
 
-    A texel takes the weighted mean of the pictures that see it. The weight is (cosine·focal length/distance)⁶, so that
+    A texel takes the weighted mean of the pictures that show it. The weight is (cosine·focal length/distance)⁶, so that
     near views from the front decide. Hidden texels are found by drawing the mesh into each view. Texels that no view
-    sees keep the colours of the vertices.
+    shows keep the colours of the vertices.
 
     Args:
       mesh: a mesh in the world of the cameras.
@@ -67,11 +67,7 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
 
 
 def check_texture(size: int) -> ModuleType:
-    """Return the library xatlas.
-
-    Raises:
-      ValueError: if it is not installed, or the side of an atlas is out of range.
-    """
+    """Return the library xatlas. ValueError: it is not installed, or the side of an atlas is out of range."""
     if not SMALLEST_SIDE <= size <= LARGEST_SIDE:
         raise ValueError(f"texture_size must lie in {SMALLEST_SIDE}..{LARGEST_SIDE} texels; got {size}")
     try:
@@ -83,21 +79,14 @@ def check_texture(size: int) -> ModuleType:
 class Texels(NamedTuple):
     """Texels that charts cover."""
 
-    place: np.ndarray
-    """[T] number in the atlas, row by row from the top."""
-    position: np.ndarray
-    """[T, 3] float32 position in the world."""
-    normal: np.ndarray
-    """[T, 3] float32 unit normal of the face."""
-    color: np.ndarray
-    """[T, 3] float32 colour in [0, 1] between those of the vertices; grey without them."""
+    place: np.ndarray  # [T] number in the atlas, row by row from the top.
+    position: np.ndarray  # [T, 3] float32 position in the world.
+    normal: np.ndarray  # [T, 3] float32 unit normal of the face.
+    color: np.ndarray  # [T, 3] float32 colour in [0, 1] between the colours of the vertices; grey without them.
 
 
 def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Texels]:
-    """Return the mesh with positions in a square atlas of `size`, by xatlas, and the texels that its charts cover.
-
-    Vertices at the seams of charts are repeated.
-    """
+    """Return the mesh with positions in a square atlas of `size`, by xatlas, and the texels that its charts cover."""
     xatlas = check_texture(size)
     atlas, pack = xatlas.Atlas(), xatlas.PackOptions()
     atlas.add_mesh(np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.uint32))
@@ -122,10 +111,8 @@ def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Texels]:
 def _seen(
     texels: Texels, camera: Camera, picture: np.ndarray, mask: np.ndarray | None, depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the texels that a view sees, as indices [S], its weights [S] for them, and its colours [S, 3].
-
-    A texel that is farther than the drawn mesh's depth [H, W] is hidden.
-    """
+    """Return the texels visible in a view, as indices [S], its weights [S] for them, and its colours [S, 3]. Texels
+    farther than the drawn mesh's depth [H, W] are hidden."""
     viewmat, K = np.asarray(camera.viewmat, np.float32), np.asarray(camera.K, np.float32)
     at = texels.position @ viewmat[:3, :3].T + viewmat[:3, 3]
     toward = -np.sum(at * (texels.normal @ viewmat[:3, :3].T), axis=1)
@@ -151,12 +138,9 @@ def _seen(
 class Raster(NamedTuple):
     """Faces and places of pixels."""
 
-    face: np.ndarray
-    """[H, W] int32 face of each pixel; -1 without one."""
-    weights: np.ndarray
-    """[H, W, 3] float32 barycentric coordinates there."""
-    depth: np.ndarray
-    """[H, W] float32 depth there; infinite without a face."""
+    face: np.ndarray  # [H, W] int32 face of each pixel; -1 without one.
+    weights: np.ndarray  # [H, W, 3] float32 barycentric coordinates there.
+    depth: np.ndarray  # [H, W] float32 depth there; infinite without a face.
 
 
 def draw_view(mesh: Mesh, camera: Camera) -> Raster:

@@ -48,33 +48,28 @@ class BorderRoom(NamedTuple):
 class Hop(NamedTuple):
     """Pixels that each device sends to the one of another band of its view; all static."""
 
-    bands: int
-    """Number of bands to the other one; negative upwards."""
-    first: int
-    """First of the rows of pixels, in the other one's share of an even cut."""
+    bands: int  # Number of bands to the other one; negative upwards.
+    first: int  # First of the rows of pixels, in the other one's share of an even cut.
     rows: int
 
 
 class ImageBands(NamedTuple):
     """Bands of each view; all static."""
 
-    whole: TileGrid
-    """Grid of a view."""
-    num: int
-    """Number B of bands of a view."""
+    whole: TileGrid  # Of a view.
+    num: int  # Number B of bands of a view.
     room: BorderRoom
-    """Room for borders."""
 
     @staticmethod
     def of(grid: TileGrid, num: int, room: BorderRoom | None = None) -> "ImageBands":
-        """Return the bands of a view; without a room, that for any borders."""
+        """Return the bands of a view, with room for any borders by default."""
         # A border lies at most at the end of the tiles, and in an even cut at most at the end of the devices' rows.
         most = max(grid.rows * grid.tile_size, num * -(-grid.height // num)) if num > 1 else 0
         return ImageBands(grid, num, BorderRoom(*(min(most, own) for own in room or (most, most))))
 
     @property
     def even_height(self) -> int:
-        """Rows of pixels that each device has of an even cut; the last ones may lie below the image."""
+        """Rows of pixels that each device has of an even cut; the last ones may be below the image."""
         return -(-self.whole.height // self.num)
 
     @property
@@ -85,8 +80,8 @@ class ImageBands(NamedTuple):
         return self.whole._replace(height=min(rows * size, self.whole.height))
 
     def pixels(self, rays: Array | None) -> TilePixels | None:
-        """Return the pixels of all tiles, and of so many below the image that any band has its own grid of them; None
-        of a pinhole camera."""
+        """Return the pixels of all tiles, and of enough below the image for the grid of any band; None for a pinhole
+        camera."""
         return None if rays is None else tile_pixels(rays, self.whole.tile_size, self.whole.rows + self.own.rows)
 
     def pairs_of_rows(self, boxes: Rectangles) -> Array:
@@ -145,7 +140,7 @@ class ImageBands(NamedTuple):
     def hops(self) -> Iterator[Hop]:
         """Yield what devices send, to others and to themselves, so that each has its rows of an even cut."""
         height = self.even_height
-        yield Hop(0, 0, height)
+        yield Hop(0, 0, height)  # To itself.
         for number in range(1, self.num):
             below, above = (min(height, room - (number - 1) * height) for room in (self.room.below, self.room.above))
             if below > 0:
@@ -187,14 +182,10 @@ ROOM_OF_A_BAND = 1.5
 class Exchange:
     """Devices that render together; hashable, so that settings can hold it."""
 
-    mesh: Mesh
-    """Devices along the one axis `AXIS`."""
-    rows_per_pair: float = 1.0
-    """Rows that one device can send to another, as a share of the capacity for pairs."""
-    border_room: BorderRoom | None = None
-    """Room for the borders between bands; None: for any borders."""
-    views_at_once: int = 1
-    """Number of views that are drawn at once (`value_and_grad_of_views`); a divisor of D."""
+    mesh: Mesh  # Devices along the one axis `AXIS`.
+    rows_per_pair: float = 1.0  # Rows that one device can send to another, as a share of the capacity for pairs.
+    border_room: BorderRoom | None = None  # For the borders between bands; None: for any borders.
+    views_at_once: int = 1  # Number of views that are drawn at once (`value_and_grad_of_views`); a divisor of D.
 
     @property
     def num(self) -> int:
@@ -206,7 +197,7 @@ class Exchange:
         return dataclasses.replace(self, views_at_once=math.gcd(num_views, self.num))
 
     def filled_up(self, x: Array, value: float | None = None) -> Array:
-        """Return rows followed by so many of a value, or copies of the last one, that D divides their number."""
+        """Return rows, filled up to a multiple of D with a value or copies of the last row."""
         num = -x.shape[0] % self.num
         last = x[-1:] if value is None else jnp.full((1, *x.shape[1:]), value, x.dtype)
         return jnp.concatenate([x, jnp.repeat(last, num, axis=0)]) if num else x
@@ -230,9 +221,9 @@ def composite_on_devices(
 ) -> Composited:  # fmt: skip
     """Composite a view as `compositor.composite` does on one device, with its arguments: each device a band.
 
-    `capacity` is the number of pairs of a whole image; the result's number of pairs is the capacity that has room for
-    the fullest band and for all that is sent to it. If the devices draw several views at once, this is called for each
-    of them under `value_and_grad_of_views`. The rays [H, W, 2] of the lens are `Camera.rays`.
+    The capacity is the number of pairs of a whole image; the result's number of pairs is the capacity with room for the
+    fullest band and for all that is sent to it. `value_and_grad_of_views` calls this for each view that is drawn at
+    once. The rays [H, W, 2] of the lens are `Camera.rays`.
     """
     draw = functools.partial(_composite_views, settings, exchange, capacity, texels, regions, rays)
     arrays = splats, cutoff, jacobian, probe
@@ -272,7 +263,7 @@ def _composite_views(
 
 
 def share_of_a_band(num_bands: int) -> float:
-    """Return the share of the capacity for pairs that each of so many bands of a view has."""
+    """Return the share of the capacity for pairs that each band of a view has."""
     return min(1.0, ROOM_OF_A_BAND / num_bands)
 
 
@@ -344,10 +335,10 @@ def _shifted(M: Array, top: Array) -> Array:
     return M.at[:, 1].add(-top.astype(M.dtype) * M[:, 2])
 
 
-# Several views that devices draw at once: a function of one view under `jax.vmap`, whose devices they share. All is
-# written for one view. Where the views meet, in `composite_on_devices`, each of them gets all of them (`of_all_views`),
-# and takes its own from the result (`of_own_view`). Derivatives are taken around the `jax.vmap`, since views that share
-# their devices are drawn, and differentiated, together.
+# Several views that devices draw at once: a function of one view under `jax.vmap`. Where the views meet, in
+# `composite_on_devices`, each of them gets all of them (`of_all_views`), and takes its own from the result
+# (`of_own_view`). Derivatives are taken around the `jax.vmap`, since views that share their devices are drawn, and
+# differentiated, together.
 
 
 VIEWS_AXIS = "views_at_once"
@@ -357,9 +348,9 @@ VIEWS_AXIS = "views_at_once"
 def value_and_grad_of_views(
     loss: Callable[..., tuple[Array, object]], num_views: int, axes: object
 ) -> Callable[..., Any]:
-    """Return what `jax.value_and_grad(loss, (0, 1, 2, 3), has_aux=True)` is for one view, for G views at once.
+    """Return `jax.value_and_grad(loss, (0, 1, 2, 3), has_aux=True)` for G views at once.
 
-    Results have a leading axis [G, ...], but for the gradient in `appearance`, a mean over the views. The loss is a
+    Results have a leading axis [G, ...], except the gradient in `appearance`, a mean over the views. The loss is a
     function of (gaussians, appearance, rows, probe, view), which returns a scalar and any auxiliary value. `rows` and
     `view`, mapped along `axes`, are of each view; the others are shared.
     """
@@ -370,7 +361,7 @@ def value_and_grad_of_views(
         return jnp.sum(values), (values, aux)
 
     def differentiated(gaussians: object, appearance: object, rows: object, probe: object, views: object) -> Any:
-        # Each view has its own copy of what events want the gradient of each view in.
+        # Each view has its own copy, since events need the gradient of each view.
         copy = lambda x: jnp.broadcast_to(x, (num_views, *x.shape))  # noqa: E731
         gaussians, probe = jax.tree.map(copy, (gaussians, probe))
         with_gradients = jax.value_and_grad(of_views, argnums=(0, 1, 2, 3), has_aux=True)
@@ -419,15 +410,12 @@ def _all(size: int, is_batched: object, views: object, index: Array) -> tuple[An
 GROUP_AXIS = "views"
 """Axis of a mesh of the same devices along which their groups are."""
 PICTURES = ("images", "alphas", "masks", "depths")
-"""Fields of a batch [V, H, ...] of which each device needs those that it draws. It has the others whole."""
+"""Fields of a batch [V, H, ...] that devices share. Each device has the others whole."""
 
 
 def sharding_of_batch(exchange: Exchange, num_views: int, height: int) -> NamedSharding:
-    """Return where the pictures [V, H, ...] of a batch are: each on the devices that draw its view, which share its
-    rows of pixels if their number divides H.
-
-    The g-th of G groups of devices draws the g-th part of the views, one after the other.
-    """
+    """Return where the pictures [V, H, ...] of a batch are: each on the group of devices that draws its view, which
+    share its rows of pixels if their number divides H. The g-th of G groups draws the g-th part of the views."""
     num_groups = exchange.views_at_once
     if num_groups == 1:
         return sharding_of_rows(exchange.mesh, (num_views, height), axis=1)
@@ -447,12 +435,8 @@ def are_drawn_here(exchange: Exchange | None, num_views: int, height: int) -> li
 
 
 def on_devices(exchange: Exchange, photographs: Any, *, is_batch: bool) -> Any:
-    """Return `training.batches.Photographs` of V views with their pictures spread over the devices, the rest on every
-    device; the rays of their lens stay where they are.
-
-    Other processes' devices may draw a part of a batch (`are_drawn_here`). Otherwise all devices share each picture's
-    rows of pixels, if D divides them.
-    """
+    """Return `training.batches.Photographs` of V views with their pictures spread over the devices that draw them, for
+    a batch, or otherwise over all devices; the rest is on every device, and the rays of a lens stay where they are."""
     placed_fields = {}
     for name, field in photographs._asdict().items():
         if name in PICTURES and field is not None:

@@ -5,7 +5,6 @@ move. A step that needs more is not taken, and is repeated with more room.
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -28,32 +27,22 @@ from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles
 class RoomOfView(NamedTuple):
     """Room that devices need to draw a view together."""
 
-    rows: int
-    """Rows that a device must be able to send to another one."""
+    rows: int  # Rows that a device must be able to send to another one.
     borders: BorderRoom
-    """Room for the borders between bands."""
-    pairs: int
-    """Capacity of which every band's share holds its pairs."""
+    pairs: int  # Capacity of which every band's share holds its pairs.
 
 
 def room_of_view(
-    gaussians: Gaussians,
-    camera: Camera,
-    appearance: Appearance,
-    settings: RenderSettings,
+    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings,
     num_live: Integer | None = None,
-) -> RoomOfView:
+) -> RoomOfView:  # fmt: skip
     """Return the room that the devices of `settings.exchange` need in a view (host)."""
     assert settings.exchange is not None
     camera = settings.finer(camera)
-    rows, above, below, pairs = map(int, _jitted_needs()(gaussians, camera, appearance, settings, num_live))
+    needs = jax.jit(_needs, static_argnums=3)(gaussians, camera, appearance, settings, num_live)
+    rows, above, below, pairs = map(int, needs)
     share = share_of_a_band(settings.exchange.num // settings.exchange.views_at_once)
     return RoomOfView(rows, BorderRoom(above, below), math.ceil(pairs / share))
-
-
-@functools.cache
-def _jitted_needs() -> jax.stages.Wrapped:
-    return jax.jit(_needs, static_argnums=(3,))
 
 
 def _needs(

@@ -40,12 +40,10 @@ class Liveness:
     """Connections of one process to those that must live as long as it does."""
 
     def __init__(self, others: Mapping[int, Connection], count: int, seconds: float, on_end: Callable[[str], None]):
-        """Args:
-        others: connections by the number of the process.
-        count: number of all processes.
-        seconds: time after which a silent process is lost.
-        on_end: called in a thread with the reason once another process is lost, or with "" if the first one wants
-          the others to end quietly. It ends the process.
+        """Watch the others, by number, of `count` processes; a silent one is lost after some seconds.
+
+        A thread calls `on_end`, which ends this process, with the reason once another one is lost, or with "" if the
+        first process ends the others quietly.
         """
         self._others, self._count, self._seconds, self._on_end = dict(others), count, seconds, on_end
         self._ending, self._sending = threading.Lock(), threading.Lock()
@@ -55,11 +53,8 @@ class Liveness:
         threading.Thread(target=self._beat, daemon=True).start()
 
     def end(self, kind: bytes, reason: str = "") -> None:
-        """Report the end of this process to the others.
-
-        BYE: it needs them no more, and they not it. INTERRUPTED: it was interrupted, as they should be. FAILED: it
-        ends by an error of its own, the reason. QUIT: they are to end quietly.
-        """
+        """Report the end of this process to the others: by BYE, they can continue alone; by INTERRUPTED, they were
+        interrupted as well; by FAILED, it ends by its own error, the reason; by QUIT, they are to end quietly."""
         if kind != FAILED:
             self._is_left.set()
         self._say(kind + reason.encode())
@@ -109,10 +104,8 @@ class Liveness:
 
 
 def accept(listener: socket.socket, key: bytes, count: int) -> dict[int, Connection]:
-    """Return the connections of processes 1 to `count` - 1, each of which first sends its number.
-
-    Strangers, who lack the key or send nothing, are turned away and keep nobody waiting.
-    """
+    """Return the connections of processes 1 to `count` - 1, each of which first sends its number. Strangers, who lack
+    the key or send nothing, are turned away and keep nobody waiting."""
     arrived: queue.SimpleQueue[tuple[int, Connection]] = queue.SimpleQueue()
     found: dict[int, Connection] = {}
 
@@ -144,8 +137,7 @@ def connect(host: str, port: int, key: bytes, number: int) -> dict[int, Connecti
 
 
 def listen() -> tuple[socket.socket, int, bytes]:
-    """Return a listener on a free port, that port, and a key for those who may connect: by IPv4, and IPv6 if it is
-    there."""
+    """Return a listener on a free port, by IPv4 and, if available, IPv6, the port, and a key for who may connect."""
     has_both = socket.has_dualstack_ipv6()
     family = socket.AF_INET6 if has_both else socket.AF_INET
     listener = socket.create_server(("", 0), family=family, backlog=64, dualstack_ipv6=has_both)
@@ -217,7 +209,7 @@ class Team:
             jax.distributed.shutdown()
 
     def report(self, error: BaseException) -> None:
-        """Report an error to the others; if it comes of a lost process, wait for what is known of that one."""
+        """Report an error to the others; if a lost process caused it, wait for the report about that one."""
         liveness, self._liveness = self._liveness, None
         if liveness is None:
             return
@@ -267,8 +259,7 @@ def joined(place: ProcessPlace | None) -> Iterator[Team | None]:
 
     def give_up() -> NoReturn:
         missing = f"not all processes have joined --coordinator {place.coordinator} within {JOIN_SECONDS} s"
-        advice = "start as many as --num-processes says, each with a --process-id of its own"
-        print(f"a2tg: error: {missing}: {advice}", file=sys.stderr)
+        print(f"a2tg: error: {missing}: start --num-processes of them, each with its --process-id", file=sys.stderr)
         sys.stderr.flush()
         os._exit(LOST)
 
@@ -283,7 +274,7 @@ def joined(place: ProcessPlace | None) -> Iterator[Team | None]:
         # JAX's handler of SIGTERM would replace `signals`.
         jax.config.update("jax_enable_preemption_service", False)
         try:
-            # Its own times are a net beneath this module's.
+            # JAX's own timeouts are longer: a safety net.
             jax.distributed.initialize(
                 None if is_auto else place.coordinator,
                 place.num_processes,
@@ -314,10 +305,7 @@ def joined(place: ProcessPlace | None) -> Iterator[Team | None]:
 
 def broadcast(data: bytes) -> bytes:
     """Return the first process's bytes in every process; all call it together."""
-    length = np.frombuffer(len(data).to_bytes(8, "big"), np.uint8)
-    size = int.from_bytes(bytes(np.asarray(multihost_utils.broadcast_one_to_all(length), np.uint8)), "big")
-    own = np.frombuffer(data, np.uint8) if jax.process_index() == 0 else np.zeros(size, np.uint8)
-    return bytes(np.asarray(multihost_utils.broadcast_one_to_all(own), np.uint8)) if size else b""
+    return gather(data if jax.process_index() == 0 else b"")[0]
 
 
 def gather(data: bytes) -> list[bytes]:
@@ -329,8 +317,7 @@ def gather(data: bytes) -> list[bytes]:
 
 
 def is_of_collectives(error: BaseException) -> bool:
-    """Return whether an error was raised because processes could not reach each other. A lack of memory is a process's
-    own."""
+    """Return whether an error was raised because processes could not reach each other."""
     if "RESOURCE_EXHAUSTED" in str(error):
         return False
     return isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error) or "NCCL" in str(error)

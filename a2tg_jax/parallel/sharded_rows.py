@@ -1,9 +1,8 @@
 """Who holds which rows: arrays whose rows are spread over the devices of a mesh, and those that every device has.
 
-JAX's shardings say it all: an array has its mesh. A `Mesh | None` says where new arrays go; None is one device, where
-every function here leaves arrays as they are. On the host an array is read by `on_host` and written by `placed_like`,
-one at a time, so that a change takes a share of the memory of each device. If the devices belong to several processes,
-all of them make the same calls.
+An array has its mesh in its sharding. A `Mesh | None` says where new arrays go; None is one device, where all arrays
+stay as they are. On the host, arrays are read by `on_host` and written by `placed_like`, one at a time, so that a
+change takes a share of the memory of each device. All processes make the same calls.
 """
 
 import warnings
@@ -44,14 +43,9 @@ def sharding_of_rows(mesh: Mesh, shape: tuple[int, ...], axis: int = 0) -> Named
 
 
 def spread(mesh: Mesh | None, tree: T, axis: int = 0) -> T:
-    """Return arrays with their rows, along an axis, spread over the devices; those that D does not divide are on every
-    device.
-
-    Under jit it constrains where results are; otherwise it moves the arrays.
-
-    Raises:
-      ValueError: if arrays that are not spread yet differ between processes.
-    """
+    """Return arrays with their rows, along an axis, spread over the devices, or on every device if D does not divide
+    them. Under jit it constrains where results are. ValueError: arrays that are not spread yet differ between
+    processes."""
     if mesh is None:
         return tree
     own = [x for x in jax.tree.leaves(tree) if not isinstance(x, jax.core.Tracer) and _is_own(x)]
@@ -144,16 +138,12 @@ def rows_moved(x: Array, rows: Array | np.ndarray) -> Array:
 
 
 def readable(tree: T) -> T:
-    """Return arrays that this process can read: those that are on other processes' devices too are read (host)."""
-
-    def of_leaf(x: Any) -> Any:
-        return x if not isinstance(x, jax.Array) or x.is_fully_addressable else on_host(x)
-
-    return jax.tree.map(of_leaf, tree)
+    """Return arrays that this process can read: those that are also on other processes' devices are read (host)."""
+    return jax.tree.map(lambda x: x if not isinstance(x, jax.Array) or x.is_fully_addressable else on_host(x), tree)
 
 
 def warn_of_uneven_rows(num: int, num_devices: int) -> None:
-    """Warn if the rows of a checkpoint cannot be spread evenly over so many devices, which costs memory."""
+    """Warn if the rows of a checkpoint cannot be spread evenly over the devices, which costs memory."""
     if num % num_devices:
         fitting = [number for number in range(1, num_devices) if num % number == 0]
         warnings.warn(
@@ -164,7 +154,7 @@ def warn_of_uneven_rows(num: int, num_devices: int) -> None:
 
 
 def asked_by_any(mesh: Mesh | None, is_asked: bool) -> bool:
-    """Return whether any of the processes wants something (host)."""
+    """Return whether `is_asked` holds in any process (host)."""
     if num_processes(mesh) == 1:
         return is_asked
     return bool(np.any(multihost_utils.process_allgather(np.asarray(is_asked))))
@@ -183,7 +173,7 @@ def of_first(mesh: Mesh | None, tree: T) -> T:
     return jax.tree.map(of_leaf, tree)
 
 
-# Inside shard_map: results of foreign functions, of which JAX assumes that they are the same on all devices
+# Inside shard_map: results of foreign functions, which JAX assumes to be the same on all devices
 
 
 def _axes(tree: object) -> frozenset[str]:

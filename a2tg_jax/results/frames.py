@@ -14,9 +14,8 @@ from typing import Literal, get_args
 
 from PIL import Image
 
-from a2tg_jax.core.camera_paths import path_through, smooth_path
+from a2tg_jax.core.camera_paths import path_through, smooth_path, turntable
 from a2tg_jax.core.cameras import Camera, crop_camera
-from a2tg_jax.core.capture_geometry import turntable
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.host.regular_files import is_regular, read_regular

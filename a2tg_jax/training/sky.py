@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
+from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.capture_geometry import vertical_of
 from a2tg_jax.core.gaussians import Gaussians, sh_of_colors
 from a2tg_jax.data.scene import Scene, View
 
