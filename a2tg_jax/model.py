@@ -29,7 +29,7 @@ from a2tg_jax.render import render_appearance, with_features
 from a2tg_jax.texture import Textures
 
 SAME_PLACE = 1e-5
-"""Largest distance of two models' origins that are taken for one."""
+"""Largest distance between two models' origins that count as the same."""
 
 
 @pytree
@@ -48,11 +48,11 @@ class Model:
     background: Color = static(default=BLACK)
     """RGB behind all splats."""
     origin: Origin | None = beside(default=None)
-    """Training cameras and world; None if unknown. No part of the pytree: what jit or `jax.tree.map` returns has none,
-    and models that differ in it only share compiled programs."""
+    """Training cameras and world; None if unknown. Not part of the pytree: results of jit or `jax.tree.map` have none,
+    and models that differ only in it share compiled programs."""
 
     def __post_init__(self) -> None:
-        """Refuse other values of this library instead of Gaussians and appearance; rates and the like pass."""
+        """Refuse this library's other values instead of Gaussians and appearance; rates and the like pass."""
         is_ours = type(self.gaussians).__module__.startswith("a2tg_jax.")
         if is_ours or isinstance(self.gaussians, str):
             check_kind("gaussians", self.gaussians, Gaussians)
@@ -181,10 +181,8 @@ class Model:
     def transform(self, similarity: Similarity) -> "Model":
         """Return the same model in the world that `similarity` leads to, with its cameras (host).
 
-        View dependence turns with the world; everything else of the appearance stays.
-
-        Lengths of the settings are in units of the world: `near_plane` is 0.2 of the new units. Scale it along for
-        the same image, which else may lack or show splats close to the camera:
+        View dependence turns with the world; everything else of the appearance stays. Lengths of the settings are in
+        units of the world; scale them along, or the image may lack or gain splats close to the camera:
 
             moved = model.transform(similarity)
             moved.render(moved.origin.cameras[0], settings=settings.transform(similarity))
@@ -208,7 +206,7 @@ class Model:
         return html_table("Model", self._facts())
 
     def _facts(self) -> list[tuple[str, str]]:
-        """Return what a reader wants about a model, by name (host)."""
+        """Return the main facts about a model, by name (host)."""
         degree = self.gaussians.sh_degree
         has_bands = self.appearance.bands is not None
         facts = [
@@ -222,17 +220,19 @@ class Model:
 
 def _indices(rows: ArrayLike | slice, num: int) -> np.ndarray:
     """Return the indices of the rows that a mask, indices or a slice choose of `num`."""
+    if isinstance(rows, slice):
+        return np.arange(num)[rows]
     if isinstance(rows, int | np.integer) and not isinstance(rows, bool):
         if not -num <= rows < num:
             raise ValueError(f"rows must choose among {num} Gaussians; got {rows}")
         end = f"{rows + 1}" if rows != -1 else ""
         raise ValueError(f"rows must be a mask [{num}], indices or a slice; for one Gaussian say model[{rows}:{end}]")
     check_unmasked("rows", rows)
-    chosen = rows if isinstance(rows, slice) else np.asarray(rows)
-    if not isinstance(chosen, slice) and (chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "biu")):
+    chosen = np.asarray(rows)
+    if chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "biu"):
         raise ValueError(f"rows must be a mask [{num}], indices or a slice; got {chosen.dtype} {[*chosen.shape]}")
     try:
-        return np.arange(num)[chosen if isinstance(chosen, slice) or chosen.size else slice(0)]
+        return np.arange(num)[chosen if chosen.size else slice(0)]
     except IndexError as error:
         raise ValueError(f"rows must choose among {num} Gaussians: {error}") from None
 
@@ -245,8 +245,8 @@ def check_is_model(model: object) -> None:
 def concatenate(models: Sequence[Model]) -> Model:
     """Return the Gaussians of several models as one model, in their order.
 
-    The models lie in one world: move them first (`Model.transform`). A warning names a model that was read relative to
-    another offset than the first. Spherical harmonics of lower degrees are filled up with zeros.
+    The models must be in one world: move them first (`Model.transform`). A warning names a model that was read relative
+    to another offset than the first. Spherical harmonics of lower degrees are filled up with zeros.
 
     Args:
       models: at least one, of the same appearance with the same options.
@@ -262,15 +262,14 @@ def concatenate(models: Sequence[Model]) -> Model:
     for index, model in enumerate(models):
         check_kind(f"models[{index}]", model, Model)
     models = [model.live for model in models]
-    first = models[0]
-    if kinds := [in_words(m.appearance) for m in models if template_of(m.appearance) != template_of(first.appearance)]:
-        own = in_words(first.appearance)
-        why = f"{own} and {kinds[0]}" if kinds[0] != own else f"{own} of different options"
-        raise ValueError(f"models must have one appearance; got {why}")
-    if dtypes := [
-        str(m.gaussians.means.dtype) for m in models if m.gaussians.means.dtype != first.gaussians.means.dtype
-    ]:
-        raise ValueError(f"models must have one dtype; got {first.gaussians.means.dtype} and {dtypes[0]}")
+    first, words = models[0], [in_words(model.appearance) for model in models]
+    for model, shown in zip(models, words, strict=True):
+        if template_of(model.appearance) != template_of(first.appearance):
+            why = f"{words[0]} and {shown}" if shown != words[0] else f"{shown} of different options"
+            raise ValueError(f"models must have one appearance; got {why}")
+        if model.gaussians.means.dtype != first.gaussians.means.dtype:
+            dtypes = f"{first.gaussians.means.dtype} and {model.gaussians.means.dtype}"
+            raise ValueError(f"models must have one dtype; got {dtypes}")
     for index, model in enumerate(models[1:], 1):
         if first.origin is not None and model.origin is not None and not model.origin.names:
             apart = model.origin.transform.inverse().then(first.origin.transform).apply(np.zeros(3))

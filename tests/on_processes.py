@@ -9,6 +9,7 @@ python tests/on_processes.py --losses                a process of a training is 
 import argparse
 import dataclasses
 import functools
+import itertools
 import os
 import signal
 import socket
@@ -34,17 +35,12 @@ from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 
+SHARED = {"densify": {"cap": 120}}
 SYSTEMS = {
     "a2tg": lambda length: system(
-        a2tg.A2tg,
-        densify={"cap": 120},
-        texture={"at": (0.5,)},
-        stage1_iterations=length,
-        stage2_iterations=length,
+        a2tg.A2tg, **SHARED, texture={"at": (0.5,)}, stage1_iterations=length, stage2_iterations=length
     ),
-    "streamed": lambda length: system(
-        Gaussians2dMcmc, densify={"cap": 120}, stage1_iterations=2 * length, batch_size=6
-    ),
+    "streamed": lambda length: system(Gaussians2dMcmc, **SHARED, stage1_iterations=2 * length, batch_size=6),
 }
 """The second one does not leave its photographs on the devices."""
 SMALL = ("--preset", "smoke", "--downscale", "4", "--densify.cap", "60")
@@ -204,22 +200,17 @@ def wait(place, what):
 
 def losses(seconds=8.0):
     """A process of a training is killed or stopped: the other one ends in time, and the checkpoint can be read."""
-    for victim in (0, 1):
-        for number in (signal.SIGKILL, signal.SIGSTOP):
-            with tempfile.TemporaryDirectory() as folder:
-                print(victim, number.name, *_lost_in_training(victim, number, seconds, Path(folder) / "run"))
-
-
-def _lost_in_training(victim, number, seconds, out):
-    processes = trainings(out, (*LONG, "--heartbeat-timeout-seconds", str(seconds)), (), ())
-    while not list(out.glob("checkpoints/*.npz")):
-        assert all(process.poll() is None for process in processes)
-        time.sleep(0.1)
-    at = time.perf_counter()
-    took, told = survivor_of(processes, victim, number, 5 * seconds)
-    checkpoint = a2tg.load_checkpoint(sorted(out.glob("checkpoints/*.npz"))[-1])
-    assert time.perf_counter() - at < 3 * seconds
-    return took, told.splitlines()[-1], checkpoint
+    for victim, number in itertools.product((0, 1), (signal.SIGKILL, signal.SIGSTOP)):
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "run"
+            processes = trainings(out, (*LONG, "--heartbeat-timeout-seconds", str(seconds)), (), ())
+            while not list(out.glob("checkpoints/*.npz")):
+                assert all(process.poll() is None for process in processes)
+                time.sleep(0.1)
+            took, told = survivor_of(processes, victim, number, 5 * seconds)
+            checkpoint = a2tg.load_checkpoint(sorted(out.glob("checkpoints/*.npz"))[-1])
+            assert took < 3 * seconds
+            print(victim, number.name, took, told.splitlines()[-1], checkpoint)
 
 
 def survivor_of(processes, victim, number, timeout):
@@ -236,17 +227,11 @@ def survivor_of(processes, victim, number, timeout):
 
 def main():
     parser = argparse.ArgumentParser()
-    add = parser.add_argument
-    add("--what", default="train")
-    add("--system", default="a2tg")
-    add("--length", type=int, default=120)
-    add("--folder")
-    add("--seconds", type=float, default=60.0)
-    add("--processes", type=int, default=4)
-    add("--losses", action="store_true")
-    add("--coordinator")
-    add("--num-processes", type=int)
-    add("--process-id", type=int)
+    for name, default in {"what": "train", "system": "a2tg", "length": 120, "seconds": 60.0, "processes": 4}.items():
+        parser.add_argument(f"--{name}", default=default, type=type(default))
+    for name, kind in {"folder": str, "coordinator": str, "num-processes": int, "process-id": int}.items():
+        parser.add_argument(f"--{name}", type=kind)
+    parser.add_argument("--losses", action="store_true")
     args = parser.parse_args()
     if args.coordinator is not None:
         place = ProcessPlace(args.coordinator, args.num_processes, args.process_id, args.seconds)

@@ -13,7 +13,6 @@ from oracle import (
     Float,
     Hits,
     Image,
-    Layer,
     Rules,
     Scene,
     Shown,
@@ -36,14 +35,10 @@ def hits_of(scene: Scene, i: int, has_low_pass: bool = True) -> Hits:
     return intersect(*homography(scene, i), scene.width, scene.height, DEFAULT_RULES.near, has_low_pass)
 
 
-def layers_of(scene: Scene, arrays: Any, show: Show, rules: Rules = DEFAULT_RULES) -> list[Layer]:
-    """The layers of all splats."""
-    return [shown_layer(scene, i, rules, *show(scene, arrays, i)) for i in range(len(scene.means))]
-
-
 def render_appearance(scene: Scene, arrays: Any, show: Show, rules: Rules = DEFAULT_RULES) -> Image:
     """The image of splats of an appearance."""
-    return composite(layers_of(scene, arrays, show, rules), scene.background)
+    layers = [shown_layer(scene, i, rules, *show(scene, arrays, i)) for i in range(len(scene.means))]
+    return composite(layers, scene.background)
 
 
 def glossy(scene: Scene, arrays: dict[str, Float], i: int, has_low_pass: bool = True) -> tuple[Hits, Shown]:

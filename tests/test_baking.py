@@ -1,6 +1,7 @@
 """Baking: plain Gaussians in place of textured ones look like them."""
 
 import dataclasses
+import itertools
 import sys
 
 import jax.numpy as jnp
@@ -65,11 +66,11 @@ def psnr(model: Model, other: Model) -> float:
     return float(-10 * np.log10(np.mean((found - wanted) ** 2)))
 
 
-@pytest.mark.parametrize("num", [1, 2, 4, 8])
-@pytest.mark.parametrize("convention", ["texel-centre", "align-corners"])
+@pytest.mark.parametrize(
+    ("num", "convention"),
+    [(1, "texel-centre"), *itertools.product((2, 4, 8), ("texel-centre", "align-corners"))],
+)
 def test_kernels_add_up_to_the_gaussian(num, convention):
-    if (num, convention) == (1, "align-corners"):
-        return
     means, scales = kernels(num, convention)
     u = np.linspace(-4, 4, 401)
     each = np.exp(-0.5 * ((u[:, None] - means) / scales) ** 2)
@@ -90,7 +91,7 @@ def test_a_splat_per_texel_looks_like_the_texture(split):
     assert psnr(split, model) > psnr(as_plain(model.gaussians, model), model) + 5
 
 
-@pytest.mark.parametrize("shape", [-0.8, 0.0, 0.3])
+@pytest.mark.parametrize("shape", [-0.8, 0.3])
 def test_small_splats_are_as_opaque_as_the_kernel_at_their_centres(shape):
     """Their optical depths add up to those of the kernel, but at corners, where some would have to be negative."""
     parent = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.asarray([1.0]))
@@ -103,13 +104,13 @@ def test_small_splats_are_as_opaque_as_the_kernel_at_their_centres(shape):
     np.testing.assert_allclose(1 - np.exp(-depths), parent.opacities[0] * kernel, atol=3e-3)
 
 
-@pytest.mark.parametrize("log_exponent", [-1.0, -0.55, 0.0, 0.4, 1.0])
+@pytest.mark.parametrize("log_exponent", [-1.0, 0.0, 0.4])
 def test_the_nearest_gaussian_has_the_least_squared_difference(log_exponent):
-    gaussians = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.zeros(1))
-    found = nearest_gaussians(gaussians, shapes_of(np.asarray([log_exponent])))
+    gaussians, shapes = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.zeros(1)), shapes_of([log_exponent])
+    found = nearest_gaussians(gaussians, shapes)
     peak, factor = 2 * float(found.opacities[0]), float(jnp.exp(found.log_scales - gaussians.log_scales)[0, 0])
     rho = np.linspace(0, 144, 100_001)
-    kernel = np.asarray(falloff_of(curves_of(jnp.asarray(shapes_of(np.asarray([log_exponent])))), jnp.asarray(rho)))
+    kernel = np.asarray(falloff_of(curves_of(jnp.asarray(shapes)), jnp.asarray(rho)))
     difference = lambda a, k: np.mean((a * np.exp(-rho / 2 / k) - kernel) ** 2)  # noqa: E731
     least = difference(peak, factor**2)
     others = [difference(peak * a, factor**2 * k) for a, k in ((0.95, 1), (1.05, 1), (1, 0.9), (1, 1.1), (1.05, 0.95))]
@@ -129,24 +130,15 @@ def test_texels_are_kept_where_pictures_need_them():
     np.testing.assert_allclose(found[0, 0, :, 0], [0.2, 1, 0.2, 1], rtol=1e-5)
 
 
-def test_training_on_pictures_brings_a_plain_model_nearer(split):
-    model = textured()
-    trained = distill(split, model, [CAMERA], iterations=30)
-    assert trained.num == split.num and trained.origin == model.origin
-    assert psnr(trained, model) > psnr(split, model) + 0.5
-
-
-def test_cameras_in_one_place_move_the_means_too(split):
+def test_training_brings_a_plain_model_nearer_over_its_background(split):
+    """Cameras in one place, which have no extent, move the means as well."""
     assert drawn_scene(textured(), [CAMERA], WHITE).scale > 1
-    trained = distill(split, textured(), [CAMERA], iterations=2)
-    assert (np.asarray(trained.gaussians.means) != np.asarray(split.gaussians.means)).any()
-
-
-def test_training_draws_over_the_background_of_the_model(split):
-    over_white = dataclasses.replace(textured(), background=WHITE)
+    wanted = dataclasses.replace(textured(), background=WHITE)
     start = dataclasses.replace(split, background=WHITE)
-    trained = distill(start, over_white, [CAMERA], iterations=30)
-    assert psnr(trained, over_white) > psnr(start, over_white) + 0.5
+    trained = distill(start, wanted, [CAMERA], iterations=30)
+    assert trained.num == split.num and trained.origin == wanted.origin
+    assert (np.asarray(trained.gaussians.means) != np.asarray(split.gaussians.means)).any()
+    assert psnr(trained, wanted) > psnr(start, wanted) + 0.5
 
 
 def test_growth_is_kept_where_degrees_differ(monkeypatch):
@@ -159,12 +151,9 @@ def test_growth_is_kept_where_degrees_differ(monkeypatch):
         assert split_splats(model, [CAMERA], 9.0).gaussians.sh_degree == 3
 
 
-def test_held_out_cameras_do_not_train():
-    cameras = [CAMERA] * 3
-    training, held_out = conversion.cameras_apart(Origin.of_cameras(cameras, is_test=[False, True, False]))
-    assert (len(training), len(held_out)) == (2, 1)
-    training, held_out = conversion.cameras_apart(Origin.of_cameras(cameras, is_test=[True] * 3))
-    assert (len(training), len(held_out)) == (3, 0)
+@pytest.mark.parametrize(("is_test", "counts"), [([False, True, False], (2, 1)), ([True] * 3, (3, 0))])
+def test_held_out_cameras_do_not_train(is_test, counts):
+    assert tuple(map(len, conversion.cameras_apart(Origin.of_cameras([CAMERA] * 3, is_test=is_test)))) == counts
 
 
 def test_plain_files_hold_the_nearest_gaussians(tmp_path):

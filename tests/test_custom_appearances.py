@@ -52,19 +52,18 @@ class Glossy(Appearance):
         return 2 * exponents * (jnp.exp(jnp.log(255 * opacities) / exponents) - 1)
 
 
-def rounded(arrays: dict, dtype: str) -> dict[str, np.ndarray]:
+def random_arrays(num: int, dtype: str, **makers: Callable) -> dict[str, np.ndarray]:
     """Numbers of float32, so that both precisions start from the same ones."""
-    return {name: np.asarray(value, np.float32).astype(dtype) for name, value in arrays.items()}
+    rng = np.random.default_rng(1)
+    return {name: np.asarray(make(rng), np.float32).astype(dtype) for name, make in makers.items()}
 
 
 def glossy_arrays(num: int, dtype="float64") -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(1)
-    arrays = {
-        "colors": rng.normal(scale=0.3, size=(num, 3)),
-        "axes": rng.normal(size=(num, 3)),
-        "log_exponents": rng.uniform(0.5, 2, num),
-    }
-    return rounded(arrays, dtype)
+    return random_arrays(
+        num, dtype,
+        colors=lambda rng: rng.normal(scale=0.3, size=(num, 3)), axes=lambda rng: rng.normal(size=(num, 3)),
+        log_exponents=lambda rng: rng.uniform(0.5, 2, num),
+    )  # fmt: skip
 
 
 def glossy(arrays: dict, **options) -> Glossy:
@@ -72,14 +71,12 @@ def glossy(arrays: dict, **options) -> Glossy:
 
 
 def kernel_arrays(num: int, dtype="float64") -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(1)
-    arrays = {
-        "centers": rng.normal(size=(num, 4, 2)),
-        "sharpness": rng.uniform(0.05, 1, (num, 4)),
-        "logit_opacities": rng.uniform(-1, 2, (num, 4)),
-        "colors": rng.normal(scale=0.4, size=(num, 4, 3)),
-    }
-    return rounded(arrays, dtype)
+    return random_arrays(
+        num, dtype,
+        centers=lambda rng: rng.normal(size=(num, 4, 2)), sharpness=lambda rng: rng.uniform(0.05, 1, (num, 4)),
+        logit_opacities=lambda rng: rng.uniform(-1, 2, (num, 4)),
+        colors=lambda rng: rng.normal(scale=0.4, size=(num, 4, 3)),
+    )  # fmt: skip
 
 
 def movable_kernels(arrays: dict) -> MovableKernels:
@@ -87,7 +84,7 @@ def movable_kernels(arrays: dict) -> MovableKernels:
 
 
 def shaped_arrays(num: int, dtype="float64") -> dict[str, np.ndarray]:
-    return rounded({"shapes": np.random.default_rng(1).normal(scale=1.5, size=num)}, dtype)
+    return random_arrays(num, dtype, shapes=lambda rng: rng.normal(scale=1.5, size=num))
 
 
 def shaped(arrays: dict) -> Appearance:
@@ -95,9 +92,11 @@ def shaped(arrays: dict) -> Appearance:
 
 
 def billboard_arrays(num: int, dtype="float64") -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(1)
-    alpha = rng.uniform(0.1, 0.9, (num, SIDE, SIDE, 1))
-    return rounded({"texels": np.concatenate([rng.normal(size=(num, SIDE, SIDE, 3)), alpha], axis=-1)}, dtype)
+    def texels(rng):
+        alpha = rng.uniform(0.1, 0.9, (num, SIDE, SIDE, 1))
+        return np.concatenate([rng.normal(size=(num, SIDE, SIDE, 3)), alpha], axis=-1)
+
+    return random_arrays(num, dtype, texels=texels)
 
 
 def billboards(arrays: dict) -> Billboards:
@@ -113,27 +112,24 @@ class Case(NamedTuple):
     arrays: Callable[..., dict]
     appearance: Callable[[dict], Appearance]
     show: oracle_appearances.Show
-    is_gaussian_opaque: bool
-    """The Gaussian's own opacity counts."""
-    smooth_seed: int
-    """A scene that keeps clear of thresholds and kinks."""
+    is_gaussian_opaque: bool  # Whether the Gaussian's own opacity counts.
+    smooth_seed: int  # Of a scene that keeps clear of thresholds and kinks.
     max_alpha: float = 0.99
 
 
 CASES = {
     "glossy": Case(glossy_arrays, glossy, oracle_appearances.glossy, True, 53),
     "glossy, no low-pass filter": Case(
-        glossy_arrays,
-        functools.partial(glossy, has_low_pass=False, max_alpha=0.7),
-        functools.partial(oracle_appearances.glossy, has_low_pass=False),
-        True,
-        1,
-        0.7,
+        glossy_arrays, functools.partial(glossy, has_low_pass=False, max_alpha=0.7),
+        functools.partial(oracle_appearances.glossy, has_low_pass=False), True, 1, 0.7,
     ),
     "shaped": Case(shaped_arrays, shaped, oracle_appearances.shaped, True, 53),
     "movable kernels": Case(kernel_arrays, movable_kernels, oracle_appearances.movable, False, 1),
     "billboards": Case(billboard_arrays, billboards, oracle_appearances.billboard, False, 0),
-}
+}  # fmt: skip
+FAST = "movable kernels"
+"""The case whose gradients the default tests compare."""
+some_long = [pytest.param(name, marks=[] if name == FAST else pytest.mark.long) for name in CASES]
 
 
 def rendered(scene, appearance, compositor="auto", dtype="float64"):
@@ -173,43 +169,55 @@ def test_float32(name):
         assert np.mean(error < 3e-4) >= 0.999, name
 
 
-@pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("compositor", ["native", "xla"])
-@pytest.mark.parametrize("name", CASES)
-def test_every_leaf_against_differences(name, compositor):
-    """Of the appearance, of the Gaussians, and of the camera, on which the numbers may depend."""
+@functools.cache
+def expected_gradients(name: str):
+    """The oracle's gradients by differences: of the appearance, of the Gaussians, and of the camera, on which the
+    numbers may depend."""
     case = CASES[name]
     scene = draw_smooth_scene(case.smooth_seed)
     arrays, weights = case.arrays(len(scene.means)), draw_weights(scene)
     image = expected_image(case, scene, arrays)
     assert min(image.margin.min(), image.kink.min()) > CLEARANCE
-    settings, background = RenderSettings(compositor=compositor), jnp.asarray(scene.background)
 
-    def loss(arrays, gaussians, viewmat):
-        camera = Camera(viewmat, jnp.asarray(scene.K), scene.width, scene.height)
-        output = render_appearance(gaussians, camera, case.appearance(arrays), background=background, settings=settings)
-        return sum(jnp.sum(getattr(output, name) * jnp.asarray(weight)) for name, weight in weights.items())
-
-    def expected_loss(scene, arrays):
+    def loss(scene, arrays):
         image = expected_image(case, scene, arrays)
         return sum(np.sum(getattr(image, name) * weight) for name, weight in weights.items())
 
-    found = jax.grad(loss, argnums=(0, 1, 2))(arrays, as_gaussians(scene, "float64"), jnp.asarray(scene.viewmat))
-    for leaf in arrays:
-        expected = differences(arrays[leaf], lambda value, leaf=leaf: expected_loss(scene, arrays | {leaf: value}))
-        assert_gradients_close(found[0][leaf], expected, leaf)
-    leaves = {leaf: getattr(found[1], leaf) for leaf in ("means", "quats", "log_scales")} | {"viewmat": found[2]}
-    if case.is_gaussian_opaque:
-        leaves["logit_opacities"] = found[1].logit_opacities
-    else:
-        np.testing.assert_array_equal(found[1].logit_opacities, 0)
-    for leaf, gradient in leaves.items():
-        moved = lambda value, leaf=leaf: expected_loss(scene._replace(**{leaf: value}), arrays)  # noqa: E731
-        assert_gradients_close(gradient, differences(getattr(scene, leaf), moved), leaf)
+    leaves = ["means", "quats", "log_scales", "viewmat", *["logit_opacities"] * case.is_gaussian_opaque]
+    return (
+        {leaf: differences(own, lambda x, leaf=leaf: loss(scene, arrays | {leaf: x})) for leaf, own in arrays.items()},
+        {leaf: differences(getattr(scene, leaf), lambda x, leaf=leaf: loss(scene._replace(**{leaf: x}), arrays))
+         for leaf in leaves},
+    )  # fmt: skip
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("compositor", ["native", "xla"])
+@pytest.mark.parametrize("name", some_long)
+def test_every_leaf_against_differences(name, compositor):
+    case = CASES[name]
+    scene = draw_smooth_scene(case.smooth_seed)
+    weights, background = draw_weights(scene), jnp.asarray(scene.background)
+
+    def loss(arrays, gaussians, viewmat):
+        camera = Camera(viewmat, jnp.asarray(scene.K), scene.width, scene.height)
+        options = {"background": background, "settings": RenderSettings(compositor=compositor)}
+        output = render_appearance(gaussians, camera, case.appearance(arrays), **options)
+        return sum(jnp.sum(getattr(output, name) * jnp.asarray(weight)) for name, weight in weights.items())
+
+    inputs = case.arrays(len(scene.means)), as_gaussians(scene, "float64"), jnp.asarray(scene.viewmat)
+    of_arrays, of_gaussians, of_viewmat = jax.grad(loss, argnums=(0, 1, 2))(*inputs)
+    expected, others = expected_gradients(name)
+    for leaf, gradient in expected.items():
+        assert_gradients_close(of_arrays[leaf], gradient, leaf)
+    for leaf, gradient in others.items():
+        assert_gradients_close(of_viewmat if leaf == "viewmat" else getattr(of_gaussians, leaf), gradient, leaf)
+    if not case.is_gaussian_opaque:
+        np.testing.assert_array_equal(of_gaussians.logit_opacities, 0)
 
 
 @pytest.mark.usefixtures("gpu_kernels")
-@pytest.mark.parametrize("name", ["glossy", "movable kernels", "billboards"])
+@pytest.mark.parametrize("name", [FAST, pytest.param("billboards", marks=pytest.mark.long)])
 def test_gpu_kernels_are_those_of_xla(name):
     # In this scene no splat is seen so edge-on that v² would leave float32 three digits.
     case, scene = CASES[name], draw_scene(1, num=16, width=19, height=13)
@@ -228,7 +236,7 @@ def test_gpu_kernels_are_those_of_xla(name):
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("compositor", ["native", "xla"])
+@pytest.mark.parametrize("compositor", ["native", pytest.param("xla", marks=pytest.mark.long)])
 def test_the_statistic_takes_the_way_of_the_falloff(compositor):
     """At one pixel, of splats whose mean does nothing else, it is the size of the gradient; none, for billboards."""
     scene = draw_smooth_scene(53)
@@ -268,26 +276,25 @@ def test_arrays_in_elementwise_functions_are_refused(compositor):
         rendered(scene, Tinted(tints=jnp.ones(())), compositor, "float32")
 
 
-def test_numbers_of_another_shape_are_refused():
-    scene = draw_scene(4, num=3, width=8, height=8)
-    arrays = glossy_arrays(3, "float32")
-
-    @pytree(kw_only=True)
-    class Wrong(Glossy):
-        def numbers(self, gaussians, camera):
-            return jnp.zeros(5)
-
-    with pytest.raises(ValueError, match=r"numbers \[N, K\] of N = 3.*\(5,\)"):
-        rendered(scene, Wrong(**jax.tree.map(jnp.asarray, arrays)), dtype="float32")
+@pytree(kw_only=True)
+class Wrong(Glossy):
+    def numbers(self, gaussians, camera):
+        return jnp.zeros(5)
 
 
-def test_a_largest_alpha_of_one_is_refused():
-    scene = draw_scene(4, num=3, width=8, height=8)
-    with pytest.raises(ValueError, match=r"max_alpha .* is 1\.0"):
-        rendered(scene, Appearance(max_alpha=1.0), dtype="float32")
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Wrong(**glossy_arrays(3, "float32")), r"numbers \[N, K\] of N = 3.*\(5,\)"),
+        (lambda: Appearance(max_alpha=1.0), r"max_alpha .* is 1\.0"),
+    ],
+)
+def test_wrong_numbers_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        rendered(draw_scene(4, num=3, width=8, height=8), make(), dtype="float32")
 
 
-@pytest.mark.parametrize("compositor", ["native", "xla"])
+@pytest.mark.parametrize("compositor", ["native", pytest.param("xla", marks=pytest.mark.long)])
 def test_without_a_low_pass_filter_edge_on_splats_show_nothing(compositor):
     scene = hand_scene([[0, 0, 4]], [EDGE_ON], [[0.0, 0.0]], [0.9], [[1, 1, 1]])
     arrays, settings = glossy_arrays(1, "float32"), RenderSettings(compositor=compositor)

@@ -1,4 +1,4 @@
-"""One scene on several devices: those of a CPU, in a process that is told to have four (`on_devices`)."""
+"""One scene on several devices: four devices of a CPU, in processes of their own (`on_devices`)."""
 
 import os
 import pathlib
@@ -11,17 +11,12 @@ import pytest
 from a2tg_jax.training import Session
 
 SCRIPT = pathlib.Path(__file__).with_name("on_devices.py")
-FOUR = "--xla_force_host_platform_device_count=4"
+LONG = ("batches", "training", "events", "overflowing", "textures", "memory", "lenses", "balance")
 
 
-LONG = [
-    pytest.param(what, marks=pytest.mark.long) for what in ("overflowing", "textures", "memory", "lenses", "balance")
-]
-
-
-@pytest.mark.parametrize("what", ["rendering", "batches", "training", "events", *LONG])
+@pytest.mark.parametrize("what", ["rendering", *(pytest.param(what, marks=pytest.mark.long) for what in LONG)])
 def test_several_devices_do_what_one_does(what, tmp_path, monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} {FOUR}")
+    monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4")
     command = [sys.executable, str(SCRIPT), what, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stderr[-3000:]

@@ -1,5 +1,6 @@
 """Meshes: fusion of exact depths, marching cubes over bricks, cleaning, files, distances, and the command."""
 
+import dataclasses
 import json
 import struct
 import sys
@@ -66,23 +67,14 @@ def sphere():
     return fused_sphere(Space.of(np.array([0.01, 0.02, 0.03]), 1.0, 1 / 60, False))
 
 
-def edges_of(mesh):
-    pairs = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
-    return np.unique(pairs, axis=0, return_counts=True)
-
-
-def test_a_sphere_is_fused_from_exact_depths(sphere):
+def test_a_sphere_is_fused_from_exact_depths_without_cracks(sphere):
     error = np.linalg.norm(sphere.vertices, axis=1) - RADIUS
     assert np.abs(error).mean() < 0.1 / 60 and np.abs(error).max() < 1 / 60
     assert sphere.area == pytest.approx(4 * np.pi * RADIUS**2, rel=0.02)
-    centers = sphere.corners.mean(axis=1)
-    assert (np.sum(sphere.face_normals * centers, axis=1) > 0).mean() > 0.999
+    assert (np.sum(sphere.face_normals * sphere.corners.mean(axis=1), axis=1) > 0).mean() > 0.999
     np.testing.assert_allclose(sphere.colors / 255, np.clip(0.5 + sphere.vertices, 0, 1), atol=0.05)
-
-
-def test_bricks_are_welded_without_cracks(sphere):
-    _, counts = edges_of(sphere)
-    assert (counts == 2).all()
+    edges = np.sort(sphere.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all(), "bricks are welded"
 
 
 def test_an_unbounded_space_is_even_within_the_radius_and_grows_beyond():
@@ -101,24 +93,14 @@ def test_far_surfaces_are_meshed_in_an_unbounded_space_only():
     assert not fused_sphere(Space.of(np.zeros(3), 1.0, 0.1, False), **far).num_faces
 
 
-def test_blocks_are_named_and_found():
-    blocks = np.array([[0, 0, 0], [-1, 5, 7], [0, 0, 0], [-(1 << 21), 0, 0]])
-    grid = BlockGrid(10**6)
-    assert list(grid.allocate(blocks)) == [0, 1] == list(grid.allocate(blocks))
-    assert grid.coordinates.tolist() == [[-1, 5, 7], [0, 0, 0]]
-    assert list(grid.find(np.array([[9, 9, 9], [0, 0, 0], [-1, 5, 7]]))) == [-1, 1, 0]
-
-
-def test_small_parts_are_dropped_and_counted(sphere):
-    small = a2tg.Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32))
+@pytest.mark.parametrize(("most", "least_faces"), [(50, 50), (1, 0)])
+def test_small_parts_are_dropped_and_counted(sphere, most, least_faces):
     both = a2tg.Mesh(
-        np.concatenate([sphere.vertices, small.vertices]),
-        np.concatenate([sphere.faces, small.faces + sphere.num_vertices]),
+        np.concatenate([sphere.vertices, np.eye(3)]),
+        np.concatenate([sphere.faces, np.array([[0, 1, 2]], np.int32) + sphere.num_vertices]),
     )
-    kept, dropped = largest_clusters(both, 50, 50)
+    kept, dropped = largest_clusters(both, most, least_faces)
     assert dropped == 1 and kept.num_faces == sphere.num_faces and kept.num_vertices == sphere.num_vertices
-    kept, dropped = largest_clusters(both, 1, 0)
-    assert dropped == 1 and kept.num_faces == sphere.num_faces
 
 
 def test_a_drawn_mesh_has_the_depths_that_it_was_fused_from(sphere):
@@ -207,14 +189,12 @@ def test_the_mesh_and_the_splats_of_a_model_lie_on_each_other(model, tmp_path):
     assert splats["bufferViews"][0] == mesh["bufferViews"][0] and means[:size] == positions[:size]
 
 
-def test_all_files_of_a_mesh_are_told_beforehand(tmp_path):
-    corners, faces = np.eye(3), np.array([[0, 1, 2]], np.int32)
-    mesh = a2tg.Mesh(corners, faces, uv=np.eye(3)[:, :2], texture=np.zeros((4, 4, 3), np.uint8))
-    for suffix in (".glb", ".ply", ".obj"):
-        path = tmp_path / suffix[1:] / f"mesh{suffix}"
-        path.parent.mkdir()
-        written = a2tg.save_mesh(path, mesh)
-        assert written == mesh_files(path, has_texture=True) and set(path.parent.iterdir()) == set(written)
+@pytest.mark.parametrize("suffix", [".glb", ".ply", ".obj"])
+def test_all_files_of_a_mesh_are_known_before(tmp_path, suffix):
+    own = {"uv": np.eye(3)[:, :2], "texture": np.zeros((4, 4, 3), np.uint8)}
+    mesh, path = a2tg.Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), **own), tmp_path / f"mesh{suffix}"
+    assert a2tg.save_mesh(path, mesh) == mesh_files(path, has_texture=True)
+    assert set(tmp_path.iterdir()) == set(mesh_files(path, has_texture=True))
 
 
 # From a model
@@ -229,12 +209,11 @@ def model():
     axis = np.cross((0, 0, 1), normals)
     half = np.stack([1 + normals[:, 2], *axis.T], -1)
     gaussians = a2tg.init_from_points(RADIUS * normals, 0.5 + 0.4 * normals, sh_degree=0)
-    gaussians = gaussians.__class__(
-        gaussians.means,
-        jnp.asarray(half / np.linalg.norm(half, axis=1, keepdims=True), jnp.float32),
-        jnp.full((1500, 2), np.log(0.03), jnp.float32),
-        jnp.full((1500,), 3.0, jnp.float32),
-        gaussians.sh,
+    gaussians = dataclasses.replace(
+        gaussians,
+        quats=jnp.asarray(half / np.linalg.norm(half, axis=1, keepdims=True), jnp.float32),
+        log_scales=jnp.full((1500, 2), np.log(0.03), jnp.float32),
+        logit_opacities=jnp.full((1500,), 3.0, jnp.float32),
     )
     cameras = [camera_at(1.2 * each / np.linalg.norm(each)) for each in AROUND if (each == 0).sum() != 1]
     similarity = a2tg.Similarity(0.1, np.eye(3), np.zeros(3))
@@ -245,12 +224,20 @@ def test_a_model_becomes_a_mesh(model):
     result = a2tg.extract_mesh(model, resolution=80)
     assert result.num_views == 14 and result.radius == pytest.approx(2.4, rel=1e-3)
     assert np.median(np.abs(np.linalg.norm(result.mesh.vertices, axis=1) - RADIUS)) < result.voxel
+    center, radius = common_sphere(model.origin.viewmats)
+    np.testing.assert_allclose(center, 0, atol=1e-6)
+    assert radius == pytest.approx(2.4, rel=1e-3)
 
 
 def test_one_camera_looks_at_what_it_sees(model):
     result = a2tg.extract_mesh(model, model.origin.cameras[:1], resolution=60)
-    assert 0.3 < np.linalg.norm(result.center) < 0.6
-    assert result.mesh.num_faces > 100
+    assert 0.3 < np.linalg.norm(result.center) < 0.6 and result.mesh.num_faces > 100
+
+
+def test_far_splats_do_not_matter_within_the_radius(model):
+    means = model.gaussians.means.at[:50].multiply(1e6)
+    far = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, means=means))
+    assert np.abs(a2tg.extract_mesh(far, resolution=40).mesh.vertices).max() < 2.4
 
 
 @pytest.mark.parametrize(
@@ -260,34 +247,16 @@ def test_one_camera_looks_at_what_it_sees(model):
         ({"radius": 0.05, "center": np.array([3.0, 0, 0])}, "there is no surface within 0.05"),
         ({"resolution": 0}, "resolution must lie in"),
         ({"resolution": 10, "voxel": 0.1}, "resolution and voxel both"),
-        ({"resolution": None, "voxel": np.nan}, "voxel must be positive"),
         ({"least_faces": 10**6}, "parts? had fewer than 1000000 faces: raise the resolution, or lower least_faces"),
         ({"most_clusters": 0}, "most_clusters must be at least 1"),
         ({"max_bytes": 0}, "max_bytes must be positive"),
         ({"cameras": []}, "there are no cameras"),
+        (None, "has no Gaussians"),
     ],
 )
-def test_mistakes_are_told(model, options, message):
+def test_mistakes_are_reported(model, options, message):
     with pytest.raises(ValueError, match=message):
-        a2tg.extract_mesh(model, **{"resolution": 20, **options})
-
-
-def test_an_empty_model_is_refused(model):
-    with pytest.raises(ValueError, match="has no Gaussians"):
-        a2tg.extract_mesh(model[:0])
-
-
-def test_far_splats_do_not_matter_within_the_radius(model):
-    means = model.gaussians.means.at[:50].multiply(1e6)
-    far = a2tg.Model(model.gaussians.__class__(means, *[getattr(model.gaussians, name) for name in (
-        "quats", "log_scales", "logit_opacities", "sh")]), origin=model.origin)  # fmt: skip
-    assert np.abs(a2tg.extract_mesh(far, resolution=40).mesh.vertices).max() < 2.4
-
-
-def test_the_common_sphere_of_cameras_around(model):
-    center, radius = common_sphere(model.origin.viewmats)
-    np.testing.assert_allclose(center, 0, atol=1e-6)
-    assert radius == pytest.approx(2.4, rel=1e-3)
+        a2tg.extract_mesh(model[:0] if options is None else model, **{"resolution": 20, **(options or {})})
 
 
 # The command
@@ -436,24 +405,6 @@ def test_dtu_counts_what_was_observed_above_the_table():
     wrong = grid + np.where(grid[:, :1] >= 10, 7.0, 0.0) * np.array([0, 0, 1])
     found = surface_quality.dtu_distance(wrong, grid, mask, bounds, 1.0, plane)
     assert found.accuracy == 0 and found.completeness > 1
-
-
-def test_a_matrix_of_another_shape_and_a_missing_reader_are_told(tmp_path, monkeypatch):
-    path = tmp_path / "world.txt"
-    for text in ("1 2 3", "1 2\n3", "one"):
-        path.write_text(text)
-        with pytest.raises(ValueError, match=r"world.txt: must hold .* 4 × 4 matrix"):
-            surface_quality.read_matrix(path)
-    np.savetxt(path, np.eye(4))
-    np.testing.assert_array_equal(surface_quality.read_matrix(path), np.eye(4))
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(ValueError, match=r"trimesh: pip install 'a2tg-jax\[experiments\]'"):
-        surface_quality.read_mesh(tmp_path / "mesh.ply")
-
-
-def test_the_preset_for_surfaces_has_their_losses():
-    terms = a2tg.Gaussians2d.preset("surfaces").stages()[0].losses
-    assert [term.function.__name__ for term in terms[1:]] == ["normals"]
 
 
 @pytest.mark.parametrize(

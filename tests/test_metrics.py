@@ -29,13 +29,10 @@ def test_psnr_and_ssim_equal_scikit_image_on_clipped_images(x64):
     np.testing.assert_allclose(jax.jit(ssim)(image, target), wanted, atol=1e-12)
 
 
-def test_equal_images_are_perfect():
+def test_equal_images_are_perfect_and_shapes_must_agree():
     image = jnp.asarray(random_image(0), jnp.float32)
     assert psnr(image, image) == np.inf
     np.testing.assert_allclose(jax.jit(ssim)(image, image), 1, atol=1e-6)
-
-
-def test_images_of_different_shape_are_refused():
     with pytest.raises(ValueError, match="must both be"):
         psnr(jnp.zeros((4, 4, 3)), jnp.zeros((4, 5, 3)))
 
@@ -95,23 +92,28 @@ def test_weights_are_read_once(random_squeeze):
     assert load_lpips(str(random_squeeze)) is load_lpips(random_squeeze)
 
 
-def test_wrong_weights_are_named(tmp_path, random_squeeze):
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("text", "is not an .npz archive"), ("one array", "is not an .npz archive"),
+        ("other", "does not hold LPIPS weights"), ("mixed", "do not fit the channels of squeeze"),
+    ],
+)  # fmt: skip
+def test_wrong_weights_are_named(tmp_path, random_squeeze, name, words):
+    arrays = dict(np.load(random_squeeze))
+    wrong = {"other": {"means": np.zeros(3)}, "mixed": arrays | {"lin3.weight": arrays["lin3.weight"][:, :5]}}
+    path = tmp_path / f"{name}.npz"
+    with open(path, "wb") as file:
+        if name in wrong:
+            np.savez(file, **wrong[name])
+        elif name == "text":
+            file.write(b"not an archive")
+        else:
+            np.save(file, np.zeros(3))
+    with pytest.raises(ValueError, match=f"{name}.*{words}"):
+        load_lpips(path)
     with pytest.raises(FileNotFoundError, match=r"no LPIPS weights at .*absent\.npz"):
         load_lpips(tmp_path / "absent.npz")
-    (tmp_path / "text.npz").write_text("not an archive")
-    with pytest.raises(ValueError, match=r"text\.npz is not an \.npz archive"):
-        load_lpips(tmp_path / "text.npz")
-    np.save(tmp_path / "one_array.npy", np.zeros(3))
-    with pytest.raises(ValueError, match=r"is not an \.npz archive"):
-        load_lpips(tmp_path / "one_array.npy")
-    np.savez(tmp_path / "other.npz", means=np.zeros(3))
-    with pytest.raises(ValueError, match=r"other\.npz does not hold LPIPS weights"):
-        load_lpips(tmp_path / "other.npz")
-    arrays = dict(np.load(random_squeeze))
-    arrays["lin3.weight"] = arrays["lin3.weight"][:, :5]
-    np.savez(tmp_path / "mixed.npz", **arrays)
-    with pytest.raises(ValueError, match="do not fit the channels of squeeze"):
-        load_lpips(tmp_path / "mixed.npz")
 
 
 def test_lpips_refuses_tiny_images(random_squeeze):

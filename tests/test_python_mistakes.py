@@ -216,7 +216,7 @@ KINDS = {
     "A2tg.texture.cap is an unknown key; say texture={'cap': …}": lambda: a2tg.A2tg.preset(
         "quick", **{"texture.cap": 4}
     ),
-    "and up is [0. 0. 1.]: say another up=": lambda: a2tg.look_at([0, 0, 1], [0, 0, 0], width=64, height=48),
+    "and up is [0. 0. 1.]: pass another up": lambda: a2tg.look_at([0, 0, 1], [0, 0, 0], width=64, height=48),
     "is a folder; name a file": lambda: a2tg.load_model(tempfile.gettempdir()),
     "rates.sh must broadcast to [7, 16, 3] at equal rank; got [1, 4, 1]": lambda: stepped(
         a2tg.LearningRates().of_gaussians(1e-3, 1)

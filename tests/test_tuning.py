@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_values import some_gaussians
-from test_compact import MODELS, SETTINGS, every_model, order_of
+from test_compact import MODELS, SETTINGS, order_of
 from test_compaction import SCENE, a_model
 
 import a2tg_jax as a2tg
@@ -63,11 +63,12 @@ def assert_same(found: Model, wanted: Model) -> None:
         np.testing.assert_allclose(values, arrays_of(wanted)[name], rtol=2e-5, atol=2e-6, err_msg=name)
 
 
-@every_model
+@pytest.mark.parametrize("name", ["plain 4", "banded 1", "textured or not", "banded, shaped and textured"])
 def test_training_and_the_file_round_alike(name):
-    """Also numbers that training has moved, beyond the ends of the grids too."""
+    """Numbers that training has moved beyond the ends of the grids as well."""
     start = half_turned(MODELS[name]())
     grids = grids_of(start, COARSE)
+    assert encode_model(start, COARSE, grids) == encode_model(start, COARSE)
     changed = moved(start)
     rounded = round_to(GridRounding.to(grids, COARSE), changed)
     assert encode_model(changed, COARSE, grids) == encode_model(rounded, COARSE, grids)
@@ -78,40 +79,28 @@ def test_training_and_the_file_round_alike(name):
     assert np.abs(images[0] - images[1]).max() < 2e-4 < np.abs(images[1] - images[2]).max()
 
 
-def test_own_grids_are_those_of_a_file_without():
-    start = half_turned(MODELS["banded, shaped and textured"]())
-    assert encode_model(start, COARSE, grids_of(start, COARSE)) == encode_model(start, COARSE)
-
-
 @pytest.mark.parametrize("precision", ["float32", "float16"])
 def test_groups_kept_as_floats_are_not_rounded(precision):
     start = half_turned(MODELS["banded, shaped and textured"]())
     choices = CompactChoices().keeping(dict.fromkeys(GROUPS, precision))
     grids = grids_of(start, choices)
     assert not grids
-    rounded = GridRounding.to(grids, choices)(start)
+    rounded = round_to(GridRounding.to(grids, choices), start)
     assert all(map(np.array_equal, jax.tree.leaves(rounded), jax.tree.leaves(start)))
 
 
 def test_numbers_are_rounded_one_after_the_other_and_stay():
     start = half_turned(MODELS["banded, shaped and textured"]())
     rounding = GridRounding.to(grids_of(start, COARSE), COARSE)
-    event = GradualRounding(rounding)
-    times = event.init(start)
-    wanted = round_to(rounding, start)
-    before: set[int] = set()
+    times, wanted, jitted = GradualRounding(rounding).init(start), round_to(rounding, start), jax.jit(partly_rounded)
+    before = np.zeros(0, int)
     for share in (0.0, 0.3, 0.6, 1.0):
-        is_rounded = jax.tree.map(lambda time, share=share: time < share, times)
-        found = jax.jit(partly_rounded)(rounding, moved(start, 1e-4), is_rounded)
-        same = jnp.concatenate(
-            [
-                jnp.isclose(a, b, rtol=1e-5, atol=1e-6).reshape(-1)
-                for a, b in zip(jax.tree.leaves(found.gaussians), jax.tree.leaves(wanted.gaussians), strict=True)
-            ]
-        )
-        on_grid = set(np.flatnonzero(same).tolist())
-        assert len(before - on_grid) <= 0.02 * len(same)  # w of quaternions moves along with their other numbers.
-        assert abs(len(on_grid) / len(same) - share) < 0.15
+        found = jitted(rounding, moved(start, 1e-4), jax.tree.map(lambda time, share=share: time < share, times))
+        pairs = zip(jax.tree.leaves(found.gaussians), jax.tree.leaves(wanted.gaussians), strict=True)
+        same = np.concatenate([np.isclose(a, b, rtol=1e-5, atol=1e-6).reshape(-1) for a, b in pairs])
+        on_grid = np.flatnonzero(same)
+        # w of quaternions moves along with their other numbers.
+        assert len(np.setdiff1d(before, on_grid)) <= 0.02 * len(same) and abs(same.mean() - share) < 0.15
         before = on_grid
     assert_same(found, round_to(rounding, moved(start, 1e-4)))
 
@@ -119,12 +108,12 @@ def test_numbers_are_rounded_one_after_the_other_and_stay():
 @functools.cache
 def trained_model() -> Model:
     """A model that has learned; 16 bits round next to nothing."""
-    return tune_compact(a_model(), SCENE, SYSTEM, FINE, iterations=2000).model
+    return tune_compact(a_model(), SCENE, SYSTEM, FINE, iterations=800).model
 
 
 @functools.cache
 def tuned_model(choices: CompactChoices = COARSE) -> Tuned:
-    return tune_compact(trained_model(), SCENE, SYSTEM, choices, iterations=600)
+    return tune_compact(trained_model(), SCENE, SYSTEM, choices, iterations=300)
 
 
 def test_tuning_makes_up_for_rounding():
@@ -136,26 +125,14 @@ def test_tuning_makes_up_for_rounding():
     assert tuned_model().model.origin == fine.origin == a_model().origin
 
 
-def test_the_file_holds_the_tuned_model():
+def test_the_file_holds_the_tuned_model(tmp_path):
     found = tuned_model()
     again = decode_model(found.data)
     assert_same(again, found.model[order_of(found.model, again)])
-    loss = loss_on_views(found.model, SCENE.train)
-    assert abs(loss(again)) < 1e-4
-    rounded = round_to(GridRounding.to(found.grids, found.choices), found.model)
-    assert_same(rounded, found.model)
-
-
-def test_save_compact_writes_the_tuned_model(tmp_path):
-    found = tuned_model()
+    assert abs(loss_on_views(found.model, SCENE.train)(again)) < 1e-4
+    assert_same(round_to(GridRounding.to(found.grids, found.choices), found.model), found.model)
     a2tg.save_compact(tmp_path / "scene.a2tgz", found.model, choices=found.choices, grids=found.grids)
     assert (tmp_path / "scene.a2tgz").read_bytes() == found.data
-
-
-def test_a_diverged_tuning_is_an_error():
-    spoiled = dataclasses.replace(SYSTEM, rates=dataclasses.replace(SYSTEM.rates, log_scales=1e30))
-    with pytest.raises(DivergedError, match="stage tuning"):
-        tune_compact(a_model(), SCENE, spoiled, COARSE, iterations=3)
 
 
 def test_models_with_textures_are_tuned():
@@ -165,23 +142,28 @@ def test_models_with_textures_are_tuned():
     assert found.model.textures is not None and decode_model(found.data).num == a_model().num
 
 
+def shaped_model():
+    gaussians = some_gaussians()
+    return Model(gaussians, allocate_appearance(Appearance(exponents=Exponents()), jax.random.key(0), gaussians))
+
+
 @pytest.mark.parametrize(
-    ("model", "iterations", "words"),
+    ("make", "iterations", "kind", "words"),
     [
-        (a_model(), 0, "iterations must be at least 1; got 0"),
+        (a_model, 0, ValueError, "iterations must be at least 1; got 0"),
         (
-            Model(
-                some_gaussians(),
-                allocate_appearance(Appearance(exponents=Exponents()), jax.random.key(0), some_gaussians()),
-            ),
+            shaped_model,
             5,
-            "model must show what the last stage of the system, .gaussians., trains, .* shows Gaussians with exponents",
+            ValueError,
+            "stage of the system, .gaussians., trains, .* shows Gaussians with exponents",
         ),
+        (a_model, 3, DivergedError, "stage tuning"),
     ],
 )
-def test_what_cannot_be_tuned_is_refused(model, iterations, words):
-    with pytest.raises(ValueError, match=words):
-        tune_compact(model, SCENE, SYSTEM, COARSE, iterations=iterations)
+def test_what_cannot_be_tuned_is_refused(make, iterations, kind, words):
+    rates = dataclasses.replace(SYSTEM.rates, log_scales=1e30 if kind is DivergedError else SYSTEM.rates.log_scales)
+    with pytest.raises(kind, match=words):
+        tune_compact(make(), SCENE, dataclasses.replace(SYSTEM, rates=rates), COARSE, iterations=iterations)
 
 
 # Corrections
@@ -194,8 +176,6 @@ CORRECTED = dataclasses.replace(SYSTEM, exposure=True, refine_poses=True)
 
 @dataclasses.dataclass(frozen=True)
 class CorrectedStage(a2tg.training.System):
-    """A system of one stage."""
-
     stage: Stage = dataclasses.field(default_factory=lambda: CORRECTED.stages()[-1])
 
     def stages(self):
@@ -281,92 +261,54 @@ def test_corrections_stay_as_they_are(monkeypatch, kind):
 # The search
 
 
-def search(monkeypatch, loss_after, max_loss=0.05):
-    """Tolerances tried, what was found and the models started from, if tuning changes a loss so."""
-    tolerances, started = [], []
+@pytest.mark.parametrize(
+    ("losses", "max_loss", "tolerances", "kept"),
+    [
+        pytest.param((0.05, 0.05, 0.3, 0.05), 0.05, (0.5, 1, 2, 2**0.5), 3, id="doubles until too much is lost"),
+        pytest.param((0.2, 0.0, 0.04, 0.3), 0.05, (0.5, 0.5**1.5, 0.5, 0.5**0.5), 2, id="tries again after training"),
+        pytest.param((1.5, 3, 2, 1.5), 1.5, (3, 6, 18**0.5, 3), 0, id="begins beyond a large loss"),
+        pytest.param((0.0, 1.0, 1.0, 0.0), 0.05, (0.5, 1, 0.5**0.5, 0.5), 0, id="keeps no larger file"),
+        pytest.param((0.401,) * 4, 0.4, (0.8, 0.8 * 0.5**0.5, 0.4, 0.4), None, id="keeps nothing beyond the loss"),
+        pytest.param((0.0, 0.0, "diverges"), 0.05, (0.5, 1, 2), 1, id="ends where a tuning diverges"),
+    ],
+)
+def test_the_search(monkeypatch, losses, max_loss, tolerances, kept):
+    """Its tolerances before tuning, the file it keeps, and the models it starts from, given losses after tuning."""
+    tried, started = [], []
 
-    def within(model, losses, tolerance, trials):
-        tolerances.append(tolerance)
-        return Trial(CompactChoices(means=max(16 - len(tolerances), 1)), 0, (tolerance,))
+    def within(model, measures, tolerance, trials):
+        tried.append(tolerance)
+        return Trial(CompactChoices(means=16 - len(tried)), 0, (tolerance,))
 
     def tune(model, choices, number):
-        assert number == len(tolerances)
+        assert number == len(tried)
         started.append(model)
-        return Tuned(f"after {tolerances[-1]:.2f}", choices, {})
+        if losses[number - 1] == "diverges":
+            raise DivergedError("the loss has exploded", None)
+        return Tuned(number, choices, {})
 
-    def measured(found, losses):
-        return Trial(found.choices, round(1000 / tolerances[-1]), (loss_after(tolerances[-1]),))
+    def measured(found, measures):
+        return Trial(found.choices, round(1000 / tried[-1]), (losses[len(tried) - 1],))
 
     monkeypatch.setattr(tuning, "smallest_within", within)
     monkeypatch.setattr(tuning, "_measured", measured)
-    return tolerances, smallest_tuned("model", [], max_loss, [], tune), started
+    found = smallest_tuned("model", [], max_loss, [], tune)
+    np.testing.assert_allclose(tried, tolerances)
+    assert started == ["model", 1, 2, 3][: len(started)]
+    assert found.diverged == ("the loss has exploded" if "diverges" in losses else None)
+    assert len(found.tried) == (2 if found.diverged else MOST_TUNINGS)
+    assert found.tuned is None if kept is None else (found.tuned.model, found.chosen) == (kept + 1, found.tried[kept])
 
 
-def test_the_search_doubles_the_tolerance_until_too_much_is_lost(monkeypatch):
-    tolerances, found, started = search(monkeypatch, lambda before: 0.05 if before <= 1.5 else 0.3)
-    np.testing.assert_allclose(tolerances, [0.5, 1, 2, 2**0.5])
-    assert found.tuned.model == "after 1.41" and found.chosen == found.tried[-1] and len(found.tried) == MOST_TUNINGS
-    assert started == ["model", "after 0.50", "after 1.00", "after 2.00"]
-
-
-def test_what_was_too_much_is_tried_again_after_more_training(monkeypatch):
-    left = iter([0.2, 0.0, 0.04, 0.3])
-    tolerances, found, _ = search(monkeypatch, lambda before: next(left))
-    np.testing.assert_allclose(tolerances, [0.5, 0.5**1.5, 0.5, 0.5**0.5])
-    assert found.tuned.model == "after 0.50" and found.chosen == found.tried[2]
-
-
-def test_the_search_begins_beyond_a_large_loss(monkeypatch):
-    tolerances, found, _ = search(monkeypatch, lambda before: before / 2, max_loss=1.5)
-    np.testing.assert_allclose(tolerances, [3, 6, 18**0.5, 3])
-    assert found.tuned.model == "after 3.00"
-
-
-def test_a_larger_file_is_not_kept(monkeypatch):
-    losses = iter([0.0, 1.0, 1.0, 0.0])
-    _, found, _ = search(monkeypatch, lambda before: next(losses))
-    assert found.chosen == found.tried[0] and found.tuned.model == "after 0.50"
-
-
-def test_a_search_in_which_nothing_stays_within_keeps_nothing(monkeypatch):
-    tolerances, found, _ = search(monkeypatch, lambda before: 0.401, max_loss=0.4)
-    np.testing.assert_allclose(tolerances, [0.8, 0.8 * 0.5**0.5, 0.4, 0.4])
-    assert found.chosen is None and found.tuned is None and len(found.tried) == MOST_TUNINGS
-
-
-def diverged_in(number):
-    """A tuning function for the search that diverges in one of its tunings."""
-
-    def tune(model, choices, now):
-        if now == number:
-            raise DivergedError("the loss has exploded", None)
-        return Tuned(f"after {now}", choices, {})
-
-    return tune
-
-
-def test_a_tuning_that_diverges_ends_the_search(monkeypatch):
-    bits = iter([9, 8, 7])
-    monkeypatch.setattr(tuning, "smallest_within", lambda *a: Trial(CompactChoices(means=next(bits)), 0, (0.0,)))
-    monkeypatch.setattr(tuning, "_measured", lambda found, _: Trial(found.choices, found.choices.means, (0.0,)))
-    found = smallest_tuned("model", [], 0.05, [], diverged_in(3))
-    assert found.diverged == "the loss has exploded" and len(found.tried) == 2
-    assert found.tuned.model == "after 2" and found.chosen.num_bytes == 8
-
-
-def test_a_search_without_choices_to_start_from_is_empty():
-    assert smallest_tuned(a_model(), [lambda _: 1.0], 0.05, [], diverged_in(1)) == TunedFiles([])
-
-
-def test_the_search_ends_at_the_coarsest_choices(monkeypatch):
-    choices = CompactChoices()
+def test_the_search_ends_without_choices_and_at_the_coarsest(monkeypatch):
+    choices, tune = CompactChoices(), lambda *_: Tuned("tuned", CompactChoices(), {})
+    assert smallest_tuned(a_model(), [lambda _: 1.0], 0.05, [], tune) == TunedFiles([])
     monkeypatch.setattr(tuning, "smallest_within", lambda *a: Trial(choices, 0, (0.0,)))
     monkeypatch.setattr(tuning, "_measured", lambda *a: Trial(choices, 7, (0.0,)))
-    found = smallest_tuned("model", [], 0.05, [], lambda *a: Tuned("tuned", choices, {}))
+    found = smallest_tuned("model", [], 0.05, [], tune)
     assert len(found.tried) == 1 and found.tuned.model == "tuned"
 
 
 def test_coarser_choices_come_first():
-    assert all(list(steps) == sorted(steps) for steps in TUNED_LADDER.values())
-    assert all(len(set(steps)) == len(steps) for steps in TUNED_LADDER.values())
     assert set(TUNED_LADDER) == set(GROUPS)
+    assert all(list(steps) == sorted(set(steps)) for steps in TUNED_LADDER.values())

@@ -1,11 +1,8 @@
 """Bilinear interpolation in a splat's texture: the texels around a position, and their weights.
 
-This is the arithmetic of a texture lookup. The appearance (`appearance.base`) gives the position; `texture` stores
-textures of many sizes; `rasterize.kernels.native.texture_lookups` does the same lookup for vectors of pixels.
-
-The textures of all splats lie in one array of texels [T, C], each a `TextureRegion` of it, row by row. Every function
-is element-wise: it takes scalars, or arrays that broadcast. (x, y) counts texels from the centre of the first one and
-lies in [0, width − 1] × [0, height − 1].
+The textures of all splats are in one array of texels [T, C], each a `TextureRegion` of it, row by row. Functions are
+element-wise, on scalars or on arrays that broadcast. (x, y) counts texels from the centre of the first one and is in
+[0, width − 1] × [0, height − 1]. `rasterize.kernels.native.texture_lookups` does the same for vectors of pixels.
 """
 
 from typing import NamedTuple
@@ -37,36 +34,26 @@ def within_texels(regions: TextureRegion, num_texels: int) -> TextureRegion:
 class Corner(NamedTuple):
     """One of the four texels around (x, y)."""
 
-    texel: Array
-    """Index among all texels."""
-    weight: Array
-    """Bilinear weight, in [0, 1]."""
-    slope_x: Array
-    """Derivative of the weight by x, within the cell."""
+    texel: Array  # Index among all texels.
+    weight: Array  # Bilinear weight, in [0, 1].
+    slope_x: Array  # Derivative of the weight by x, within the cell.
     slope_y: Array
-    """Derivative of the weight by y, within the cell."""
 
 
 class Sample(NamedTuple):
-    """C interpolated values at (x, y), and their derivatives."""
+    """C interpolated values at (x, y), and their derivatives by x and by y within the cell."""
 
     values: tuple[Array, ...]
-    """The C interpolated numbers."""
     slope_x: tuple[Array, ...]
-    """Derivatives by x, within the cell."""
     slope_y: tuple[Array, ...]
-    """Derivatives by y, within the cell."""
 
 
 class Lookup(NamedTuple):
     """A sample of a splat's texture, and the texels it was read from."""
 
     region: TextureRegion
-    """Place of the texture."""
     sample: Sample
-    """Interpolated values."""
-    corners: tuple[Corner, ...] = ()
-    """Texels that were read; empty if the kernel finds their cotangents in another way."""
+    corners: tuple[Corner, ...] = ()  # Empty if the kernel finds the texels' cotangents in another way.
 
 
 def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:

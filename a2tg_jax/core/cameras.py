@@ -18,7 +18,7 @@ from a2tg_jax.core.checks import (
     make_plain,
     short_repr,
 )
-from a2tg_jax.core.pytree import pytree
+from a2tg_jax.core.pytree import pytree, static
 
 LONGEST_SIDE = 100_000
 """Largest longer side of an image, in pixels."""
@@ -36,7 +36,7 @@ LARGEST_COORDINATE = LARGEST_NUMBER
 
 @pytree
 class Camera:
-    """One view: a pinhole camera in OpenCV's frame, x right, y down, z forward; pixel centres lie at +0.5.
+    """One view: a pinhole camera in OpenCV's frame, x right, y down, z forward; pixel centres are at +0.5.
 
     `viewmat` and `K` are differentiable; the image size is static.
     """
@@ -45,14 +45,14 @@ class Camera:
     """[4, 4] world to camera, a rigid motion: x_camera = viewmat[:3, :3] · x_world + viewmat[:3, 3]."""
     K: Array
     """[3, 3] intrinsics in pixels, last row (0, 0, 1)."""
-    width: int = dataclasses.field(metadata={"static": True})
+    width: int = static()
     """Image width in pixels."""
-    height: int = dataclasses.field(metadata={"static": True})
+    height: int = static()
     """Image height in pixels."""
     rays: Array | None = None
-    """[H, W, 2] where the ray of each pixel meets the image plane of K, in its pixels, for a lens that is no pinhole:
-    pixel (i, j) looks along K⁻¹·(x, y, 1). A pixel whose numbers are not finite shows the background. A constant, which
-    is not differentiated; None is a pinhole camera."""
+    """[H, W, 2] points (x, y) of the image plane of K, in its pixels, where the rays of the pixels of a lens meet it:
+    they run along K⁻¹·(x, y, 1). A pixel without finite numbers shows the background. Not differentiated; None: a
+    pinhole camera."""
 
     def __post_init__(self) -> None:
         """Convert sides of numpy's integers to Python's, and lists and NumPy's special arrays to plain arrays."""
@@ -129,11 +129,8 @@ def checked_cameras(cameras: Any, name: str = "cameras") -> list[Camera]:
 
 
 def check_calibration(viewmat: np.ndarray, K: np.ndarray, width: int, height: int, what: str) -> None:
-    """Check the numbers of a camera that was read from a file (host).
-
-    Raises:
-      ValueError: naming the camera, if a number is NaN, infinite, or outside the limits at the top of this module.
-    """
+    """Raise ValueError, naming the camera, if a number from a file is NaN, infinite, or outside this module's limits
+    (host)."""
     check_intrinsics(K, width, height, what)
     rotation = viewmat[:3, :3]
     if not (np.abs(viewmat) <= LARGEST_COORDINATE).all():  # False for NaN.
@@ -151,10 +148,10 @@ def check_intrinsics(K: np.ndarray, width: int, height: int, what: str) -> None:
     focal, offset = K[[0, 1], [0, 1]], K[[0, 1], [2, 2]]
     if not ((focal >= SHORTEST_FOCAL * side) & (focal <= LONGEST_FOCAL * side)).all():  # False for NaN.
         wanted = f"{SHORTEST_FOCAL * side:g}..{LONGEST_FOCAL * side:g} pixels, for its image is {width}x{height}"
-        raise ValueError(f"{what}: its focal lengths must lie in {wanted}; got {_numbers(focal)}")
+        raise ValueError(f"{what}: its focal lengths must be in {wanted}; got {_numbers(focal)}")
     if not (np.abs(offset) <= LARGEST_OFFSET * side).all():
         wanted = f"within {LARGEST_OFFSET:g} sides of its image of {width}x{height}"
-        raise ValueError(f"{what}: its principal point must lie {wanted}; got {_numbers(offset)}")
+        raise ValueError(f"{what}: its principal point must be {wanted}; got {_numbers(offset)}")
     if not np.array_equal(K[2], [0, 0, 1]) or K[1, 0] != 0 or not np.abs(K[0, 1]) <= focal[0]:
         raise ValueError(f"{what}: its K must be upper triangular, with a last row of (0, 0, 1); got {_numbers(K)}")
 
@@ -164,11 +161,8 @@ def _numbers(values: np.ndarray) -> str:
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the same view at another image size: K scales with each side (pixel edges stay edges).
-
-    Raises:
-      ValueError: unless it is a camera, and both sides are positive ints.
-    """
+    """Return the same view at another image size: K scales with each side (pixel edges stay edges). ValueError: it is
+    not a camera, or a side is not a positive int."""
     check_is_camera(camera)
     check_int("width", width, 1)
     check_int("height", height, 1)
@@ -229,7 +223,6 @@ def viewmat_of_axes(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
 
 # Small rigid motions of cameras, so(3) × R³: a twist [6] is a rotation vector ω in radians and a translation. θ is the
 # angle |ω|, W the matrix with W·x = ω × x.
-
 
 SMALL = 1e-2
 """Squared angle below which the series are exact to 14 digits."""

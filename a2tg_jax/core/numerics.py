@@ -29,8 +29,8 @@ def safe_sqrt(x: Array) -> Array:
 def at_least(x: Array, least: float) -> Array:
     """Return max(x, least), with derivative 1 where x = least; JAX's maximum has ½ there.
 
-    A parameter that starts on the bound, or is projected onto it, moves on if the gradient leads inside. Sums that miss
-    the bound by rounding, up to 4 ε, count as on it and are returned as they are. NaN stays NaN.
+    A parameter on the bound therefore moves if the gradient leads inside. Sums that miss the bound by rounding, up to
+    4 ε, count as on it and are returned unchanged. NaN stays NaN.
     """
     return jnp.where(x < least - _rounding_of(x), jnp.asarray(least, x.dtype), x)
 

@@ -17,7 +17,7 @@ from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host.text import shortened
 
 with warnings.catch_warnings():
-    # jaxopt says at import that it is no longer maintained, which a user of this package can do nothing about.
+    # jaxopt warns at import that it is no longer maintained, about which users of this package can do nothing.
     warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
     from jaxopt import OptStep as OptStep  # type: ignore[import-untyped]
     from jaxopt.linear_solve import solve_cg as solve_cg  # type: ignore[import-untyped]
@@ -36,8 +36,7 @@ class AdamState:
 
 
 def adam_init(params: object) -> AdamState:
-    """Return the state before the first update of a pytree of float arrays: zero moments. ValueError: a leaf holds no
-    floats, naming it."""
+    """Return zero moments for a pytree of float arrays. ValueError, naming the leaf: it holds no floats."""
     _check_floats(params)
     zeros = jax.tree.map(jnp.zeros_like, params)
     return AdamState(mu=zeros, nu=jax.tree.map(jnp.zeros_like, params), count=jnp.zeros((), jnp.int32))

@@ -67,13 +67,9 @@ class Origin:
 
     def moved(self, similarity: Similarity) -> "Origin":
         """Return the same cameras in the world that `similarity` leads to, without the corrections they contain."""
-        viewmats = [similarity.apply_to_viewmat(viewmat) for viewmat in self.viewmats]
-        return dataclasses.replace(
-            self,
-            viewmats=np.array(viewmats).reshape(-1, 4, 4),
-            transform=self.transform.then(similarity),
-            corrections={},
-        )
+        viewmats = np.array([similarity.apply_to_viewmat(viewmat) for viewmat in self.viewmats]).reshape(-1, 4, 4)
+        transform = self.transform.then(similarity)
+        return dataclasses.replace(self, viewmats=viewmats, transform=transform, corrections={})
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Origin):

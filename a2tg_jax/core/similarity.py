@@ -35,7 +35,7 @@ class Similarity:
     def apply_to_viewmat(self, viewmat: np.ndarray) -> np.ndarray:
         """Return the world-to-camera matrix [4, 4] of the new world for one of the old; again a rigid motion.
 
-        The camera frame is scaled along with the world, which no pinhole camera notices:
+        The camera frame is scaled along with the world, which changes no image of a pinhole camera:
         s·(Rc·x + t) = (Rc·Rᵀ)·x' + (s·t - Rc·Rᵀ·translation).
         """
         moved = np.eye(4)
@@ -82,11 +82,11 @@ SH_DEGREES = (slice(0, 1), slice(1, 4), slice(4, 9), slice(9, 16))
 def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
     """Return the same Gaussians in the world that `similarity` leads to (host).
 
-    A camera carried along sees the same image: means and scales follow the similarity, quaternions, unit in the result,
-    and SH its rotation.
+    The image of a camera carried along stays the same: means and scales follow the similarity, quaternions, unit in the
+    result, and SH its rotation.
 
     Raises:
-      ValueError: if a field of the Gaussians has another shape than it must have, or the similarity is none.
+      ValueError: if a field of the Gaussians has a wrong shape, or the similarity is none.
     """
     check_gaussians(gaussians)
     check_similarity(similarity, "similarity")
