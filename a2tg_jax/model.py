@@ -169,7 +169,7 @@ class Model:
           camera: the view.
           features: [N, D] numbers to show instead of colours (`render_image`), one row for each allocated Gaussian.
           background: [3] colour, or [D] features; None is the model's own, or 0 behind features.
-          settings: static options; `texture` is not used, for the appearance has options of its own. Under jit they
+          settings: static options; `texture` is ignored, since the appearance has its own options. Under jit they
             need a capacity: `plan_render(model, cameras)`.
         """
         background = self.background if background is None and features is None else background

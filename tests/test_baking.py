@@ -141,6 +141,7 @@ def test_training_brings_a_plain_model_nearer_over_its_background(split):
     assert psnr(trained, wanted) > psnr(start, wanted) + 0.5
 
 
+@pytest.mark.long
 def test_growth_is_kept_where_degrees_differ(monkeypatch):
     monkeypatch.setattr(baking, "least_degree", lambda *_: 3)
     monkeypatch.setattr(baking, "texel_weights", lambda model, *_: model.textures)
@@ -156,6 +157,7 @@ def test_held_out_cameras_do_not_train(is_test, counts):
     assert tuple(map(len, conversion.cameras_apart(Origin.of_cameras([CAMERA] * 3, is_test=is_test)))) == counts
 
 
+@pytest.mark.long
 def test_plain_files_hold_the_nearest_gaussians(tmp_path):
     model = shaped(dataclasses.replace(textured(), appearance=Appearance()))
     save_splats(tmp_path / "a.ply", model)

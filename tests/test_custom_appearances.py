@@ -52,51 +52,38 @@ class Glossy(Appearance):
         return 2 * exponents * (jnp.exp(jnp.log(255 * opacities) / exponents) - 1)
 
 
-def random_arrays(num: int, dtype: str, **makers: Callable) -> dict[str, np.ndarray]:
-    """Numbers of float32, so that both precisions start from the same ones."""
+def random_arrays(kind: str, num: int, dtype="float64") -> dict[str, np.ndarray]:
+    """Arrays of an appearance. Numbers are of float32, so that both precisions start from the same ones."""
     rng = np.random.default_rng(1)
-    return {name: np.asarray(make(rng), np.float32).astype(dtype) for name, make in makers.items()}
-
-
-def glossy_arrays(num: int, dtype="float64") -> dict[str, np.ndarray]:
-    return random_arrays(
-        num, dtype,
-        colors=lambda rng: rng.normal(scale=0.3, size=(num, 3)), axes=lambda rng: rng.normal(size=(num, 3)),
-        log_exponents=lambda rng: rng.uniform(0.5, 2, num),
-    )  # fmt: skip
+    arrays = {
+        "glossy": lambda: {
+            "colors": rng.normal(scale=0.3, size=(num, 3)), "axes": rng.normal(size=(num, 3)),
+            "log_exponents": rng.uniform(0.5, 2, num),
+        },
+        "movable": lambda: {
+            "centers": rng.normal(size=(num, 4, 2)), "sharpness": rng.uniform(0.05, 1, (num, 4)),
+            "logit_opacities": rng.uniform(-1, 2, (num, 4)), "colors": rng.normal(scale=0.4, size=(num, 4, 3)),
+        },
+        "shaped": lambda: {"shapes": rng.normal(scale=1.5, size=num)},
+        "billboard": lambda: {
+            "alphas": rng.uniform(0.1, 0.9, (num, SIDE, SIDE, 1)), "rgb": rng.normal(size=(num, SIDE, SIDE, 3))
+        },
+    }[kind]()  # fmt: skip
+    if kind == "billboard":
+        arrays = {"texels": np.concatenate([arrays["rgb"], arrays["alphas"]], axis=-1)}
+    return {name: np.asarray(values, np.float32).astype(dtype) for name, values in arrays.items()}
 
 
 def glossy(arrays: dict, **options) -> Glossy:
     return Glossy(**jax.tree.map(jnp.asarray, arrays), **options)
 
 
-def kernel_arrays(num: int, dtype="float64") -> dict[str, np.ndarray]:
-    return random_arrays(
-        num, dtype,
-        centers=lambda rng: rng.normal(size=(num, 4, 2)), sharpness=lambda rng: rng.uniform(0.05, 1, (num, 4)),
-        logit_opacities=lambda rng: rng.uniform(-1, 2, (num, 4)),
-        colors=lambda rng: rng.normal(scale=0.4, size=(num, 4, 3)),
-    )  # fmt: skip
-
-
 def movable_kernels(arrays: dict) -> MovableKernels:
     return MovableKernels(**jax.tree.map(jnp.asarray, arrays))
 
 
-def shaped_arrays(num: int, dtype="float64") -> dict[str, np.ndarray]:
-    return random_arrays(num, dtype, shapes=lambda rng: rng.normal(scale=1.5, size=num))
-
-
 def shaped(arrays: dict) -> Appearance:
     return Appearance(exponents=Exponents(jnp.asarray(arrays["shapes"])))
-
-
-def billboard_arrays(num: int, dtype="float64") -> dict[str, np.ndarray]:
-    def texels(rng):
-        alpha = rng.uniform(0.1, 0.9, (num, SIDE, SIDE, 1))
-        return np.concatenate([rng.normal(size=(num, SIDE, SIDE, 3)), alpha], axis=-1)
-
-    return random_arrays(num, dtype, texels=texels)
 
 
 def billboards(arrays: dict) -> Billboards:
@@ -109,24 +96,26 @@ def billboards(arrays: dict) -> Billboards:
 class Case(NamedTuple):
     """An appearance, and the oracle's."""
 
-    arrays: Callable[..., dict]
+    kind: str
     appearance: Callable[[dict], Appearance]
-    show: oracle_appearances.Show
     is_gaussian_opaque: bool  # Whether the Gaussian's own opacity counts.
     smooth_seed: int  # Of a scene that keeps clear of thresholds and kinks.
     max_alpha: float = 0.99
+    options: dict = {}  # noqa: RUF012 - of the oracle
+
+    def arrays(self, scene, dtype="float64"):
+        return random_arrays(self.kind, len(scene.means), dtype)
 
 
 CASES = {
-    "glossy": Case(glossy_arrays, glossy, oracle_appearances.glossy, True, 53),
+    "glossy": Case("glossy", glossy, True, 53),
     "glossy, no low-pass filter": Case(
-        glossy_arrays, functools.partial(glossy, has_low_pass=False, max_alpha=0.7),
-        functools.partial(oracle_appearances.glossy, has_low_pass=False), True, 1, 0.7,
+        "glossy", functools.partial(glossy, has_low_pass=False, max_alpha=0.7), True, 1, 0.7, {"has_low_pass": False}
     ),
-    "shaped": Case(shaped_arrays, shaped, oracle_appearances.shaped, True, 53),
-    "movable kernels": Case(kernel_arrays, movable_kernels, oracle_appearances.movable, False, 1),
-    "billboards": Case(billboard_arrays, billboards, oracle_appearances.billboard, False, 0),
-}  # fmt: skip
+    "shaped": Case("shaped", shaped, True, 53),
+    "movable kernels": Case("movable", movable_kernels, False, 1),
+    "billboards": Case("billboard", billboards, False, 0),
+}
 FAST = "movable kernels"
 """The case whose gradients the default tests compare."""
 some_long = [pytest.param(name, marks=[] if name == FAST else pytest.mark.long) for name in CASES]
@@ -140,15 +129,16 @@ def rendered(scene, appearance, compositor="auto", dtype="float64"):
 
 def expected_image(case: Case, scene, arrays) -> oracle.Image:
     rules = DEFAULT_RULES._replace(max_alpha=case.max_alpha)
-    return oracle_appearances.render_appearance(scene, arrays, case.show, rules)
+    show = functools.partial(getattr(oracle_appearances, case.kind), **case.options)
+    return oracle_appearances.render_appearance(scene, arrays, show, rules)
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("compositor", ["native", "xla"])
+@pytest.mark.parametrize("compositor", ["native", pytest.param("xla", marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", CASES)
 def test_float64(name, compositor):
     case, scene = CASES[name], draw_scene(4)
-    arrays = case.arrays(len(scene.means))
+    arrays = case.arrays(scene)
     expected = expected_image(case, scene, arrays)
     assert expected.margin.min() > 1e-9 and expected.alpha.max() > 0.9
     output = rendered(scene, case.appearance(arrays), compositor)
@@ -156,14 +146,14 @@ def test_float64(name, compositor):
         assert error.max() < 1e-9, name
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", some_long)
 def test_float32(name):
     """As the textures' test of float32."""
     case, scene = CASES[name], draw_scene(4)
-    expected = expected_image(case, scene, case.arrays(len(scene.means)))
+    expected = expected_image(case, scene, case.arrays(scene))
     is_compared = expected.margin > 1e-4
     assert is_compared.mean() > 0.95
-    output = rendered(scene, case.appearance(case.arrays(len(scene.means), "float32")), dtype="float32")
+    output = rendered(scene, case.appearance(case.arrays(scene, "float32")), dtype="float32")
     for name, error in errors(output, expected, is_compared).items():
         assert np.mean(error < 1e-5) >= 0.99, name
         assert np.mean(error < 3e-4) >= 0.999, name
@@ -175,7 +165,7 @@ def expected_gradients(name: str):
     numbers may depend."""
     case = CASES[name]
     scene = draw_smooth_scene(case.smooth_seed)
-    arrays, weights = case.arrays(len(scene.means)), draw_weights(scene)
+    arrays, weights = case.arrays(scene), draw_weights(scene)
     image = expected_image(case, scene, arrays)
     assert min(image.margin.min(), image.kink.min()) > CLEARANCE
 
@@ -205,7 +195,7 @@ def test_every_leaf_against_differences(name, compositor):
         output = render_appearance(gaussians, camera, case.appearance(arrays), **options)
         return sum(jnp.sum(getattr(output, name) * jnp.asarray(weight)) for name, weight in weights.items())
 
-    inputs = case.arrays(len(scene.means)), as_gaussians(scene, "float64"), jnp.asarray(scene.viewmat)
+    inputs = case.arrays(scene), as_gaussians(scene, "float64"), jnp.asarray(scene.viewmat)
     of_arrays, of_gaussians, of_viewmat = jax.grad(loss, argnums=(0, 1, 2))(*inputs)
     expected, others = expected_gradients(name)
     for leaf, gradient in expected.items():
@@ -228,7 +218,7 @@ def test_gpu_kernels_are_those_of_xla(name):
         return jnp.sum(output.color**2), output.color
 
     differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
-    inputs = case.arrays(16, "float32"), as_gaussians(scene, "float32")
+    inputs = case.arrays(scene, "float32"), as_gaussians(scene, "float32")
     wanted, found = (jax.tree.leaves(differentiate(*inputs, compositor)) for compositor in ("xla", "cuda"))
     for a, b in zip(wanted, found, strict=True):
         assert np.isfinite(a).all()
@@ -241,7 +231,7 @@ def test_the_statistic_takes_the_way_of_the_falloff(compositor):
     """At one pixel, of splats whose mean does nothing else, it is the size of the gradient; none, for billboards."""
     scene = draw_smooth_scene(53)
     scene = scene._replace(width=1, height=1, K=scene.K * np.array([[1, 1, 0.06], [1, 1, 0.06], [1, 1, 1]]))
-    arrays = glossy_arrays(len(scene.means))
+    arrays = random_arrays("glossy", len(scene.means))
     arrays["colors"][:] = 0
     settings = RenderSettings(compositor=compositor, capacity=1024, sh_degree=0)
     camera, background = as_camera(scene, "float64"), jnp.zeros(3)
@@ -255,7 +245,7 @@ def test_the_statistic_takes_the_way_of_the_falloff(compositor):
     by_mean, statistic = differentiate(gaussians, probe, glossy(arrays))
     assert jnp.max(jnp.abs(by_mean.means)) > 1e-2
     np.testing.assert_allclose(statistic[:, :3], jnp.abs(by_mean.means), atol=1e-12)
-    _, statistic = differentiate(gaussians, probe, billboards(billboard_arrays(len(scene.means))))
+    _, statistic = differentiate(gaussians, probe, billboards(random_arrays("billboard", len(scene.means))))
     np.testing.assert_array_equal(statistic[:, :3], 0)
 
 
@@ -285,7 +275,7 @@ class Wrong(Glossy):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Wrong(**glossy_arrays(3, "float32")), r"numbers \[N, K\] of N = 3.*\(5,\)"),
+        (lambda: Wrong(**random_arrays("glossy", 3, "float32")), r"numbers \[N, K\] of N = 3.*\(5,\)"),
         (lambda: Appearance(max_alpha=1.0), r"max_alpha .* is 1\.0"),
     ],
 )
@@ -297,7 +287,7 @@ def test_wrong_numbers_are_refused(make, words):
 @pytest.mark.parametrize("compositor", ["native", pytest.param("xla", marks=pytest.mark.long)])
 def test_without_a_low_pass_filter_edge_on_splats_show_nothing(compositor):
     scene = hand_scene([[0, 0, 4]], [EDGE_ON], [[0.0, 0.0]], [0.9], [[1, 1, 1]])
-    arrays, settings = glossy_arrays(1, "float32"), RenderSettings(compositor=compositor)
+    arrays, settings = random_arrays("glossy", 1, "float32"), RenderSettings(compositor=compositor)
 
     def total(gaussians, has_low_pass):
         appearance = glossy(arrays, has_low_pass=has_low_pass)

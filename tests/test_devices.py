@@ -11,7 +11,7 @@ import pytest
 from a2tg_jax.training import Session
 
 SCRIPT = pathlib.Path(__file__).with_name("on_devices.py")
-LONG = ("batches", "training", "events", "overflowing", "textures", "memory", "lenses", "balance")
+LONG = ("xla", "batches", "training", "events", "overflowing", "textures", "memory", "lenses", "balance")
 
 
 @pytest.mark.parametrize("what", ["rendering", *(pytest.param(what, marks=pytest.mark.long) for what in LONG)])

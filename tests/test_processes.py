@@ -21,7 +21,7 @@ from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.model_file import load_model
-from a2tg_jax.parallel import processes, sharded_rows
+from a2tg_jax.parallel import processes
 from a2tg_jax.parallel.processes import LOST, Liveness, accept, connect, is_of_collectives, listen
 from a2tg_jax.results import run_training
 from a2tg_jax.results.folder import RunFolder, resuming_command
@@ -50,6 +50,7 @@ def test_events_change_the_same_in_two_processes():
     ended(pair(["--what", "events"]))
 
 
+@pytest.mark.long
 def test_another_seed_than_the_first_process_has_is_refused(tmp_path):
     first, other = trainings(tmp_path / "run", SHORT, (), ("--seed", "1"))
     told, _ = [process.communicate(timeout=120)[1] for process in (first, other)]
@@ -66,6 +67,7 @@ def waiting(what="wait"):
     return processes
 
 
+@pytest.mark.long
 def test_each_process_reads_what_it_draws_and_an_error_of_the_first_ends_both_at_once():
     first, other = waiting("read")
     first.send_signal(signal.SIGINT)
@@ -74,7 +76,9 @@ def test_each_process_reads_what_it_draws_and_an_error_of_the_first_ends_both_at
     assert told[1] == "" and other.returncode == LOST
 
 
-@pytest.mark.parametrize(("victim", "number"), [(0, signal.SIGKILL), (1, signal.SIGSTOP)])
+@pytest.mark.parametrize(
+    ("victim", "number"), [(0, signal.SIGKILL), pytest.param(1, signal.SIGSTOP, marks=pytest.mark.long)]
+)
 def test_a_lost_process_is_noticed(victim, number):
     processes = waiting()
     took, told = survivor_of(processes, victim, number, 60)
@@ -217,17 +221,6 @@ def test_a_process_that_follows_may_have_the_scene_elsewhere(tmp_path):
         train.resumed(run)
 
 
-def test_numbers_of_the_first_process_keep_their_bits(monkeypatch):
-    own = (np.array([1 / 3, 2.0]), np.arange(4)[::2], np.ones((2, 2), np.float32))
-    assert sharded_rows.of_first(None, own) is own
-    told = []
-    monkeypatch.setattr(sharded_rows.multihost_utils, "broadcast_one_to_all", lambda x: told.append(x.dtype) or x + 0)
-    devices = np.array([SimpleNamespace(process_index=index) for index in range(2)])
-    found = sharded_rows.of_first(SimpleNamespace(devices=devices), own)
-    jax.tree.map(np.testing.assert_array_equal, found, own)
-    assert [x.dtype for x in found] == [x.dtype for x in own] and set(told) == {np.dtype(np.uint8)}
-
-
 def test_a_lack_of_memory_is_no_lost_connection():
     lost = ("Gloo all-reduce failed: Connection closed by peer", "NCCL operation failed", "UNAVAILABLE: task is gone")
     assert all(is_of_collectives(jax.errors.JaxRuntimeError(text)) for text in lost)
@@ -257,6 +250,7 @@ def test_wrong_places_are_told(tmp_path, capsys, flags, told):
     assert told in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot fork here")
 def test_a_forked_child_says_what_to_do_where_it_would_hang():
     """Before JAX starts anything, a fork is fine: the program is itself a child."""

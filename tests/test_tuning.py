@@ -63,7 +63,10 @@ def assert_same(found: Model, wanted: Model) -> None:
         np.testing.assert_allclose(values, arrays_of(wanted)[name], rtol=2e-5, atol=2e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["plain 4", "banded 1", "textured or not", "banded, shaped and textured"])
+@pytest.mark.parametrize(
+    "name",
+    ["banded, shaped and textured", *(pytest.param(name, marks=pytest.mark.long) for name in ("plain 4", "banded 1"))],
+)
 def test_training_and_the_file_round_alike(name):
     """Numbers that training has moved beyond the ends of the grids as well."""
     start = half_turned(MODELS[name]())
@@ -79,6 +82,7 @@ def test_training_and_the_file_round_alike(name):
     assert np.abs(images[0] - images[1]).max() < 2e-4 < np.abs(images[1] - images[2]).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("precision", ["float32", "float16"])
 def test_groups_kept_as_floats_are_not_rounded(precision):
     start = half_turned(MODELS["banded, shaped and textured"]())
@@ -108,7 +112,7 @@ def test_numbers_are_rounded_one_after_the_other_and_stay():
 @functools.cache
 def trained_model() -> Model:
     """A model that has learned; 16 bits round next to nothing."""
-    return tune_compact(a_model(), SCENE, SYSTEM, FINE, iterations=800).model
+    return tune_compact(a_model(), SCENE, SYSTEM, FINE, iterations=2000).model
 
 
 @functools.cache
@@ -116,6 +120,7 @@ def tuned_model(choices: CompactChoices = COARSE) -> Tuned:
     return tune_compact(trained_model(), SCENE, SYSTEM, choices, iterations=300)
 
 
+@pytest.mark.long
 def test_tuning_makes_up_for_rounding():
     """It ends above the same training whose result is rounded afterwards, and below the one without rounding."""
     fine = tuned_model(FINE).model
@@ -125,6 +130,7 @@ def test_tuning_makes_up_for_rounding():
     assert tuned_model().model.origin == fine.origin == a_model().origin
 
 
+@pytest.mark.long
 def test_the_file_holds_the_tuned_model(tmp_path):
     found = tuned_model()
     again = decode_model(found.data)
@@ -221,6 +227,7 @@ def corrected_psnr(scene: Scene, model: Model) -> float:
     return evaluate(refined_views(scene.train, model), model, fit_colors=True).psnr
 
 
+@pytest.mark.long
 def test_tuning_keeps_what_was_learned_of_the_photographs():
     """A second tuning too, which starts from the first."""
     scene, model = corrected()
@@ -232,6 +239,7 @@ def test_tuning_keeps_what_was_learned_of_the_photographs():
         model = tuned
 
 
+@pytest.mark.long
 def test_a_model_without_what_was_learned_of_the_photographs_is_refused():
     """A compact file gives back such a model, which would be trained towards photographs that nothing corrects."""
     scene, model = corrected()
@@ -240,6 +248,7 @@ def test_a_model_without_what_was_learned_of_the_photographs_is_refused():
         tune_compact(bare, scene, CORRECTED, FINE, iterations=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [OwnExposure, Exposure])
 def test_corrections_stay_as_they_are(monkeypatch, kind):
     """Corrections keep their rows while a model is tuned, also those of a user's class without a field `rate`."""

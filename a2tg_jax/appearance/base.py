@@ -8,7 +8,7 @@ and the K numbers it computes a colour residual and an alpha factor (`shade`):
     α = min(max_alpha, peak opacity · falloff(numbers, ρ) · factor),  colour = SH colour + residual
 
 `Appearance()` is plain 2DGS. Its optional parts are a texture, exponents of the kernels, and bands of spherical
-harmonics. A subclass adds arrays of its own and overrides what differs; the parts work with it as well.
+harmonics. A subclass adds its own arrays and overrides what differs; the parts work with it as well.
 
 An appearance whose arrays are None is a template, such as the one of a stage: it has the options only, and
 `allocate_appearance` makes the arrays for some Gaussians. A plain array of a subclass has a row for each Gaussian.
@@ -71,7 +71,7 @@ class Appearance:
     # For subclasses: class attributes.
 
     has_low_pass = True
-    """Whether the low-pass filter of 2DGS shows splats that are smaller than a pixel or seen edge-on. Without it, ρ is
+    """Whether the low-pass filter of 2DGS shows splats that are edge-on or smaller than a pixel. Without it, ρ is
     u² + v² at the hit of the pixel's ray, and a splat without a hit is invisible."""
     num_colors = 3
     """Number D of colours of a splat: red, green and blue, or as many features."""
@@ -116,7 +116,7 @@ class Appearance:
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
         """Return the lookup position (x, y) in texels, clamped to [0, width − 1] and [0, height − 1].
 
-        Element-wise, on scalars or on arrays that broadcast, as `shade` and `falloff`. These three see the static
+        Element-wise, on scalars or on arrays that broadcast, as `shade` and `falloff`. These three can use static
         fields only: return differentiated values, and values that differ between splats, from `numbers` or `atlas`.
         """
         if self.texture is None:

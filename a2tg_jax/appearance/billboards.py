@@ -1,6 +1,6 @@
 """The appearance of BBSplat: flat RGBA pictures, whose alpha replaces opacity and Gaussian.
 
-A picture of S × S texels covers u and v from −1 to 1, in standard deviations: texel (x, y) lies at u = 2x/(S − 1) − 1,
+A picture of S × S texels covers u and v from −1 to 1, in standard deviations: texel (x, y) is at u = 2x/(S − 1) − 1,
 v likewise, the outer ones on the border. It is looked up bilinearly among zeros, so that it fades out over one texel
 beyond the border:
 

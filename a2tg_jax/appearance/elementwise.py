@@ -102,7 +102,7 @@ class _LeftOut:
 
     def _refuse(self, *_: object) -> NoReturn:
         raise ValueError(
-            f"{self._name} is an array, and texel_position, shade and falloff see only the static fields of an "
+            f"{self._name} is an array, and texel_position, shade and falloff can use only the static fields of an "
             "appearance: return it from numbers(), or put it in the texels of atlas()"
         )
 

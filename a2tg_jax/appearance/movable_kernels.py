@@ -73,7 +73,7 @@ class MovableKernels(Appearance):
         return (red, green, blue), opacity
 
     def cutoff(self, opacities: Array) -> Array:
-        # No weight exceeds that at the kernel's centre.
+        # A weight is largest at the kernel's centre.
         return gaussian_cutoff(opacities * jnp.mean(self.kernel_opacities, axis=1) * (1 + LEAST_WEIGHT))
 
     def allocate(self, key: Array, gaussians: Gaussians) -> "MovableKernels":
@@ -102,7 +102,7 @@ class MovableKernels(Appearance):
         return jnp.mean(self.kernel_opacities, axis=1)
 
     def share(self, gaussians: Gaussians, num_shares: Array) -> tuple[Gaussians, "MovableKernels"]:
-        """Share the mean opacity of the kernels like that of a Gaussian; all kernels fade by one factor."""
+        """Share the mean opacity of the kernels like a Gaussian's opacity; all kernels fade by one factor."""
         before = self.opacities(gaussians)
         logits, log_scales = share(logit(before), gaussians.log_scales, num_shares)
         faded = self.kernel_opacities * (jax.nn.sigmoid(logits) / before)[:, None]

@@ -167,7 +167,7 @@ class Texture(Part):
     def atlas(self) -> tuple[Array, TextureRegion]:
         """Return all texels [T, 4], and the N places of the textures among them; an empty texture has no texels."""
         textures = self.shown()
-        # Buckets lie one after the other; a texture begins at its bucket's start plus its row times the area.
+        # Buckets follow each other; a texture begins at its bucket's start plus its row times the area.
         areas = [height * width for height, width in textures.bucket_sizes]
         capacities = [bucket.shape[0] for bucket in textures.buckets]
         starts = np.cumsum([0] + [capacity * area for capacity, area in zip(capacities, areas, strict=True)])[:-1]
@@ -304,7 +304,7 @@ MAX_DEGREE = 3
 
 @pytree(repr=False)
 class Coefficients(Table):
-    """Blocks [K, 3] of the coefficients that each Gaussian has beyond those of all; K is 0 without any."""
+    """Blocks [K, 3] of the coefficients that each Gaussian has beyond the common ones; K is 0 without any."""
 
     owners: tuple[Array, ...] = ()
     """[capacity] int32 Gaussian of each row of each bucket; N for a row of padding."""
@@ -399,7 +399,7 @@ def empty_bands(degrees: ArrayLike, base_degree: int, dtype: DTypeLike = jnp.flo
 
 
 def dense_bands(coefficients: Coefficients, base_degree: int) -> np.ndarray:
-    """Return all coefficients above the base degree [N, K, 3], zeros above a Gaussian's degree; K is that of degree 3
+    """Return all coefficients above the base degree [N, K, 3], zeros above a Gaussian's degree; K is for degree 3
     (host)."""
     dtype = coefficients.buckets[0].dtype if coefficients.buckets else np.float32
     dense = np.zeros((coefficients.num, NUM_BASES[MAX_DEGREE] - NUM_BASES[base_degree], 3), dtype)

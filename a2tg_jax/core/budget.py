@@ -65,7 +65,7 @@ def number_to_reach(num: Array, cap: int, num_left: Integer) -> Array:
     now = num.astype(jnp.result_type(float))
     exponent = 1 / jnp.maximum(jnp.asarray(num_left, jnp.int32), 1).astype(now.dtype)
     wanted = jnp.ceil(now * (cap / jnp.maximum(now, 1)) ** exponent)
-    # Powers are rounded: the last event is a case of its own, so that it leaves the cap itself.
+    # Powers are rounded: the last event is a separate case, so that it reaches the cap exactly.
     return jnp.where(num_left > 1, jnp.clip(wanted.astype(jnp.int32), num, cap), cap)
 
 

@@ -131,7 +131,7 @@ def plain_array(name: str, value: object, dtype: DTypeLike | None = None) -> Any
 
 
 def check_unmasked(name: str, value: object) -> None:
-    """Raise ValueError if a value is a masked array with masked entries, which would be read as if they were not."""
+    """Raise ValueError if a value is a masked array with masked entries, which would be read as unmasked."""
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         raise ValueError(f"{name} has masked entries: replace them, as in array.filled(0), or drop their rows")
 

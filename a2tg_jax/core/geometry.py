@@ -36,7 +36,7 @@ def pixel_sizes(means: Floats, scales: Floats, viewmat: Floats, K: Floats) -> Fl
 
 def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
     """Return M [N, 3, 3] and normals [N, 3] in the world, turned to face the camera."""
-    # Number by number: CPUs vectorise over N, and hardly over axes of 2 and 3.
+    # Number by number: CPUs vectorise over N, but not over axes of 2 and 3.
     x_axis, y_axis, normal = rotation_columns(tuple(gaussians.quats[:, k] for k in range(4)))
     mean = tuple(gaussians.means[:, k] for k in range(3))
     scale_x, scale_y = gaussians.scales[:, 0], gaussians.scales[:, 1]
@@ -131,7 +131,7 @@ def clipped_box(M: Sequence[Sequence[Array]], outline: Outline, cutoff: Array, n
     outline is clipped."""
     angles = np.arange(POLYGON_SIDES) * (2 * np.pi / POLYGON_SIDES)
     reach = jnp.sqrt(jnp.maximum(cutoff, 0.0)) / math.cos(math.pi / POLYGON_SIDES)
-    # The disc lies within a regular polygon whose sides touch it, of reach r / cos(π/n).
+    # A regular polygon whose sides touch the disc contains it; its corners are at r / cos(π/n).
     points = []
     for cosine, sine in zip(np.cos(angles).tolist(), np.sin(angles).tolist(), strict=True):
         u, v = reach * cosine, reach * sine

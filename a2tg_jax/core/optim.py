@@ -1,6 +1,6 @@
 """Adam and its schedules, in jaxopt's style: pure functions that take and return (params, state).
 
-jaxopt has no Adam of its own. No other module imports jaxopt.
+jaxopt has no Adam. No other module imports jaxopt.
 """
 
 import math

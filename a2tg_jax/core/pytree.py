@@ -35,7 +35,7 @@ def pytree(*, kw_only: bool = False, repr: bool = True) -> Callable[[type[T]], t
 
 def pytree(cls: Any = None, /, **options: Any) -> Any:
     """Decorate a class: make it a frozen dataclass, with options of `dataclasses.dataclass`, and a pytree of its
-    fields, but for static ones. Its bases may be decorated, too.
+    fields, except static ones. Its bases may be decorated as well.
 
     Transformations of JAX build instances without calling `__init__` and `__post_init__`, so that these may check and
     convert what a caller gives.

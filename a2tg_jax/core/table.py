@@ -1,7 +1,7 @@
 """A block of numbers for each Gaussian, of one of several sizes, in one padded bucket for each size.
 
 N Gaussians. A block of size (T₁, …) is [T₁, …, C], such as a texture (Tv, Tu) of C = 4 channels, or the spherical
-harmonics (K,) of C = 3 colours that a Gaussian has beyond those of all. Blocks of one size share a bucket
+harmonics (K,) of C = 3 colours that a Gaussian has beyond the common ones. Blocks of one size share a bucket
 [capacity, T₁, …, C], whose rows past the used ones are padding. Programs are compiled for sizes and capacities, so that
 only a change of these, on the host, compiles a step again.
 """
@@ -201,7 +201,7 @@ class Table:
         return dataclasses.replace(self, buckets=(moved,))
 
     def clear(self, is_cleared: Array) -> Self:
-        """Return moments of blocks with those of the marked Gaussians [N] at zero; traceable."""
+        """Return moments of blocks, zero for the marked Gaussians [N]; traceable."""
         cleared = []
         for index, bucket in enumerate(self.buckets):
             # Gaussians of other buckets point beyond the end, where they are dropped.
@@ -412,7 +412,7 @@ def check_table(table: Table, num: int | None = None, name: str = "textures") ->
 
 
 def check_places(table: Table, name: str = "textures") -> None:
-    """Raise ValueError unless each block has a row of its own; the table must have passed `check_table` (host)."""
+    """Raise ValueError unless each block has its own row; the table must have passed `check_table` (host)."""
     bucket, row = on_host(table.bucket), on_host(table.row)
     capacities = np.asarray([len(blocks) for blocks in table.buckets], np.int64)
     starts = np.cumsum(capacities) - capacities

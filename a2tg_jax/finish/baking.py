@@ -61,7 +61,7 @@ def bake(
       model: of any appearance. Textures become a splat per texel or fewer; of other appearances the Gaussians are
         taken, those nearest to kernels of other shapes.
       cameras: views that the new model is trained on.
-      growth: largest ratio of the bytes of all floats to those of the model. If the Gaussians differ in their degree,
+      growth: largest ratio of the bytes of all floats to the model's. If the Gaussians differ in their degree,
         the common one is lowered until one splat for each fits.
       iterations: of training on pictures of the model; 0: none.
       progress: show a progress bar.

@@ -94,7 +94,7 @@ def loss_beside_renders(
 ) -> Loss:
     """Return the estimated loss of PSNR of models, if the given one has `assumed_psnr`.
 
-    10·log10(1 + e/E): e is the mean squared difference of two renders, E the error that the PSNR stands for.
+    10·log10(1 + e/E): e is the mean squared difference of two renders, E the error that the PSNR implies.
     Uncorrelated errors add up this way.
     """
     check_is_model(model)

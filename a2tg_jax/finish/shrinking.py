@@ -37,7 +37,7 @@ LEAST_OPACITY = 1e-4
 LEAST_SAVED = 0.005
 """Smallest share of a model's bytes that a round must save for another one."""
 LEAST_WEIGHT = 1e-9
-"""Visibility of texels that no view sees; it keeps means finite."""
+"""Visibility of texels in no view; it keeps means finite."""
 
 
 def shrink_textures(

@@ -1,6 +1,6 @@
 """Training of a finished model while its numbers are rounded to the grids of a compact file: fewer bits then suffice.
 
-Rounding all numbers in each step, with gradients that pass straight through, helps little: numbers whose optimum lies
+Rounding all numbers in each step, with gradients that pass straight through, helps little: numbers whose optimum is
 between two steps jump from one to the other until the end. Here more and more numbers stay rounded. Those that are not
 yet rounded follow exact gradients and make up for it. The file keeps the grids of the training: it holds the tuned
 model up to the last digit of a float32.
@@ -156,7 +156,7 @@ def _with_w(xyz: Array) -> Array:
 class GradualRounding(StepEvent):
     """Rounding of more and more numbers, each from a random time on, until all of them are rounded.
 
-    A number is rounded after every later iteration too, so that it leaves its step of the grid only if an update is
+    A number is rounded after every later iteration as well, so that it leaves its step of the grid only if an update is
     larger than half a step.
     """
 
@@ -194,7 +194,7 @@ def partly_rounded(rounding: GridRounding, model: Model, is_rounded: Model) -> M
 
 @dataclasses.dataclass(frozen=True)
 class Tuned:
-    """A model whose numbers lie on the grids of a compact file."""
+    """A model whose numbers are on the grids of a compact file."""
 
     model: Model
     choices: CompactChoices
@@ -319,7 +319,7 @@ def smallest_tuned(
 
     Choices that lose more before tuning are tuned for, `MOST_TUNINGS` times. That loss is doubled as long as the tuned
     model stays within `max_loss`; from the first time on that it does not, the loss falls or grows by a factor of √2.
-    Each tuning goes on from the one before, so that what was too much once may be tried again. The search ends early if
+    Each tuning starts from the one before, so that what was too much once may be tried again. The search ends early if
     a tuning diverges or even the finest choices lose more, and keeps what was found before.
 
     Args:

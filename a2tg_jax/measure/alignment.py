@@ -88,24 +88,19 @@ def align_poses(
     check_is_model(model)
     model = model.live
     background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
-    cameras = [view.camera for view in views]
-    planned = plan_render(model, cameras, head_room=HEAD_ROOM, settings=settings)
-    return tuple(_aligned(view, model, background, planned, num_steps) for view in views)
-
-
-def _aligned(view: View, model: Model, background: Array, settings: RenderSettings, num_steps: int) -> View:
-    dtype = background.dtype
-    target = jnp.asarray(view_image(view, np.asarray(background)), dtype)
-    mask = None if view.mask is None else jnp.asarray(view.mask.read())[..., None]
-    camera = jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera)
-    descend = jax.jit(_descent, static_argnums=(6, 7))
-    twist, overflow = descend(model.gaussians, model.appearance, camera, target, mask, background, settings, num_steps)
-    if bool(overflow):
-        assert settings.capacity is not None
-        more = dataclasses.replace(settings, capacity=2 * settings.capacity)
-        return _aligned(view, model, background, more, num_steps)
-    viewmat = moved_viewmat(twist, camera.viewmat)
-    return dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat.astype(jnp.float32)))
+    planned = plan_render(model, [view.camera for view in views], head_room=HEAD_ROOM, settings=settings)
+    descend, aligned = jax.jit(_descent, static_argnums=(6, 7)), []
+    for view in views:
+        target = jnp.asarray(view_image(view, np.asarray(background)), background.dtype)
+        mask = None if view.mask is None else jnp.asarray(view.mask.read())[..., None]
+        camera = jax.tree.map(lambda x: jnp.asarray(x, background.dtype), view.camera)
+        inputs, settings = (model.gaussians, model.appearance, camera, target, mask, background), planned
+        while (found := descend(*inputs, settings, num_steps))[1]:
+            assert settings.capacity is not None
+            settings = dataclasses.replace(settings, capacity=2 * settings.capacity)
+        viewmat = moved_viewmat(found[0], camera.viewmat).astype(jnp.float32)
+        aligned.append(dataclasses.replace(view, camera=dataclasses.replace(view.camera, viewmat=viewmat)))
+    return tuple(aligned)
 
 
 def _descent(

@@ -97,7 +97,7 @@ def extract_mesh(
     """Return the surface of a model as triangles, by fusion of rendered depths and marching cubes (2DGS).
 
     The depths of each view are fused into a truncated signed distance function on sparse voxels. A depth is the mean of
-    the splats that a ray meets, and counts less where they lie apart. Small connected parts are removed.
+    the splats that a ray meets, and counts less where they are apart. Small connected parts are removed.
 
         result = a2tg.extract_mesh(model, resolution=256)
         a2tg.save_mesh("scene.glb", result.mesh, model.origin.transform)
@@ -136,7 +136,7 @@ def extract_mesh(
         raise ValueError(f"most_clusters must be at least 1; got {most_clusters}")
     renderer, depths_of = Renderer(model, cameras=cameras, settings=settings), jax.jit(rendered_depth)
     own_center, own_radius = common_sphere([camera.viewmat for camera in cameras])
-    if not own_radius:  # Cameras at one place look at what lies at the median depth of the first.
+    if not own_radius:  # Cameras at one place look at the median depth of the first.
         depth = np.asarray(depths_of(renderer(cameras[0]), cameras[0]).depth)
         middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
         own_center, own_radius = own_center + middle * np.asarray(cameras[0].viewmat, float)[2, :3], RADII * middle

@@ -1,7 +1,7 @@
 """Fusion of rendered depths into sparse voxels: truncated signed distances, their mean over the views, and colours.
 
 A render has the sums Σ w·z and Σ w·z² of its splats, so that a depth is a mean with a spread. At an edge, or in a cloud
-of splats, the spread is large, and the mean lies between surfaces. A view therefore counts where it faces the surface
+of splats, the spread is large, and the mean is between surfaces. A view therefore counts where it faces the surface
 and its depths are sure. The distance is measured from the surface's plane, by the normal of the render.
 """
 
@@ -89,7 +89,7 @@ class Space:
         return jnp.maximum(ratio, 1.0) if self.is_unbounded else jnp.ones_like(ratio)
 
     def contains(self, points: Array) -> Array:
-        """Return [P] whether positions lie within the space."""
+        """Return [P] whether positions are within the space."""
         return self.radii(points) <= (FARTHEST if self.is_unbounded else 1.0)
 
 

@@ -1,4 +1,4 @@
-"""Textures of meshes from pictures: each texel is a weighted mean over the views that see it (host)."""
+"""Textures of meshes from pictures: each texel is a weighted mean over the views that show it (host)."""
 
 import importlib
 from collections.abc import Iterable, Iterator
@@ -14,7 +14,7 @@ from a2tg_jax.mesh.triangles import Mesh
 POWER = 6
 """Power of cosine over distance that weighs a view: the higher, the more the best view decides."""
 LEAST_FACING = 0.15
-"""Smallest cosine between the normal and the direction to a camera that sees a texel."""
+"""Smallest cosine between the normal and the direction to a camera whose view shows a texel."""
 HIDDEN = 0.01
 """Distance behind the mesh, in units of its depth, from which on a texel is hidden."""
 CHUNK = 1 << 20
@@ -61,7 +61,7 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
     atlas, is_empty = np.zeros((size, size, 3), np.uint8), np.ones((size, size), bool)
     atlas.reshape(-1, 3)[texels.place] = np.rint(255 * np.clip(color, 0, 1))
     is_empty.flat[texels.place] = False
-    if not is_empty.all():  # Where no chart lies, the nearest texel's colour keeps seams from showing.
+    if not is_empty.all():  # Between charts, the nearest texel's colour keeps seams from showing.
         atlas = atlas[tuple(distance_transform_edt(is_empty, return_distances=False, return_indices=True))]
     return Mesh(mesh.vertices, mesh.faces, mesh.colors, mesh.uv, atlas)
 
@@ -144,7 +144,7 @@ class Raster(NamedTuple):
 
 
 def draw_view(mesh: Mesh, camera: Camera) -> Raster:
-    """Draw a mesh as a camera sees it; faces that reach behind the camera are left out."""
+    """Draw a mesh in the view of a camera; faces that reach behind the camera are left out."""
     viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
     at = mesh.vertices @ viewmat[:3, :3].T + viewmat[:3, 3]
     z = at[:, 2]

@@ -158,7 +158,7 @@ class SurfaceDistance(NamedTuple):
 def surface_distance(
     points: np.ndarray, reference: np.ndarray, *, threshold: float, most: float = np.inf
 ) -> SurfaceDistance:
-    """Compare the points of a surface with those of its reference.
+    """Compare the points of a surface with points of its reference.
 
     Args:
       points: [P, 3] points on the surface, such as `sample_surface` gives.

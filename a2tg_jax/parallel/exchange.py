@@ -63,7 +63,7 @@ class ImageBands(NamedTuple):
     @staticmethod
     def of(grid: TileGrid, num: int, room: BorderRoom | None = None) -> "ImageBands":
         """Return the bands of a view, with room for any borders by default."""
-        # A border lies at most at the end of the tiles, and in an even cut at most at the end of the devices' rows.
+        # A border is at most at the end of the tiles, and in an even cut at most at the end of the devices' rows.
         most = max(grid.rows * grid.tile_size, num * -(-grid.height // num)) if num > 1 else 0
         return ImageBands(grid, num, BorderRoom(*(min(most, own) for own in room or (most, most))))
 

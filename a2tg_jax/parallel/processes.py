@@ -1,6 +1,6 @@
 """Several processes that train one scene together: they join by `jax.distributed`, watch each other, and leave.
 
-They watch each other over TCP: each reports that it lives, and notices who has ended or fallen silent. The first
+They watch each other over TCP: each reports regularly, and notices who has ended or fallen silent. The first
 process has a connection to every other one, and reports whom it has lost. Everything runs in threads, because a
 training waits for a lost process inside XLA and cannot be interrupted there.
 """
@@ -37,7 +37,7 @@ ALIVE, BYE, FAILED, INTERRUPTED, OTHER_LOST, QUIT = b".", b"b", b"f", b"i", b"l"
 
 
 class Liveness:
-    """Connections of one process to those that must live as long as it does."""
+    """Connections of one process to the others, whose loss ends it."""
 
     def __init__(self, others: Mapping[int, Connection], count: int, seconds: float, on_end: Callable[[str], None]):
         """Watch the others, by number, of `count` processes; a silent one is lost after some seconds.

@@ -98,7 +98,7 @@ def on_host(x: Any) -> np.ndarray:
     num_rows = max(1, LARGEST_PART * len(x) // max(1, x.nbytes * len(starts)))
     for shard, rows in zip(shards, firsts, strict=True):
         for first in range(0, len(shard.data), num_rows):
-            # JAX keeps what was read of an array as long as the array lives, so a copy is read.
+            # JAX caches what is read of an array as long as the array exists, so a copy is read.
             part = np.asarray(jnp.array(shard.data[first : first + num_rows], copy=True))
             parts = part[None] if x.is_fully_addressable else multihost_utils.process_allgather(part)
             for row, values in zip(rows, parts, strict=True):
