@@ -486,7 +486,7 @@ def test_an_image_is_removed_as_the_error_says(tmp_path, text):
     with_tracks(tmp_path, text)
     (tmp_path / "images" / "img_04.png").unlink()
     with pytest.raises(
-        FileNotFoundError, match=r"img_04\.png: no such image, but the model has a camera for it"
+        FileNotFoundError, match=r"img_04\.png: no such image, but the scene has a camera for it"
     ) as told:
         load_scene(tmp_path)
     advice = str(told.value).rpartition("or ")[2]

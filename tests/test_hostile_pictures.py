@@ -13,7 +13,7 @@ from PIL import Image
 
 from a2tg_jax.data import decoding, run_sfm
 from a2tg_jax.data.decoding import MAX_PIXELS, picture_facts, read_pixels
-from a2tg_jax.data.image_files import inside, locate_image
+from a2tg_jax.data.image_files import find_image, inside
 from a2tg_jax.results.images import picture_names, save_picture
 
 CHANNELS = {0: 1, 2: 3, 4: 2, 6: 4}
@@ -165,12 +165,12 @@ def test_names_do_not_lead_out_of_the_scene(tmp_path, name):
     (tmp_path / "images").mkdir()
     (tmp_path / "x.png").write_bytes(png(4, 3))
     with pytest.raises(ValueError, match="leads out of the scene's folder"):
-        locate_image(tmp_path / "images", name)
+        find_image(tmp_path / "images", name)
 
 
 def test_names_that_are_too_long_are_shortened(tmp_path):
     with pytest.raises(ValueError, match=r"too long a name \(5000 letters\)") as caught:
-        locate_image(tmp_path, "x" * 5000)
+        find_image(tmp_path, "x" * 5000)
     assert len(str(caught.value)) < 500
 
 
@@ -181,7 +181,7 @@ def test_names_within_the_scene_and_links_are_followed(tmp_path):
     (tmp_path / "scene" / "images").symlink_to(tmp_path / "elsewhere")
     for name in ("images/x.png", "./images/x.png", "images//x.png"):
         assert inside(tmp_path / "scene", name) == "images/x.png"
-        assert read_pixels(locate_image(tmp_path / "scene", name)).shape == (3, 4, 3)
+        assert read_pixels(find_image(tmp_path / "scene", name)).shape == (3, 4, 3)
 
 
 def test_photographs_are_looked_at_before_colmap_reads_them(tmp_path):
@@ -197,8 +197,7 @@ def test_photographs_are_looked_at_before_colmap_reads_them(tmp_path):
 def test_a_link_to_itself_is_no_image(tmp_path):
     (tmp_path / "a.png").symlink_to(tmp_path / "b.png")
     (tmp_path / "b.png").symlink_to(tmp_path / "a.png")
-    with pytest.raises(FileNotFoundError, match=r"a\.png: no such image"):
-        locate_image(tmp_path, "a.png")
+    assert find_image(tmp_path, "a.png") is None
 
 
 def test_results_never_share_a_file():

@@ -12,7 +12,7 @@ from test_data_colmap import HEIGHT, WIDTH, dot_place, write_scene
 from test_data_transforms import FOCAL, SIZE, write_frames, write_json
 
 from a2tg_jax import Gaussians2dMcmc, evaluate, fit, load_scene, polish, psnr, ssim, synthetic_scene
-from a2tg_jax.data.masks import Mask
+from a2tg_jax.data import Mask
 from a2tg_jax.measure.metrics import load_lpips, lpips
 from a2tg_jax.training.start import check_views, initial_model
 

@@ -6,6 +6,7 @@ import json
 import pickle
 import threading
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -228,7 +229,7 @@ def test_shelves_are_filled_and_read_by_many_threads():
 
     def work(start):
         for index in range(start, 60, 4):
-            kept[index] = shelf.keep(images[index])
+            kept[index] = shelf.keep(images[index], Path("a.png"), np.copy)
             time.sleep(0)
             np.testing.assert_array_equal(kept[index].read(), images[index])
 
@@ -248,7 +249,7 @@ def test_a_full_disk_is_said_with_what_to_do(monkeypatch):
 
     monkeypatch.setattr(pictures.tempfile, "TemporaryFile", full)
     with pytest.raises(OSError, match=r"cannot keep the scene's photographs \(No space left.*larger downscale"):
-        Shelf(0).keep(np.zeros((4, 4, 3), np.uint8))
+        Shelf(0).keep(np.zeros((4, 4, 3), np.uint8), Path("a.png"), np.copy)
 
 
 def test_a_view_takes_pixels_and_pictures():

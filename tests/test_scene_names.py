@@ -71,7 +71,7 @@ def test_every_name_in_a_transforms_file(tmp_path, monkeypatch, kind):
 def test_a_frame_is_removed_as_the_error_says(tmp_path):
     write_scene(tmp_path)
     (tmp_path / "images" / "03.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"03\.png: no such image.*, or remove its frame from the file"):
+    with pytest.raises(FileNotFoundError, match=r"03\.png: no such image.*, or remove its frame from "):
         load_scene(tmp_path)
     contents = json.loads((tmp_path / "transforms.json").read_text())
     contents["frames"].pop(3)

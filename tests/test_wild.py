@@ -13,7 +13,7 @@ from test_data_colmap import HEIGHT, WIDTH, write_scene
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
-from a2tg_jax.data.depths import find_depths, read_depths
+from a2tg_jax.data.photo_reading import find_depths, read_depths
 from a2tg_jax.data.synthetic import exact_depths
 from a2tg_jax.densify.pruning import are_near, shown_in
 from a2tg_jax.events import Due

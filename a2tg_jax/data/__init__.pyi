@@ -1,9 +1,8 @@
 from .arrays import scene_from_arrays as scene_from_arrays
 from .assembly import with_validation_views as with_validation_views
 from .load import load_scene as load_scene
-from .masks import Mask as Mask
 from .observations import ObservedPoints as ObservedPoints, observed_points as observed_points
-from .photo_store import Picture as Picture
+from .photo_store import Mask as Mask, Picture as Picture
 from .scene import (
     Scene as Scene,
     View as View,

@@ -11,10 +11,8 @@ from a2tg_jax.core.camera_paths import nearest_point
 from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, check_test_every, every_kth, rigid_viewmat
-from a2tg_jax.data.depths import DepthMap
-from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.observations import before_camera, observed_points, pinhole_pixels
-from a2tg_jax.data.photo_store import Picture, how_to_convert
+from a2tg_jax.data.photo_store import DepthMap, Mask, Picture, how_to_convert
 from a2tg_jax.data.scene import Scene
 
 OFF_CENTER = 1.25

@@ -18,10 +18,8 @@ from a2tg_jax.core.camera_paths import LEAST_FACING, nearest_point
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
 from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.similarity import Similarity, camera_centers
-from a2tg_jax.data.depths import DepthMap
-from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.observations import ObservedPoints
-from a2tg_jax.data.photo_store import Picture
+from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.host.text import counted
 

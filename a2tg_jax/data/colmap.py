@@ -1,4 +1,4 @@
-"""COLMAP scenes: a sparse model (.bin or .txt) beside a folder of images."""
+"""COLMAP scenes: a sparse model (.bin or .txt) next to a folder of images."""
 
 import dataclasses
 import warnings
@@ -10,21 +10,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.similarity import camera_centers
-from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_viewmat
+from a2tg_jax.data.assembly import PointCloud, assemble_scene, every_kth, rigid_viewmat
 from a2tg_jax.data.colmap_files import KINDS, POINT, FrameRecord, ImageRecord, RigRecord, num_images, read_file
-from a2tg_jax.data.depths import find_depths
-from a2tg_jax.data.image_files import (
-    find_copies,
-    find_image,
-    inside,
-    map_in_threads,
-    on_disk,
-    warn_of_unposed,
-)
+from a2tg_jax.data.image_files import inside, on_disk, warn_of_unposed
 from a2tg_jax.data.lenses import checked_lens
-from a2tg_jax.data.masks import FOLDER, find_mask, mask_to_read
 from a2tg_jax.data.observations import before_camera, observed_points
-from a2tg_jax.data.photo_reading import Options, Photo, check_masks, read_photos
+from a2tg_jax.data.photo_reading import Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
 from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
@@ -53,6 +44,11 @@ class SparseModel(NamedTuple):
     """[P] `POINT`, by id."""
     rigs: list[RigRecord]
     frames: list[FrameRecord]
+
+    @property
+    def viewmats(self) -> np.ndarray:
+        """World-to-camera matrices [V, 4, 4] of the images."""
+        return np.array([viewmat_of(image) for image in self.images]).reshape(-1, 4, 4)
 
 
 def find_models(path: Path) -> list[Path]:
@@ -94,40 +90,39 @@ def load_colmap(path: Path, options: Options) -> Scene:
     The path is the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) may be in it,
     beside the model, or up to two folders above.
     """
-    downscale = options.downscale
     model = _model_of(path)
     contents = _read_model(model)
-    scene, folder = _find_photos(path, model, contents.images, downscale)
+    scene, folder = _find_photos(path, model, contents.images, options.downscale)
     images = [image._replace(name=inside(folder, image.name)) for image in contents.images]
     used = sorted({image.camera_id for image in images})
     lenses = {key: checked_lens(contents.cameras[key], f"{model}: camera {key}", options.lens) for key in used}
-    # Masks and depth maps are beside `images` in the scene.
-    masks = map_in_threads(lambda image: find_mask(scene / IMAGES, image.name, downscale), images, place=folder)
-    named = [*((folder, image.name) for image in images), *(mask for mask in masks if mask is not None)]
-    copies = find_copies(named, downscale, scene)
-    photos_folder, still_to_downscale = copies.of(folder)
-    files = _located(photos_folder, images, model)
     warn_of_unposed(folder, [image.name for image in images], is_deep=folder != scene)
-    panoramas = _panoramas(contents)
+    viewmats, panoramas = contents.viewmats, _panoramas(contents)
+    photos = [
+        Photo(
+            image.name, viewmat, (folder, image.name), (scene / IMAGES, image.name), lenses[image.camera_id],
+            str(folder / image.name), panorama=panoramas.get(image.id),
+        )
+        for image, viewmat in zip(images, viewmats, strict=True)
+    ]  # fmt: skip
 
-    def photo(image: ImageRecord, file: Path, mask: tuple[Path, str] | None) -> Photo:
-        return Photo(
-            image.name, viewmat_of(image), file, still_to_downscale, lambda _: lenses[image.camera_id], str(file),
-            mask_to_read(mask, copies), find_depths(scene / IMAGES, image.name), panoramas.get(image.id),
-        )  # fmt: skip
+    def how_to_remove(name: str) -> str:
+        file = _model_files(model)["images"]
+        if file.suffix.lower() == ".txt":
+            return f"delete its two lines in {file}"
+        return (
+            f"remove it from the model in Python: import pycolmap; model = pycolmap.Reconstruction({str(model)!r}); "
+            f"model.deregister_frame(model.find_image_with_name({name!r}).frame_id); model.write({str(model)!r})"
+        )
 
-    def with_points(shot: Shot, image: ImageRecord) -> Shot:
+    shots = read_photos(photos, options, path, scene, how_to_remove)
+    for index, (shot, image) in enumerate(zip(shots, images, strict=True)):
         own = image.point_ids[np.isin(image.point_ids, contents.points["id"])]
-        if not len(own):
-            return shot
-        positions = contents.points["position"][np.searchsorted(contents.points["id"], own)]
-        places, (height, width) = before_camera(positions, shot.viewmat), shot.picture.size
-        xy = lenses[image.camera_id].projected(places, shot.K, (width, height))
-        return dataclasses.replace(shot, points=observed_points(xy, places[:, 2], (height, width)))
-
-    found = read_photos(list(map(photo, images, files, masks)), options, path)
-    shots = list(map(with_points, found, images))
-    check_masks(shots, str(path), scene / FOLDER)
+        if len(own):
+            positions = contents.points["position"][np.searchsorted(contents.points["id"], own)]
+            places, (height, width) = before_camera(positions, shot.viewmat), shot.picture.size
+            xy = lenses[image.camera_id].projected(places, shot.K, (width, height))
+            shots[index] = dataclasses.replace(shot, points=observed_points(xy, places[:, 2], (height, width)))
     train, test = every_kth(shots, options.test_every)
     return assemble_scene(scene_name(scene), train, test, _start_cloud(model, contents), source=str(path))
 
@@ -142,8 +137,7 @@ def read_cameras_and_points(path: Path) -> tuple[np.ndarray, PointCloud]:
     """Return world-to-camera matrices [V, 4, 4] by name of the image, and the points, without reading images."""
     model = _model_of(path)
     contents = _read_model(model)
-    images = sorted(contents.images, key=lambda image: image.name)
-    return np.stack([viewmat_of(image) for image in images]), _start_cloud(model, contents)
+    return contents.viewmats[np.argsort([image.name for image in contents.images])], _start_cloud(model, contents)
 
 
 def viewmat_of(image: ImageRecord) -> np.ndarray:
@@ -162,35 +156,14 @@ def viewmat_of(image: ImageRecord) -> np.ndarray:
     return rigid_viewmat(viewmat, image.name)
 
 
-def _located(folder: Path, images: Sequence[ImageRecord], model: Path) -> list[Path]:
-    """Return the file of each image of a model in a folder. If some are missing, the error says what to do."""
-    found = map_in_threads(lambda image: find_image(folder, image.name), images, place=folder)
-    missing = [image.name for image, file in zip(images, found, strict=True) if file is None]
-    if missing:
-        more = f", and {len(missing) - 1} more of its {len(images)} are missing" if len(missing) > 1 else ""
-        images_file = _model_files(model)["images"]
-        if images_file.suffix.lower() == ".txt":
-            advice = f"delete its two lines in {images_file}"
-        else:
-            advice = (
-                "remove it from the model in Python: "
-                f"import pycolmap; model = pycolmap.Reconstruction({str(model)!r}); "
-                f"model.deregister_frame(model.find_image_with_name({missing[0]!r}).frame_id); "
-                f"model.write({str(model)!r})"
-            )
-        raise FileNotFoundError(
-            f"{folder / missing[0]}: no such image, but the model has a camera for it{more}; put it there, or {advice}"
-        )
-    return [file for file in found if file is not None]
-
-
 def _panoramas(model: SparseModel) -> dict[int, int]:
     """Return the number of the frame of each image whose rig looks around from one place (`SAME_PLACE`), by its id."""
     frames = {image_id: frame for frame in model.frames for image_id in frame.image_ids}
-    places = {frames[image.id].id if image.id in frames else -image.id: viewmat_of(image) for image in model.images}
+    ids = [frames[image.id].id if image.id in frames else -image.id for image in model.images]
+    places = dict(zip(ids, camera_centers(model.viewmats), strict=True))
     reach = 0.0
     if len(places) > 1:
-        centers = camera_centers(np.stack(list(places.values())))
+        centers = np.stack(list(places.values()))
         reach = SAME_PLACE * float(np.median(cKDTree(centers).query(centers, k=2)[0][:, 1]))
     around = {
         rig.id

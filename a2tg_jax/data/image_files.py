@@ -1,16 +1,14 @@
-"""Photographs and masks on disk: files by name, smaller copies of them, and threads that read them."""
+"""Photographs and masks on disk: files by name, and threads that read them."""
 
 import os
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path, PurePath, PureWindowsPath
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
-from a2tg_jax.data.decoding import picture_size
-from a2tg_jax.host.regular_files import is_folder, is_regular, names_in
+from a2tg_jax.host.regular_files import is_regular, names_in
 from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import counted, shortened
 
@@ -20,36 +18,19 @@ LONGEST_NAME = 1000
 """Largest number of letters in an image's path below its folder."""
 MOST_READERS = 8
 """Largest number of threads that read photographs."""
-ROUNDING = 1.0
-"""Largest difference in pixels between a side of a smaller copy and the photograph's side divided by the downscale."""
 
 Result = TypeVar("Result")
 
 
-def locate_image(folder: Path, name: str) -> Path:
-    """Return the file of an image, whose name is a path below a folder, perhaps without suffix.
+def find_image(folder: Path, name: str) -> Path | None:
+    """Return the file of an image, whose name is a path below a folder, perhaps without suffix; None without one.
 
     Raises:
-      FileNotFoundError: naming the image, if it is not there.
       ValueError: if the name leads out of the folder.
     """
     name = inside(folder, name)
-    for candidate in (folder / name, folder / f"{name}.png", *_with_suffixes(folder, name)):
-        if is_regular(candidate):
-            return candidate
-    if (found := on_disk(folder, name)) is not None:
-        return found
-    raise FileNotFoundError(
-        f"{folder / name}: no such image, but the scene has a camera for it; "
-        f"put the image there, or remove its frame from the file that names it"
-    )
-
-
-def find_image(folder: Path, name: str) -> Path | None:
-    """Return the file that `locate_image` returns, or None if it is not there."""
-    with suppress(FileNotFoundError):
-        return locate_image(folder, name)
-    return None
+    candidates = (folder / name, folder / f"{name}.png", *_with_suffixes(folder, name))
+    return next(filter(is_regular, candidates), None) or on_disk(folder, name)
 
 
 def named_image(folder: Path, name: str) -> Path | None:
@@ -98,14 +79,14 @@ def on_disk(folder: Path, *names: str) -> Path | None:
     for name in () if files else names:
         found = [folder]
         for part in Path(name).parts:
-            # All that fit so far, because folders may differ in capitals, too.
+            # All that fit so far, because folders may differ in capitals as well.
             found = [each / own for each in found for own in names_in(each) if _letters(own) == _letters(part)]
         files += [found[0]] if len(found) == 1 and is_regular(found[0]) else []
     return files[0] if files else None
 
 
 def _letters(name: str) -> str:
-    """Return a name without capitals. macOS writes accents as letters of their own, which are joined."""
+    """Return a name without capitals. macOS writes accents as separate letters, which are joined."""
     return unicodedata.normalize("NFC", name.casefold())
 
 
@@ -123,64 +104,6 @@ def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) ->
     if others:
         told = f"{counted(len(others), 'photograph')} without a pose, such as {shortened(others[0])}"
         warnings.warn(f"{folder}: {told}: not used", stacklevel=3)
-
-
-class SmallerCopies(NamedTuple):
-    """Where a scene has smaller copies of its files: images_2 beside images, for a downscale of 2."""
-
-    downscale: int
-    folders: Mapping[Path, Path]
-    """Folder of the copies, by folder of the full files."""
-
-    def of(self, folder: Path) -> tuple[Path, int]:
-        """Return the folder to read a folder's files from, and the remaining factor of downscaling."""
-        return (self.folders[folder], 1) if folder in self.folders else (folder, self.downscale)
-
-
-def find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) -> SmallerCopies:
-    """Find the folders NAME_k beside folders NAME of a scene that hold its files at 1/k of their size.
-
-    Such a folder may also be another clip of the scene. It counts if the scene names no file in it, and it has a copy
-    of each file of NAME, 1/k as large. A folder that fails is not used, with a warning. Files whose full size is
-    missing, cannot be read or is in object storage are not compared.
-
-    Args:
-      files: folder, and path below it, of every photograph and mask that the scene names.
-      downscale: k >= 1.
-      root: the scene's folder, which has no copies: its siblings are other scenes.
-    """
-
-    def difference(name: str) -> str:
-        """Return how the copy of a file differs from one of 1/downscale of its size; "" if it does not."""
-        full, copy = (find_image(place, name) for place in (folder, smaller))
-        if full is None:
-            return ""
-        if copy is None:
-            return f"{name}, which is missing"
-        if is_remote(full):
-            return ""
-        with suppress(ValueError):  # A photograph may be too large to be read in full.
-            size, copied = picture_size(full), picture_size(copy)
-            if any(abs(side - whole / downscale) > ROUNDING for side, whole in zip(copied, size, strict=True)):
-                return f"{name}, which is {copied[0]}x{copied[1]} for {size[0]}x{size[1]}"
-        return ""
-
-    found: dict[Path, Path] = {}
-    named = {(folder / name).parent for folder, name in files} if downscale > 1 else set()
-    for folder in dict.fromkeys(folder for folder, _ in files if downscale > 1 and folder != root):
-        smaller = folder.with_name(f"{folder.name}_{downscale}")
-        if not is_folder(smaller) or any(place.is_relative_to(smaller) for place in named):
-            continue
-        names = [name for own, name in files if own == folder]
-        if told := [each for each in map_in_threads(difference, names, place=folder) if each]:
-            warnings.warn(
-                f"{smaller}: does not hold the files of {folder} at 1/{downscale} of their size, for {len(told)} of "
-                f"{len(names)}, such as {told[0]}: not used",
-                stacklevel=4,
-            )
-        else:
-            found[folder] = smaller
-    return SmallerCopies(downscale, found)
 
 
 def map_in_threads(

@@ -14,11 +14,10 @@ from a2tg_jax.data.assembly import check_test_every, with_validation_views
 from a2tg_jax.data.colmap import find_models, load_colmap
 from a2tg_jax.data.division import among_processes, divided, sharing_errors
 from a2tg_jax.data.lenses import LensUse, forget_rays
-from a2tg_jax.data.masks import AlphaMeaning, Mask, check_left
 from a2tg_jax.data.phone_captures import polycam, record3d
 from a2tg_jax.data.photo_folder import check_no_video, holds_photos, told_of_capture
 from a2tg_jax.data.photo_reading import Options
-from a2tg_jax.data.photo_store import Shelf
+from a2tg_jax.data.photo_store import Mask, Shelf, check_left
 from a2tg_jax.data.photogrammetry import metashape, realityscan
 from a2tg_jax.data.scene import Scene, View, scene_name, warn_of_lenses
 from a2tg_jax.data.synthetic import synthetic_scene
@@ -31,6 +30,8 @@ SYNTHETIC = "synthetic"
 """Name of the built-in scene."""
 SYNTHETIC_SIZE = (208, 156)
 """Its width and height in runs, small enough to train in minutes on two cores."""
+AlphaMeaning = Literal["transparency", "mask"]
+"""Meaning of the alpha channel of photographs: transparency over a background, or a mask."""
 HeldOut = Literal["test", "validation"]
 OTHER_PROGRAMS: tuple[Callable[[Path], Callable[[], Frames] | None], ...] = (polycam, record3d, metashape, realityscan)
 """Functions that recognise a folder of another program, in order of preference, and return what reads its frames."""

@@ -1,31 +1,45 @@
-"""Reading of a scene's photographs with their masks, by one process or by several that divide them.
+"""Reading of a scene's photographs with their masks and depth maps, by one process or by several that divide them.
 
 One process reads all photographs, so that a broken one is found before training. Of several processes each reads its
-share, and what has room in its memory. It leaves the others until it draws them.
+share, plus as many others as its memory has room for. The rest is read when it is first drawn.
+
+Next to the folder `images` may be
+ - `masks` with NAME.EXT.png (as COLMAP has them), NAME.png or NAME.EXT for NAME.EXT. Black, or transparent, excludes a
+   pixel; everything else keeps it, as with COLMAP and nerfstudio;
+ - `depths` with NAME.npy or NAME.png. What they hold is an option of the training (`training.depth_prior`). They are
+   read when a training needs them;
+ - `images_k` and `masks_k` with copies at 1/k of the size.
 """
 
 import contextlib
 import math
+import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from a2tg_jax.data.assembly import Shot
-from a2tg_jax.data.decoding import picture_size, read_pixels
-from a2tg_jax.data.depths import depth_map
+from a2tg_jax.data.decoding import MAX_PIXELS, picture_size, read_grey, read_pixels
 from a2tg_jax.data.division import Division, divided
-from a2tg_jax.data.image_files import map_in_threads
-from a2tg_jax.data.lenses import Lens, LensUse
-from a2tg_jax.data.masks import Mask, check_left, load_mask
-from a2tg_jax.data.photo_store import Picture, Shelf
+from a2tg_jax.data.image_files import find_image, map_in_threads, on_disk
+from a2tg_jax.data.lenses import Lens, LensUse, resize_pixels
+from a2tg_jax.data.photo_store import DepthMap, Mask, Picture, Shelf, check_left
+from a2tg_jax.host.npz import read_npy
 from a2tg_jax.host.regular_files import is_folder
-from a2tg_jax.host.remote_files import is_remote
+from a2tg_jax.host.remote_files import Unreachable, is_remote
+from a2tg_jax.host.text import shortened
 
+MASKS, DEPTHS = "masks", "depths"
 MAX_ASPECT_ERROR = 0.01
 """Largest relative difference of aspect between an image and its camera, beyond one pixel of rounding."""
+MAX_DEPTH_ASPECT_ERROR = 0.02
+"""Largest relative difference of aspect between a depth map and its photograph, beyond two pixels of rounding."""
+ROUNDING = 1.0
+"""Largest difference in pixels between a side of a smaller copy and the photograph's side divided by the downscale."""
 
 
 class Options(NamedTuple):
@@ -35,39 +49,65 @@ class Options(NamedTuple):
     test_every: int
     lens: LensUse
     shelf: Shelf
-    """Where pixels go."""
+    """Store of the pixels."""
     division: Division | None
     """Processes that load the scene together, within `sharing_errors`; None: one."""
 
 
 class Photo(NamedTuple):
-    """Files and camera of a photograph that is not read yet."""
+    """A photograph that the scene names, with its camera."""
 
     name: str
-    """Path of the image below the folder of images."""
     viewmat: np.ndarray
     """[4, 4] float64 world to camera (OpenCV), in the original world."""
-    file: Path
-    downscale: int
-    """Factor by which the file's pixels are downscaled."""
-    lens_of: Callable[[tuple[int, int]], Lens]
-    """Function from the file's (width, height) to the lens."""
+    image: tuple[Path, str]
+    """Folder of the full images, and path below it."""
+    below_images: tuple[Path, str] | None
+    """Folder `images` and path below it, for masks and depth maps; None if it is elsewhere."""
+    lens: Lens | Callable[[tuple[int, int]], Lens]
+    """Lens, or a function from the full image's (width, height) to it."""
     what: str
     """Name of the photograph in errors of its lens."""
-    mask: tuple[Path, int] | None
-    """File of the mask, and the factor by which it is downscaled."""
-    depths: Path | None
-    """File of the depth map."""
+    mask: Path | None = None
+    """Mask that the scene names."""
+    depths: Path | None = None
+    """Depth map that the scene names."""
     panorama: int | None = None
     """Number of the panorama that it was cut from."""
 
-    def processing(self, lens: Lens) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the function from the file's pixels to the view's."""
-        return lambda pixels: lens.view_pixels(pixels, self.downscale)[0]
+
+class _Found(NamedTuple):
+    """A photograph with its files, and the factors by which their pixels are downscaled."""
+
+    photo: Photo
+    file: Path
+    downscale: int
+    mask: tuple[Path, int] | None
+    depths: Path | None
+
+    def lens_of(self, stored: tuple[int, int], downscale: int) -> Lens:
+        """Return the lens of the photograph, whose file is (width, height), in a scene that is downscaled."""
+        if isinstance(self.photo.lens, Lens):
+            return self.photo.lens
+        full = stored
+        if self.downscale < downscale:  # The file is a smaller copy, and the full image may be missing.
+            full = downscale * stored[0], downscale * stored[1]
+            # Of stores, the size would be another request for each photograph.
+            if not is_remote(self.file) and (original := find_image(*self.photo.image)) is not None:
+                full = picture_size(original)
+        return self.photo.lens(full)
+
+    def check_size(self, size: tuple[int, int], stored: tuple[int, int]) -> None:
+        """Raise ValueError unless the file has the size (width, height) that another process has read."""
+        if size != stored:
+            raise ValueError(
+                f"{self.file}: is {size[0]}x{size[1]}, but {stored[0]}x{stored[1]} where another process reads it; "
+                "give all processes the same photographs"
+            )
 
 
-class Facts(NamedTuple):
-    """Facts about a photograph that are known once it is decoded."""
+class _Facts(NamedTuple):
+    """Facts about a decoded photograph, which a process sends to the others."""
 
     stored: tuple[int, int]
     """(width, height) of the file's pixels."""
@@ -78,81 +118,187 @@ class Facts(NamedTuple):
     mask: Mask | None
 
 
-def read_photos(photos: Sequence[Photo], options: Options, place: Path) -> list[Shot]:
-    """Return the photographs of a scene at a place, given in an order that is the same in all processes."""
+def read_photos(
+    photos: Sequence[Photo], options: Options, place: Path, root: Path, how_to_remove: Callable[[str], str]
+) -> list[Shot]:
+    """Read the photographs of a scene.
+
+    Args:
+      photos: in an order that is the same in all processes.
+      options: of `load_scene`.
+      place: path of the scene in messages.
+      root: the scene's folder, which has no smaller copies: its siblings are other scenes.
+      how_to_remove: function from the name of an image to what removes it from the scene.
+    """
+    found = _find_files(photos, options.downscale, place, root, how_to_remove)
     names: dict[Path, str] = {}
-    for photo in photos:
-        if names.setdefault(photo.file, photo.name) != photo.name:
+    for own in found:
+        if names.setdefault(own.file, own.photo.name) != own.photo.name:
             raise ValueError(
-                f"{photo.file}: is the only file for {names[photo.file]} and {photo.name}; put both there, or remove "
+                f"{own.file}: is the only file for {names[own.file]} and {own.photo.name}; put both there, or remove "
                 "one from the scene"
             )
-    shelf, read = options.shelf, dict[int, Shot]()
+    read = dict[int, Shot]()
 
-    def facts_of(number: int) -> Facts:
-        facts, read[number] = _read(photos[number], shelf)
+    def own_share(number: int) -> _Facts:
+        facts, read[number] = _read(found[number], options)
         return facts
 
-    told = [f"{photo.name} downscaled by {photo.downscale}" for photo in photos]
-    facts = divided(options.division, told, facts_of, "photographs", place)
+    told = [f"{own.photo.name} downscaled by {own.downscale}" for own in found]
+    facts = divided(options.division, told, own_share, "photographs", place)
     # All of them are read here if there is one process.
-    others = [number for number in range(len(photos)) if number not in read]
-    fitting = shelf.fitting([math.prod(facts[number].shape) for number in others])
+    others = [number for number in range(len(found)) if number not in read]
 
     def of_another(number: int, fits: bool) -> Shot:
         if not fits:
-            return _unread(photos[number], shelf, facts[number])
-        found, shot = _read(photos[number], shelf)
-        _check_size(photos[number], found.stored, facts[number].stored)
+            return _read_later(found[number], options, facts[number])
+        again, shot = _read(found[number], options)
+        found[number].check_size(again.stored, facts[number].stored)
         return shot
 
-    found = map_in_threads(of_another, others, fitting, place=place)
-    read.update(zip(others, found, strict=True))
-    return [read[number] for number in range(len(photos))]
+    fitting = options.shelf.fitting([math.prod(facts[number].shape) for number in others])
+    read.update(zip(others, map_in_threads(of_another, others, fitting, place=place), strict=True))
+    shots = [read[number] for number in range(len(found))]
+    _check_masks(shots, str(place), {photo.below_images[0] for photo in photos if photo.below_images})
+    return shots
 
 
-def _read(photo: Photo, shelf: Shelf) -> tuple[Facts, Shot]:
+def _read(found: _Found, options: Options) -> tuple[_Facts, Shot]:
     """Read a photograph, and undistort and downscale it."""
-    photograph = read_pixels(photo.file)
+    photograph = read_pixels(found.file)
     stored = photograph.shape[1], photograph.shape[0]
-    lens = photo.lens_of(stored)
-    _check_aspect(photo.file, stored, lens.size)
-    with _named(photo):
-        pixels, K = lens.view_pixels(photograph, photo.downscale)
+    lens = found.lens_of(stored, options.downscale)
+    _check_aspect(found.file, stored, lens.size)
+    with _named(found.photo):
+        pixels, K = lens.view_pixels(photograph, found.downscale)
         rays = lens.rays(*pixels.shape[1::-1])
     is_stored, size = pixels is photograph, (pixels.shape[1], pixels.shape[0])
-    mask = load_mask(photo.mask, lens, stored, size)
-    picture = shelf.keep(pixels, photo.file, None if is_stored else photo.processing(lens))
-    return Facts(stored, pixels.shape, is_stored, mask), _shot(photo, lens, stored, K, rays, picture, mask)
+    mask = None if found.mask is None else _read_mask(*found.mask, lens, stored, size)
+    picture = options.shelf.keep(pixels, found.file, None if is_stored else _processing(found, lens))
+    facts = _Facts(stored, pixels.shape, is_stored, mask)
+    return facts, _shot(found, lens, facts, K, rays, picture)
 
 
-def _unread(photo: Photo, shelf: Shelf, facts: Facts) -> Shot:
+def _read_later(found: _Found, options: Options, facts: _Facts) -> Shot:
     """Return a photograph that another process has read. Its own file is read when it is first needed."""
-    if not is_remote(photo.file):
-        _check_size(photo, picture_size(photo.file), facts.stored)
-    lens = photo.lens_of(facts.stored)
-    with _named(photo):
-        size, K = lens.view_of(facts.stored, photo.downscale)
+    if not is_remote(found.file):
+        found.check_size(picture_size(found.file), facts.stored)
+    lens = found.lens_of(facts.stored, options.downscale)
+    with _named(found.photo):
+        size, K = lens.view_of(facts.stored, found.downscale)
         rays = lens.rays(*size)
-    picture = shelf.read_later(facts.shape, photo.file, None if facts.is_stored else photo.processing(lens))
-    return _shot(photo, lens, facts.stored, K, rays, picture, facts.mask)
+    processing = None if facts.is_stored else _processing(found, lens)
+    picture = options.shelf.read_later(facts.shape, found.file, processing)
+    return _shot(found, lens, facts, K, rays, picture)
 
 
-def _shot(
-    photo: Photo, lens: Lens, stored: tuple[int, int], K: np.ndarray, rays: np.ndarray | None, picture: Picture,
-    mask: Mask | None,
-) -> Shot:  # fmt: skip
-    depth = depth_map(photo.depths, lens, stored, picture.size[::-1])
-    return Shot(photo.name, photo.viewmat, K, picture, mask, rays, depth, photo.panorama)
+def _processing(found: _Found, lens: Lens) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function from the file's pixels to the view's."""
+    return lambda pixels: lens.view_pixels(pixels, found.downscale)[0]
 
 
-def _check_size(photo: Photo, size: tuple[int, int], stored: tuple[int, int]) -> None:
-    """Raise ValueError unless a photograph has the size (width, height) that another process has read."""
-    if size != stored:
-        raise ValueError(
-            f"{photo.file}: is {size[0]}x{size[1]}, but {stored[0]}x{stored[1]} where another process reads it; give "
-            "all processes the same photographs"
+def _shot(found: _Found, lens: Lens, facts: _Facts, K: np.ndarray, rays: np.ndarray | None, picture: Picture) -> Shot:
+    photo, depth = found.photo, None
+    if found.depths is not None:
+        depth = _depth_map(found.depths, lens, facts.stored, picture.size[::-1])
+    return Shot(photo.name, photo.viewmat, K, picture, facts.mask, rays, depth, photo.panorama)
+
+
+def _find_files(
+    photos: Sequence[Photo], downscale: int, place: Path, root: Path, how_to_remove: Callable[[str], str]
+) -> list[_Found]:
+    """Return the files of photographs, from folders of smaller copies where they are complete."""
+
+    def find_mask(photo: Photo) -> tuple[Path, str] | None:
+        """Return the folder of the full mask, and the mask's path below it."""
+        if photo.mask is not None:
+            return photo.mask.parent, photo.mask.name
+        if photo.below_images is None:
+            return None
+        images, name = photo.below_images
+        folder = images.with_name(MASKS)
+        names = f"{name}.png", str(Path(name).with_suffix(".png")), name
+        for each in (folder, folder.with_name(f"{MASKS}_{downscale}"))[: 2 if downscale > 1 else 1]:
+            if (found := on_disk(each, *names)) is not None:
+                return folder, found.relative_to(each).as_posix()
+        return None
+
+    masks = map_in_threads(find_mask, photos, place=place)
+    named = [*(photo.image for photo in photos), *(mask for mask in masks if mask is not None)]
+    copies = _find_copies(named, downscale, root)
+
+    def find(photo: Photo, mask: tuple[Path, str] | None) -> _Found | None:
+        (folder, name), mask_file = photo.image, None
+        image = find_image(copies.get(folder, folder), name)
+        if mask is not None:
+            found = on_disk(copies.get(mask[0], mask[0]), mask[1])
+            mask_file = None if found is None else (found, 1 if mask[0] in copies else downscale)
+            if found is None and photo.mask is not None:
+                raise FileNotFoundError(
+                    f"{photo.mask}: no such mask, but the scene names it; add the mask or remove its mask_path"
+                )
+        depths = photo.depths
+        if depths is None and photo.below_images is not None:
+            depths = find_depths(*photo.below_images)
+        factor = 1 if folder in copies else downscale
+        return None if image is None else _Found(photo, image, factor, mask_file, depths)
+
+    files = map_in_threads(find, photos, masks, place=place)
+    missing = [photo.image for photo, own in zip(photos, files, strict=True) if own is None]
+    if missing:
+        (folder, name), num = missing[0], len(missing)
+        more = f", and {num - 1} more of its {len(photos)} are missing" if num > 1 else ""
+        raise FileNotFoundError(
+            f"{copies.get(folder, folder) / name}: no such image, but the scene has a camera for it{more}; put it "
+            f"there, or {how_to_remove(name)}"
         )
+    return [own for own in files if own is not None]
+
+
+def _find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) -> dict[Path, Path]:
+    """Return the folders NAME_k that hold the files of folders NAME of a scene at 1/k of their size, by NAME.
+
+    Such a folder may also be another clip of the scene. It counts if the scene names no file in it, and it has a copy
+    of each file of NAME, 1/k as large. A folder that fails is not used, with a warning. Files whose full size is
+    missing, cannot be read or is in object storage are not compared.
+
+    Args:
+      files: folder, and path below it, of every photograph and mask that the scene names.
+      downscale: k >= 1.
+      root: as in `read_photos`.
+    """
+
+    def difference(name: str) -> str:
+        """Return how the copy of a file differs from one of 1/downscale of its size; "" if it does not."""
+        full, copy = (find_image(each, name) for each in (folder, smaller))
+        if full is None:
+            return ""
+        if copy is None:
+            return f"{name}, which is missing"
+        if is_remote(full):
+            return ""
+        with contextlib.suppress(ValueError):  # A photograph may be too large to be read in full.
+            size, copied = picture_size(full), picture_size(copy)
+            if any(abs(side - whole / downscale) > ROUNDING for side, whole in zip(copied, size, strict=True)):
+                return f"{name}, which is {copied[0]}x{copied[1]} for {size[0]}x{size[1]}"
+        return ""
+
+    found: dict[Path, Path] = {}
+    named = {(folder / name).parent for folder, name in files} if downscale > 1 else set()
+    for folder in dict.fromkeys(folder for folder, _ in files if downscale > 1 and folder != root):
+        smaller = folder.with_name(f"{folder.name}_{downscale}")
+        if not is_folder(smaller) or any(each.is_relative_to(smaller) for each in named):
+            continue
+        names = [name for own, name in files if own == folder]
+        if told := [each for each in map_in_threads(difference, names, place=folder) if each]:
+            warnings.warn(
+                f"{smaller}: does not hold the files of {folder} at 1/{downscale} of their size, for {len(told)} of "
+                f"{len(names)}, such as {told[0]}: not used",
+                stacklevel=4,
+            )
+        else:
+            found[folder] = smaller
+    return found
 
 
 def _check_aspect(path: Path, stored: tuple[int, int], camera: tuple[int, int]) -> None:
@@ -177,20 +323,89 @@ def _named(photo: Photo) -> Iterator[None]:
         raise ValueError(f"{photo.what}: its camera model {error}") from None
 
 
-def check_masks(shots: Sequence[Shot], source: str, folder: Path | None = None) -> None:
-    """Warn of photographs without a mask if others have one, or if the folder of masks has none of any photograph.
+def _check_masks(shots: Sequence[Shot], source: str, images: set[Path]) -> None:
+    """Warn of photographs without a mask if others have one, or of a folder of masks without any photograph's.
 
     Raise ValueError, naming the photograph, if its mask leaves nothing.
     """
     lacking = [shot.name for shot in shots if shot.mask is None]
     if len(lacking) == len(shots):
-        if folder is not None and is_folder(folder):
+        for folder in (each.with_name(MASKS) for each in images if is_folder(each.with_name(MASKS))):
             message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
-            warnings.warn(message, stacklevel=3)
-        return
-    if lacking:
+            warnings.warn(message, stacklevel=4)
+    elif lacking:
         message = f"{source}: {len(lacking)} of {len(shots)} photographs have no mask, such as {lacking[0]}"
-        warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
+        warnings.warn(f"{message}: all of their pixels count", stacklevel=4)
     for shot in shots:
         if shot.mask is not None:
             check_left(shot.mask, shot.name, source)
+
+
+def _read_mask(file: Path, downscale: int, lens: Lens, stored: tuple[int, int], view_size: tuple[int, int]) -> Mask:
+    """Return the mask of a view, undistorted and downscaled as its photograph was.
+
+    A pixel counts if all its source pixels count. Sizes are (width, height), of the photograph's file and of the view.
+    """
+    pixels = read_pixels(file)
+    counts = np.asarray(pixels[..., :3].any(axis=-1))
+    if pixels.shape[2] == 4 and (pixels[..., 3] != pixels[0, 0, 3]).any():  # The alpha channel is a mask.
+        is_opaque = pixels[..., 3].astype(bool)
+        lit = pixels[is_opaque & counts]
+        # Colours hold a mask too if there are two of them, one black: not in a cut-out photograph, nor where all are
+        # black. A file with a mask in both excludes what either does.
+        has_both = 0 < len(lit) < is_opaque.sum() and (lit[:, :3] == lit[0, :3]).all()
+        counts = is_opaque & counts if has_both else is_opaque
+    size = counts.shape[::-1]
+    if size not in (stored, lens.size):
+        told = "x".join(map(str, size)), "x".join(map(str, stored))
+        raise ValueError(f"{file}: is {told[0]}, but its photograph is {told[1]}; a mask must be of the same size")
+    planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
+    planes, _ = lens.view_pixels(planes, downscale)
+    return Mask.of(resize_pixels(planes, *view_size)[..., 0] == 255)
+
+
+def find_depths(images: Path, name: str) -> Path | None:
+    """Return the depth map of an image below a folder: NAME.npy, NAME.png, NAME.EXT.npy or NAME.EXT.png in the sibling
+    folder `depths`; None without one.
+    """
+    stems = str(Path(name).with_suffix("")), name
+    return on_disk(images.with_name(DEPTHS), *(stem + suffix for suffix in (".npy", ".png") for stem in stems))
+
+
+def _depth_map(file: Path, lens: Lens, stored: tuple[int, int], size: tuple[int, int]) -> DepthMap:
+    """Return the depth map of a view, which is undistorted and resized as its photograph when it is read.
+
+    Sizes are (width, height), of the photograph's file and of the view.
+    """
+
+    def load() -> np.ndarray:
+        values = read_depths(file)
+        height, width = values.shape
+        if abs(width * stored[1] - height * stored[0]) > max(
+            MAX_DEPTH_ASPECT_ERROR * width * stored[1], 2 * max(stored)
+        ):
+            raise ValueError(
+                f"{file}: is {width}x{height}, of another aspect than its photograph, {stored[0]}x{stored[1]}"
+            )
+        return np.asarray(Image.fromarray(lens.view_plane(values)).resize(size, Image.Resampling.BILINEAR))
+
+    return DepthMap((size[1], size[0]), load)
+
+
+def read_depths(file: str | os.PathLike[str]) -> np.ndarray:
+    """Return the numbers [H, W] float32 of a depth map, an .npy or a greyscale PNG, whose largest value is 1."""
+    if str(file).endswith(".npy"):
+        try:
+            values = read_npy(file)
+        except Unreachable:
+            raise
+        except Exception as error:  # what a damaged file raises goes from SyntaxError to struct.error
+            reason = shortened(str(error) or type(error).__name__)
+            raise ValueError(f"{file}: cannot be read as a depth map ({reason}); replace or remove it") from error
+        values = values.reshape([side for side in values.shape if side != 1]) if values.ndim > 2 else values
+    else:
+        levels, largest = read_grey(file)
+        values = levels.astype(np.float32) / largest
+    if values.ndim != 2 or not 0 < values.size <= MAX_PIXELS:
+        raise ValueError(f"{file}: a depth map must be [H, W]; got {list(values.shape)}")
+    return np.ascontiguousarray(values, np.float32)

@@ -1,4 +1,7 @@
-"""Storage of photographs: in memory while there is room, otherwise read on demand from a disk or a store."""
+"""What views hold of their photographs: pixels, masks and depth maps; and the store that keeps pixels.
+
+Pixels are in memory while there is room, and otherwise read on demand from a disk or object storage.
+"""
 
 import contextlib
 import dataclasses
@@ -24,7 +27,6 @@ Processing = Callable[[np.ndarray], np.ndarray]
 """Function from the pixels in an image file to undistorted or resized ones."""
 SHARE_OF_MEMORY = 0.25
 """Share of the process's memory for photographs; those beyond it stay on disk."""
-
 SHARE_OF_DISK = 0.5
 """Share of the free disk for undistorted or resized photographs of object storage."""
 
@@ -98,6 +100,94 @@ class Picture:
         return int(np.prod(self.shape)) * np.dtype(self.dtype).itemsize
 
 
+@dataclasses.dataclass(frozen=True)
+class Mask:
+    """[H, W] bool, True where a pixel counts, as compressed bits. All masks of a scene take less than one
+    photograph."""
+
+    shape: tuple[int, int]
+    """(H, W)."""
+    num: int
+    """Number of pixels that count."""
+    data: bytes = dataclasses.field(repr=False)
+
+    @staticmethod
+    def of(counts: "np.ndarray | Mask") -> "Mask":
+        """Return the mask of an array [H, W]; a mask is returned unchanged.
+
+        Raises:
+          ValueError: unless it is bool, [H, W].
+        """
+        if isinstance(counts, Mask):
+            return counts
+        _check_plane(counts, "a mask must be an array bool [H, W], True where pixels count", np.bool_)
+        height, width = counts.shape
+        return Mask((height, width), int(counts.sum()), zlib.compress(np.packbits(counts).tobytes(), 1))
+
+    @property
+    def is_full(self) -> bool:
+        """Whether all pixels count."""
+        return self.num == self.shape[0] * self.shape[1]
+
+    def read(self) -> np.ndarray:
+        """Return [H, W] bool."""
+        bits = np.frombuffer(zlib.decompress(self.data), np.uint8)
+        return np.unpackbits(bits, count=self.shape[0] * self.shape[1]).view(bool).reshape(self.shape)
+
+
+def check_left(mask: Mask, name: str, source: str) -> None:
+    """Raise ValueError, naming the photograph, if its mask leaves nothing."""
+    if mask.num == 0:
+        raise ValueError(
+            f"{source}: the mask of {name} excludes every pixel; remove the photograph or correct the mask"
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DepthMap:
+    """A depth map of a view, loaded each time it is read."""
+
+    shape: tuple[int, int]
+    """(H, W)."""
+    load: Callable[[], np.ndarray] = dataclasses.field(repr=False)
+
+    @staticmethod
+    def of(values: "np.ndarray | DepthMap") -> "DepthMap":
+        """Return the map of an array [H, W] of floats, NaN where unknown; a map is returned unchanged.
+
+        Raises:
+          ValueError: if it is no such array.
+        """
+        if isinstance(values, DepthMap):
+            return values
+        _check_plane(values, "a depth map must be an array of floats [H, W]", np.floating)
+        height, width = values.shape
+        return DepthMap((height, width), lambda: values)
+
+    def __deepcopy__(self, memo: object) -> "DepthMap":
+        """Return the map itself, which nothing changes."""
+        return self
+
+    def __reduce__(self) -> Any:
+        """Pickle the numbers that `read` returns."""
+        return DepthMap.of, (self.read(),)
+
+    def read(self) -> np.ndarray:
+        """Return [H, W] float32, NaN where unknown, its largest magnitude 1 (scales are unknown anyway)."""
+        values = np.array(self.load(), np.float32)
+        values[~np.isfinite(values)] = np.nan
+        largest = np.nanmax(np.abs(values), initial=0.0)
+        return values / largest if largest > 0 else values
+
+
+def _check_plane(values: Any, wanted: str, kind: type) -> None:
+    """Raise ValueError unless values are an array [H, W] of a kind of dtype."""
+    if not hasattr(values, "dtype"):
+        raise ValueError(f"{wanted}; got {type(values).__name__}")
+    if values.ndim != 2 or not np.issubdtype(values.dtype, kind):
+        raise ValueError(f"{wanted}; got {values.dtype} {[*values.shape]}")
+
+
 class Shelf:
     """Store of the pictures of one scene; safe to use from several threads.
 
@@ -117,12 +207,12 @@ class Shelf:
         self._end = 0
         self._disk: int | None = None
 
-    def keep(self, pixels: np.ndarray, source: Path | None = None, view: Processing | None = None) -> Picture:
+    def keep(self, pixels: np.ndarray, source: Path, view: Processing | None = None) -> Picture:
         """Return a picture of these pixels, uint8 of any shape.
 
         Args:
           pixels: the pixels.
-          source: image file that they come from; None: no file has them.
+          source: image file that they come from.
           view: function that made them of the pixels in the file; None: they are exactly these.
         """
         with self._lock:
@@ -134,7 +224,7 @@ class Shelf:
         return self._left(pixels, source, view)
 
     def fitting(self, sizes: Sequence[int]) -> list[bool]:
-        """Return which pictures of so many bytes have room in memory, if they are kept in this order."""
+        """Return which pictures of the given bytes have room in memory, if they are kept in this order."""
         room, fitting = self._room, []
         for size in sizes:
             fitting.append(size <= room)
@@ -143,7 +233,7 @@ class Shelf:
 
     def read_later(self, shape: tuple[int, ...], source: Path, view: Processing | None) -> Picture:
         """Return the picture in an image file that is not read before it is needed, and not kept in memory then."""
-        # The first reading leaves a checksum or a copy on disk, to which all later ones are held.
+        # The first reading leaves a checksum or a copy on disk, which all later ones must match.
         lock, kept = threading.Lock(), list[Picture]()
 
         def read() -> np.ndarray:
@@ -161,9 +251,9 @@ class Shelf:
 
         return Picture(shape, read, is_remote=is_remote(source))
 
-    def _left(self, pixels: np.ndarray, source: Path | None, view: Processing | None) -> Picture:
+    def _left(self, pixels: np.ndarray, source: Path, view: Processing | None) -> Picture:
         """Return a picture of pixels without room in memory. Arguments as for `keep`."""
-        if source is not None and (view is None or (is_remote(source) and not self._takes_disk(pixels.nbytes))):
+        if view is None or (is_remote(source) and not self._takes_disk(pixels.nbytes)):
             checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
             return Picture(pixels.shape, _FileRead(source, view, checksum), is_remote=is_remote(source))
         folder, shape = cache_folder(), pixels.shape
@@ -192,8 +282,10 @@ class Shelf:
         return Picture(shape, read)
 
     def _takes_disk(self, num_bytes: int) -> bool:
-        """Take so many bytes of the share of the disk for pictures of remote files, and return whether it had them.
-        It has none if no file can be made there."""
+        """Reserve bytes in the share of the disk for pictures of remote files; return whether it had them.
+
+        There is no share if no file can be made there.
+        """
         with self._lock:
             if self._disk is None:
                 folder = cache_folder()

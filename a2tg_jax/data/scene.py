@@ -15,10 +15,8 @@ from a2tg_jax.core.checks import check_array, check_kind, check_number, check_sh
 from a2tg_jax.core.notebook_display import THUMBNAIL, enlarged, html_image, png
 from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
-from a2tg_jax.data.depths import DepthMap
-from a2tg_jax.data.masks import Mask
 from a2tg_jax.data.observations import ObservedPoints
-from a2tg_jax.data.photo_store import Picture
+from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
 from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import counted, in_bytes
 

@@ -11,7 +11,6 @@ import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,18 +19,15 @@ import numpy as np
 from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_viewmat
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.decoding import picture_size
-from a2tg_jax.data.depths import find_depths
 from a2tg_jax.data.division import divided
-from a2tg_jax.data.image_files import SmallerCopies, find_copies, inside, locate_image, map_in_threads
+from a2tg_jax.data.image_files import inside
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
-from a2tg_jax.data.masks import Mask, find_mask, mask_to_read
-from a2tg_jax.data.photo_reading import Options, Photo, check_masks, read_photos
+from a2tg_jax.data.photo_reading import Options, Photo, read_photos
+from a2tg_jax.data.photo_store import Mask
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
-from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import shortened
 
 NERFSTUDIO_FILE = "transforms.json"
@@ -177,66 +173,24 @@ def _check_meta(file: Path, meta: object) -> None:
 def _read_shots(files: Sequence[tuple[Path, dict[str, Any]]], options: Options) -> list[list[Shot]]:
     """Return the frames of each transforms file of a scene, downscaled, in the file's order.
 
-    The files come with their contents, which `_check_meta` has checked.
+    The files come with their contents, which `_check_meta` has checked. Values of a frame override the file's.
     """
-    frames = [(file, {**meta, **frame}) for file, meta in files for frame in meta["frames"]]
-    masks: list[tuple[Path, str] | None] = []
-    named: list[tuple[Path, str]] = []
-    for file, frame in frames:
+    photos = []
+    for file, frame in ((file, {**meta, **frame}) for file, meta in files for frame in meta["frames"]):
         if "file_path" not in frame or "transform_matrix" not in frame:
             raise ValueError(f"{file}: a frame lacks file_path or transform_matrix")
-        image, mask = file.parent / frame["file_path"], None
-        if frame.get("mask_path"):
-            path = file.parent / frame["mask_path"]
-            mask = path.parent, path.name
-        elif (name := _below_images(file, image)) is not None:
-            mask = find_mask(file.parent / "images", name, options.downscale)
-        masks.append(mask)
-        named += [(image.parent, image.name), *([] if mask is None else [mask])]
+        folder, name = file.parent, frame["file_path"]
+        path, images, what = folder / name, folder / "images", f"{file}: {name}"
+        lens: Lens | Callable[[tuple[int, int]], Lens] = functools.partial(_lens, frame, what, options.lens)
+        if frame.get("w") and frame.get("h"):
+            lens = _lens(frame, what, options.lens, (0, 0))
+        mask, depths = (folder / frame[key] if frame.get(key) else None for key in ("mask_path", "depth_file_path"))
+        below = (images, path.relative_to(images).as_posix()) if path.is_relative_to(images) else None
+        viewmat = _viewmat(frame["transform_matrix"], what)
+        photos.append(Photo(name, viewmat, (path.parent, path.name), below, lens, what, mask, depths))
     place = files[0][0]
-    copies = find_copies(named, options.downscale, place.parent)
-    read = functools.partial(_photo, copies, options.lens)
-    photos = map_in_threads(read, *zip(*frames, strict=True), masks, place=place)
-    shots = iter(read_photos(photos, options, place))
-    groups = [[next(shots) for _ in meta["frames"]] for _, meta in files]
-    for (file, _), group in zip(files, groups, strict=True):
-        check_masks(group, str(file))
-    return groups
-
-
-def _below_images(file: Path, image: Path) -> str | None:
-    """Return the path of an image below the folder `images`, next to which masks and depth maps are; None elsewhere."""
-    images = file.parent / "images"
-    return str(image.relative_to(images)) if image.is_relative_to(images) else None
-
-
-def _photo(
-    copies: SmallerCopies, use: LensUse, file: Path, frame: dict[str, Any], mask: tuple[Path, str] | None
-) -> Photo:
-    """Return the files of one frame; `frame` also holds the file's global values, which the frame's own override."""
-    name, downscale = frame["file_path"], copies.downscale
-    path, told = file.parent / name, f"{file}: {name}"
-    folder, still_to_downscale = copies.of(path.parent)
-    depths, below = None, _below_images(file, path)
-    if frame.get("depth_file_path"):
-        depths = file.parent / frame["depth_file_path"]
-    elif below is not None:
-        depths = find_depths(file.parent / "images", below)
-
-    def lens_of(stored: tuple[int, int]) -> Lens:
-        """Return the camera of the full image, of which the file may be a smaller copy."""
-        full = stored
-        if still_to_downscale < downscale and not (frame.get("w") and frame.get("h")):
-            full = downscale * stored[0], downscale * stored[1]
-            if not is_remote(path):  # Of stores, the size would be another request for each photograph.
-                with suppress(FileNotFoundError):  # The full image may be missing.
-                    full = picture_size(locate_image(path.parent, path.name))
-        return _lens(frame, full, told, use)
-
-    return Photo(
-        name, _viewmat(frame["transform_matrix"], told), locate_image(folder, path.name), still_to_downscale, lens_of,
-        told, mask_to_read(mask, copies, is_named=bool(frame.get("mask_path"))), depths,
-    )  # fmt: skip
+    shots = iter(read_photos(photos, options, place, place.parent, lambda name: f"remove its frame from {place}"))
+    return [[next(shots) for _ in meta["frames"]] for _, meta in files]
 
 
 def _viewmat(transform_matrix: object, what: str) -> np.ndarray:
@@ -252,7 +206,7 @@ def _viewmat(transform_matrix: object, what: str) -> np.ndarray:
     return np.linalg.inv(rigid_viewmat(camera_to_world, what))
 
 
-def _lens(frame: dict[str, object], full: tuple[int, int], what: str, use: LensUse) -> Lens:
+def _lens(frame: dict[str, object], what: str, use: LensUse, full: tuple[int, int]) -> Lens:
     """Return the camera of a frame; its size defaults to the full image's, the principal point to the centre."""
     width, height = _side(frame, "w", full[0], what), _side(frame, "h", full[1], what)
     fx, fy = _focal_lengths(frame, width, height, what)
