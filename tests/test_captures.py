@@ -517,7 +517,7 @@ def test_a_capture_that_is_not_read_is_told_what_to_do(tmp_path, name, words):
             load_scene(path)
     for index in range(3):
         (tmp_path / f"{index}.jpg").touch()
-    with pytest.raises(FileNotFoundError, match=rf"{words}.* or find cameras anew: a2tg sfm .* SCENE|a2tg sfm finds"):
+    with pytest.raises(FileNotFoundError, match=rf"{words}.* or find cameras again: a2tg sfm .* SCENE|a2tg sfm finds"):
         load_scene(tmp_path)
 
 

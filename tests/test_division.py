@@ -189,7 +189,7 @@ def test_masks_are_told_to_all(tmp_path, together, decoded):
         alone = load_scene(tmp_path / "scene")
         decoded.clear()
         scenes = together(*loading(folders, room=0))
-    assert decoded["scene0"] + decoded["scene1"] == 9
+    assert decoded["scene0"] + decoded["scene1"] == 9 + 4, "photographs and masks"
     for scene in scenes:
         assert_same_views(scene, alone)
 

@@ -21,7 +21,6 @@ MOST_COMPARED = 100
 """Number of views whose poses are compared with other conventions; ten times as many points."""
 LEAST_SEEN, CLEARLY = 0.05, 1.5
 """Least share of the points that the views see by another convention, and how many times the share of the given one."""
-
 PRECISIONS = 0.2, 0.01
 """How near to the place, as a share of its distance, the axes of photographs and of rendered images may pass."""
 
@@ -48,13 +47,13 @@ def scene_from_arrays(
       Ks: [V, 3, 3] intrinsics in pixels, or [3, 3] for all.
       points: [P, 3] points to start from, in the same world; None: random ones, with a warning.
       colors: [P, 3] uint8 colours of the points; None: grey.
-      names: of the views, each its own; None: numbers.
+      names: names of the views, all different; None: numbers.
       masks: [H, W] bool for each image, True at pixels that count, or None.
       depths: [H, W] floats for each image, NaN where unknown, or None: inverse depth up to scale and shift for
         `loss.depth_weight`, or depth up to scale with `loss.depth_kind="depth"`.
       observed: for each image the indices [S] of the points that it observed, for `loss.points_weight`; may be empty.
       test_every: every k-th view is a test view; 0 keeps none.
-      name: of the scene.
+      name: name of the scene.
 
     It warns of what looks like a mistake: camera-to-world matrices, axes of OpenGL, intrinsics of another image size,
     and colours of [0, 1] that were converted without a factor of 255.
@@ -96,47 +95,43 @@ def scene_from_arrays(
         return Shot(own, viewmat, Ks[index], picture, mask, depth=depth, points=points)
 
     shots = [shot(index) for index in range(num)]
-    told = [
-        *_told_of_values(images, colors),
-        _told_of_sizes(shots),
-        _told_of_poses(shots, None if cloud is None else cloud.points),
-    ]
-    for message in filter(None, told):
+    for message in _mistakes(images, colors, shots, None if cloud is None else cloud.points):
         warnings.warn(f"the scene {name}: {message}", stacklevel=2)
     return assemble_scene(name, *every_kth(shots, test_every), cloud, source=f"the scene {name}")
 
 
-def _told_of_values(images: Sequence[object], colors: ArrayLike | None) -> Iterator[str]:
-    """Yield a warning if colours are only 0 and 1 of 255: colours of [0, 1] whose factor of 255 is missing."""
-    given = {"images": [image for image in images if not isinstance(image, Picture)]}
-    given |= {} if colors is None else {"colors": [colors]}
-    for name, arrays in given.items():
+def _mistakes(
+    images: Sequence[object], colors: ArrayLike | None, shots: Sequence[Shot], points: np.ndarray | None
+) -> Iterator[str]:
+    """Yield warnings of what looks like a mistake."""
+    # Colours are only 0 and 1 of 255. One image is enough, as a rule.
+    arrays = {"images": [image for image in images if not isinstance(image, Picture)]}
+    for name, own in (arrays | ({} if colors is None else {"colors": [colors]})).items():
         largest = 0
-        for array in arrays:  # One image is enough, as a rule.
+        for array in own:
             largest = max(largest, int(np.max(np.asarray(array)[..., :3], initial=0)))
             if largest > 1:
                 break
         if largest == 1:
             yield f"{name} hold no value above 1 of 255: multiply colours in [0, 1] by 255 before astype(np.uint8)"
-
-
-def _told_of_sizes(shots: Sequence[Shot]) -> str:
-    """Return a warning if principal points fit images of another size, which differs on both axes."""
+    # Principal points fit images of another size, which differs on both axes.
     sizes = np.array([shot.picture.size[::-1] for shot in shots], float)
     twice = np.array([2 * shot.K[:2, 2] for shot in shots])
     is_off = (np.maximum(twice, sizes) > OFF_CENTER * np.minimum(twice, sizes)).all(axis=1)
-    if np.count_nonzero(is_off) <= len(shots) / 2:
-        return ""
-    first = int(np.argmax(is_off))
-    (width, height), (of_width, of_height) = sizes[first], twice[first]
-    return (
-        f"Ks do not fit the images: {np.count_nonzero(is_off)} of {len(shots)} principal points are far from the "
-        f"middle; Ks[{first}] would fit {of_width:g} × {of_height:g} pixels, but the image has {width:g} × {height:g}. "
-        "Multiply the first row of K by the ratio of the widths, the second by that of the heights"
-    )
+    if np.count_nonzero(is_off) > len(shots) / 2:
+        first = int(np.argmax(is_off))
+        (width, height), (of_width, of_height) = sizes[first], twice[first]
+        yield (
+            f"Ks do not fit the images: {np.count_nonzero(is_off)} of {len(shots)} principal points are far from the "
+            f"middle; Ks[{first}] would fit {of_width:g} × {of_height:g} pixels, but the image has {width:g} × "
+            f"{height:g}. Multiply the first row of K by the ratio of the widths, the second by the ratio of the "
+            "heights"
+        )
+    if message := _likelier_poses(shots, points):
+        yield f"viewmats must be world to camera, x right, y down, z forward: {message}"
 
 
-def _told_of_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
+def _likelier_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
     """Return what to say if the poses make sense by another convention only.
 
     With points: far more of them are then in the images. Without: all cameras then look at one place, and else do not.
@@ -150,20 +145,18 @@ def _told_of_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
         "in Blender and NeRF": np.linalg.inv(given @ flip),
         "np.diag([1, -1, -1, 1]) @ viewmats, if these have y up and z backward, as in OpenGL": flip @ given,
     }
-    said = "viewmats must be world to camera, x right, y down, z forward: "
     if points is not None and len(points):
         some = points[np.unique(np.linspace(0, len(points) - 1, 10 * MOST_COMPARED).astype(int))]
         own, *found = (_share_seen(chosen, viewmats, some) for viewmats in (given, *others.values()))
         best = int(np.argmax(found))
         if found[best] < LEAST_SEEN or own * CLEARLY > found[best]:
             return ""
-        return f"{said}the views see {own:.0%} of the points, and would see {found[best]:.0%} with {[*others][best]}"
+        return f"the views see {own:.0%} of the points, and would see {found[best]:.0%} with {[*others][best]}"
     for precision in PRECISIONS:
         own, *found = (_share_that_meet(viewmats, precision) for viewmats in (given, *others.values()))
         best = int(np.argmax(found[:2]))  # Cameras that look outwards meet behind, as flipped ones do.
         if own <= 0.5 and found[best] >= 0.9:
-            share = f"{own:.0%} of the cameras look at one place, and {found[best]:.0%} would"
-            return f"{said}{share} with {[*others][best]}"
+            return f"{own:.0%} of the cameras look at one place, and {found[best]:.0%} would with {[*others][best]}"
     return ""
 
 
@@ -217,7 +210,7 @@ def _cloud(points: ArrayLike, colors: ArrayLike | None) -> PointCloud:
 
 
 def _chosen(points: np.ndarray, indices: ArrayLike, what: str) -> np.ndarray:
-    """Return some of the points."""
+    """Return the points of the given indices."""
     check_unmasked(what, indices)
     indices = np.asarray(indices)
     is_index = indices.ndim == 1 and (np.issubdtype(indices.dtype, np.integer) or not indices.size)

@@ -1,6 +1,6 @@
 """From photographs with poses in the original world to a scene in the normalised one.
 
-Every scene gets the same origin, orientation and size before training. All of it is float64 on the host.
+Every scene gets the same origin, orientation and size before training. All of it is float64 numpy.
 """
 
 import dataclasses
@@ -28,9 +28,9 @@ OBJECT_SHARE = 0.8958
 """Half the side of an object's cube over half the width that cameras see at its centre: the cube of ±1.3 of NeRF's
 synthetic objects, whose cameras are 4.031 away and see 39.6°."""
 NEAREST, DEEPEST_AROUND = 0.4, 2.0
-"""Depths of random points before cameras around a subject, in units of their distance from it."""
+"""Depths of random points in front of cameras around a subject, in units of their distance from it."""
 SHALLOWEST, DEEPEST = 0.5, 10.0
-"""Depths of random points before other cameras."""
+"""Depths of random points in front of other cameras."""
 FIRST_LOOK = 10_000
 """Number of points, evenly chosen, that a view is tried with before all of them."""
 RANDOM_COLOR = 128
@@ -56,12 +56,10 @@ class Shot:
     """[3, 3] float64 intrinsics in pixels of the picture."""
     picture: Picture
     mask: Mask | None = None
-    """Pixels that count; None if all do."""
     rays: np.ndarray | None = None
     """[H, W, 2] rays of the pixels, as `Camera.rays` has them, NaN where there is none; None of a pinhole."""
     depth: DepthMap | None = None
     panorama: int | None = None
-    """Number of the panorama that it was cut from; None of a photograph."""
     points: ObservedPoints | None = None
     """Points that it observed, their depths in units of the original world; None if they are not known."""
 
@@ -101,9 +99,15 @@ def assemble_scene(
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
-    centers = camera_centers(np.stack(list(viewmats.values())))
     sights = [Sight.of(viewmats[shot.name], shot.K, shot.picture.size, shot.rays) for shot in train]
-    cloud = cloud and _usable(cloud, transform, source)
+    if cloud is not None:
+        is_usable = _are_somewhere(cloud.points)
+        is_usable[is_usable] = _are_somewhere(transform.apply(cloud.points[is_usable]))
+        if not is_usable.all():
+            left_out = counted(int(np.count_nonzero(~is_usable)), "point")
+            message = f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}"
+            warnings.warn(message, stacklevel=3)
+            cloud = PointCloud(cloud.points[is_usable], cloud.colors[is_usable])
     points = None if cloud is None or len(cloud.points) < 2 else transform.apply(cloud.points)
     unseen_by = [] if points is None else unseeing(points, sights)
     if cloud is None or points is None or len(unseen_by) == len(sights):
@@ -118,20 +122,15 @@ def assemble_scene(
         if unseen_by:
             message = f"{source}: {len(unseen_by)} of {len(sights)} training views see none of its points, such as "
             warnings.warn(f"{message}{train[unseen_by[0]].name}: nothing to start from there", stacklevel=3)
-
-    def views(group: Sequence[Shot]) -> tuple[View, ...]:
-        return tuple(
-            _view(shot, viewmats[shot.name], transform.scale) for shot in sorted(group, key=lambda shot: shot.name)
-        )
-
+    views = {shot.name: _view(shot, viewmats[shot.name], transform.scale) for shot in shots}
     return Scene(
         name=name,
-        train=views(train),
-        test=views(test),
+        train=tuple(views[key] for key in sorted(shot.name for shot in train)),
+        test=tuple(views[key] for key in sorted(shot.name for shot in test)),
         points=np.asarray(points, np.float32),
         colors=colors.astype(np.float32) / np.float32(255),
         transform=transform,
-        scale=scene_scale(centers),
+        scale=scene_scale(camera_centers(np.stack(list(viewmats.values())))),
     )
 
 
@@ -194,7 +193,7 @@ def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None
     places = np.concatenate([rng.uniform(low, high), np.ones((NUM_RANDOM_POINTS, 1))], axis=1)
     to_rays = np.linalg.inv(np.stack([sight.K for sight in sights]))[view]
     share = rng.uniform(size=NUM_RANDOM_POINTS)
-    # Cosine between the optical axis and the direction to the origin: near 1 if cameras stand around a subject.
+    # Cosine between the optical axis and the direction to the origin: near 1 if the cameras surround a subject.
     facing = -np.einsum("vi,vi->v", centers, axes) / np.maximum(distances, 1e-12)
     if np.median(facing) >= LEAST_FACING:
         depths = (NEAREST + (DEEPEST_AROUND - NEAREST) * share) * np.maximum(distances, SHALLOWEST)[view]
@@ -211,7 +210,7 @@ def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
     rotation = viewmat[:3, :3]
     if not (np.abs(viewmat) <= LARGEST_COORDINATE).all():  # False for NaN.
         largest = np.abs(viewmat).max()
-        found = f"lies beyond ±{LARGEST_COORDINATE:g}, at {largest:g}" if np.isfinite(largest) else "is not finite"
+        found = f"exceeds ±{LARGEST_COORDINATE:g}, at {largest:g}" if np.isfinite(largest) else "is not finite"
         raise ValueError(f"{what}: its pose {found}; remove it from the scene or correct the pose")
     left, singular_values, right = np.linalg.svd(rotation)
     if np.abs(singular_values - 1).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
@@ -238,21 +237,9 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
     farthest = int(np.argmax(distances))
     if 0 < FARTHEST * np.median(distances) < distances[farthest]:
         raise ValueError(
-            f"{source}: {shots[farthest].name} stands more than {FARTHEST:g} times as far away as half of the cameras; "
+            f"{source}: {shots[farthest].name} is more than {FARTHEST:g} times as far away as half of the cameras; "
             "remove it from the scene or correct the pose"
         )
-
-
-def _usable(cloud: PointCloud, transform: Similarity, source: str) -> PointCloud:
-    """Return the points within bounds; leave out others with a warning."""
-    is_usable = _are_somewhere(cloud.points)
-    is_usable[is_usable] = _are_somewhere(transform.apply(cloud.points[is_usable]))
-    if is_usable.all():
-        return cloud
-    left_out = counted(int(np.count_nonzero(~is_usable)), "point")
-    message = f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}"
-    warnings.warn(message, stacklevel=4)
-    return PointCloud(cloud.points[is_usable], cloud.colors[is_usable])
 
 
 def _are_somewhere(points: np.ndarray) -> np.ndarray:
@@ -296,7 +283,7 @@ def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     distance = float(np.median(np.linalg.norm(centers - origin, axis=1)))
     if min(spread, distance) <= zero:
-        raise ValueError("all cameras stand at one place; photographs from different positions are needed")
+        raise ValueError("all cameras are at one place; photographs from different positions are needed")
     return Similarity(1.0 / distance, rotation, -rotation @ origin / distance)
 
 
@@ -332,8 +319,7 @@ def check_test_every(test_every: int) -> None:
 
 
 def every_kth(shots: Sequence[Shot], test_every: int) -> tuple[list[Shot], list[Shot]]:
-    """Return (train, test): test shots are 0, k, 2k, … in order of names; none for k = 0. Shots of a panorama count as
-    one."""
+    """Return (train, test) as `split_views` does, of shots in order of names."""
     return split_views(sorted(shots, key=lambda shot: shot.name), test_every)
 
 

@@ -29,8 +29,7 @@ class SharedError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Division:
-    """Processes that do some work together, as one of them has it. All make the same calls in the same order, within
-    `sharing_errors`."""
+    """Processes that work together. All make the same calls in the same order, within `sharing_errors`."""
 
     index: int
     """Number of this process."""
@@ -44,27 +43,21 @@ class Division:
 
         Raise SharedError in every process if one sends an error, or is at another step, by name.
         """
-        parts = self._all((step, value))
-        if any(part[0] != parts[0][0] for part in parts):
-            raise SharedError(_difference([part[:1] for part in parts], "steps of loading"))
+        parts = self._gathered((step, value))
+        _check_same([[part[0]] for part in parts], "steps of loading")
         return [part[1] for part in parts]
 
     def send_error(self, error: Exception) -> None:
         """Raise a SharedError in every process: in the others at their next exchange."""
-        self._all(_plain(error))
+        self._gathered(_plain(error))
 
     def check_same(self, values: Sequence[str], what: str) -> None:
         """Raise SharedError in every process, with the first difference, unless all have the same values."""
-        found = self.exchange(what, list(values))
-        if any(own != found[0] for own in found):
-            raise SharedError(_difference(found, what))
+        _check_same(self.exchange(what, list(values)), what)
 
-    def _all(self, own: object) -> list[Any]:
-        """Return the messages of all processes. Raise SharedError if one of them is an error."""
+    def _gathered(self, own: object) -> list[Any]:
         # The processes of one training run each other's programs anyway, so pickles may be trusted.
-        parts = [pickle.loads(part) for part in self.gather(pickle.dumps(own))]
-        _raise_first(parts)
-        return parts
+        return _without_errors([pickle.loads(part) for part in self.gather(pickle.dumps(own))])
 
 
 def divided(
@@ -78,7 +71,7 @@ def divided(
 
     Args:
       division: processes that call this together; None: one.
-      names: of the items, the same in all processes.
+      names: names of the items, the same in all processes.
       work: function of an item's number. If it fails, all processes raise the error of the first such item.
       what: plural noun for the items.
       place: path that the work reads from, as in `map_in_threads`.
@@ -95,9 +88,7 @@ def divided(
 
     own = map_in_threads(attempt, range(division.index, len(names), division.count), place=place)
     parts = division.exchange(f"results of {what}", own)
-    found = [parts[number % division.count][number // division.count] for number in range(len(names))]
-    _raise_first(found)
-    return found
+    return _without_errors([parts[n % division.count][n // division.count] for n in range(len(names))])
 
 
 @contextlib.contextmanager
@@ -132,19 +123,20 @@ def _plain(error: Exception) -> Exception:
     return next(kind for kind in ERRORS if isinstance(error, kind))(str(error))
 
 
-def _raise_first(results: Sequence[object]) -> None:
-    """Raise SharedError with the first error among results, if there is one."""
-    error = next((result for result in results if isinstance(result, Exception)), None)
-    if error is not None:
+def _without_errors(results: list[Any]) -> list[Any]:
+    """Return results, or raise SharedError with the first error among them."""
+    if (error := next((result for result in results if isinstance(result, Exception)), None)) is not None:
         raise SharedError(error)
+    return results
 
 
-def _difference(values: Sequence[Sequence[str]], what: str) -> ValueError:
-    """Return an error that names the first difference between the values of each process."""
-    number = next(number for number, own in enumerate(values) if own != values[0])
+def _check_same(values: Sequence[Sequence[str]], what: str) -> None:
+    """Raise SharedError with the first difference between the values of each process."""
+    number = next((number for number, own in enumerate(values) if own != values[0]), None)
+    if number is None:
+        return
     pairs = itertools.zip_longest(values[number], values[0], fillvalue="none")
     own, first = next((own, first) for own, first in pairs if own != first)
-    return ValueError(
-        f"process {number} has other {what} than process 0: {shortened(own, 200)}, not {shortened(first, 200)}; "
-        "give all processes the same options and the same files, with the same folders such as images_2"
-    )
+    message = f"process {number} has other {what} than process 0: {shortened(own, 200)}, not {shortened(first, 200)}; "
+    advice = "give all processes the same options and the same files, with the same folders such as images_2"
+    raise SharedError(ValueError(message + advice))

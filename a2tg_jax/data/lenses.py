@@ -28,7 +28,7 @@ FARTHEST_FROM_RAY = 0.1
 """Largest distance in pixels at which a ray may be seen from its pixel; farther ones are no ray of it."""
 LEAST_SEEN = 0.05
 """Smallest share of pixels with a ray."""
-CUT = ": find cameras anew with a2tg sfm, which cuts panoramas into views"
+CUT = ": find cameras again with a2tg sfm, which cuts panoramas into views"
 """What to do about cameras that look all around."""
 LensUse = Literal["undistort", "keep"]
 """Whether photographs are undistorted to pinholes, or kept as they are and drawn through the lens."""

@@ -32,7 +32,7 @@ class ObservedPoints(NamedTuple):
 
 
 def observed_points(xy: np.ndarray, depths: np.ndarray, size: tuple[int, int]) -> ObservedPoints:
-    """Return the points within a picture and before its camera.
+    """Return the points within a picture and in front of its camera.
 
     Args:
       xy: [S, 2] x and y in pixels, 0.5 at the centre of the first; NaN where there is none.
@@ -48,25 +48,25 @@ def observed_points(xy: np.ndarray, depths: np.ndarray, size: tuple[int, int]) -
     is_within = ((xy >= 0) & (xy < size[::-1])).all(axis=1) & _are_usable(depths)  # False for NaN.
     column, row = xy[is_within].astype(np.int32).T
     pixels, near = row * np.int32(size[1]) + column, depths[is_within].astype(np.float32)
-    order = np.lexsort((near, pixels))  # By pixel, the nearest first, of which `unique` gives the place.
+    order = np.lexsort((near, pixels))  # By pixel, the nearest first; `unique` returns the index of the first.
     found, first = np.unique(pixels[order], return_index=True)
     return ObservedPoints(found, near[order][first])
 
 
 def before_camera(points: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
-    """Return the points of [P, 3] in a world that are before a camera, in its frame."""
+    """Return the points of [P, 3] in a world that are in front of a camera, in its frame."""
     own: np.ndarray = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     return own[own[:, 2] > 0]
 
 
 def pinhole_pixels(points: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Return x and y [P, 2] in pixels of points [P, 3] before a pinhole camera, in its frame."""
+    """Return x and y [P, 2] in pixels of points [P, 3] in front of a pinhole camera, in its frame."""
     seen = points @ K.T
     return seen[:, :2] / seen[:, 2:]
 
 
 def _are_usable(depths: np.ndarray) -> np.ndarray:
-    """Return [S] whether depths are within the bounds of coordinates, and their inverses, too."""
+    """Return [S] whether depths, and their inverses, are within the bounds of coordinates."""
     return (depths >= 1 / LARGEST_COORDINATE) & (depths <= LARGEST_COORDINATE)  # False for NaN.
 
 

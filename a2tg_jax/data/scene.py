@@ -42,11 +42,11 @@ class View:
     camera: Camera
     """Its camera in the normalised world, float32, of the image's size."""
     picture: Picture
-    """Its pixels, in memory or on disk; an array [H, W, 3] or [H, W, 4] uint8 may be given, too."""
+    """Its pixels, in memory or on disk; an array [H, W, 3] or [H, W, 4] uint8 may be given as well."""
     mask: Mask | None = None
-    """Mask of the pixels that count in losses and metrics; None counts all. An array [H, W] bool may be given, too."""
+    """Mask of the pixels that count in losses and metrics, or an array [H, W] bool; None counts all."""
     depth: DepthMap | None = None
-    """Depth map for `loss.depth_weight`; None without one. An array [H, W] of floats may be given, too."""
+    """Depth map for `loss.depth_weight`, or an array [H, W] of floats; None without one."""
     panorama: int | None = None
     """Number of the panorama that it was cut from; None of a photograph. Its views are held out together."""
     points: ObservedPoints | None = None
@@ -92,7 +92,7 @@ class View:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """Photographs, cameras and points in the normalised world. Lives on the host; not a pytree."""
+    """Photographs, cameras and points in the normalised world. A value of numpy arrays, not a pytree."""
 
     name: str
     train: tuple[View, ...]
@@ -126,8 +126,8 @@ class Scene:
 def check_scene(scene: Scene) -> None:
     """Raise ValueError, naming the field, unless its numbers are valid and its training views have different names."""
     names = [view.name for view in scene.train]
-    twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
-    if twice is not None:
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"scene.train has two views called {twice!r}: give each its own name")
     check_array("scene.points", scene.points)
     check_shape("scene.points", scene.points, ("P", 3))
@@ -174,13 +174,13 @@ def ray_bytes(views: Sequence[View]) -> int:
 
 
 def warn_of_lenses(scene: Scene) -> None:
-    """Warn if most photographs have a lens of their own: the rays of each then take more memory than its pixels."""
+    """Warn if most photographs have their own lens: the rays of each then take more memory than its pixels."""
     views = [view for view in (*scene.train, *scene.test) if view.camera.rays is not None]
     num = len(_lenses(views))
     if num > MANY_LENSES and 2 * num > len(views):
         warnings.warn(
             f"{scene.name}: {len(views)} photographs have {num} lenses, whose rays take {in_bytes(ray_bytes(views))}: "
-            "calibrate photographs of one camera together, or undistort them (--lens undistort)",
+            'calibrate photographs of one camera together, or undistort them (lens="undistort")',
             stacklevel=3,
         )
 
