@@ -409,7 +409,9 @@ def test_photographs_that_are_too_large_are_read_smaller_as_the_error_says(tmp_p
     """Their size is read from the large files where no other file has it."""
     writer(tmp_path)
     monkeypatch.setattr(decoding, "MAX_PIXELS", 6000)
-    with pytest.raises(ValueError, match=r"is the limit; .* copies of all images .* \(images_2 and --downscale 2\)"):
+    with pytest.raises(
+        ValueError, match=r"is the limit; .* copies of all images .* \(images_2, for a downscale of 2\)"
+    ):
         load_scene(tmp_path)
     (tmp_path / "images_2").mkdir()
     for file in (tmp_path / "images").glob("*.png"):

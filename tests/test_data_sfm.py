@@ -285,7 +285,7 @@ def test_failure_says_what_to_do():
     with pytest.raises(ValueError, match=r"take more.*overlap.*texture") as told:
         sfm._check_models([], NAMES, "photos", "exhaustive", 4, [])
     assert "sequential" not in str(told.value)
-    with pytest.raises(ValueError, match="matching exhaustive"):
+    with pytest.raises(ValueError, match="matching='exhaustive'"):
         sfm._check_models([], NAMES, "photos", "sequential", 4, [])
 
 

@@ -98,7 +98,7 @@ def test_a_broken_connection_is_continued(server, tmp_path):
 def test_a_connection_that_breaks_too_often_leaves_what_came(server, tmp_path):
     archive = archive_of(server, {"a.txt": "a" * 5_000})
     server.breaks_after = 500
-    with pytest.raises(OSError, match=r"2,500 of 5,\d+ bytes came; call again to go on"):
+    with pytest.raises(OSError, match=r"2,500 of 5,\d+ bytes came; call again to continue"):
         fetch(archive, tmp_path / "scenes")
     server.breaks_after = None
     fetch(archive, tmp_path / "scenes")
@@ -167,7 +167,7 @@ def test_what_came_from_elsewhere_is_not_overwritten(server, tmp_path):
     own.write_text("my own")
     for _ in range(2):
         with pytest.raises(
-            FileExistsError, match=r"a\.txt: exists already and is not what set\.zip has there; move it"
+            FileExistsError, match=r"a\.txt: exists already and differs from the one in set\.zip; move it"
         ):
             fetch(archive, tmp_path / "scenes")
     assert own.read_text() == "my own" and server.firsts == [0]
@@ -182,7 +182,7 @@ def test_tar_archives(server, tmp_path):
 
 def test_room_on_the_disk_is_checked_first(server, tmp_path):
     archive = archive_of(server, {"a.txt": "a"}, num_bytes=10**18)
-    with pytest.raises(OSError, match=r"needs 2000000000\.0 GB of disk in .* make room, or choose another --out"):
+    with pytest.raises(OSError, match=r"needs 2000000000\.0 GB of disk in .* make room, or choose another folder"):
         fetch(archive, tmp_path / "scenes")
     assert server.firsts == []
 

@@ -22,7 +22,7 @@ from test_data_transforms import (
 )
 
 from a2tg_jax.data import load_scene
-from a2tg_jax.data.colmap_files import KINDS, read_binary, read_text
+from a2tg_jax.data.colmap_files import KINDS, read_file
 from a2tg_jax.data.lenses import checked_lens
 from a2tg_jax.data.ply import read_ply_points
 
@@ -48,7 +48,7 @@ def model(request, tmp_path_factory):
 @pytest.mark.parametrize("kind", KINDS)
 def test_whole_files_pass(model, kind):
     file = next((model / "sparse" / "0").glob(f"{kind}.*"))
-    (read_binary if file.suffix == ".bin" else read_text)(file, kind)  # Warnings are errors here.
+    read_file(file, kind)  # Warnings are errors here.
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -60,7 +60,7 @@ def test_every_cut_of_a_binary_file_is_noticed(tmp_path, kind):
     for size in range(len(whole)):
         file.write_bytes(whole[:size])
         with pytest.raises(ValueError, match=rf"{kind}\.bin: is cut off or damaged"):
-            read_binary(file, kind)
+            read_file(file, kind)
     refused(tmp_path, rf"{kind}\.bin: is cut off")
     file.write_bytes(whole + b"\0")
     refused(tmp_path, rf"{kind}\.bin: .* is followed by 1 bytes")
@@ -81,7 +81,7 @@ def test_points_and_names_of_images_that_do_not_end_are_refused(tmp_path):
     whole = file.read_bytes()
     at = whole.index(b"img_00.png\0") + 11
     file.write_bytes(whole[:at] + struct.pack("<Q", 2**61) + whole[at + 8 :])
-    refused(tmp_path, r"images\.bin: .* wants \d+ bytes")
+    refused(tmp_path, r"images\.bin: .* needs \d+ bytes")
     file.write_bytes(whole[: at - 1] + b"x" * 5000)
     refused(tmp_path, r"images\.bin: .* has a name that does not end")
 
@@ -95,7 +95,7 @@ def test_lines_that_are_cut_off_are_noticed(tmp_path, kind):
     for count in range(1, len(words)):
         file.write_text("\n".join([" ".join(words[:count]), *lines[1:]]) + "\n")
         with pytest.raises(ValueError, match=rf"{kind}\.txt: line 1 cannot be read"):
-            read_text(file, kind)
+            read_file(file, kind)
     refused(tmp_path, rf"{kind}\.txt: line 1 cannot be read")
 
 
@@ -105,7 +105,7 @@ def test_lines_that_are_cut_off_are_noticed(tmp_path, kind):
         ("rigs", "1 4000000000 CAMERA 1", "line 1"),
         ("frames", "1 1 1 0 0 0 0 0 0 4000000000 CAMERA 1 1", "line 1"),
         ("cameras", "1 PINHOLE 128 96 110 120 70", "PINHOLE has 4 parameters; got 3"),
-        ("cameras", "1 MAGIC 128 96 110", "knows no camera model MAGIC"),
+        ("cameras", "1 MAGIC 128 96 110", "COLMAP has no camera model MAGIC"),
         ("cameras", "1 PINHOLE wide 96 110 120 70 40", "line 1"),
         ("images", "1 1 0 0 0 0 0 0 1", "it is cut off after 9 words"),
         ("images", "1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 0 1 b.png\n", "the line of its points is missing"),
@@ -125,7 +125,7 @@ def test_lines_of_text_that_lie_are_refused(tmp_path, kind, line, message):
     file = tmp_path / f"{kind}.txt"
     file.write_text(line)
     with pytest.raises(ValueError, match=rf"{kind}\.txt: line 1.*" if message == "line 1" else message):
-        read_text(file, kind)
+        read_file(file, kind)
 
 
 def test_a_text_that_ends_too_early_is_told(tmp_path):
@@ -135,7 +135,7 @@ def test_a_text_that_ends_too_early_is_told(tmp_path):
         file = tmp_path / "sparse" / "0" / f"{kind}.txt"
         file.write_text("".join(file.read_text().splitlines(keepends=True)[:-size]))
         with pytest.warns(UserWarning, match=rf"{kind}\.txt: says that it has . {kind}, and has ."):
-            read_text(file, kind)
+            read_file(file, kind)
 
 
 # Numbers
@@ -389,7 +389,7 @@ def test_a_text_of_colmap_of_one_endless_line(tmp_path):
     (tmp_path / "points3D.txt").touch()
     os.truncate(tmp_path / "points3D.txt", 10**9)
     with pytest.raises(ValueError, match=r"points3D\.txt: has a line of more than"):
-        read_text(tmp_path / "points3D.txt", "points3D")
+        read_file(tmp_path / "points3D.txt", "points3D")
 
 
 def test_links_to_files_are_followed(tmp_path):

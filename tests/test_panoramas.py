@@ -101,7 +101,7 @@ def test_panoramas_become_a_rig(tmp_path, panorama, choice):
     if choice == "no":
         assert (len(cameras), len(frames), told) == (1, 3, [])
         return
-    assert told == ["3 panoramas of 160x80, each cut into 8 views of 60x60; --panorama no leaves them whole"]
+    assert told == ["3 panoramas of 160x80, each cut into 8 views of 60x60; panorama='no' leaves them whole"]
     assert (len(cameras), len(frames), found.num_places, len(found.names)) == (8, 3, 3, 24)
     assert all(len(frame.data_ids) == 8 for frame in frames)
     assert all(camera.model.name == "PINHOLE" and camera.has_prior_focal_length for camera in cameras)

@@ -34,10 +34,10 @@ from a2tg_jax.host.text import shortened
 KINDS = ("cameras", "images", "points3D", "rigs", "frames")
 """Names of a model's files without suffix. A model has cameras and images, and the others if it needs them."""
 POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8")])
+FEATURE = np.dtype([("place", "<f8", 2), ("id", "<u8")])
 NO_POINT = (1 << 64) - 1
 """Id of the point of a feature that observed none."""
 LONGEST_NAME = 4096
-FEATURE = np.dtype([("place", "<f8", 2), ("id", "<u8")])
 CAMERA_SENSOR = 0
 """Kind of the sensors that take images."""
 LONGEST_LINE = 1 << 26
@@ -75,15 +75,6 @@ class FrameRecord(NamedTuple):
     image_ids: list[int]
 
 
-def read_file(path: Path, kind: str) -> Any:
-    """Return the records of a binary or text file of a kind in `KINDS`: a list, or of points3D an array [P] of `POINT`.
-
-    Raises:
-      ValueError: naming the file, and the record or the line that cannot be read.
-    """
-    return (read_binary if path.suffix.lower() == ".bin" else read_text)(path, kind)
-
-
 def num_images(path: Path) -> int:
     """Return the number of images that a binary file announces, or that a text file has, without reading them."""
     with open_regular(path) as opened:
@@ -92,6 +83,26 @@ def num_images(path: Path) -> int:
         lines = _lines(opened, path)
         # The next line, if there is one, has the image's features.
         return sum(1 for _, line in lines if _has_record(line) and next(lines, True))
+
+
+def read_file(path: Path, kind: str) -> Any:
+    """Return the records of a binary or text file of a kind in `KINDS`: a list, or of points3D an array [P] of `POINT`.
+
+    Binary files must end where their counts say, and lines of text have the right number of words. Text files that
+    other programs write are read as well: with a byte order mark, without the last empty line, with spaces in names, or
+    whole numbers such as 96.0. Warn if the count in a comment is another: the file may be truncated, but other programs
+    copy comments.
+
+    Raises:
+      ValueError: naming the file, and the record or the line that cannot be read.
+    """
+    with open_regular(path) as opened:
+        if path.suffix.lower() != ".bin":
+            return _read_text(opened, path, kind)
+        if os.fstat(opened.fileno()).st_size == 0:  # Nothing can be mapped.
+            return _Binary(path, kind, b"").records()
+        with mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            return _Binary(path, kind, data).records()
 
 
 @functools.cache
@@ -114,9 +125,7 @@ def _decoded_name(path: Path, name: bytes) -> str:
         ) from None
 
 
-@functools.cache
-def _little_endian(format: str) -> struct.Struct:
-    return struct.Struct(f"<{format}")
+_little_endian = functools.cache(lambda format: struct.Struct(f"<{format}"))
 
 
 class _Binary:
@@ -144,7 +153,7 @@ class _Binary:
         """Return the position from before."""
         left = len(self.data) - self.at
         if num_bytes > left:
-            raise self.error(f"wants {num_bytes} bytes at byte {self.at}, and {left} are left")
+            raise self.error(f"needs {num_bytes} bytes at byte {self.at}, and {left} are left")
         self.at += num_bytes
         return self.at - num_bytes
 
@@ -162,7 +171,7 @@ class _Binary:
         """Return the name of a camera model and the number of its parameters."""
         model = self.whole("i")
         if model not in _camera_models():
-            raise self.error(f"has the model {model}, which COLMAP does not know")
+            raise self.error(f"has the model {model}, which COLMAP does not have")
         return _camera_models()[model]
 
     def name(self) -> str:
@@ -185,8 +194,7 @@ class _Binary:
 
     def is_camera(self) -> bool:
         """Return whether a sensor takes images."""
-        kind, _ = self.take("iI")
-        return bool(kind == CAMERA_SENSOR)
+        return bool(self.take("iI")[0] == CAMERA_SENSOR)
 
 
 class _Text:
@@ -214,7 +222,7 @@ class _Text:
         name = self.take(1)[0].decode("ascii", "replace")
         count = dict(_camera_models().values()).get(name)
         if count is None:
-            raise ValueError(f"COLMAP knows no camera model {shortened(name)}")
+            raise ValueError(f"COLMAP has no camera model {shortened(name)}")
         if len(self.words) != 4 + count:
             raise ValueError(f"{name} has {count} parameters; got {len(self.words) - 4}")
         return name, count
@@ -252,7 +260,7 @@ class _Text:
 def _whole(word: bytes) -> int:
     """Return a whole number of at least 0, which may be written like 96.0."""
     number = int(word) if word.isdigit() else float(word)
-    if not 0 <= number <= NO_POINT or number != int(number):  # NaN is refused, too.
+    if not 0 <= number <= NO_POINT or number != int(number):  # NaN fails as well.
         raise ValueError(f"{shortened(word.decode(errors='replace'))} is no whole number of at least 0")
     return int(number)
 
@@ -271,10 +279,6 @@ def _image(source: Source) -> ImageRecord:
     return ImageRecord(source.whole("I"), source.floats(7), source.whole("I"), source.name(), source.point_ids())
 
 
-def _point(source: Source) -> Any:
-    return source.point()
-
-
 def _rig(source: Source) -> RigRecord:
     number = source.whole("I")
     translations: list[list[float] | None] = []
@@ -291,48 +295,34 @@ def _frame(source: Source) -> FrameRecord:
     return FrameRecord(number, rig, [image for is_camera, image in data if is_camera])
 
 
-READERS: dict[str, Callable[[Any], Any]] = dict(zip(KINDS, (_camera, _image, _point, _rig, _frame), strict=True))
+READERS: dict[str, Callable[[Any], Any]] = {
+    "cameras": _camera, "images": _image, "points3D": lambda source: source.point(), "rigs": _rig, "frames": _frame,
+}  # fmt: skip
 """Function that reads one record of a file, by kind."""
 
 
-def read_binary(path: Path, kind: str) -> Any:
-    """Return the records of a binary file, as `read_file`; it must end where its counts say."""
-    with open_regular(path) as opened:
-        if os.fstat(opened.fileno()).st_size == 0:  # Nothing can be mapped.
-            return _Binary(path, kind, b"").records()
-        with mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            return _Binary(path, kind, data).records()
-
-
-def read_text(path: Path, kind: str) -> Any:
-    """Return the records of a text file, as `read_file`. Every line must have the right number of words.
-
-    Files that other programs write differ from COLMAP's: they start with a byte order mark, lack the last empty line,
-    have names with spaces, or whole numbers such as 96.0. These are read as well. Warn if the count in a comment is
-    another: the file may be truncated, but other programs copy comments.
-    """
+def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
     announced: int | None = None
     found = []
-    with open_regular(path) as opened:
-        lines = _lines(opened, path)
-        for number, line in lines:
-            if match := ANNOUNCED.match(line):
-                announced = int(match[1])
-            if not _has_record(line):
-                continue
-            source = _Text(path, line, next(lines, (0, b""))[1] if kind == "images" else b"")
-            try:
-                found.append(READERS[kind](source))
-                if source.at < len(source.words):
-                    raise ValueError("it continues past its end")
-            except (ValueError, OverflowError) as error:
-                if str(error).startswith(str(path)):
-                    raise
-                told = shortened(str(error))
-                raise ValueError(f"{path}: line {number} cannot be read ({told}); export the model again") from None
+    lines = _lines(file, path)
+    for number, line in lines:
+        if match := ANNOUNCED.match(line):
+            announced = int(match[1])
+        if not _has_record(line):
+            continue
+        source = _Text(path, line, next(lines, (0, b""))[1] if kind == "images" else b"")
+        try:
+            found.append(READERS[kind](source))
+            if source.at < len(source.words):
+                raise ValueError("it continues past its end")
+        except (ValueError, OverflowError) as error:
+            if str(error).startswith(str(path)):
+                raise
+            told = shortened(str(error))
+            raise ValueError(f"{path}: line {number} cannot be read ({told}); export the model again") from None
     if announced not in (None, len(found)):
         message = f"{path}: says that it has {announced} {kind}, and has {len(found)}: if it is cut off, export it"
-        warnings.warn(f"{message} again", stacklevel=2)
+        warnings.warn(f"{message} again", stacklevel=3)
     return np.array(found, POINT) if kind == "points3D" else found
 
 

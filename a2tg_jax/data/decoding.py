@@ -162,8 +162,8 @@ def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool =
             if is_decoded and image.width * image.height > MAX_PIXELS:
                 raise ValueError(
                     f"{path}: has {image.width}x{image.height} pixels, and {MAX_PIXELS // 10**6} megapixels is the "
-                    "limit; make it smaller, or put smaller copies of all images beside them (images_2 and "
-                    "--downscale 2)"
+                    "limit; make it smaller, or put smaller copies of all images next to them (images_2, for a "
+                    "downscale of 2)"
                 )
             if is_decoded and most_bits == 8 and (image.mode.startswith(("I", "F")) or _is_deep(image)):
                 raise ValueError(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")

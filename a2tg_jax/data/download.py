@@ -27,8 +27,6 @@ PAUSE_SECONDS = 2.0
 """Pause before the second attempt; each further one is twice as long."""
 LEFT_OUT = "__MACOSX"
 """Folder of a system's own files in archives, which is not unpacked."""
-FULL = 416
-"""HTTP status of a request for bytes beyond the end."""
 GRESEARCH = "https://storage.googleapis.com/gresearch/refraw360"
 
 
@@ -110,6 +108,8 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
 def _download(archive: Archive, file: Path, progress: bool) -> None:
     """Download a file, from where an earlier attempt stopped, and continue when the connection breaks."""
     partial = file.with_name(f"{file.name}.partial")
+    # The server's name (ETag) of the version of which a part has come.
+    version = partial.with_name(f"{partial.name}.etag")
     if archive.num_bytes is not None:
         _check_room(file.parent, 2 * archive.num_bytes - _size(partial), archive.url)
     total = None
@@ -117,12 +117,12 @@ def _download(archive: Archive, file: Path, progress: bool) -> None:
         if attempt:
             time.sleep(PAUSE_SECONDS * 2 ** (attempt - 1))
         try:
-            total = _receive(archive.url, partial, progress)
+            total = _receive(archive.url, partial, version, progress)
         except urllib.error.HTTPError as error:
             raise OSError(f"{archive.url}: {error}") from error
         except (urllib.error.URLError, ConnectionError, TimeoutError, http.client.HTTPException) as error:
             if attempt == ATTEMPTS - 1 or (attempt == 0 and isinstance(error, urllib.error.URLError)):
-                raise OSError(f"{archive.url}: the connection broke ({error}); call again to go on") from error
+                raise OSError(f"{archive.url}: the connection broke ({error}); call again to continue") from error
             continue
         if total is None or _size(partial) >= total:
             break
@@ -130,14 +130,14 @@ def _download(archive: Archive, file: Path, progress: bool) -> None:
         partial.unlink()
         raise OSError(f"{archive.url}: more bytes were there than it has; they were deleted, call again")
     if total is not None and _size(partial) < total:
-        raise OSError(f"{archive.url}: {_size(partial):,} of {total:,} bytes came; call again to go on")
+        raise OSError(f"{archive.url}: {_size(partial):,} of {total:,} bytes came; call again to continue")
     partial.replace(file)
-    _version_of(partial).unlink(missing_ok=True)
+    version.unlink(missing_ok=True)
 
 
-def _receive(url: str, partial: Path, progress: bool) -> int | None:
+def _receive(url: str, partial: Path, version: Path, progress: bool) -> int | None:
     """Receive what is missing of a file. Return its size if the server says it."""
-    have, version = _size(partial), _version_of(partial)
+    have = _size(partial)
     request = urllib.request.Request(url)
     if have:
         request.add_header("Range", f"bytes={have}-")
@@ -145,45 +145,34 @@ def _receive(url: str, partial: Path, progress: bool) -> int | None:
             request.add_header("If-Range", version.read_text(encoding="ascii"))
     try:
         with urllib.request.urlopen(request, timeout=TIMEOUT_SECONDS) as response:
-            is_rest = response.status == http.HTTPStatus.PARTIAL_CONTENT
+            start = have if response.status == http.HTTPStatus.PARTIAL_CONTENT else 0
             length = response.headers.get("Content-Length")
-            total = None if length is None else int(length) + (have if is_rest else 0)
+            total = None if length is None else int(length) + start
             _check_room(partial.parent, int(length or 0), url)
             etag = response.headers.get("ETag") or "W/"
             if etag.startswith("W/") or not etag.isascii():  # Parts may be joined by strong ETags only.
                 version.unlink(missing_ok=True)
             else:
                 version.write_text(etag, encoding="ascii")
-            bar = tqdm(
-                desc=partial.name.removesuffix(".partial"), initial=have if is_rest else 0, total=total, unit="B",
-                unit_scale=True, disable=not progress,
-            )  # fmt: skip
-            with open(partial, "ab" if is_rest else "wb") as opened, bar:
+            name = partial.name.removesuffix(".partial")
+            bar = tqdm(desc=name, initial=start, total=total, unit="B", unit_scale=True, disable=not progress)
+            with open(partial, "ab" if start else "wb") as opened, bar:
                 while chunk := response.read(CHUNK_BYTES):
                     opened.write(chunk)
                     bar.update(len(chunk))
             return total
     except urllib.error.HTTPError as error:
-        if error.code != FULL:
+        if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             raise
         # No bytes are left to come: the server says how many there are.
         with error:
             return int(error.headers.get("Content-Range", f"*/{have}").rpartition("/")[2])
 
 
-def _version_of(partial: Path) -> Path:
-    """Return the file that keeps the server's name (ETag) of the version of which a part has come."""
-    return partial.with_name(f"{partial.name}.etag")
-
-
 def _unpack(file: Path, folder: Path, begun: Path, progress: bool) -> None:
     """Unpack a zip or tar archive, none of whose members may lead outside the folder, as links and devices may.
 
-    Args:
-      file: the archive.
-      folder: where its members are written.
-      begun: a file that is made before the first of them; if it is there, files of other sizes are replaced.
-      progress: show a progress bar.
+    `begun` is a file that is made before the first member; if it is there, files of other sizes are replaced.
     """
     folder.mkdir(parents=True, exist_ok=True)
     members: list[tuple[Any, str, int | None]]
@@ -203,8 +192,8 @@ def _unpack(file: Path, folder: Path, begun: Path, progress: bool) -> None:
                 raise ValueError(f"{file}: the member {name!r} would be written outside {folder}")
             if num_bytes is not None and not begun.is_file() and target.exists() and _size(target) != num_bytes:
                 raise FileExistsError(
-                    f"{target}: exists already and is not what {file.name} has there; move it away, or choose another "
-                    "--out"
+                    f"{target}: exists already and differs from the one in {file.name}; move it away, or choose "
+                    "another folder"
                 )
         _check_room(folder, sum(num_bytes or 0 for _, _, num_bytes in members), str(file))
         begun.touch()
@@ -213,12 +202,11 @@ def _unpack(file: Path, folder: Path, begun: Path, progress: bool) -> None:
 
 
 def _check_room(folder: Path, num_bytes: int, what: str) -> None:
-    """Raise OSError if the disk of a folder has no room for so many bytes."""
     free = shutil.disk_usage(folder).free
     if num_bytes > free:
         raise OSError(
             f"{what} needs {num_bytes / 1e9:.1f} GB of disk in {folder}, which has {free / 1e9:.1f} GB: make room, or "
-            "choose another --out"
+            "choose another folder"
         )
 
 

@@ -73,7 +73,7 @@ class Lens:
         if not self._is_seen_in_order(K, *size):
             raise ValueError(
                 f"{self.camera.model.name} has a distortion that folds the image or leaves it: correct its parameters, "
-                'or keep the photographs as they are with --lens keep (lens="keep")'
+                'or keep the photographs as they are (lens="keep")'
             )
         return K, size
 

@@ -239,8 +239,8 @@ def _check_models(
     has_no_depth = len(placed) < MIN_REGISTERED and num_matched >= len(names)
     advice = (NO_DEPTH if has_no_depth else "") + ADVICE
     if matching == "sequential":
-        advice += "; only neighbours by name were matched: name them in the order of taking, or choose --matching "
-        advice += "exhaustive"
+        advice += "; only neighbours by name were matched: name them in the order of taking, or match all "
+        advice += "pairs (matching='exhaustive')"
     reasons = []
     if blank:
         reasons.append(f"{NO_FEATURES} in {len(blank)} of them ({first_names(blank)})")

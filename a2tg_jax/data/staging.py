@@ -229,7 +229,7 @@ def _stage_panoramas(
         rigs.append(Rig(top, tuple(CameraGroup(own, (side, side), focal) for own in names)))
         tell(
             f"{counted(len(members), 'panorama')} of {size[0]}x{size[1]}, each cut into {len(directions())} views of "
-            f"{side}x{side}; --panorama no leaves them whole"
+            f"{side}x{side}; panorama='no' leaves them whole"
         )
     return tuple(rigs)
 
