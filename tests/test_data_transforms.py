@@ -1,5 +1,6 @@
 """transforms.json of nerfstudio and instant-ngp, and Blender's: intrinsics, splits, points, distortion, errors."""
 
+import contextlib
 import json
 
 import numpy as np
@@ -106,14 +107,10 @@ def test_global_intrinsics_and_points(tmp_path):
     write_scene(tmp_path, applied_transform=[[1, 0, 0, 5], [0, 0, 1, 0], [0, -1, 0, 0]])
     scene = load_scene(tmp_path)
     check_dots(scene)
+    assert load_scene(tmp_path / "transforms.json").name == scene.name == tmp_path.name
     assert [view.name for view in scene.test] == ["images/00.png"]
     np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
     np.testing.assert_allclose(scene.colors[0], [1, 0, 0.2], atol=1e-6)
-
-
-def test_the_json_itself_may_be_given(tmp_path):
-    write_scene(tmp_path)
-    assert load_scene(tmp_path / "transforms.json").name == tmp_path.name
 
 
 @pytest.mark.parametrize(
@@ -149,19 +146,6 @@ def test_camera_angle_stands_for_the_focal_length(tmp_path):
     frames = write_frames(tmp_path, place=lambda pose: pinhole_place(pose, 100.0, 100.0, WIDTH / 2, HEIGHT / 2))
     write_json(tmp_path, frames, camera_angle_x=angle, ply_file_path="points.ply")
     check_dots(load_scene(tmp_path))
-
-
-@pytest.mark.parametrize("has_folder", [False, True])
-def test_downscale(tmp_path, has_folder):
-    write_scene(tmp_path)
-    if has_folder:
-        (tmp_path / "images_2").mkdir()
-        for file in (tmp_path / "images").iterdir():
-            Image.open(file).reduce(2).save(tmp_path / "images_2" / file.name)
-            file.write_bytes(b"not read")
-    scene = load_scene(tmp_path, downscale=2)
-    assert scene.train[0].image.shape == (45, 60, 3)
-    check_dots(scene)
 
 
 def shades(scene):
@@ -273,33 +257,35 @@ def test_distortion_is_taken_out(tmp_path, distortion, model, params):
     check_dots(load_scene(tmp_path), 0.05)
 
 
-def test_split_lists(tmp_path):
-    names = [f"images/{index:02d}.png" for index in range(8)]
-    write_scene(tmp_path, train_filenames=names[:5], val_filenames=names[5:7], test_filenames=[f"./{names[7]}"])
-    with pytest.warns(UserWarning, match=r"2 of 8 frames .* such as images/05\.png; val_filenames count only without"):
+NAMES = [f"images/{index:02d}.png" for index in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("train", "val", "test", "message"),
+    [
+        (
+            NAMES[:5],
+            NAMES[5:7],
+            [f"./{NAMES[7]}"],
+            r"2 of 8 frames .* images/05\.png; val_filenames count only without",
+        ),
+        (NAMES[:5], NAMES[5:7], None, r"transforms\.json: 1 of 8 frames .* such as images/07\.png"),
+        (None, None, NAMES[:2], None),
+    ],
+)
+def test_split_lists(tmp_path, train, val, test, message):
+    """Without a list for training, all other frames are trained on. Frames of no list are reported."""
+    lists = {"train_filenames": train, "val_filenames": val, "test_filenames": test}
+    write_scene(tmp_path, **{key: names for key, names in lists.items() if names})
+    with pytest.warns(UserWarning, match=message) if message else contextlib.nullcontext():
         scene = load_scene(tmp_path)
-    assert [view.name for view in scene.train] == names[:5]
-    assert [view.name for view in scene.test] == names[7:]
-
-
-def test_frames_of_no_list_are_told(tmp_path):
-    names = [f"images/{index:02d}.png" for index in range(8)]
-    write_scene(tmp_path, train_filenames=names[:5], val_filenames=names[5:7])
-    with pytest.warns(UserWarning, match=r"transforms\.json: 1 of 8 frames .* such as images/07\.png"):
-        scene = load_scene(tmp_path)
-    assert [view.name for view in scene.test] == names[5:7]
-
-
-def test_without_a_list_for_training_all_other_frames_are_trained_on(tmp_path):
-    names = [f"images/{index:02d}.png" for index in range(8)]
-    write_scene(tmp_path, test_filenames=names[:2])
-    assert [view.name for view in load_scene(tmp_path).train] == names[2:]
+    assert [view.name for view in scene.train] == (train or NAMES[2:])
+    assert [view.name for view in scene.test] == [name.removeprefix("./") for name in test or val]
 
 
 @pytest.mark.parametrize("key", ["train_filenames", "val_filenames", "test_filenames"])
 def test_listed_names_without_a_frame_are_refused(tmp_path, key):
-    names = [f"images/{index:02d}.png" for index in range(8)]
-    write_scene(tmp_path, **{"train_filenames": names[:4], "test_filenames": names[4:], key: [*names[4:], "03"]})
+    write_scene(tmp_path, **{"train_filenames": NAMES[:4], "test_filenames": NAMES[4:], key: [*NAMES[4:], "03"]})
     with pytest.raises(ValueError, match=f"{key} names 03, which is no frame; .* such as images/00.png"):
         load_scene(tmp_path)
 
@@ -445,40 +431,30 @@ def write_points(file, points, colors=None, kind="uchar", names=("red", "green",
     file.write_text("\n".join([*header, "end_header", *rows, ""]))
 
 
+DC = 0.28209479177387814
+"""3DGS stores (colour - 0.5) / DC as f_dc."""
+
+
 @pytest.mark.parametrize(
-    ("kind", "factor"), [("uchar", 255), ("ushort", 65535), ("ushort", 255), ("float", 1), ("float", 255), ("int", 255)]
+    ("names", "kind", "given", "wanted"),
+    [
+        ("red green blue", "uchar", [255, 0, 51], [1, 0, 0.2]),
+        ("red green blue", "ushort", [65535, 0, 13107], [1, 0, 0.2]),
+        ("red green blue", "ushort", [255, 0, 51], [1, 0, 0.2]),
+        ("red green blue", "int", [255, 0, 51], [1, 0, 0.2]),
+        ("red green blue", "float", [1, 0, 0.2], [1, 0, 0.2]),
+        ("red green blue", "float", [255, 0, 51], [1, 0, 0.2]),
+        ("red green blue", "float", [1.3, 0.2, -0.1], [1, 0.2, 0]),
+        ("diffuse_red diffuse_green diffuse_blue", "uchar", [51, 102, 0], [0.2, 0.4, 0]),
+        ("r g b", "uchar", [51, 102, 0], [0.2, 0.4, 0]),
+        ("f_dc_0 f_dc_1 f_dc_2", "float", [0.1 / DC, -0.5 / DC, 0.3 / DC], [0.6, 0, 0.8]),
+    ],
 )
-def test_colors_of_points_in_any_range(tmp_path, kind, factor):
-    """16 bits, whole numbers of 8 bits in wider types, and floats in 0..1 or 0..255."""
-    wanted = np.array([[1.0, 0, 0.2], [0.4, 0.6, 0.8], [0.2, 0.2, 0.2], [0, 0, 0]])
-    given = wanted * factor if kind == "float" else np.rint(wanted * factor).astype(int)
+def test_colors_of_points(tmp_path, names, kind, given, wanted):
+    """16 bits, whole numbers of 8 bits in wider types, floats in 0..1 or 0..255, other names; Gaussians as points."""
     write_scene(tmp_path)
-    write_points(tmp_path / "sparse_pc.ply", TARGET + 0.1 * np.eye(4, 3), given, kind)
-    np.testing.assert_allclose(load_scene(tmp_path).colors, wanted, atol=1e-6)
-
-
-@pytest.mark.parametrize("names", [("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")])
-def test_colors_of_points_by_other_names(tmp_path, names):
-    write_scene(tmp_path)
-    file = tmp_path / "sparse_pc.ply"
-    write_points(file, TARGET + 0.1 * np.eye(2, 3), [[255, 0, 51], [51, 102, 0]], names=names)
-    np.testing.assert_allclose(load_scene(tmp_path).colors, [[1, 0, 0.2], [0.2, 0.4, 0]], atol=1e-6)
-
-
-def test_floats_a_little_above_one_are_clipped(tmp_path):
-    write_scene(tmp_path)
-    write_points(tmp_path / "sparse_pc.ply", TARGET + 0.1 * np.eye(2, 3), [[1.3, 0.2, -0.1], [0.4, 0.6, 1.5]], "float")
-    np.testing.assert_allclose(load_scene(tmp_path).colors, [[1, 0.2, 0], [0.4, 0.6, 1]], atol=1e-6)
-
-
-def test_gaussians_as_points_have_their_colors(tmp_path):
-    """3DGS stores (colour - 0.5) / 0.2820948 as f_dc."""
-    wanted = np.array([[1.0, 0, 0.2], [0.4, 0.6, 0.8]])
-    write_scene(tmp_path)
-    names = ("f_dc_0", "f_dc_1", "f_dc_2")
-    file = tmp_path / "sparse_pc.ply"
-    write_points(file, TARGET + 0.1 * np.eye(2, 3), (wanted - 0.5) / 0.28209479177387814, "float", names)
-    np.testing.assert_allclose(load_scene(tmp_path).colors, wanted, atol=1e-6)
+    write_points(tmp_path / "sparse_pc.ply", TARGET + 0.1 * np.eye(2, 3), [given] * 2, kind, names.split())
+    np.testing.assert_allclose(load_scene(tmp_path).colors, [wanted] * 2, atol=1e-6)
 
 
 def test_blender_downscale_weights_with_alpha(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.similarity import Similarity, camera_centers
-from a2tg_jax.data.assembly import normalizing_similarity, scene_scale
+from a2tg_jax.data.assembly import normalizing_similarity
 
 
 def look_at(center, target, up=(0.0, 0.0, 1.0)):
@@ -94,7 +94,3 @@ def test_cameras_at_one_place_are_an_error(offset):
     viewmats = np.stack([look_at(center, center + direction) for direction in np.eye(3)[:2]])
     with pytest.raises(ValueError, match="one place"):
         normalizing_similarity(viewmats)
-
-
-def test_scene_scale():
-    assert scene_scale(np.array([[-1.0, 0, 0], [1, 0, 0], [0, 0, 0]])) == pytest.approx(1.1)

@@ -187,11 +187,6 @@ def test_room_on_the_disk_is_checked_first(server, tmp_path):
     assert server.firsts == []
 
 
-def test_what_is_not_there_is_an_error(server, tmp_path):
-    with pytest.raises(OSError, match="the connection broke"):
-        fetch(Archive("http://127.0.0.1:9/set.zip", "."), tmp_path)
-
-
 def test_the_command_lists_and_fetches(server, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(BENCHMARK_SETS, "tiny", archive_of(server, {"a.txt": "a"}, content="a text"))
     assert cli.main(["download", "--list"]) == 0

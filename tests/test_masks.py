@@ -12,9 +12,8 @@ from test_data_colmap import HEIGHT, WIDTH, dot_place, write_scene
 from test_data_transforms import FOCAL, SIZE, write_frames, write_json
 
 from a2tg_jax import Gaussians2dMcmc, evaluate, fit, load_scene, polish, psnr, ssim, synthetic_scene
-from a2tg_jax.data import Mask
 from a2tg_jax.measure.metrics import load_lpips, lpips
-from a2tg_jax.training.start import check_views, initial_model
+from a2tg_jax.training.start import initial_model
 
 NAMES = tuple(f"img_{index:02d}.png" for index in range(9))
 
@@ -99,13 +98,6 @@ def test_a_mask_in_an_alpha_channel(tmp_path, pixels, top_only):
         np.testing.assert_array_equal(view.mask.read(), wanted)
 
 
-def test_masks_that_keep_everything_are_none(tmp_path):
-    write_scene(tmp_path)
-    for name in NAMES:
-        write_mask(tmp_path / "masks" / name, np.ones((HEIGHT, WIDTH), bool))
-    assert all(view.mask is None for view in views_of(load_scene(tmp_path)))
-
-
 def test_what_is_wrong_with_masks_is_told(tmp_path):
     write_scene(tmp_path)
     write_mask(tmp_path / "masks" / "other.png", left_half())
@@ -121,13 +113,6 @@ def test_what_is_wrong_with_masks_is_told(tmp_path):
         write_mask(tmp_path / "masks" / name, np.zeros((HEIGHT, WIDTH), bool))
     with pytest.raises(ValueError, match=r"the mask of img_00.png excludes every pixel"):
         load_scene(tmp_path)
-
-
-def test_a_view_of_your_own_whose_mask_excludes_every_pixel_is_refused():
-    scene = synthetic_scene(num_views=4, width=24, height=16)
-    view = dataclasses.replace(scene.train[0], mask=Mask.of(np.zeros((16, 24), bool)))
-    with pytest.raises(ValueError, match=rf"the mask of view {view.name} excludes every pixel: leave the view out"):
-        check_views((view,))
 
 
 def test_mask_path_of_nerfstudio(tmp_path):
@@ -225,13 +210,6 @@ def test_a_view_counts_by_its_pixels(masked):
     view = scene.train[0]
     error = (np.clip(image, 0, 1) - view.image / 255.0)[view.mask.read()]
     np.testing.assert_allclose(logged, -10 * np.log10(np.mean(error**2)), atol=1e-4)
-
-
-def test_masks_of_another_size_are_refused(masked):
-    view = masked[0].train[0]
-    wrong = dataclasses.replace(masked[0], train=(dataclasses.replace(view, mask=view.mask.read()[1:]),))
-    with pytest.raises(ValueError, match=r"mask of view \S+ must be \[30, 40\], .* got \[29, 40\]"):
-        fit(wrong, Gaussians2dMcmc(stage1_iterations=1), progress=False)
 
 
 def oracle_ssim(image, target, mask):

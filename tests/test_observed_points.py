@@ -185,12 +185,6 @@ def test_training_moves_depths_to_the_points(scene):
     assert error(loss={"points_weight": 1.0}) < 0.9 * error()
 
 
-def test_scenes_without_points_are_refused(scene):
-    views = tuple(dataclasses.replace(view, points=None) for view in scene.train)
-    with pytest.raises(ValueError, match=r"loss.points_weight, or a custom term, needs points .* COLMAP"):
-        a2tg.fit(dataclasses.replace(scene, train=views), small(loss={"points_weight": 0.1}), progress=False)
-
-
 @pytest.mark.parametrize("points, told", [
     (a2tg.ObservedPoints(np.zeros((1, 2), np.int32), np.ones((1, 2), np.float32)), "must be pixels [S] int32 and"),
     (a2tg.ObservedPoints(np.zeros(2, np.int32), np.ones(2, np.float32)), "must have increasing pixels from 0 to 1199"),

@@ -12,7 +12,7 @@ from test_data_sfm import cameras_of, staged
 from a2tg_jax.data import load_scene, synthetic, synthetic_scene
 from a2tg_jax.data.assembly import split_views, with_validation_views
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.panoramas import cut_view, directions, is_panorama, view_size
+from a2tg_jax.data.staging import cut_view, directions, is_panorama, view_size
 
 CENTER = np.array([0.3, -1.2, 1.2])
 WIDTH, FACE = 640, 224

@@ -154,12 +154,6 @@ def test_the_most_central_camera_is_in_the_middle_and_looks_at_the_subject():
     assert central_camera(viewmats) in (4, 8)
 
 
-def test_few_cameras_tell_their_mean_up():
-    viewmats = np.array([camera.viewmat for camera in ring(3)])
-    up = -viewmats[:, 1, :3].mean(axis=0)
-    np.testing.assert_allclose(vertical_of(viewmats), up / np.linalg.norm(up))
-
-
 def test_files_come_back(tmp_path):
     views = some_views()
     for found, wanted in zip(load_views(saved(tmp_path / "path.json", views)), views, strict=True):
@@ -193,11 +187,3 @@ def test_other_files_are_refused(tmp_path, changes, match):
     path = saved(tmp_path / "bad.json", some_views(1), changes)
     with pytest.raises(ValueError, match=rf"bad\.json: .*{match}"):
         load_views(path)
-
-
-def test_what_is_no_json_is_refused(tmp_path):
-    (tmp_path / "bad.json").write_bytes(b"\xff{")
-    with pytest.raises(ValueError, match=r"bad\.json"):
-        load_views(tmp_path / "bad.json")
-    with pytest.raises(FileNotFoundError, match="Save path"):
-        load_views(tmp_path / "nowhere.json")

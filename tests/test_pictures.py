@@ -150,11 +150,6 @@ def test_photographs_that_other_processes_draw_are_not_read(tmp_path, monkeypatc
     assert np.asarray(batch.Ks).all(axis=0)[0, 0] and len(batch.viewmats) == 3
 
 
-def test_room_must_not_be_negative(tmp_path):
-    with pytest.raises(ValueError, match=r"room must be at least 0 bytes; got -1"):
-        load_scene(tmp_path, room=-1)
-
-
 @pytest.mark.parametrize("change", ["gone", "another", "cut off"])
 def test_a_photograph_that_does_not_stay_is_named(tmp_path, change):
     folder = write_scene(tmp_path / "scene")
@@ -192,13 +187,6 @@ def test_photographs_on_the_device_are_not_copied(tmp_path):
     stack = stack_views(views)
     for array in (stack.images, stack.alphas):
         assert jax.device_put(array).unsafe_buffer_pointer() == array.ctypes.data
-
-
-def test_going_back_makes_batches_again():
-    ahead = Ahead(lambda indices: indices, 2)
-    assert ahead.first({5: (5,), 6: (6,)}) == (5,)
-    assert ahead.first({3: (3,), 4: (4,)}) == (3,)
-    ahead.close()
 
 
 def test_an_error_reaches_who_waits_for_that_batch_alone():

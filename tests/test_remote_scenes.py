@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from small_values import assert_same
 from test_data_colmap import write_scene as write_colmap
-from test_data_transforms import write_blender, write_json, write_scene
+from test_data_transforms import write_blender, write_scene
 from test_masks import NAMES, left_half, views_of, write_mask
 from test_pictures import write_scene as write_photographs
 
@@ -330,11 +330,6 @@ def test_secrets_are_refused_and_not_told(monkeypatch, capsys, url):
     assert f"{SECRETS[url]}: only SCENE" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("url", ["github://org:repo@main/fox", "sftp://me@host/fox", "s3://bucket/a:b@2x?c"])
-def test_urls_without_secrets_are_kept(url):
-    assert scene_place(url) == url
-
-
 def write_nothing_known(folder):
     (folder / "keyframes" / "cameras").mkdir(parents=True)
     (folder / "keyframes" / "cameras" / "1.json").write_text("{}")
@@ -391,12 +386,6 @@ def test_places_of_scenes(tmp_path, monkeypatch):
     for place in ("memory://data/fox/scene", "memory://data/fox/scene/transforms.json"):
         assert SceneSource(place).name == "fox/scene"
     assert SceneSource("memory://data/scene").name == "scene"
-
-
-def test_files_have_urls_too(tmp_path):
-    write_json(tmp_path, [])
-    with pytest.raises(ValueError, match="lists no frames"):
-        load_scene(tmp_path.as_uri())
 
 
 OTHERS = (

@@ -137,6 +137,8 @@ def _check_same(values: Sequence[Sequence[str]], what: str) -> None:
         return
     pairs = itertools.zip_longest(values[number], values[0], fillvalue="none")
     own, first = next((own, first) for own, first in pairs if own != first)
-    message = f"process {number} has other {what} than process 0: {shortened(own, 200)}, not {shortened(first, 200)}; "
-    advice = "give all processes the same options and the same files, with the same folders such as images_2"
-    raise SharedError(ValueError(message + advice))
+    message = (
+        f"process {number} has other {what} than process 0: {shortened(own, 200)}, not {shortened(first, 200)}; "
+        "give all processes the same options and the same files, with the same folders such as images_2"
+    )
+    raise SharedError(ValueError(message))

@@ -25,7 +25,7 @@ ROWS_AT_ONCE = 128
 WIDEST_ANGLE = np.deg2rad(80.0)
 """Largest angle between a ray of a kept lens and the direction of view; pixels beyond it do not count."""
 FARTHEST_FROM_RAY = 0.1
-"""Largest distance in pixels at which a ray may be seen from its pixel; farther ones are no ray of it."""
+"""Largest distance in pixels between a pixel and the projection of its ray; a ray farther off is none."""
 LEAST_SEEN = 0.05
 """Smallest share of pixels with a ray."""
 CUT = ": find cameras again with a2tg sfm, which cuts panoramas into views"
@@ -70,24 +70,19 @@ class Lens:
         except (ValueError, RuntimeError):  # COLMAP's own check that the model is perspective
             raise ValueError(f"{self.camera.model.name} cannot be undistorted to a pinhole camera{CUT}") from None
         K, size = pinhole.calibration_matrix(), (pinhole.width, pinhole.height)
-        if not self._is_seen_in_order(K, *size):
+        # The middle half of the image must be nearly in the photograph and not mirrored. Corners may fold, because
+        # calibrations are arbitrary where they saw no feature.
+        x, y = (side * np.linspace(0.25, 0.75, GRID) for side in size)
+        rays = _homogeneous(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)) @ np.linalg.inv(K).T
+        places = np.asarray(self.camera.img_from_cam(rays)).reshape(GRID, GRID, 2) / self.size
+        is_inside = ((places >= -MARGIN) & (places <= 1 + MARGIN)).all()  # False for NaN.
+        is_ordered = (np.diff(places[..., 0], axis=1) > 0).all() and (np.diff(places[..., 1], axis=0) > 0).all()
+        if not (is_inside and is_ordered):
             raise ValueError(
                 f"{self.camera.model.name} has a distortion that folds the image or leaves it: correct its parameters, "
                 'or keep the photographs as they are (lens="keep")'
             )
         return K, size
-
-    def _is_seen_in_order(self, K: np.ndarray, width: int, height: int) -> bool:
-        """Return whether the middle half of a pinhole image is nearly in the photograph and is not mirrored.
-
-        Corners may fold, because calibrations are arbitrary where they saw no feature.
-        """
-        x, y = (side * np.linspace(0.25, 0.75, GRID) for side in (width, height))
-        rays = _homogeneous(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)) @ np.linalg.inv(K).T
-        places = np.asarray(self.camera.img_from_cam(rays)).reshape(GRID, GRID, 2) / self.size
-        is_inside = ((places >= -MARGIN) & (places <= 1 + MARGIN)).all()  # False for NaN.
-        is_ordered = (np.diff(places[..., 0], axis=1) > 0).all() and (np.diff(places[..., 1], axis=0) > 0).all()
-        return bool(is_inside and is_ordered)
 
     def view_pixels(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Return the pixels [h', w', C] of a photograph's view, and their K [3, 3].
@@ -125,7 +120,8 @@ class Lens:
         return plane if self.is_kept or self.is_pinhole else self._sampled(plane[..., None])[..., 0]
 
     def projected(self, points: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Return x and y [P, 2] in pixels of points [P, 3] before the camera, in a view of a K and (width, height)."""
+        """Return x and y [P, 2] in pixels of points [P, 3] in front of the camera, in a view of a K and (width,
+        height)."""
         if not self.is_kept:
             return pinhole_pixels(points, K)
         return np.asarray(self.camera.img_from_cam(points)) * np.divide(size, self.size)
@@ -208,7 +204,7 @@ def checked_lens(camera: Any, what: str, use: LensUse = "undistort") -> Lens:
         raise ValueError(f"{what}: its camera's parameters must be finite; got {params.tolist()}")
     distortion = params[list(camera.extra_params_idxs())]
     if distortion.size and np.abs(distortion).max() > LARGEST_DISTORTION:
-        raise ValueError(f"{what}: its distortion must lie within ±{LARGEST_DISTORTION:g}; got {distortion.tolist()}")
+        raise ValueError(f"{what}: its distortion must be within ±{LARGEST_DISTORTION:g}; got {distortion.tolist()}")
     if len(camera.focal_length_idxs()):  # Panoramas have none.
         check_intrinsics(camera.calibration_matrix(), camera.width, camera.height, what)
     return Lens(camera, is_kept=use == "keep")
@@ -220,12 +216,10 @@ def _homogeneous(points: np.ndarray) -> np.ndarray:
 
 
 def resize_pixels(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Return the image at a smaller size, each new pixel a weighted mean around its area (weighted with alpha too).
-
-    Pillow's box filter uses whole pixels only, which shifts details at fractional ratios.
-    """
+    """Return the image at a smaller size, each new pixel a weighted mean around its area (weighted with alpha too)."""
     if pixels.shape[:2] == (height, width):
         return pixels
+    # Pillow's box filter uses whole pixels only, which shifts details at fractional ratios.
     return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.HAMMING))
 
 

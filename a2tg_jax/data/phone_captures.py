@@ -49,11 +49,7 @@ def polycam(path: Path) -> Callable[[], Frames] | None:
 
 
 def _polycam_frames(cameras: Path, images: Path) -> Frames:
-    """Return the frames of Polycam's raw data: a JSON file for each image, of the same name, and perhaps a depth map.
-
-    Corrected images have a black border where undistortion found nothing, which is masked. Newer exports have no width
-    and height: the image's own are taken.
-    """
+    """Return the frames of Polycam's raw data: a JSON file, and perhaps a depth map, for each image."""
     frames, lacking = [], []
     for file in sorted(cameras.glob("*.json")):
         image = named_image(images, file.stem)
@@ -66,10 +62,9 @@ def _polycam_frames(cameras: Path, images: Path) -> Frames:
         if missing:
             raise ValueError(f"{file}: lacks {missing[0]}, a number of the camera; export the raw data again")
         frame: dict[str, Any] = {key: values[name] for key, name in INTRINSICS.items()}
-        size = values.get("width"), values.get("height")
-        frame["w"], frame["h"] = (
-            size if all(isinstance(side, int | float) and side > 0 for side in size) else picture_size(image)
-        )
+        size = values.get("width"), values.get("height")  # Newer exports have none.
+        has_size = all(isinstance(side, int | float) and side > 0 for side in size)
+        frame["w"], frame["h"] = size if has_size else picture_size(image)
         rows = [[values[name] for name in row] for row in POSE]
         frames.append({**frame, "file_path": f"{images.name}/{image.name}", "transform_matrix": rows})
     nothing = f"{cameras}: none of its cameras has an image of its name in {images}; export the raw data again"
@@ -80,6 +75,7 @@ def _polycam_frames(cameras: Path, images: Path) -> Frames:
     share = NUM_POINTS // len(depths) + 1 if depths else 0
     parts = map_in_threads(lambda item: _points_of(base, item[0], item[1], share), depths)
     cloud = PointCloud(*(np.concatenate(part) for part in zip(*parts, strict=True))) if parts else None
+    # Corrected images have a black border where undistortion found nothing.
     return Frames(cameras, frames, cloud, _within_border if images.name.startswith("corrected") else None)
 
 
@@ -124,15 +120,12 @@ def record3d(path: Path) -> Callable[[], Frames] | None:
 
 
 def _record3d_frames(file: Path) -> Frames:
-    """Return the frames of Record3D: image N has pose N of the metadata, a quaternion (x, y, z, w) and a position.
-
-    Intrinsics (fx, fy, cx, cy) are each frame's own, or else of the matrix K, which is stored by columns.
-    """
+    """Return the frames of Record3D: image N has pose N of the metadata, a quaternion (x, y, z, w) and a position."""
     values = read_object(file)
     poses = _rows(values.get("poses"), 7, f"{file}: poses")
     given = values.get("perFrameIntrinsicCoeffs")
     intrinsics = _rows(given, 4, f"{file}: perFrameIntrinsicCoeffs") if given else np.empty((0, 4))
-    if not given or len(intrinsics) < len(poses):
+    if not given or len(intrinsics) < len(poses):  # K is stored by columns.
         K = _rows([values.get("K")], 9, f"{file}: K")[0].reshape(3, 3).T
         intrinsics = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (len(poses), 1))
     size: dict[str, Any] = {key: values[key] for key in ("w", "h") if key in values}
@@ -151,7 +144,7 @@ def _record3d_frames(file: Path) -> Frames:
             lens: dict[str, Any] = dict(zip(INTRINSICS, intrinsics[number].tolist(), strict=True)) | size
             name = image.relative_to(file.parent).as_posix()
             frames.append({**lens, "file_path": name, "transform_matrix": pose.tolist()})
-    nothing = f"{file}: no images rgb/0.jpg, rgb/1.jpg, … lie beside it; export RGB frames with Record3D"
+    nothing = f"{file}: no images rgb/0.jpg, rgb/1.jpg, … are beside it; export RGB frames with Record3D"
     check_images(file, frames, [str(number) for number in range(len(poses)) if number not in images], nothing)
     unposed = [image.name for number, image in sorted(images.items()) if number >= len(poses)]
     if unposed:

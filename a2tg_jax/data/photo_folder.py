@@ -1,7 +1,7 @@
 """Folders of plain photographs: which files are photographs, and what to do about the others.
 
-Masks, depth maps, copies and pictures that this program wrote are left out: taken for photographs they would give a
-test view a twin among the training views, or a pose of their own. Captures in formats that are not read are recognised.
+Masks, depth maps, copies and pictures that this program wrote are left out: as photographs they would give a test view
+a twin among the training views, or get a pose. Captures in formats that are not read are recognised.
 """
 
 import itertools
@@ -29,7 +29,7 @@ LEAST_PHOTOS = 3
 MOST_TOLD = 5
 """Largest number of suffixes that a message counts."""
 CAMERA_PICTURE = "cameras.png"
-"""Picture of the cameras that `a2tg sfm` puts beside `sparse`."""
+"""Picture of the cameras that `a2tg sfm` puts next to `sparse`."""
 LISTS = (".a2tg-run", ".a2tg-frames")
 """Lists of what runs and renders wrote into a folder, a name a line, after its checksum if it has one."""
 MOST_LIST_BYTES = 1 << 26
@@ -79,7 +79,7 @@ def holds_photos(folder: Path) -> bool:
 def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
     """Return paths of the photographs below a folder, relative to it, sorted.
 
-    Warnings count pictures that are no photographs (`_other_pictures`), and files of other formats.
+    Warnings count pictures that are no photographs, and files of other formats.
 
     Raises:
       FileNotFoundError: if there is no such folder.
@@ -90,16 +90,25 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of photographs")
     files = sorted(file.relative_to(folder) for file in _files_below(folder))
-    pictures = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
-    left_out, told_others = _other_pictures(folder, pictures)
-    photos = [name for name in pictures if name not in left_out]
+    names = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
+    kinds = {
+        "written by a2tg": _written(folder, names),
+        "in hidden folders": {name for name in names if any(part[0] in ".@" for part in name.split("/")[:-1])},
+        "masks or depth maps": _masks(names),
+    }
+    others = set().union(*kinds.values())
+    kinds["copies of others"] = _copies(folder, [name for name in names if name not in others])
+    others |= kinds["copies of others"]
+    told = [f"{kind}: {len(found)} ({first_names(_patterns(found))})" for kind, found in kinds.items() if found]
+    told_others = f"Not taken for photographs: {'; '.join(told)}. To use some, give a folder of these only"
+    photos = [name for name in names if name not in others]
     unread = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
     if len(photos) < least:
         held = f"holds {counted(len(photos), 'photograph') if photos else 'no photographs'}" if files else "is empty"
-        told = f"{folder}: {held}; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
+        needed = f"{folder}: {held}; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
         skipped = [_skipped(folder, unread)] if unread else []
-        raise ValueError(". ".join([told, *([told_others] if left_out else []), *skipped]))
-    if left_out:
+        raise ValueError(". ".join([needed, *([told_others] if others else []), *skipped]))
+    if others:
         warnings.warn(f"{folder}: {told_others}", stacklevel=3)
     foreign = [file for file in unread if file.suffix.lower() in FOREIGN_SUFFIXES + VIDEO_SUFFIXES]
     if foreign:
@@ -133,25 +142,11 @@ def _skipped(folder: Path, files: list[Path]) -> str:
 
 
 def told_of_capture(path: Path) -> str | None:
-    """Return what a file or folder is and what to do with it, or None if nothing is known of it."""
+    """Return what a file or folder of another program is and what to do with it, or None if it is unknown."""
     if not path.is_dir():
         return next((told for pattern, told in FOUND_BY if "/" not in pattern and path.match(pattern)), None)
     found = ((min(path.glob(pattern), default=None), told) for pattern, told in FOUND_BY)
     return next((f"{first.relative_to(path).as_posix()} {told}" for first, told in found if first is not None), None)
-
-
-def _other_pictures(folder: Path, names: Sequence[str]) -> tuple[set[str], str]:
-    """Return the pictures among sorted names below a folder that are no photographs, and a line that counts them."""
-    kinds = {
-        "written by a2tg": _written(folder, names),
-        "in hidden folders": {name for name in names if any(part[0] in ".@" for part in name.split("/")[:-1])},
-        "masks or depth maps": _masks(names),
-    }
-    others = set().union(*kinds.values())
-    kinds["copies of others"] = _copies(folder, [name for name in names if name not in others])
-    told = [f"{kind}: {len(found)} ({first_names(_patterns(found))})" for kind, found in kinds.items() if found]
-    line = f"Not taken for photographs: {'; '.join(told)}. To use some, give a folder of these only"
-    return others | kinds["copies of others"], line
 
 
 def _written(folder: Path, names: Sequence[str]) -> set[str]:
@@ -167,7 +162,7 @@ def _written(folder: Path, names: Sequence[str]) -> set[str]:
 
 
 def _masks(names: Sequence[str]) -> set[str]:
-    """Return the pictures in folders of masks and the like, and the ones named so next to a photograph."""
+    """Return the pictures in folders of masks and the like, and the ones with such names next to a photograph."""
     pictures = set(names)
     known = pictures | {str(PurePosixPath(name).with_suffix("")) for name in names}
     found = set()
@@ -177,8 +172,8 @@ def _masks(names: Sequence[str]) -> set[str]:
         rest = [part.strip("_-. ") for part in parts]
         if (
             any(map(NOT_PHOTOGRAPHS.search, path.parts[:-1]))
-            or any(name and str(path.with_name(name)) in known for name in rest)  # 0_mask.png beside 0.jpg
-            or (path.suffix.lower() == ".png" and str(path.with_suffix("")) in pictures)  # 0.jpg.png beside 0.jpg
+            or any(name and str(path.with_name(name)) in known for name in rest)  # 0_mask.png next to 0.jpg
+            or (path.suffix.lower() == ".png" and str(path.with_suffix("")) in pictures)  # 0.jpg.png next to 0.jpg
         ):
             found.add(str(path))
     return found
@@ -191,31 +186,31 @@ def _copies(folder: Path, names: Sequence[str]) -> set[str]:
         path = PurePosixPath(name)
         while path.suffix.lower() in PHOTO_SUFFIXES:  # 0.heic.jpg is a copy of 0.heic.
             path = path.with_suffix("")
-        # Copies may be in a folder of their own at any level: two names are alike with one folder left out of either.
+        # Copies may be in a separate folder at any level: two names are alike with one folder left out of either.
         for key in {path.parts, *(path.parts[:at] + path.parts[at + 1 :] for at in range(len(path.parts) - 1))}:
             same_name[key].append(name)
     groups = [group for group in same_name.values() if len(group) > 1]
     wanted = sorted(set().union(*groups))
     thumbnails = map_in_threads(lambda name: upright_thumbnail(folder / name, THUMBNAIL), wanted)
     pictures = dict(zip(wanted, thumbnails, strict=True))
+
+    def is_copy(name: str, larger: str) -> bool:
+        """Return whether two pictures have the same aspect, up to a pixel of rounding, and show the same."""
+        (size, grey), (larger_size, larger_grey) = pictures[name], pictures[larger]
+        if abs(size[0] * larger_size[1] - size[1] * larger_size[0]) > sum(larger_size):
+            return False
+        tolerance = EQUAL_TOLERANCE if size == larger_size else SMALLER_TOLERANCE
+        return bool(np.abs(grey - larger_grey).mean() <= tolerance)
+
     found: set[str] = set()
     for group in groups:
-        kept: list[tuple[tuple[int, int], np.ndarray]] = []
+        kept: list[str] = []
         for name in sorted(group, key=lambda name: (-math.prod(pictures[name][0]), name)):
-            if any(_is_copy(*pictures[name], *larger) for larger in kept):
+            if any(is_copy(name, larger) for larger in kept):
                 found.add(name)
             else:
-                kept.append(pictures[name])
+                kept.append(name)
     return found
-
-
-def _is_copy(size: tuple[int, int], grey: np.ndarray, larger_size: tuple[int, int], larger_grey: np.ndarray) -> bool:
-    """Return whether two pictures have the same aspect, up to a pixel of rounding, and show the same."""
-    (width, height), (larger_width, larger_height) = size, larger_size
-    if abs(width * larger_height - height * larger_width) > larger_width + larger_height:
-        return False
-    tolerance = EQUAL_TOLERANCE if size == larger_size else SMALLER_TOLERANCE
-    return bool(np.abs(grey - larger_grey).mean() <= tolerance)
 
 
 def _patterns(names: Iterable[str]) -> list[str]:

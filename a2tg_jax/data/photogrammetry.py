@@ -126,18 +126,18 @@ def _posed_cameras(file: Path) -> list[tuple[str, Element, np.ndarray]]:
 def _offset(sensor: Element, master: Element | None, file: Path) -> np.ndarray | None:
     """Return the rigid motion [4, 4] from a sensor of a rig to the sensor of its master camera; None if the file has
     neither's place in the rig. A sensor without a place is the origin of the rig."""
-    from_sensor, from_master = (None if part is None else _in_rig(part, file) for part in (sensor, master))
+
+    def in_rig(part: Element) -> np.ndarray | None:
+        """Return the rigid motion [4, 4] from a sensor's frame to its rig's; None without one."""
+        if part.find("rotation") is None and part.find("translation") is None:
+            return None
+        return rigid_viewmat(_motion(part, file), f"{file}: sensor {part.get('id')}")
+
+    from_sensor, from_master = (None if part is None else in_rig(part) for part in (sensor, master))
     if from_sensor is None and (from_master is None or sensor.get("master_id") is not None):
         return None
     offset: np.ndarray = np.linalg.inv(np.eye(4) if from_master is None else from_master)
     return offset if from_sensor is None else offset @ from_sensor
-
-
-def _in_rig(sensor: Element, file: Path) -> np.ndarray | None:
-    """Return the rigid motion [4, 4] from a sensor's frame to its rig's; None without one."""
-    if sensor.find("rotation") is None and sensor.find("translation") is None:
-        return None
-    return rigid_viewmat(_motion(sensor, file), f"{file}: sensor {sensor.get('id')}")
 
 
 def _world(part: Element, file: Path) -> np.ndarray | None:
@@ -239,7 +239,7 @@ def _realityscan_frames(path: Path, files: list[Path]) -> Frames:
         pose[:3, 3] = _numbers_in(values.get("Position"), 3, file)
         lens = _xcr_lens(values, *picture_size(image), file)
         frames.append({**lens, "file_path": image.relative_to(path).as_posix(), "transform_matrix": pose @ OPENGL})
-    nothing = f"{path}: no photograph lies beside an XMP file of its name; put them together"
+    nothing = f"{path}: no photograph is beside an XMP file of its name; put them together"
     check_images(path / "*.xmp", frames, lacking, nothing)
     folder = path / "images" if files[0].is_relative_to(path / "images") else path
     posed = [(path / frame["file_path"]).relative_to(folder).as_posix() for frame in frames]
@@ -268,10 +268,7 @@ def _xcr_lens(values: dict[str, str], width: int, height: int, file: Path) -> di
 
 
 def _with_points(file: Path, frames: list[dict[str, Any]]) -> Frames:
-    """Return frames with poses as lists, and the points of the only PLY file beside `file`.
-
-    Several PLY files, or points far from the cameras, are not used, with a warning.
-    """
+    """Return frames with poses as lists, and the points of the only PLY file beside `file`, if it is near them."""
     poses = np.stack([frame["transform_matrix"] for frame in frames])
     middle = np.median(poses[:, :3, 3], axis=0)
     farthest = FARTHEST_POINTS * np.linalg.norm(poses[:, :3, 3] - middle, axis=1).max()
@@ -285,7 +282,7 @@ def _with_points(file: Path, frames: list[dict[str, Any]]) -> Frames:
         finite = cloud.points[np.isfinite(cloud.points).all(axis=-1)]
         if len(finite) and farthest and not np.linalg.norm(np.median(finite, axis=0) - middle) <= farthest:
             warnings.warn(
-                f"{file}: the points beside it lie far from its cameras, in another coordinate system: not used",
+                f"{file}: the points beside it are far from its cameras, in another coordinate system: not used",
                 stacklevel=3,
             )
             cloud = None
@@ -326,7 +323,7 @@ def _read_xml(file: Path) -> Element:
 
 
 def _numbers_in(text: str | None, count: int, what: object) -> np.ndarray:
-    """Return the numbers in a text, or raise ValueError unless there are so many and all are finite."""
+    """Return the numbers in a text, or raise ValueError unless there are `count` finite ones."""
     try:
         numbers = np.array([float(word) for word in (text or "").split()])
     except ValueError:

@@ -16,9 +16,8 @@ from tqdm import tqdm
 
 from a2tg_jax.core.checks import check_literal
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.panoramas import directions
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
-from a2tg_jax.data.staging import Panorama, Staged, stage
+from a2tg_jax.data.staging import Panorama, Staged, directions, stage
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.host.machine import num_threads
 from a2tg_jax.host.progress_bars import counting, has_terminal

@@ -1,6 +1,8 @@
-"""Sources of photographs gathered in one folder, as COLMAP wants them: upright, in formats it reads, by camera.
+"""Sources of photographs gathered in one folder as COLMAP needs them: upright, in formats it reads, by camera.
 
-Folders, videos and panoramas may be mixed. Photographs that need no change are linked.
+Folders, videos and panoramas may be mixed. Photographs that need no change are linked. Panoramas of 360° × 180°
+(equirectangular) are cut into perspective views of one place. A panorama's own camera frame has x to the right, y down
+and z towards the middle of the picture. Longitude grows to the right, from -π at the left edge.
 """
 
 import itertools
@@ -12,11 +14,13 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal, NamedTuple
 
+import numpy as np
 from PIL import Image
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 
 from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
 from a2tg_jax.data.image_files import map_in_threads
-from a2tg_jax.data.panoramas import cut_view, directions, is_panorama, view_size
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS, find_photos, is_video
 from a2tg_jax.data.video import extract_frames
 from a2tg_jax.host.text import counted
@@ -30,6 +34,13 @@ COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 LOSSLESS_FORMATS = ("PNG", "TIFF", "BMP")
 QUALITY = 95
 """JPEG quality of photographs that are written again."""
+FIELD_OF_VIEW = np.deg2rad(100.0)
+"""Field of view of each square view of a panorama; with the headings below no direction is left out."""
+AROUND = 6
+"""Number of views around the horizon; one view up and one down join them."""
+ROWS_AT_ONCE = 128
+SEAM_TOLERANCE, LEAST_SEAM = 2.0, 3.0
+"""Largest step of brightness over the seam, in steps of neighbouring columns and in grey levels above that."""
 
 
 class CameraGroup(NamedTuple):
@@ -71,13 +82,11 @@ class Staged(NamedTuple):
 
     @property
     def num_places(self) -> int:
-        """Number of places that cameras stood at; the views of a panorama share one."""
+        """Number of camera positions; the views of a panorama share one."""
         return sum(len(group.names) for group in (*self.groups, *(rig.groups[0] for rig in self.rigs)))
 
 
 class _Photo(NamedTuple):
-    """A photograph of a source."""
-
     source: int
     file: Path
     name: str
@@ -118,7 +127,7 @@ def stage(
             name.encode()
         except UnicodeEncodeError:  # Bytes that are no UTF-8 are surrogates in Python's names of files.
             told = os.fsencode(file).decode(errors="backslashreplace")
-            raise ValueError(f"{told}: its name is not UTF-8, as COLMAP wants it; rename the photograph") from None
+            raise ValueError(f"{told}: its name is not UTF-8, as COLMAP needs it; rename the photograph") from None
 
     def look(source: int, file: Path, name: str) -> _Photo:
         facts = picture_facts(file)
@@ -179,33 +188,26 @@ def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
             return photo.name
         return photo.name + (".png" if photo.facts.format in LOSSLESS_FORMATS else ".jpg")
 
+    def place(photo: _Photo, target: Path) -> None:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if photo.facts.format in COLMAP_FORMATS and not photo.facts.is_turned:
+            try:
+                os.link(photo.file.resolve(), target)
+            except FileExistsError:
+                raise
+            except OSError:  # The file system has no links.
+                shutil.copyfile(photo.file, target)
+            return
+        partial = target.with_name(f".{target.name}")  # A link is replaced, not followed.
+        save_upright(photo.file, partial, QUALITY)
+        os.replace(partial, target)
+
     names = _made_unique([wanted_name(photo) for photo in photos])
-    map_in_threads(_place, photos, [folder / name for name in names])
+    map_in_threads(place, photos, [folder / name for name in names])
     grouped: dict[tuple[int, tuple[int, int], tuple[str, ...]], list[str]] = defaultdict(list)
     for photo, name in zip(photos, names, strict=True):
         grouped[photo.source, photo.facts.size, photo.facts.lens].append(name)
     return tuple(CameraGroup(tuple(sorted(members)), key[1]) for key, members in grouped.items())
-
-
-def _place(photo: _Photo, target: Path) -> None:
-    """Link a photograph to a new place, or write it again if it is turned or COLMAP cannot read it."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if photo.facts.format in COLMAP_FORMATS and not photo.facts.is_turned:
-        _link(photo.file, target)
-        return
-    partial = target.with_name(f".{target.name}")  # No photograph is named so, and a link is replaced, not followed.
-    save_upright(photo.file, partial, QUALITY)
-    os.replace(partial, target)
-
-
-def _link(file: Path, target: Path) -> None:
-    """Make a file appear at another place, without a copy if the file system can."""
-    try:
-        os.link(file.resolve(), target)
-    except FileExistsError:
-        raise
-    except OSError:
-        shutil.copyfile(file, target)
 
 
 def _stage_panoramas(
@@ -215,6 +217,14 @@ def _stage_panoramas(
     by_size: dict[tuple[int, int], list[_Photo]] = defaultdict(list)
     for photo in photos:
         by_size[photo.facts.size].append(photo)
+
+    def cut(photo: _Photo, top: str, view: str) -> None:
+        pixels = read_pixels(photo.file)[..., :3]
+        for direction in directions():
+            target = folder / top / direction.name / view
+            target.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(cut_view(pixels, direction)).save(target, quality=QUALITY)
+
     rigs = []
     tops = _made_unique([f"panorama{number or ''}" for number in range(len(by_size))], tops)
     for top, (size, members) in zip(tops, by_size.items(), strict=True):
@@ -222,10 +232,9 @@ def _stage_panoramas(
         views = _made_unique(
             [photo.name if own else f"{photo.name}.jpg" for photo, own in zip(members, is_jpeg, strict=True)]
         )
-        map_in_threads(_cut, [photo.file for photo in members], itertools.repeat(folder / top), views)
+        map_in_threads(cut, members, itertools.repeat(top), views)
         side, focal = view_size(size[0])
-        ordered = sorted(views)
-        names = [tuple(f"{top}/{direction.name}/{view}" for view in ordered) for direction in directions()]
+        names = [tuple(f"{top}/{direction.name}/{view}" for view in sorted(views)) for direction in directions()]
         rigs.append(Rig(top, tuple(CameraGroup(own, (side, side), focal) for own in names)))
         tell(
             f"{counted(len(members), 'panorama')} of {size[0]}x{size[1]}, each cut into {len(directions())} views of "
@@ -234,10 +243,53 @@ def _stage_panoramas(
     return tuple(rigs)
 
 
-def _cut(file: Path, folder: Path, view: str) -> None:
-    """Write the views of one panorama."""
-    pixels = read_pixels(file)[..., :3]
-    for direction in directions():
-        target = folder / direction.name / view
-        target.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(cut_view(pixels, direction)).save(target, quality=QUALITY)
+class Direction(NamedTuple):
+    """A view of a panorama."""
+
+    name: str
+    rotation: np.ndarray
+    """[3, 3] from the panorama's frame to the view's."""
+
+
+def directions() -> tuple[Direction, ...]:
+    """Return the views that a panorama is cut into, the one towards its middle first."""
+    headings = [360.0 * number / AROUND for number in range(AROUND)]
+    angles = [(f"heading{heading:03.0f}", heading, 0.0) for heading in headings]
+    angles += [("up", 0.0, 90.0), ("down", 0.0, -90.0)]
+    # A view is turned right by its heading and then up by its pitch.
+    turns = [Rotation.from_euler("YX", [heading, pitch], degrees=True) for _, heading, pitch in angles]
+    return tuple(Direction(name, turn.as_matrix().T) for (name, _, _), turn in zip(angles, turns, strict=True))
+
+
+def view_size(width: int) -> tuple[int, float]:
+    """Return (side, focal length) in pixels of the views of a panorama, which keep its resolution at their middle."""
+    side = 2 * round(width / (2 * np.pi) * np.tan(FIELD_OF_VIEW / 2))
+    return side, side / (2 * np.tan(FIELD_OF_VIEW / 2))
+
+
+def cut_view(panorama: np.ndarray, direction: Direction) -> np.ndarray:
+    """Return the square view [side, side, C] uint8 of a panorama [H, W, C] in a direction, sampled bilinearly."""
+    height, width, channels = panorama.shape
+    side, focal = view_size(width)
+    wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)  # Columns continue over the seam.
+    view = np.empty((side, side, channels), np.uint8)
+    for top in range(0, side, ROWS_AT_ONCE):
+        rows = view[top : top + ROWS_AT_ONCE]
+        x, y = np.meshgrid(np.arange(side) + 0.5 - side / 2, np.arange(top, top + len(rows)) + 0.5 - side / 2)
+        rays = np.stack([x, y, np.full_like(x, focal)], -1) @ direction.rotation
+        longitude = np.arctan2(rays[..., 0], rays[..., 2])
+        latitude = np.arctan2(-rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
+        row, column = (0.5 - latitude / np.pi) * height, (0.5 + longitude / (2 * np.pi)) * width
+        places = np.stack([row - 0.5, column - 0.5 + 1])  # One more for the wrapped column on the left.
+        for channel in range(channels):
+            rows[..., channel] = np.rint(map_coordinates(wrapped[..., channel], places, np.float32, 1, mode="nearest"))
+    return view
+
+
+def is_panorama(pixels: np.ndarray) -> bool:
+    """Return whether a picture [H, W, C] is twice as wide as high, and its right edge continues at its left edge."""
+    if pixels.shape[1] != 2 * pixels.shape[0]:
+        return False
+    columns = pixels[:, [-1, 0, 1, 2, 3]].astype(np.float32)
+    steps = np.abs(np.diff(columns, axis=1)).mean(axis=(0, 2))
+    return bool(steps[0] <= SEAM_TOLERANCE * steps[1:].mean() + LEAST_SEAM)

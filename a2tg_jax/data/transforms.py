@@ -227,7 +227,7 @@ def _side(frame: dict[str, object], key: str, default: int, what: str) -> int:
     """Return a side of the image in pixels; 0 and null stand for the image's own."""
     side = _number(frame, key, default, what) if frame.get(key) else default
     if not 1 <= side <= LONGEST_SIDE:  # False for NaN.
-        raise ValueError(f"{what}: {key} must lie in 1..{LONGEST_SIDE} pixels; got {side:g}")
+        raise ValueError(f"{what}: {key} must be in 1..{LONGEST_SIDE} pixels; got {side:g}")
     return int(side)
 
 
