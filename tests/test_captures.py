@@ -60,18 +60,6 @@ def test_polycam(tmp_path, prefix):
         load_scene(tmp_path)
 
 
-def test_polycam_without_sizes(tmp_path):
-    """Present exports have no width and height; points of depth maps need them, too."""
-    write_polycam_with_depth(tmp_path)
-    for file in tmp_path.rglob("*.json"):
-        values = json.loads(file.read_text())
-        file.write_text(json.dumps({key: value for key, value in values.items() if key not in ("width", "height")}))
-    scene = load_scene(tmp_path)
-    check_dots(scene, 0.1)
-    points = scene.transform.inverse().apply(scene.points)
-    assert np.linalg.norm(points - TARGET, axis=1).min() < 0.03
-
-
 def write_polycam_with_depth(folder):
     """The target's depth all over each map, in mm; the first map has low confidence."""
     keyframes = write_polycam(folder).parent
@@ -127,13 +115,6 @@ def test_record3d(tmp_path, metadata, images, changes):
     write_record3d(tmp_path, metadata, images, poses=[[0, 0, 0, 1, 0, 0]])
     with pytest.raises(ValueError, match="poses must be rows of 7 finite numbers"):
         load_scene(tmp_path)
-
-
-def test_images_of_record3d_without_a_pose_are_told(tmp_path):
-    write_record3d(tmp_path)
-    save_dot(tmp_path / "rgbd" / f"{COUNT}.jpg", (9, 9))
-    with pytest.warns(UserWarning, match=rf"1 of {COUNT + 1} images have no pose, such as {COUNT}\.jpg: not used"):
-        assert len(load_scene(tmp_path, test_every=0).train) == COUNT
 
 
 def metashape_place(pose, f=100.0, b1=-4.0, cx=-2.0, cy=2.0, k1=-0.1, k2=0.02, k3=0.001, p1=0.004, p2=-0.003):
@@ -253,16 +234,6 @@ def test_rigs_of_metashape(tmp_path, master):
     check_dots(scene, 0.05)
 
 
-def test_rigs_of_metashape_without_offsets_are_told(tmp_path):
-    save_dots(tmp_path / "images", [f"{index}_0.png" for index in range(COUNT)])
-    (tmp_path / "cameras.xml").write_text(rig_xml(np.eye(4), sensors=(" ",)))
-    with pytest.warns(
-        UserWarning, match=r"4 of 8 cameras have no pose or are switched off, such as 0_1\.png: not used"
-    ):
-        scene = load_scene(tmp_path)
-    assert len(scene.train) + len(scene.test) == COUNT
-
-
 def fisheye_place(pose, projection, k=(0.0, 0.0, 0.0, 0.0), p1=0.0, p2=0.0):
     """The place of the target by Metashape's manual: the fisheye's radius of the angle, then Brown's distortion."""
     x, y, z = to_camera(pose, TARGET)
@@ -296,17 +267,6 @@ def test_fisheyes_of_metashape(tmp_path, projection, terms):
     xml = metashape_xml(WORLD, lens=lens).replace('type="frame"', f'type="{projection}"')
     (tmp_path / "cameras.xml").write_text(xml)
     check_dots(load_scene(tmp_path), 0.06)
-
-
-def test_the_adjusted_lens_of_metashape_is_taken(tmp_path):
-    """Metashape writes the calibration that the adjustment began with before the one that it ended with."""
-    write_metashape(tmp_path)
-    file = tmp_path / "cameras.xml"
-    xml, initial = file.read_text(), '<calibration type="frame" class="initial"><f>50</f></calibration>'
-    file.write_text(xml.replace("<calibration", f"{initial}<calibration"))
-    check_dots(load_scene(tmp_path), 0.1)
-    file.write_text(xml.replace('class="adjusted"', 'class="initial"'))
-    check_dots(load_scene(tmp_path), 0.1)
 
 
 @pytest.mark.parametrize(

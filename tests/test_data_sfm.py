@@ -4,7 +4,7 @@ import contextlib
 import os
 import re
 import shutil
-from pathlib import Path
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +16,7 @@ from a2tg_jax.data import load_scene, run_sfm, sfm, synthetic_scene
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_facts, picture_size, read_pixels
 from a2tg_jax.data.photo_folder import find_photos
-from a2tg_jax.data.staging import _prefixes, stage
+from a2tg_jax.data.staging import stage
 from a2tg_jax.host import progress_bars
 from a2tg_jax.results.figures import save_camera_picture
 
@@ -197,16 +197,6 @@ def test_photographs_that_lose_their_alpha_are_told(tmp_path, mode):
     assert len(told) == 1
 
 
-def test_heic_photographs_become_jpeg(tmp_path):
-    pillow_heif = pytest.importorskip("pillow_heif")
-    image = Image.fromarray(np.full((48, 64, 3), 99, np.uint8))
-    for index in range(3):
-        pillow_heif.from_pillow(image).save(tmp_path / f"{index}.HEIC")
-    (group,) = staged([tmp_path], tmp_path / "work").groups
-    assert group.names == ("0.HEIC.jpg", "1.HEIC.jpg", "2.HEIC.jpg") and group.size == (64, 48)
-    assert abs(np.asarray(Image.open(tmp_path / "work/photos/0.HEIC.jpg")).mean() - 99) < 3
-
-
 def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):
     """A photograph that is written anew, here one in a format of its own, may get the name of another."""
     names = ["a.bmp", "a.bmp.jpg", "A.BMP.JPG", "a.bmp~2.jpg"]
@@ -254,16 +244,6 @@ def test_too_little_in_common(tmp_path, capfd):
     assert capfd.readouterr().err == "" and not (tmp_path / "new").exists()
 
 
-def test_photographs_without_features_are_named(tmp_path):
-    """More photographs would not help if all are blank."""
-    (tmp_path / "photos").mkdir()
-    for index in range(6):
-        Image.new("RGB", (64, 64), (90, 120, 150)).save(tmp_path / "photos" / f"{index}.png")
-    with pytest.raises(ValueError, match=r"no features.* in 6 of them \(0.png, 1.png, .*4.png, …\)$") as told:
-        run_sfm(tmp_path / "photos", tmp_path / "scene", progress=False)
-    assert "take more" not in str(told.value)
-
-
 NAMES = [f"{number}.jpg" for number in range(300)]
 
 
@@ -294,13 +274,6 @@ def test_photographs_that_are_left_out_are_named():
         UserWarning, match=r": 10 of 300 .*\(290.jpg, 291.jpg, .*, …\).* in 1 of them \(299.jpg\).* 290, 9"
     ):
         sfm._check_models(parts, NAMES, "photos", "exhaustive", 999, NAMES[299:])
-
-
-def test_sources_of_one_name_are_told_apart(tmp_path):
-    names = [path.as_posix() for path in (tmp_path / "x/a", tmp_path / "y/a", tmp_path / "b")]
-    assert _prefixes([Path(name) for name in names]) == ["a/", "a~2/", "b/"]
-    assert _prefixes([tmp_path]) == [""]
-    assert _prefixes([Path("x/a~2"), Path("x/a"), Path("y/a")]) == ["a~2/", "a/", "a~3/"]
 
 
 def test_the_picture_of_the_cameras(tmp_path):
@@ -379,20 +352,6 @@ def test_pictures_that_are_no_photographs_are_left_out(tmp_path):
         ValueError, match=r"holds no photographs; at least 3 .*\. Not taken for photographs: .*\. To use"
     ):
         find_photos(tmp_path)
-
-
-def test_turned_and_converted_copies_are_found(tmp_path):
-    """A phone's photograph with EXIF rotation, its upright copy without, and one in another format."""
-    random = np.random.default_rng(0)
-    for index in range(3):
-        save_blocks(tmp_path / "webp" / f"{index}.webp", 192, 144, random)
-        for folder in ("phone", "upright"):
-            (tmp_path / folder).mkdir(exist_ok=True)
-        with Image.open(tmp_path / "webp" / f"{index}.webp") as image:
-            save_turned(image, tmp_path / "phone" / f"{index}.jpg", 6)
-            image.reduce(2).save(tmp_path / "upright" / f"{index}.jpg")
-    with pytest.warns(UserWarning, match=r"copies of others: 6 \(upright/\*.jpg, webp/\*.webp\)"):
-        assert find_photos(tmp_path) == [f"phone/{index}.jpg" for index in range(3)]
 
 
 def photos_of(folder, *names, data=b"no image"):

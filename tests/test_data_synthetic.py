@@ -48,14 +48,6 @@ def test_points_have_the_colours_of_the_pixels_that_see_them(scene):
     assert np.mean(best < 0.01) > 0.97
 
 
-def test_normalised_like_any_scene(scene):
-    assert (len(scene.train), len(scene.test)) == (7, 2)
-    centers = np.stack([np.asarray(view.camera.center) for view in (*scene.train, *scene.test)])
-    assert np.median(np.linalg.norm(centers, axis=1)) == pytest.approx(1, abs=1e-5)
-    assert scene.scale == pytest.approx(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max(), rel=1e-5)
-    assert scene.points.dtype == scene.colors.dtype == np.float32
-
-
 def test_seed_and_downscale():
     options = dict(num_views=2, width=64, height=48, num_points=50, test_every=0)
     first, again, other = (synthetic_scene(seed, **options) for seed in (0, 0, 1))

@@ -33,16 +33,6 @@ def ring(rng, target, count=12):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_similarity_inverse(seed):
-    rng = np.random.default_rng(seed)
-    similarity, points = random_similarity(rng), rng.normal(size=(5, 3))
-    np.testing.assert_allclose(similarity.inverse().apply(similarity.apply(points)), points, atol=1e-12)
-    viewmat = look_at(rng.normal(size=3), rng.normal(size=3))
-    back = similarity.inverse().apply_to_viewmat(similarity.apply_to_viewmat(viewmat))
-    np.testing.assert_allclose(back, viewmat, atol=1e-12)
-
-
-@pytest.mark.parametrize("seed", range(3))
 def test_moved_camera_sees_the_moved_point_at_the_same_pixel(seed):
     rng = np.random.default_rng(seed)
     similarity, point = random_similarity(rng), rng.normal(size=3)
@@ -79,13 +69,6 @@ def test_parallel_axes_fall_back_to_the_mean_camera():
 def test_cameras_hanging_upside_down_are_turned_over():
     viewmats = np.stack([look_at(center, (0, 0, 0), up=(0, 0, -1)) for center in np.eye(3) + 0.1])
     np.testing.assert_allclose(normalizing_similarity(viewmats).rotation @ [0, 0, -1], [0, 0, 1], atol=0.5)
-
-
-def test_ups_that_cancel_keep_the_axes():
-    viewmats = np.stack(
-        [look_at((0.0, 0, 1), (0, 0, 0), up=(1, 0, 0)), look_at((0.0, 0.1, 1), (0, 0.1, 0), up=(-1, 0, 0))]
-    )
-    np.testing.assert_array_equal(normalizing_similarity(viewmats).rotation, np.eye(3))
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e5])

@@ -95,16 +95,6 @@ def test_a_broken_connection_is_continued(server, tmp_path):
     assert server.firsts == [0, 2_000, 4_000] and (tmp_path / "scenes/360_v2/a.txt").read_text() == "a" * 5_000
 
 
-def test_a_connection_that_breaks_too_often_leaves_what_came(server, tmp_path):
-    archive = archive_of(server, {"a.txt": "a" * 5_000})
-    server.breaks_after = 500
-    with pytest.raises(OSError, match=r"2,500 of 5,\d+ bytes came; call again to continue"):
-        fetch(archive, tmp_path / "scenes")
-    server.breaks_after = None
-    fetch(archive, tmp_path / "scenes")
-    assert server.firsts == [0, 500, 1_000, 1_500, 2_000, 2_500]
-
-
 def test_parts_of_two_versions_are_not_joined(server, tmp_path, monkeypatch):
     archive = archive_of(server, {"a.txt": "a" * 5_000})
     server.breaks_after = 500
@@ -173,11 +163,6 @@ def test_what_came_from_elsewhere_is_not_overwritten(server, tmp_path):
     assert own.read_text() == "my own" and server.firsts == [0]
     (tmp_path / "scenes/archives/set.zip.unpacking").touch()  # As an unpacking leaves it that was interrupted.
     assert fetch(archive, tmp_path / "scenes") and own.read_text() == "new"
-
-
-def test_tar_archives(server, tmp_path):
-    fetch(archive_of(server, {"scan24/a.txt": "a"}, "set.tar.gz"), tmp_path / "scenes")
-    assert (tmp_path / "scenes/360_v2/scan24/a.txt").read_text() == "a"
 
 
 def test_room_on_the_disk_is_checked_first(server, tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from a2tg_jax.data import decoding, run_sfm
+from a2tg_jax.data import decoding
 from a2tg_jax.data.decoding import MAX_PIXELS, picture_facts, read_pixels
 from a2tg_jax.data.image_files import find_image, inside
 from a2tg_jax.results.images import picture_names, save_picture
@@ -169,22 +169,6 @@ def test_names_within_the_scene_and_links_are_followed(tmp_path):
     for name in ("images/x.png", "./images/x.png", "images//x.png"):
         assert inside(tmp_path / "scene", name) == "images/x.png"
         assert read_pixels(find_image(tmp_path / "scene", name)).shape == (3, 4, 3)
-
-
-def test_photographs_are_looked_at_before_colmap_reads_them(tmp_path):
-    for index, data in enumerate([encoded("PNG"), encoded("PNG"), png(4, 3, depth=16)]):
-        (tmp_path / f"{index}.png").write_bytes(data)
-    with pytest.raises(ValueError, match=r"2\.png: has more than 8 bits per channel"):
-        run_sfm(tmp_path, tmp_path / "scene", progress=False)
-    (tmp_path / "2.png").write_bytes(encoded("PNG")[:100])
-    with pytest.raises(ValueError, match=r"2\.png: cannot be read as an image"):
-        run_sfm(tmp_path, tmp_path / "scene", progress=False)
-
-
-def test_a_link_to_itself_is_no_image(tmp_path):
-    (tmp_path / "a.png").symlink_to(tmp_path / "b.png")
-    (tmp_path / "b.png").symlink_to(tmp_path / "a.png")
-    assert find_image(tmp_path, "a.png") is None
 
 
 def test_results_never_share_a_file():

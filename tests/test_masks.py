@@ -130,21 +130,6 @@ def test_mask_path_of_nerfstudio(tmp_path):
         load_scene(tmp_path)
 
 
-def test_masks_of_another_clip_are_no_smaller_masks(tmp_path):
-    """Frames of two clips have the same names; each has masks of its own."""
-    frames = write_frames(tmp_path)
-    for index, frame in enumerate(frames):
-        frame["mask_path"] = f"masks/clip{'_2' * (index % 2)}/{index // 2}.png"
-        counts = left_half(SIZE["w"], SIZE["h"])
-        write_mask(tmp_path / frame["mask_path"], ~counts if index % 2 else counts)
-    write_json(tmp_path, frames, **FOCAL, **SIZE)
-    with pytest.warns(UserWarning, match="random points"):
-        views = views_of(load_scene(tmp_path, downscale=2))
-    for view in views:
-        kept = view.mask.read()[:, [20, 40]]
-        assert (kept == ([False, True] if int(view.name[-6:-4]) % 2 else [True, False])).all()
-
-
 def test_alpha_is_transparency_or_a_mask(tmp_path):
     frames = write_frames(tmp_path, alpha=True)
     for frame in frames:

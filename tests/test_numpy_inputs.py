@@ -73,13 +73,6 @@ def test_images_features_backgrounds_and_points(kind):
     assert all(map(np.array_equal, jax.tree.leaves(own), jax.tree.leaves(other)))
 
 
-@pytest.mark.usefixtures("x64")
-def test_lists_take_the_dtype_of_the_arrays_beside_them():
-    wide = jax.tree.map(lambda x: x.astype(np.float64), GAUSSIANS)
-    assert dataclasses.replace(wide, sh=wide.sh.tolist()).sh.dtype == np.float64
-    assert dataclasses.replace(GAUSSIANS, sh=GAUSSIANS.sh.tolist()).sh.dtype == np.float32
-
-
 def masked(x):
     return np.ma.masked_array(x, np.arange(x.size).reshape(x.shape) == 1)
 

@@ -215,15 +215,3 @@ def test_points_too_far_or_too_near_are_left_out(tmp_path, far):
     depths = scene.train[0].points.depths
     assert np.isfinite(depths).all() and depths.max() < 100 and len(before.pixels) > 5
     a2tg.fit(scene, small(stage1_iterations=1, loss={"points_weight": 0.1}), progress=False)
-
-
-def test_half_the_size_has_half_the_places_and_the_same_depths(tmp_path):
-    with_observations(tmp_path, "RADIAL", [range(1, 40)] * 5)
-    views = [a2tg.load_scene(tmp_path, test_every=0, downscale=k).train[0] for k in (1, 2)]
-    whole, half = (
-        {z: divmod(pixel, view.camera.width) for pixel, z in zip(*map(np.ndarray.tolist, view.points), strict=True)}
-        for view in views
-    )
-    assert half.keys() <= whole.keys() and len(whole) >= len(half) > 10
-    for z, place in half.items():
-        assert np.abs(np.add(place, 0.5) * 2 - np.add(whole[z], 0.5)).max() <= 1.5

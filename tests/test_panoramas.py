@@ -1,6 +1,5 @@
 """Panoramas are cut into perspective views that agree with direct renders of the built-in scene."""
 
-import dataclasses
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -9,8 +8,8 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 from test_data_sfm import cameras_of, staged
 
-from a2tg_jax.data import load_scene, synthetic, synthetic_scene
-from a2tg_jax.data.assembly import split_views, with_validation_views
+from a2tg_jax.data import load_scene, synthetic
+from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.staging import cut_view, directions, is_panorama, view_size
 
@@ -151,10 +150,3 @@ def test_the_views_of_a_panorama_are_held_out_together(rig_scene):
         assert {view.name for view in one.test} == {f"{camera}/{place}.png" for camera in (1, 2, 3) for place in (1, 5)}
         with pytest.raises(ValueError, match="there is 1 panorama, cut into 3 views"):
             with_validation_views(with_validation_views(scene))
-
-
-def test_views_of_one_name_are_views_of_their_own():
-    view = synthetic_scene(num_views=2, width=8, height=6, num_points=9).train[0]
-    panorama = [dataclasses.replace(view, panorama=0)] * 2
-    kept, held_out = split_views([view, *panorama, view, view], 2)
-    assert [one.panorama for one in kept] == [0, 0, None] and [one.panorama for one in held_out] == [None, None]

@@ -18,7 +18,7 @@ from a2tg_jax import Gaussians2dMcmc, Mcmc, fit, load_scene, synthetic_scene
 from a2tg_jax.data import photo_store as pictures
 from a2tg_jax.data.photo_store import Picture, Shelf
 from a2tg_jax.training import batches, loop
-from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore, stack_views
+from a2tg_jax.training.batches import Ahead, BatchOrder, PhotoStore
 
 SYSTEM = Gaussians2dMcmc(stage1_iterations=12, initial_gaussians=60, densify=Mcmc(cap=70))
 KINDS = {
@@ -181,14 +181,6 @@ def test_batches_are_made_in_order_once_and_not_too_many():
     assert sorted(made) == [1, 2, 3, 4, 5]
 
 
-def test_photographs_on_the_device_are_not_copied(tmp_path):
-    """On a CPU the device's memory is the host's."""
-    views = [view for view in load(write_scene(tmp_path / "scene", alpha=True)).train]
-    stack = stack_views(views)
-    for array in (stack.images, stack.alphas):
-        assert jax.device_put(array).unsafe_buffer_pointer() == array.ctypes.data
-
-
 def test_an_error_reaches_who_waits_for_that_batch_alone():
     def load(indices):
         if indices == (2,):
@@ -200,14 +192,6 @@ def test_an_error_reaches_who_waits_for_that_batch_alone():
     with pytest.raises(ValueError, match="photograph 2 is gone"):
         ahead.first({2: (2,), 3: (3,)})
     assert ahead.first({3: (3,)}) == (3,)
-    ahead.close()
-
-
-def test_what_comes_next_is_made_while_one_is_looked_at():
-    is_made = threading.Event()
-    ahead = Ahead(lambda indices: (indices, indices == (2,) and is_made.set())[0], 1)
-    ahead.first({1: (1,), 2: (2,)})
-    assert is_made.wait(10)
     ahead.close()
 
 
@@ -238,15 +222,6 @@ def test_a_full_disk_is_said_with_what_to_do(monkeypatch):
     monkeypatch.setattr(pictures.tempfile, "TemporaryFile", full)
     with pytest.raises(OSError, match=r"cannot keep the scene's photographs \(No space left.*larger downscale"):
         Shelf(0).keep(np.zeros((4, 4, 3), np.uint8), Path("a.png"), np.copy)
-
-
-def test_a_view_takes_pixels_and_pictures():
-    view = synthetic_scene(num_views=3, width=16, height=12, num_points=20).train[0]
-    pixels = np.arange(16 * 12 * 4).reshape(12, 16, 4).astype(np.uint8)
-    changed = dataclasses.replace(view, picture=pixels)
-    np.testing.assert_array_equal(changed.image, pixels[..., :3])
-    np.testing.assert_array_equal(changed.alpha, pixels[..., 3])
-    assert dataclasses.replace(changed, name="other").picture is changed.picture
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -14,7 +14,7 @@ from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, fish
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Appearance
-from a2tg_jax.core.cameras import Camera, looking, resize_camera
+from a2tg_jax.core.cameras import Camera, looking
 from a2tg_jax.data.scene import kinds_of, ray_bytes
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.model import Model
@@ -166,14 +166,6 @@ def test_pixels_without_a_ray_see_the_background(x64):
         dataclasses.replace(as_gaussians(scene, "float64"), means=means), blind,
     ).color))(as_gaussians(scene, "float64").means)  # fmt: skip
     assert np.isfinite(gradient).all()
-
-
-def test_rays_are_resized_with_their_image():
-    camera = fisheye(as_camera(draw_scene(1), "float32"))
-    smaller = resize_camera(camera, 21, 15)
-    again = fisheye(resize_camera(dataclasses.replace(camera, rays=None), 21, 15))
-    np.testing.assert_allclose(smaller.rays, again.rays, atol=0.05)
-    np.testing.assert_array_equal(resize_camera(camera, WIDTH, HEIGHT).rays, camera.rays)
 
 
 def write_fisheye(folder, num_views=4, focal=20.0, size=(32, 24), **more):

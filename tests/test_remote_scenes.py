@@ -227,28 +227,6 @@ def test_the_bound_of_a_file_holds_whatever_its_store_lists(store, monkeypatch, 
         assert len(file.read()) == 500
 
 
-def test_links_are_followed(store, monkeypatch):
-    for name in ("linked", "dangling"):
-        store.fs.pipe_file(f"{ROOT}/{name}", bytes(5))
-    listed_as(monkeypatch, type="link", size=1)
-    path = remote_files.located(URL)
-    remote_files.check_reachable(path)
-    store.fs.rm(f"{ROOT}/dangling")
-    assert remote_files.is_remote_file(path / "linked") and remote_files.remote_size(path / "linked") == 5
-    assert not remote_files.is_remote_file(path / "dangling")
-
-
-def test_folders_in_no_listing_are_not_asked_for(store):
-    """A store may refuse to list what is not there."""
-    store.fs.pipe_file(f"{ROOT}/images/a.png", b"a")
-    path = remote_files.located(URL)
-    remote_files.check_reachable(path)
-    store.num.clear()
-    assert not remote_files.is_remote_folder(path / "sparse" / "0") and not store.num
-    assert remote_files.is_remote_file(path / "images" / "a.png") and store.num_of("ls") == 1
-    assert not remote_files.is_remote_file(path / "masks" / "a.png") and store.num_of("ls") == 1
-
-
 def test_a_slow_listing_holds_up_no_other(store, monkeypatch):
     """Threads that want the same folder wait for one request."""
     for name in ("slow", "quick"):
@@ -362,20 +340,6 @@ def test_what_cannot_be_read_is_told(tmp_path, monkeypatch, store, url, error, m
         fsspec.register_implementation(scheme, f"{name}.Files", errtxt=f"{name} is needed", clobber=True)
     with pytest.raises(error, match=message):
         load_scene(url)
-
-
-def test_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "upath", None)
-    with pytest.raises(ValueError, match=r"pip install 'a2tg-jax\[remote\]'"):
-        load_scene(URL)
-
-
-def test_a_store_that_does_not_answer_is_told_at_once(monkeypatch, store):
-    """A first attempt fails for wrong credentials or a wrong name, which no pause mends."""
-    monkeypatch.setattr(remote_files, "PAUSES", (60.0,))
-    monkeypatch.setattr(type(store.fs), "ls", lambda *args, **kwargs: 1 / 0)
-    with pytest.raises(OSError, match=r"cannot be read from its store \(ZeroDivisionError: division by zero\)"):
-        load_scene(URL)
 
 
 def test_places_of_scenes(tmp_path, monkeypatch):
