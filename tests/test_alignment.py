@@ -59,6 +59,7 @@ def test_a_known_map_of_colours_is_found():
     np.testing.assert_allclose(color_fit(image, target, mask), known, atol=1e-9)
 
 
+@pytest.mark.long
 def test_scores_with_colours_fitted_do_not_see_an_exposure(scene, model):
     """Photographs under another exposure have the same scores, up to the rounding to 8 bits, but only with the fit."""
     views = scene.test
@@ -84,6 +85,7 @@ def test_a_disturbed_test_camera_comes_back(scene, model):
     assert evaluate(disturbed, model).psnr < 30 < 40 < evaluate(aligned, model).psnr
 
 
+@pytest.mark.long
 def test_masked_pixels_do_not_pull_at_a_camera(scene, model):
     view = moved(scene.test[0], TWIST)
     mask = np.ones(view.picture.size, bool)
@@ -98,6 +100,7 @@ def test_masked_pixels_do_not_pull_at_a_camera(scene, model):
     assert np.abs(clean - view.camera.viewmat).max() > 1e-3
 
 
+@pytest.mark.long
 def test_exposures_win_back_what_known_ones_took(scene, system, model):
     rng = np.random.default_rng(0)
 
@@ -115,10 +118,11 @@ def test_exposures_win_back_what_known_ones_took(scene, system, model):
     assert scores[1] > scores[0] + 0.3
 
 
+@pytest.mark.long
 def test_a_run_tells_both_scores_and_what_it_learned(tmp_path, capsys):
     out = tmp_path / "run"
-    arguments = "train synthetic --preset smoke --downscale 8 --stage1-iterations 12 --stage2-iterations 8 "
-    arguments += "--exposure --refine-poses --compare gaussians-2d --initial-gaussians 200 --densify.cap 210 --out"
+    arguments = "train synthetic --system gaussians-2d-mcmc --preset smoke --downscale 8 --stage1-iterations 12 "
+    arguments += "--exposure --refine-poses --initial-gaussians 200 --densify.cap 210 --out"
     assert main([*arguments.split(), str(out)]) == 0
     told = capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text())["models"]
@@ -129,7 +133,7 @@ def test_a_run_tells_both_scores_and_what_it_learned(tmp_path, capsys):
         assert measured["test_aligned_color_fit"]["psnr"] >= measured["test"]["psnr"]
     for title in ("test, colours fitted: PSNR (dB)", "train, poses aligned: SSIM"):
         assert title in told and title in (out / "report.html").read_text()
-    learned = json.loads((out / "corrections" / "a2tg-textures.json").read_text())
-    assert len(learned) == metrics["a2tg-textures"]["train"]["views"]
+    learned = json.loads((out / "corrections" / "gaussians-2d-mcmc.json").read_text())
+    assert len(learned) == metrics["gaussians-2d-mcmc"]["train"]["views"]
     for view in learned.values():
         assert np.shape(view["exposure"]) == (3, 4) and np.shape(view["pose"]) == (6,)

@@ -360,10 +360,12 @@ def write_floats(model):
     change(model / "points3D.txt", b" 255 128 ", b" 255.0 128.0 ")
 
 
+def strip_last_line(model):
+    (model / "images.txt").write_text((model / "images.txt").read_text().rstrip())
+
+
 TEXTS = {
-    "without the last line": lambda model: (model / "images.txt").write_text(
-        (model / "images.txt").read_text().rstrip()
-    ),
+    "without the last line": strip_last_line,
     "byte order marks": lambda model: for_files(model, lambda data: b"\xef\xbb\xbf" + data),
     "floats": write_floats,
     "CRLF": lambda model: for_files(model, lambda data: data.replace(b"\n", b"\r\n")),

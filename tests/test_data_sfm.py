@@ -214,6 +214,7 @@ def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):
     assert sorted(round(np.asarray(Image.open(folder / name)).mean() / 60) for name in group.names) == [0, 1, 2, 3]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_terminal", [False, True])
 def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd, monkeypatch, is_terminal):
     """Phases are bars on a terminal and plain lines in a pipe."""

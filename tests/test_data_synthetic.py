@@ -59,6 +59,7 @@ def test_seed_and_downscale():
     np.testing.assert_allclose(half.camera.K[:2], np.asarray(first.train[0].camera.K)[:2] / 2)
 
 
+@pytest.mark.long
 def test_default_is_made_in_seconds():
     start = time.process_time()
     scene = synthetic_scene()

@@ -174,10 +174,6 @@ def test_masked_pixels_do_not_reach_training(masked):
     clean, noisy = (fit(scene, system, progress=False) for scene in masked)
     jax.tree.map(np.testing.assert_array_equal, clean.model.gaussians, noisy.model.gaussians)
     np.testing.assert_array_equal(clean.history.psnr, noisy.history.psnr)
-    unmasked = tuple(dataclasses.replace(view, mask=None) for view in masked[1].train)
-    other = fit(dataclasses.replace(masked[1], train=unmasked), system, progress=False)
-    assert np.abs(other.model.gaussians.sh - clean.model.gaussians.sh).max() > 1e-3
-
     polished = [polish(clean.model, scene.train, num_steps=2).gaussians.sh for scene in masked]
     np.testing.assert_array_equal(*polished)
     assert np.abs(polished[0] - clean.model.gaussians.sh).max() > 1e-3
@@ -185,6 +181,7 @@ def test_masked_pixels_do_not_reach_training(masked):
     assert first == second
 
 
+@pytest.mark.long
 def test_a_view_counts_by_its_pixels(masked):
     """The PSNR of a step is that of the pixels that count."""
     scene = dataclasses.replace(masked[0], train=masked[0].train[:1])
@@ -221,6 +218,7 @@ def test_metrics_of_the_pixels_that_count(x64, seed):
         np.testing.assert_allclose(metric(image, target, everywhere), metric(image, target), rtol=1e-12)
 
 
+@pytest.mark.long
 def test_lpips_does_not_see_masked_pixels(shared):
     weights = load_lpips(shared / "lpips" / "lpips_squeeze.npz")
     rng = np.random.default_rng(0)

@@ -75,6 +75,7 @@ def test_points_lie_where_the_photograph_shows_them(tmp_path, model, lens):
             assert distance.min() < 1.5
 
 
+@pytest.mark.long
 def test_real_scenes(shared):
     """COLMAP's features lie within a pixel or so of where its points are drawn."""
     folder = shared / "scenes/fox"
@@ -170,6 +171,7 @@ def test_batches_hold_the_points_of_their_views(scene):
     assert more == 8 * len(views[1].points.pixels) and view_bytes(views[0], Extras(points=True)) == view_bytes(views[0])
 
 
+@pytest.mark.long
 def test_training_moves_depths_to_the_points(scene):
     """Wrong points to start from: rendered depth comes nearer to the true one with the loss than without."""
     moved = dataclasses.replace(scene, points=scene.points + 0.1 * RNG.normal(size=scene.points.shape).astype("f4"))
@@ -202,7 +204,7 @@ def test_other_points_are_refused(scene, points, told):
         a2tg.observed_points([[1, 2]] * 3, [1, 2], (4, 4))
 
 
-@pytest.mark.parametrize("far", [1e13, 1e39, 1e-14, np.inf])
+@pytest.mark.parametrize("far", [1e39, 1e-14])
 def test_points_too_far_or_too_near_are_left_out(tmp_path, far):
     reconstruction = with_observations(tmp_path, "PINHOLE", [range(1, 30)] * 5)
     image = reconstruction.find_image_with_name("img_00.png")

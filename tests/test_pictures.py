@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import json
 import pickle
 import threading
@@ -36,9 +37,14 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache" / "a2tg-jax"
 
 
+@functools.cache
+def built_in():
+    return synthetic_scene(num_views=6, width=40, height=32, num_points=100)
+
+
 def write_scene(folder, *, alpha=False, **intrinsics):
     """The built-in scene as files; returns the folder."""
-    made = synthetic_scene(num_views=6, width=40, height=32, num_points=100)
+    made = built_in()
     frames = []
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for index, view in enumerate((*made.train, *made.test)):
@@ -138,7 +144,7 @@ def test_photographs_that_other_processes_draw_are_not_read(tmp_path, monkeypatc
         picture, depth = Picture((32, 40, 4), load), np.ones((32, 40), np.float32)
         return dataclasses.replace(view, picture=picture, mask=np.ones((32, 40), bool), depth=depth)
 
-    views = tuple(counted(view) for view in synthetic_scene(num_views=6, width=40, height=32, num_points=20).train)
+    views = tuple(counted(view) for view in built_in().train)
     order = BatchOrder(views, 3, 0)
     monkeypatch.setattr(batches, "are_drawn_here", lambda *_: [False, True, False])
     store = PhotoStore(views, order, 1, extras=batches.Extras(depths=True), room=0)
@@ -224,8 +230,7 @@ def test_a_full_disk_is_said_with_what_to_do(monkeypatch):
         Shelf(0).keep(np.zeros((4, 4, 3), np.uint8), Path("a.png"), np.copy)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("room", [None, 0])
+@pytest.mark.parametrize(("kind", "room"), [*((kind, 0) for kind in KINDS), ("undistorted", None)])
 def test_a_scene_is_pickled_and_copied(tmp_path, kind, room):
     """Photographs that are read from their files as they are stay there; all others travel with the pickle."""
     told = dict(KINDS[kind])
