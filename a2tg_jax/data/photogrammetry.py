@@ -10,7 +10,7 @@ import functools
 import re
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -65,19 +65,24 @@ def metashape(path: Path) -> Callable[[], Frames] | None:
 
 
 def _metashape_frames(file: Path) -> Frames:
-    """Return the frames of Metashape's cameras. A PLY file beside them, if it is the only one, holds their points.
-
-    Component and chunk have a transform to the world, which poses go through; its scale leaves the cameras rigid.
-    """
+    """Return the frames of Metashape's cameras. A PLY file beside them, if it is the only one, holds their points."""
     frames, lacking = [], []
-    below = _images_below(file.parent / "images")
+    folder, images = file.parent, file.parent / "images"
+    below: dict[str, set[Path]] = defaultdict(set)  # Images in all folders below, with and without suffix.
+    for image in images.rglob("*"):
+        if image.suffix.lower() in PHOTO_SUFFIXES and is_regular(image):
+            below[image.name].add(image)
+            below[image.stem].add(image)
     for label, sensor, pose in _posed_cameras(file):
-        image = _image_of(file.parent, label, below)
-        if image is None:
+        name = re.split(r"[/\\]", label)[-1]  # A label is a path of any machine, or a name.
+        inside(folder, name)
+        unique = next(iter(below[name])) if len(below[name]) == 1 else None
+        found = named_image(images, name) or named_image(folder, name) or unique
+        if found is None:
             lacking.append(label)
             continue
-        lens = _metashape_lens(sensor, f"{file}: {label}")
-        frames.append({**lens, "file_path": image, "transform_matrix": pose @ OPENGL})
+        lens, path = _metashape_lens(sensor, f"{file}: {label}"), found.relative_to(folder).as_posix()
+        frames.append({**lens, "file_path": path, "transform_matrix": pose @ OPENGL})
     nothing = f"{file}: none of its cameras has a pose and an image beside it; put the photographs into images/"
     check_images(file, frames, lacking, nothing)
     return _with_points(file, frames)
@@ -288,27 +293,6 @@ def _with_points(file: Path, frames: list[dict[str, Any]]) -> Frames:
             cloud = None
     listed = [{**frame, "transform_matrix": pose.tolist()} for frame, pose in zip(frames, poses, strict=True)]
     return Frames(file, listed, cloud)
-
-
-def _images_below(folder: Path) -> dict[str, Path]:
-    """Return the images in all folders below a folder, by name and by name without suffix, as far as that is unique."""
-    found: dict[str, set[Path]] = defaultdict(set)
-    for file in folder.rglob("*"):
-        if file.suffix.lower() in PHOTO_SUFFIXES and is_regular(file):
-            found[file.name].add(file)
-            found[file.stem].add(file)
-    return {name: next(iter(files)) for name, files in found.items() if len(files) == 1}
-
-
-def _image_of(folder: Path, label: str, below: Mapping[str, Path]) -> str | None:
-    """Return the path, from the folder, of the image of a camera's label: a path of any machine, or a name.
-
-    It is looked for in `images`, in the folder itself, and then among the images `below`.
-    """
-    name = re.split(r"[/\\]", label)[-1]
-    inside(folder, name)
-    found = named_image(folder / "images", name) or named_image(folder, name) or below.get(name)
-    return None if found is None else found.relative_to(folder).as_posix()
 
 
 def _read_xml(file: Path) -> Element:

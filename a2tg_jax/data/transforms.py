@@ -206,54 +206,43 @@ def _viewmat(transform_matrix: object, what: str) -> np.ndarray:
     return np.linalg.inv(rigid_viewmat(camera_to_world, what))
 
 
-def _lens(frame: dict[str, object], what: str, use: LensUse, full: tuple[int, int]) -> Lens:
+def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int]) -> Lens:
     """Return the camera of a frame; its size defaults to the full image's, the principal point to the centre."""
-    width, height = _side(frame, "w", full[0], what), _side(frame, "h", full[1], what)
-    fx, fy = _focal_lengths(frame, width, height, what)
-    model, distortion = _distortion(frame, what)
-    params = [fx, fy, _number(frame, "cx", width / 2, what), _number(frame, "cy", height / 2, what), *distortion]
-    return checked_lens(pycolmap().Camera(model=model, width=width, height=height, params=params), what, use)
 
+    def number(key: str, default: float) -> float:
+        value = frame.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"{what}: {key} must be a number; got {shortened(value)}")
+        return float(value)
 
-def _number(frame: dict[str, object], key: str, default: float, what: str) -> float:
-    """Return a number of a frame. Raise ValueError for anything else."""
-    value = frame.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{what}: {key} must be a number; got {shortened(value)}")
-    return float(value)
+    def side(key: str, default: int) -> int:
+        side = number(key, default) if frame.get(key) else default  # 0 and null stand for the image's own.
+        if not 1 <= side <= LONGEST_SIDE:  # False for NaN.
+            raise ValueError(f"{what}: {key} must be in 1..{LONGEST_SIDE} pixels; got {side:g}")
+        return int(side)
 
-
-def _side(frame: dict[str, object], key: str, default: int, what: str) -> int:
-    """Return a side of the image in pixels; 0 and null stand for the image's own."""
-    side = _number(frame, key, default, what) if frame.get(key) else default
-    if not 1 <= side <= LONGEST_SIDE:  # False for NaN.
-        raise ValueError(f"{what}: {key} must be in 1..{LONGEST_SIDE} pixels; got {side:g}")
-    return int(side)
-
-
-def _focal_lengths(frame: dict[str, object], width: int, height: int, what: str) -> tuple[float, float]:
-    """Return (fx, fy) in pixels, from fl_x and fl_y or from the angles of view; one stands for both if alone."""
+    width, height = side("w", full[0]), side("h", full[1])
     lengths = {}
     for axis, size in (("x", width), ("y", height)):
         if f"fl_{axis}" in frame:
-            lengths[axis] = _number(frame, f"fl_{axis}", 0.0, what)
+            lengths[axis] = number(f"fl_{axis}", 0.0)
         elif f"camera_angle_{axis}" in frame:
-            angle = _number(frame, f"camera_angle_{axis}", 0.0, what)
+            angle = number(f"camera_angle_{axis}", 0.0)
             lengths[axis] = size / (2 * np.tan(angle / 2)) if 0 < angle < np.pi else 0.0
     if not lengths or not min(lengths.values()) > 0:
         raise ValueError(f"{what}: has no focal length; give fl_x above 0, or camera_angle_x between 0 and pi")
-    return lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))
-
-
-def _distortion(frame: dict[str, object], what: str) -> tuple[str, list[float]]:
-    """Return COLMAP's camera model and its distortion parameters; nerfstudio's have the same names and meaning."""
+    fx, fy = lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))  # One stands for both.
+    # nerfstudio's parameters of distortion have COLMAP's names and meaning.
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
-    values = {key: _number(frame, key, 0.0, what) for key in PRISM_KEYS}
+    terms = {key: number(key, 0.0) for key in PRISM_KEYS}
     if model in ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"):
-        return model, [values[key] for key in DISTORTION_KEYS[model]]
-    if model not in PERSPECTIVE_MODELS:
+        distortion = [terms[key] for key in DISTORTION_KEYS[model]]
+    elif model not in PERSPECTIVE_MODELS:
         wanted = "a perspective one, OPENCV_FISHEYE or THIN_PRISM_FISHEYE"
         raise ValueError(f"{what}: has the camera_model {shortened(model)}; {wanted} is expected")
-    if values["k4"] != 0:
-        raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are known there")
-    return "FULL_OPENCV", [*(values[key] for key in PRISM_KEYS[:5]), 0.0, 0.0, 0.0]
+    elif terms["k4"] != 0:
+        raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are read there")
+    else:
+        model, distortion = "FULL_OPENCV", [*(terms[key] for key in PRISM_KEYS[:5]), 0.0, 0.0, 0.0]
+    params = [fx, fy, number("cx", width / 2), number("cy", height / 2), *distortion]
+    return checked_lens(pycolmap().Camera(model=model, width=width, height=height, params=params), what, use)
