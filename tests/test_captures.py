@@ -408,35 +408,6 @@ def test_a_world_of_a_map_stays_there(tmp_path):
     np.testing.assert_allclose(places[0], places[1] + offset, rtol=0, atol=1e-6)
 
 
-def colmap_text(folder, points="points3D.txt"):
-    """A model as VGGT and MASt3R write it: a PINHOLE camera for each image, no features, points without tracks."""
-    save_dots(folder / "images", [f"{index}.png" for index in range(COUNT)])
-    model = folder / "sparse"
-    model.mkdir()
-    (model / "cameras.txt").write_text(
-        "".join(f"{index + 1} PINHOLE {WIDTH} {HEIGHT} 100 104 58 47\n" for index in range(COUNT))
-    )
-    lines = []
-    for index, pose in enumerate(poses()):
-        viewmat = np.linalg.inv(pose @ OPENCV)
-        x, y, z, w = Rotation.from_matrix(viewmat[:3, :3]).as_quat()
-        lines += [f"{index + 1} {numbers([w, x, y, z])} {numbers(viewmat[:3, 3])} {index + 1} {index}.png", ""]
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    if points.endswith(".ply"):
-        write_ply(model / points)
-    else:
-        (model / points).write_text(f"1 {numbers(TARGET)} 255 0 51 -1\n" + "2 1 0 0 255 0 51 0\n3 0 1 0 9 9 9 0\n")
-
-
-@pytest.mark.parametrize("points", ["points3D.txt", "points3D.ply"])
-def test_models_of_networks(tmp_path, points):
-    colmap_text(tmp_path, points)
-    scene = load_scene(tmp_path)
-    check_dots(scene)
-    assert len(scene.points) >= 3
-    np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
     [

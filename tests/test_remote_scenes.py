@@ -6,7 +6,7 @@ import re
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import jax
@@ -161,19 +161,6 @@ def test_batches_are_of_the_same_bits_wherever_photographs_are(tmp_path, monkeyp
         jax.tree.map(np.testing.assert_array_equal, one, other)
     for each in stores:
         each.close()
-
-
-def test_photographs_are_fetched_ahead_of_the_step(monkeypatch, fox, store):
-    """Each batch that is prepared ahead has a thread, even on one core."""
-    monkeypatch.setenv("A2TG_NUM_THREADS", "1")
-    views = load().train
-    store.seconds = 0.05
-    photographs = PhotoStore(views, BatchOrder(views, 1, 0), 40, room=0)
-    photographs.batch(1)
-    assert sum(thread.name.startswith("photographs") for thread in threading.enumerate()) > 4
-    done, pending = wait(photographs._ahead._batches.values(), timeout=10)
-    assert len(done) > 8 and not pending
-    photographs.close()
 
 
 def test_interrupted_reads_are_repeated(fox, store):
