@@ -1,6 +1,6 @@
 """Decoding of photographs that may be broken or malicious.
 
-Only formats of photographs are tried, because Pillow knows others, one of which starts a program. HEIC needs its own
+Only formats of photographs are tried, because Pillow has others, one of which starts a program. HEIC needs its own
 library. Size and bits are checked before decoding. Pixels are uint8, [H, W, 3] or, with straight alpha, [H, W, 4].
 """
 

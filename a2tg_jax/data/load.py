@@ -69,7 +69,7 @@ class SceneSource:
         return scene_name(folder if is_url(folder) else Path(folder))
 
     def load(self, room: int | None = None, *, is_divided: bool = False) -> Scene:
-        """Return the scene, which may be the built-in one. Arguments and errors are those of `load_scene`."""
+        """Return the scene, which may be the built-in one. Same arguments and errors as `load_scene`."""
         return _load(self, room, is_divided, is_built_in=self.path == SYNTHETIC)
 
 

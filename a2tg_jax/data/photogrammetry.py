@@ -1,6 +1,6 @@
 """Cameras of photogrammetry programs, read as frames of `transforms.json`.
 
-Metashape writes one XML file (File > Export > Export Cameras). Its lenses are those of the manual's appendix on camera
+Metashape writes one XML file (File > Export > Export Cameras). Its lenses follow the manual's appendix on camera
 models: a projection onto the plane z = 1 (frame), or onto radii θ (equidistant fisheye) or 2·sin(θ/2) (equisolid
 fisheye) for a ray at the angle θ, then Brown's distortion. RealityScan (RealityCapture) writes an XMP file beside each
 photograph.
@@ -91,7 +91,7 @@ def _metashape_frames(file: Path) -> Frames:
 def _posed_cameras(file: Path) -> list[tuple[str, Element, np.ndarray]]:
     """Return label, sensor and pose [4, 4] in the world of each camera that has a pose and is switched on.
 
-    A camera without a pose of its own in a rig has the pose of its master and the offset of its sensor. Warnings count
+    A camera without a pose in a rig has the pose of its master and the offset of its sensor. Warnings count
     those, and cameras that are not used.
     """
     found: list[tuple[str, Element, np.ndarray]] = []
@@ -188,7 +188,7 @@ def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
     higher = HIGHER_TERMS[projection]
     if any(map(read, higher)) or abs(read("b2")) * height / max(read("f"), 1.0) > LARGEST_SKEW:
         told = ", ".join(higher)
-        raise ValueError(f"{what}: its {projection} lens has {told} or b2, which are not known here; {UNDISTORTED}")
+        raise ValueError(f"{what}: its {projection} lens has {told} or b2, which are not supported; {UNDISTORTED}")
     lens: dict[str, Any] = {
         "w": int(width), "h": int(height), "fl_x": read("f") + read("b1"), "fl_y": read("f"),
         "cx": width / 2 + read("cx"), "cy": height / 2 + read("cy"),
@@ -263,7 +263,7 @@ def _xcr_lens(values: dict[str, str], width: int, height: int, file: Path) -> di
     has_brown = model.startswith("brown") or not any((k1, k2, k3))
     if k4 or t1 or t2 or not has_brown or abs(read("Skew", "0")) * longer > LARGEST_SKEW:
         raise ValueError(
-            f"{file}: has the distortion model {shortened(model)} with skew, k4, t1 or t2, which are not known here; "
+            f"{file}: has the distortion model {shortened(model)} with skew, k4, t1 or t2, which are not supported; "
             f"align with Brown3, or {UNDISTORTED}"
         )
     focal = read("FocalLength35mm", "0") / FILM_WIDTH * longer

@@ -224,36 +224,32 @@ def light(colored: list[tuple[ParametricSurface, np.ndarray]], rng: np.random.Ge
 
     Colours are [rows, columns, 3] float32 in [0, 1]; the generator turns the patterns of rays.
     """
-    shapes = [shape for shape, _ in colored]
-    return [Surface(shape, _shaded(shape, colors, shapes, rng)) for shape, colors in colored]
-
-
-def _shaded(
-    shape: ParametricSurface, colors: np.ndarray, shapes: list[ParametricSurface], rng: np.random.Generator
-) -> np.ndarray:
-    """Return the image [rows, columns, 3] uint8 of one shape: its colours times its light, clipped at 1."""
-    rows, columns = (max(2, -(-size // TEXELS_PER_SAMPLE)) for size in colors.shape[:2])
-    u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
-    points, normals = (x.astype(np.float32) for x in shape.place(u.ravel(), v.ravel()))
-    points = points + np.float32(1e-3) * normals
-    # Of the sky, the share of the cosine-weighted hemisphere with nothing nearer than SKY_REACH.
-    sky = np.zeros(points.shape[1], np.float32)
-    for offset in _unit_vectors(rng, NUM_SKY_RAYS):
-        directions = normals + np.float32(0.999) * offset[:, None]
-        directions /= np.linalg.norm(directions, axis=0)
-        sky += nearest_hits(shapes, points, directions)[0] > SKY_REACH
-    # Of the lamp, the cosine of its direction times its visible share.
-    lamp = np.zeros(points.shape[1], np.float32)
-    for offset in _unit_vectors(rng, NUM_LAMP_RAYS):
-        towards = LAMP + np.float32(LAMP_RADIUS) * offset[:, None] - points
-        cosine = (towards * normals).sum(axis=0) / np.linalg.norm(towards, axis=0)
-        is_free = nearest_hits(shapes, points, towards)[0] > 1
-        lamp += np.maximum(cosine, 0) * is_free
-    coarse = SKY_LIGHT * (sky / NUM_SKY_RAYS)
-    coarse = coarse + LAMP_LIGHT * (lamp / NUM_LAMP_RAYS)
-    factors = colors.shape[0] / rows, colors.shape[1] / columns
-    fine = zoom(coarse.reshape(rows, columns), factors, order=1, grid_mode=True, mode="nearest")
-    return np.rint(255 * np.clip(colors * fine[..., None], 0, 1)).astype(np.uint8)
+    shapes, surfaces = [shape for shape, _ in colored], []
+    for shape, colors in colored:
+        rows, columns = (max(2, -(-size // TEXELS_PER_SAMPLE)) for size in colors.shape[:2])
+        u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+        points, normals = (x.astype(np.float32) for x in shape.place(u.ravel(), v.ravel()))
+        points = points + np.float32(1e-3) * normals
+        # Of the sky, the share of the cosine-weighted hemisphere with nothing nearer than SKY_REACH.
+        sky = np.zeros(points.shape[1], np.float32)
+        for offset in _unit_vectors(rng, NUM_SKY_RAYS):
+            directions = normals + np.float32(0.999) * offset[:, None]
+            directions /= np.linalg.norm(directions, axis=0)
+            sky += nearest_hits(shapes, points, directions)[0] > SKY_REACH
+        # Of the lamp, the cosine of its direction times its visible share.
+        lamp = np.zeros(points.shape[1], np.float32)
+        for offset in _unit_vectors(rng, NUM_LAMP_RAYS):
+            towards = LAMP + np.float32(LAMP_RADIUS) * offset[:, None] - points
+            cosine = (towards * normals).sum(axis=0) / np.linalg.norm(towards, axis=0)
+            is_free = nearest_hits(shapes, points, towards)[0] > 1
+            lamp += np.maximum(cosine, 0) * is_free
+        coarse = SKY_LIGHT * (sky / NUM_SKY_RAYS)
+        coarse = coarse + LAMP_LIGHT * (lamp / NUM_LAMP_RAYS)
+        factors = colors.shape[0] / rows, colors.shape[1] / columns
+        fine = zoom(coarse.reshape(rows, columns), factors, order=1, grid_mode=True, mode="nearest")
+        image = np.rint(255 * np.clip(colors * fine[..., None], 0, 1)).astype(np.uint8)
+        surfaces.append(Surface(shape, image))
+    return surfaces
 
 
 def _unit_vectors(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -222,7 +222,7 @@ def view_image(view: View, background: Sequence[float] | np.ndarray | None = Non
         if view.has_alpha:
             warnings.warn(
                 "the image is transparent and was put on black: say view_image(view, model.background) to compare it "
-                "with a model, or give the background that you want",
+                "with a model, or give another background",
                 stacklevel=2,
             )
         background = BLACK

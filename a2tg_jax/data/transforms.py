@@ -216,7 +216,7 @@ def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int])
         return float(value)
 
     def side(key: str, default: int) -> int:
-        side = number(key, default) if frame.get(key) else default  # 0 and null stand for the image's own.
+        side = number(key, default) if frame.get(key) else default  # 0 and null mean the image's.
         if not 1 <= side <= LONGEST_SIDE:  # False for NaN.
             raise ValueError(f"{what}: {key} must be in 1..{LONGEST_SIDE} pixels; got {side:g}")
         return int(side)
@@ -231,7 +231,7 @@ def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int])
             lengths[axis] = size / (2 * np.tan(angle / 2)) if 0 < angle < np.pi else 0.0
     if not lengths or not min(lengths.values()) > 0:
         raise ValueError(f"{what}: has no focal length; give fl_x above 0, or camera_angle_x between 0 and pi")
-    fx, fy = lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))  # One stands for both.
+    fx, fy = lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))
     # nerfstudio's parameters of distortion have COLMAP's names and meaning.
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
     terms = {key: number(key, 0.0) for key in PRISM_KEYS}
