@@ -15,9 +15,9 @@ import contextlib
 import math
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -27,7 +27,7 @@ from a2tg_jax.data.decoding import MAX_PIXELS, picture_size, read_grey, read_pix
 from a2tg_jax.data.division import Division, divided
 from a2tg_jax.data.image_files import find_image, map_in_threads, on_disk
 from a2tg_jax.data.lenses import Lens, LensUse, resize_pixels
-from a2tg_jax.data.photo_store import DepthMap, Mask, Picture, Shelf, check_left
+from a2tg_jax.data.photo_store import DepthMap, Mask, Shelf, check_left
 from a2tg_jax.host.npz import read_npy
 from a2tg_jax.host.regular_files import is_folder
 from a2tg_jax.host.remote_files import Unreachable, is_remote
@@ -85,26 +85,6 @@ class _Found(NamedTuple):
     mask: tuple[Path, int] | None
     depths: Path | None
 
-    def lens_of(self, stored: tuple[int, int], downscale: int) -> Lens:
-        """Return the lens of the photograph, whose file is (width, height), in a scene that is downscaled."""
-        if isinstance(self.photo.lens, Lens):
-            return self.photo.lens
-        full = stored
-        if self.downscale < downscale:  # The file is a smaller copy, and the full image may be missing.
-            full = downscale * stored[0], downscale * stored[1]
-            # Of stores, the size would be another request for each photograph.
-            if not is_remote(self.file) and (original := find_image(*self.photo.image)) is not None:
-                full = picture_size(original)
-        return self.photo.lens(full)
-
-    def check_size(self, size: tuple[int, int], stored: tuple[int, int]) -> None:
-        """Raise ValueError unless the file has the size (width, height) that another process has read."""
-        if size != stored:
-            raise ValueError(
-                f"{self.file}: is {size[0]}x{size[1]}, but {stored[0]}x{stored[1]} where another process reads it; "
-                "give all processes the same photographs"
-            )
-
 
 class _Facts(NamedTuple):
     """Facts about a decoded photograph, which a process sends to the others."""
@@ -148,60 +128,62 @@ def read_photos(
     facts = divided(options.division, told, own_share, "photographs", place)
     # All of them are read here if there is one process.
     others = [number for number in range(len(found)) if number not in read]
+    fitting = options.shelf.fitting([math.prod(facts[number].shape) for number in others])
 
     def of_another(number: int, fits: bool) -> Shot:
-        if not fits:
-            return _read_later(found[number], options, facts[number])
-        again, shot = _read(found[number], options)
-        found[number].check_size(again.stored, facts[number].stored)
+        own, stored = found[number], facts[number].stored
+        again, shot = _read(own, options, None if fits else facts[number])
+        if fits or not is_remote(own.file):
+            size = again.stored if fits else picture_size(own.file)
+            if size != stored:
+                raise ValueError(
+                    f"{own.file}: is {size[0]}x{size[1]}, but {stored[0]}x{stored[1]} where another process reads it; "
+                    "give all processes the same photographs"
+                )
         return shot
 
-    fitting = options.shelf.fitting([math.prod(facts[number].shape) for number in others])
     read.update(zip(others, map_in_threads(of_another, others, fitting, place=place), strict=True))
     shots = [read[number] for number in range(len(found))]
     _check_masks(shots, str(place), {photo.below_images[0] for photo in photos if photo.below_images})
     return shots
 
 
-def _read(found: _Found, options: Options) -> tuple[_Facts, Shot]:
-    """Read a photograph, and undistort and downscale it."""
-    photograph = read_pixels(found.file)
-    stored = photograph.shape[1], photograph.shape[0]
-    lens = found.lens_of(stored, options.downscale)
-    _check_aspect(found.file, stored, lens.size)
-    with _named(found.photo):
-        pixels, K = lens.view_pixels(photograph, found.downscale)
-        rays = lens.rays(*pixels.shape[1::-1])
-    is_stored, size = pixels is photograph, (pixels.shape[1], pixels.shape[0])
-    mask = None if found.mask is None else _read_mask(*found.mask, lens, stored, size)
-    picture = options.shelf.keep(pixels, found.file, None if is_stored else _processing(found, lens))
-    facts = _Facts(stored, pixels.shape, is_stored, mask)
-    return facts, _shot(found, lens, facts, K, rays, picture)
+def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple[_Facts, Shot]:
+    """Read a photograph, and undistort and downscale it.
 
+    One whose facts are known from another process is read when it is first needed.
+    """
+    photo, file, downscale, _, depths = found
+    photograph: Any = read_pixels(file) if facts is None else None
+    stored = (photograph.shape[1], photograph.shape[0]) if facts is None else facts.stored
+    lens = photo.lens
+    if not isinstance(lens, Lens):
+        full = stored
+        if downscale < options.downscale:  # The file is a smaller copy, and the full image may be missing.
+            full = options.downscale * stored[0], options.downscale * stored[1]
+            # Of stores, the size would be another request for each photograph.
+            if not is_remote(file) and (original := find_image(*photo.image)) is not None:
+                full = picture_size(original)
+        lens = lens(full)
+    _check_aspect(file, stored, lens.size)
 
-def _read_later(found: _Found, options: Options, facts: _Facts) -> Shot:
-    """Return a photograph that another process has read. Its own file is read when it is first needed."""
-    if not is_remote(found.file):
-        found.check_size(picture_size(found.file), facts.stored)
-    lens = found.lens_of(facts.stored, options.downscale)
-    with _named(found.photo):
-        size, K = lens.view_of(facts.stored, found.downscale)
+    def view(pixels: np.ndarray) -> np.ndarray:
+        return lens.view_pixels(pixels, downscale)[0]
+
+    try:
+        size, K = lens.view_of(stored, downscale)
         rays = lens.rays(*size)
-    processing = None if facts.is_stored else _processing(found, lens)
-    picture = options.shelf.read_later(facts.shape, found.file, processing)
-    return _shot(found, lens, facts, K, rays, picture)
-
-
-def _processing(found: _Found, lens: Lens) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function from the file's pixels to the view's."""
-    return lambda pixels: lens.view_pixels(pixels, found.downscale)[0]
-
-
-def _shot(found: _Found, lens: Lens, facts: _Facts, K: np.ndarray, rays: np.ndarray | None, picture: Picture) -> Shot:
-    photo, depth = found.photo, None
-    if found.depths is not None:
-        depth = _depth_map(found.depths, lens, facts.stored, picture.size[::-1])
-    return Shot(photo.name, photo.viewmat, K, picture, facts.mask, rays, depth, photo.panorama)
+    except ValueError as error:
+        raise ValueError(f"{photo.what}: its camera model {error}") from None
+    if facts is None:
+        pixels = view(photograph)
+        mask = None if found.mask is None else _read_mask(*found.mask, lens, stored, size)
+        facts = _Facts(stored, pixels.shape, pixels is photograph, mask)
+        picture = options.shelf.keep(pixels, file, None if facts.is_stored else view)
+    else:
+        picture = options.shelf.read_later(facts.shape, file, None if facts.is_stored else view)
+    depth = None if depths is None else _depth_map(depths, lens, stored, size)
+    return facts, Shot(photo.name, photo.viewmat, K, picture, facts.mask, rays, depth, photo.panorama)
 
 
 def _find_files(
@@ -312,15 +294,6 @@ def _check_aspect(path: Path, stored: tuple[int, int], camera: tuple[int, int]) 
             f"{path}: is {image_width}x{image_height}, but its camera is {width}x{height}, of another aspect; "
             f"{advice}use the image that the camera was estimated from"
         )
-
-
-@contextlib.contextmanager
-def _named(photo: Photo) -> Iterator[None]:
-    """Name the photograph in errors of its lens."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{photo.what}: its camera model {error}") from None
 
 
 def _check_masks(shots: Sequence[Shot], source: str, images: set[Path]) -> None:
