@@ -28,11 +28,12 @@ KINDS = {
     "undistorted": {"k1": 0.05},
     "with opacity": {"alpha": True},
 }
+pytestmark = pytest.mark.filterwarnings("ignore:.*random points")
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """A folder of its own for what goes to disk."""
+    """A separate folder for what goes to disk."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache" / "a2tg-jax"
 
@@ -44,10 +45,9 @@ def built_in():
 
 def write_scene(folder, *, alpha=False, **intrinsics):
     """The built-in scene as files; returns the folder."""
-    made = built_in()
     frames = []
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    for index, view in enumerate((*made.train, *made.test)):
+    for index, view in enumerate((*built_in().train, *built_in().test)):
         pixels = view.image
         if alpha:  # one picture of them is opaque
             opacity = np.full((*view.picture.size, 1), 255 if index == 1 else 100, np.uint8)
@@ -55,10 +55,22 @@ def write_scene(folder, *, alpha=False, **intrinsics):
         Image.fromarray(pixels).save(folder / "images" / view.name)
         pose = np.linalg.inv(np.asarray(view.camera.viewmat, np.float64)) @ np.diag([1.0, -1.0, -1.0, 1.0])
         frames.append({"file_path": f"images/{view.name}", "transform_matrix": pose.tolist()})
-    K = np.asarray(made.train[0].camera.K, float)
-    told = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], **intrinsics}
-    (folder / "transforms.json").write_text(json.dumps({**told, "frames": frames}))
+    K = np.asarray(built_in().train[0].camera.K, float)
+    values = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], **intrinsics}
+    (folder / "transforms.json").write_text(json.dumps({**values, "frames": frames}))
     return folder
+
+
+def of_kind(folder, kind, *rooms):
+    """A scene of a kind, loaded for each memory limit."""
+    changes = dict(KINDS[kind])
+    downscale = changes.pop("downscale", 1)
+    write_scene(folder, **changes)
+    return [load_scene(folder, room=room, downscale=downscale) for room in rooms]
+
+
+def views_of(scene):
+    return (*scene.train, *scene.test)
 
 
 def num_readers():
@@ -66,20 +78,12 @@ def num_readers():
     return sum(thread.name.startswith("photographs") for thread in threading.enumerate())
 
 
-def load(folder, room=None, *, downscale=1):
-    with pytest.warns(UserWarning, match="random points"):
-        return load_scene(folder, room=room, downscale=downscale)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_batches_are_of_the_same_bits_wherever_photographs_are(tmp_path, kind, cache):
-    changes = dict(KINDS[kind])
-    downscale = changes.pop("downscale", 1)
-    folder = write_scene(tmp_path / "scene", **changes)
-    held, on_disk = load(folder, downscale=downscale), load(folder, 0, downscale=downscale)
+    held, on_disk = of_kind(tmp_path / "scene", kind, None, 0)
     assert all(view.picture.is_held for view in held.train)
-    assert not any(view.picture.is_held for view in (*on_disk.train, *on_disk.test))
-    for one, other in zip((*held.train, *held.test), (*on_disk.train, *on_disk.test), strict=True):
+    assert not any(view.picture.is_held for view in views_of(on_disk))
+    for one, other in zip(views_of(held), views_of(on_disk), strict=True):
         assert one.has_alpha == other.has_alpha and one.picture.shape == other.picture.shape
         np.testing.assert_array_equal(one.picture.read(), other.picture.read())
     order = BatchOrder(held.train, 2, 0)
@@ -93,49 +97,47 @@ def test_batches_are_of_the_same_bits_wherever_photographs_are(tmp_path, kind, c
 
 
 def test_training_gives_the_same_bits_wherever_photographs_are(tmp_path, monkeypatch):
-    """Beside photographs that are held, but brought to the device batch by batch. The threads end with training."""
-    folder = write_scene(tmp_path / "scene", k1=0.05)
-    monkeypatch.setattr(loop, "PhotoStore", lambda *told: PhotoStore(*told, room=0))
+    """Compared with photographs in memory, brought to the device batch by batch. The threads end with training."""
+    monkeypatch.setattr(loop, "PhotoStore", lambda *given: PhotoStore(*given, room=0))
     models, seen = [], []
-    for room in (None, 0):
+    for scene in of_kind(tmp_path / "scene", "undistorted", None, 0):
         keep = lambda _: seen.append(num_readers())  # noqa: E731
-        models.append(fit(load(folder, room), SYSTEM, on_checkpoint=keep, progress=False).model)
+        models.append(fit(scene, SYSTEM, on_checkpoint=keep, progress=False).model)
         assert seen.pop() > 0 == num_readers()
     assert_same(*(model.gaussians for model in models))
 
 
 def test_memory_takes_as_many_photographs_as_it_has_room_for(tmp_path):
-    folder = write_scene(tmp_path / "scene")
-    scene = load(folder, 2 * 40 * 32 * 3 + 1)
-    assert sum(view.picture.is_held for view in (*scene.train, *scene.test)) == 2
+    scene = load_scene(write_scene(tmp_path / "scene"), room=2 * 40 * 32 * 3 + 1)
+    assert sum(view.picture.is_held for view in views_of(scene)) == 2
     store = PhotoStore(scene.train, BatchOrder(scene.train, 1, 0), 12)
     assert not store.is_resident
     store.close()
 
 
 @pytest.mark.parametrize("room", [None, 0])
-def test_photographs_stay_on_no_device_if_one_process_lacks_the_room(tmp_path, monkeypatch, room):
+def test_photographs_stay_on_no_device_if_one_process_lacks_the_room(monkeypatch, room):
     """Three cases: another process has no room, this one has none, both have some."""
-    scene, told = load(write_scene(tmp_path / "scene")), []
+    views, given = built_in().train, []
     for other in (False, True):
-        monkeypatch.setattr(batches, "asked_by_any", lambda _, own, other=other: told.append(own) or own or other)
-        store = PhotoStore(scene.train, BatchOrder(scene.train, 1, 0), 12, room=room)
+        monkeypatch.setattr(batches, "asked_by_any", lambda _, own, other=other: given.append(own) or own or other)
+        store = PhotoStore(views, BatchOrder(views, 1, 0), 12, room=room)
         store.close()
         assert store.is_resident == (room is None and not other)
-    assert told == [room == 0] * 2
+    assert given == [room == 0] * 2
 
 
 def test_all_batches_have_opacities_and_masks_where_one_has(tmp_path):
-    views = list(load(write_scene(tmp_path / "scene", alpha=True), 0).train)
+    views = list(of_kind(tmp_path / "scene", "with opacity", 0)[0].train)
     views[0] = dataclasses.replace(views[0], mask=np.eye(32, 40, dtype=bool))
     store = PhotoStore(tuple(views), BatchOrder(tuple(views), 1, 0), len(views), room=0)
-    batches = [store.batch(iteration)[0] for iteration in range(1, len(views) + 1)]
+    found = [store.batch(iteration)[0] for iteration in range(1, len(views) + 1)]
     store.close()
-    assert sum(int(batch.masks.sum()) == 32 for batch in batches) == 1
-    assert sum(bool((batch.alphas == 255).all()) for batch in batches) == 1
+    assert sum(int(batch.masks.sum()) == 32 for batch in found) == 1
+    assert sum(bool((batch.alphas == 255).all()) for batch in found) == 1
 
 
-def test_photographs_that_other_processes_draw_are_not_read(tmp_path, monkeypatch):
+def test_photographs_that_other_processes_draw_are_not_read(monkeypatch):
     """Neither their masks and depth maps; their cameras come along."""
     read = []
 
@@ -144,7 +146,7 @@ def test_photographs_that_other_processes_draw_are_not_read(tmp_path, monkeypatc
         picture, depth = Picture((32, 40, 4), load), np.ones((32, 40), np.float32)
         return dataclasses.replace(view, picture=picture, mask=np.ones((32, 40), bool), depth=depth)
 
-    views = tuple(counted(view) for view in built_in().train)
+    views = tuple(map(counted, built_in().train))
     order = BatchOrder(views, 3, 0)
     monkeypatch.setattr(batches, "are_drawn_here", lambda *_: [False, True, False])
     store = PhotoStore(views, order, 1, extras=batches.Extras(depths=True), room=0)
@@ -156,48 +158,42 @@ def test_photographs_that_other_processes_draw_are_not_read(tmp_path, monkeypatc
     assert np.asarray(batch.Ks).all(axis=0)[0, 0] and len(batch.viewmats) == 3
 
 
-@pytest.mark.parametrize("change", ["gone", "another", "cut off"])
+CHANGES = {
+    "gone": lambda file: file.unlink(),
+    "another": lambda file: Image.fromarray(np.zeros((32, 40, 3), np.uint8)).save(file),
+    "cut off": lambda file: file.write_bytes(file.read_bytes()[:200]),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_a_photograph_that_does_not_stay_is_named(tmp_path, change):
     folder = write_scene(tmp_path / "scene")
-    scene = load(folder, 0)
-    victim = folder / "images" / scene.train[2].name.rpartition("/")[2]
-    if change == "gone":
-        victim.unlink()
-    elif change == "another":
-        Image.fromarray(np.zeros((32, 40, 3), np.uint8)).save(victim)
-    else:
-        victim.write_bytes(victim.read_bytes()[:200])
+    scene = load_scene(folder, room=0)
+    victim = folder / scene.train[2].name
+    change(victim)
     with pytest.raises(ValueError, match=f"{victim.name}: (cannot be read|has changed since)"):
         fit(scene, SYSTEM, progress=False)
     assert num_readers() == 0
 
 
-def test_batches_are_made_in_order_once_and_not_too_many():
+def test_batches_are_made_ahead_in_order_and_errors_stay_with_theirs():
     made = []
 
     def load(indices):
         made.append(indices[0])
+        if indices == (7,):
+            raise ValueError("photograph 7 is gone")
         return indices
 
     ahead = Ahead(load, 2)
     for iteration in (1, 2, 3, 4, 5):
         wanted = {key: (key,) for key in range(iteration, min(iteration + 2, 5) + 1)}
         assert ahead.first(wanted) == (iteration,)
-    ahead.close()
-    assert sorted(made) == [1, 2, 3, 4, 5]
-
-
-def test_an_error_reaches_who_waits_for_that_batch_alone():
-    def load(indices):
-        if indices == (2,):
-            raise ValueError("photograph 2 is gone")
-        return indices
-
-    ahead = Ahead(load, 2)
-    assert ahead.first({1: (1,), 2: (2,), 3: (3,)}) == (1,)
-    with pytest.raises(ValueError, match="photograph 2 is gone"):
-        ahead.first({2: (2,), 3: (3,)})
-    assert ahead.first({3: (3,)}) == (3,)
+    assert sorted(made) == [1, 2, 3, 4, 5], "each once"
+    assert ahead.first({6: (6,), 7: (7,), 8: (8,)}) == (6,)
+    with pytest.raises(ValueError, match="photograph 7 is gone"):
+        ahead.first({7: (7,), 8: (8,)})
+    assert ahead.first({8: (8,)}) == (8,)
     ahead.close()
 
 
@@ -221,7 +217,7 @@ def test_shelves_are_filled_and_read_by_many_threads():
         np.testing.assert_array_equal(picture.read(), images[index])
 
 
-def test_a_full_disk_is_said_with_what_to_do(monkeypatch):
+def test_a_full_disk(monkeypatch):
     def full(**_):
         raise OSError(28, "No space left on device")
 
@@ -233,12 +229,10 @@ def test_a_full_disk_is_said_with_what_to_do(monkeypatch):
 @pytest.mark.parametrize(("kind", "room"), [*((kind, 0) for kind in KINDS), ("undistorted", None)])
 def test_a_scene_is_pickled_and_copied(tmp_path, kind, room):
     """Photographs that are read from their files as they are stay there; all others travel with the pickle."""
-    told = dict(KINDS[kind])
-    downscale = told.pop("downscale", 1)
-    scene = load(write_scene(tmp_path / "scene", **told), room, downscale=downscale)
+    (scene,) = of_kind(tmp_path / "scene", kind, room)
     scene = dataclasses.replace(scene, test=(dataclasses.replace(scene.test[0], depth=np.full((2, 3), 0.5)),))
     again = pickle.loads(pickle.dumps(scene))
-    for before, after in zip((*scene.train, *scene.test), (*again.train, *again.test), strict=True):
+    for before, after in zip(views_of(scene), views_of(again), strict=True):
         np.testing.assert_array_equal(after.picture.read(), before.picture.read())
         assert_same(after.camera, before.camera)
     np.testing.assert_array_equal(again.test[0].depth.read(), scene.test[0].depth.read())

@@ -3,7 +3,7 @@
 import os
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import TypeVar
@@ -29,19 +29,8 @@ def find_image(folder: Path, name: str) -> Path | None:
       ValueError: if the name leads out of the folder.
     """
     name = inside(folder, name)
-    candidates = (folder / name, folder / f"{name}.png", *_with_suffixes(folder, name))
-    return next(filter(is_regular, candidates), None) or on_disk(folder, name)
-
-
-def named_image(folder: Path, name: str) -> Path | None:
-    """Return the image of a name, with or without its suffix, or None."""
-    own = [folder / name] if Path(name).suffix.lower() in PHOTO_SUFFIXES else []
-    found = next((file for file in (*own, *_with_suffixes(folder, name)) if name and is_regular(file)), None)
-    return found or (on_disk(folder, name) if own else None)
-
-
-def _with_suffixes(folder: Path, name: str) -> Iterator[Path]:
-    return (folder / f"{name}{each}" for suffix in PHOTO_SUFFIXES for each in (suffix, suffix.upper()))
+    suffixes = ["", ".png", *(each for suffix in PHOTO_SUFFIXES for each in (suffix, suffix.upper()))]
+    return next(filter(is_regular, (folder / (name + suffix) for suffix in suffixes)), None) or on_disk(folder, name)
 
 
 def inside(folder: Path, name: str) -> str:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.decoding import picture_size, read_grey, read_pixels
-from a2tg_jax.data.image_files import PHOTO_SUFFIXES, map_in_threads, named_image
+from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, map_in_threads
 from a2tg_jax.data.transforms import Frames, check_images
 from a2tg_jax.host.json_text import MOST_BYTES, read_object
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -52,7 +52,7 @@ def _polycam_frames(cameras: Path, images: Path) -> Frames:
     """Return the frames of Polycam's raw data: a JSON file, and perhaps a depth map, for each image."""
     frames, lacking = [], []
     for file in sorted(cameras.glob("*.json")):
-        image = named_image(images, file.stem)
+        image = find_image(images, file.stem)
         if image is None:
             lacking.append(file.name)
             continue

@@ -19,7 +19,7 @@ import numpy as np
 
 from a2tg_jax.data.assembly import PointCloud, rigid_viewmat
 from a2tg_jax.data.decoding import picture_size
-from a2tg_jax.data.image_files import PHOTO_SUFFIXES, inside, named_image, warn_of_unposed
+from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, warn_of_unposed
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.transforms import Frames, check_images
 from a2tg_jax.host.json_text import MOST_BYTES
@@ -75,9 +75,8 @@ def _metashape_frames(file: Path) -> Frames:
             below[image.stem].add(image)
     for label, sensor, pose in _posed_cameras(file):
         name = re.split(r"[/\\]", label)[-1]  # A label is a path of any machine, or a name.
-        inside(folder, name)
         unique = next(iter(below[name])) if len(below[name]) == 1 else None
-        found = named_image(images, name) or named_image(folder, name) or unique
+        found = find_image(images, name) or find_image(folder, name) or unique
         if found is None:
             lacking.append(label)
             continue
@@ -230,7 +229,7 @@ def _realityscan_frames(path: Path, files: list[Path]) -> Frames:
     """Return the frames of XMP files, each beside its image. The only PLY file in the folder holds the points."""
     frames, lacking = [], []
     for file in files:
-        image = named_image(file.parent, file.stem)
+        image = find_image(file.parent, file.stem)
         if image is None:
             lacking.append(file.name)
             continue
