@@ -20,7 +20,7 @@ from test_data_transforms import (
 )
 
 from a2tg_jax.data import load_scene
-from a2tg_jax.data.image_files import inside, on_disk
+from a2tg_jax.data.image_files import find_image, inside, on_disk
 
 KEPT = 5
 """Rows at the top that masks exclude."""
@@ -99,12 +99,26 @@ def test_names_inside(tmp_path, name, expected):
 
 @pytest.mark.parametrize(
     "name",
-    ["..\\x.png", "a\\..\\..\\x.png", "C:\\x.png", "C:/x.png", "\\\\server\\x\\y.png", "\\x.png", "{folder}/../x.png"],
+    [
+        "../x.png",
+        "/etc/x.png",
+        "a/../../x.png",
+        "a/../x.png",
+        "a\0.png",
+        "x" * 5000,
+        "..\\x.png",
+        "a\\..\\..\\x.png",
+        "C:\\x.png",
+        "C:/x.png",
+        "\\\\server\\x\\y.png",
+        "\\x.png",
+        "{folder}/../x.png",
+    ],
 )
 def test_names_that_lead_out(tmp_path, name):
     (tmp_path / "x.png").touch()
-    with pytest.raises(ValueError, match="leads out of the scene's folder"):
-        inside(tmp_path / "scene", name.format(folder=tmp_path / "scene"))
+    with pytest.raises(ValueError, match=r"leads out of the scene's folder|too long a name \(5000 letters\)"):
+        find_image(tmp_path / "scene", name.format(folder=tmp_path / "scene"))
 
 
 @pytest.mark.skipif(os.sep == "\\", reason="separates folders")
