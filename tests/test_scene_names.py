@@ -97,24 +97,13 @@ def test_names_inside(tmp_path, name, expected):
     assert inside(tmp_path / "link", name.format(folder=tmp_path / "scene", link=tmp_path / "link")) == expected
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../x.png",
-        "/etc/x.png",
-        "a/../../x.png",
-        "a/../x.png",
-        "a\0.png",
-        "x" * 5000,
-        "..\\x.png",
-        "a\\..\\..\\x.png",
-        "C:\\x.png",
-        "C:/x.png",
-        "\\\\server\\x\\y.png",
-        "\\x.png",
-        "{folder}/../x.png",
-    ],
-)
+LEADING_OUT = [
+    "../x.png", "/etc/x.png", "a/../../x.png", "a/../x.png", "a\0.png", "x" * 5000, "..\\x.png", "a\\..\\..\\x.png",
+    "C:\\x.png", "C:/x.png", "\\\\server\\x\\y.png", "\\x.png", "{folder}/../x.png",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LEADING_OUT)
 def test_names_that_lead_out(tmp_path, name):
     (tmp_path / "x.png").touch()
     with pytest.raises(ValueError, match=r"leads out of the scene's folder|too long a name \(5000 letters\)"):

@@ -64,7 +64,6 @@ def divided(
     division: Division | None,
     names: Sequence[str],
     work: Callable[[int], Result],
-    what: str,
     place: Path | None = None,
 ) -> list[Result]:
     """Return the results for all items, each made by one process, in threads.
@@ -73,12 +72,11 @@ def divided(
       division: processes that call this together; None: one.
       names: names of the items, the same in all processes.
       work: function of an item's number. If it fails, all processes raise the error of the first such item.
-      what: plural noun for the items.
       place: path that the work reads from, as in `map_in_threads`.
     """
     if division is None:
         return map_in_threads(work, range(len(names)), place=place)
-    division.check_same(names, what)
+    division.check_same(names, "photographs")
 
     def attempt(number: int) -> Any:
         try:
@@ -87,7 +85,7 @@ def divided(
             return _plain(error)
 
     own = map_in_threads(attempt, range(division.index, len(names), division.count), place=place)
-    parts = division.exchange(f"results of {what}", own)
+    parts = division.exchange("photographs read", own)
     return _without_errors([parts[n % division.count][n // division.count] for n in range(len(names))])
 
 

@@ -12,14 +12,14 @@ from tyro.conf import Positional, arg
 from a2tg_jax.core.checks import check_literal
 from a2tg_jax.data.assembly import check_test_every, with_validation_views
 from a2tg_jax.data.colmap import find_models, load_colmap
-from a2tg_jax.data.division import among_processes, divided, sharing_errors
+from a2tg_jax.data.division import among_processes, sharing_errors
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.phone_captures import polycam, record3d
 from a2tg_jax.data.photo_folder import check_no_video, holds_photos, told_of_capture
-from a2tg_jax.data.photo_reading import Options
-from a2tg_jax.data.photo_store import Mask, Shelf, check_left
+from a2tg_jax.data.photo_reading import AlphaMeaning, Options
+from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.photogrammetry import metashape, realityscan
-from a2tg_jax.data.scene import Scene, View, scene_name, warn_of_lenses
+from a2tg_jax.data.scene import Scene, scene_name, warn_of_lenses
 from a2tg_jax.data.synthetic import synthetic_scene
 from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, Frames, load_blender, load_frames, load_transforms
 from a2tg_jax.host.regular_files import is_regular
@@ -30,8 +30,6 @@ SYNTHETIC = "synthetic"
 """Name of the built-in scene."""
 SYNTHETIC_SIZE = (208, 156)
 """Its width and height in runs, small enough to train in minutes on two cores."""
-AlphaMeaning = Literal["transparency", "mask"]
-"""Meaning of the alpha channel of photographs: transparency over a background, or a mask."""
 HeldOut = Literal["test", "validation"]
 OTHER_PROGRAMS: tuple[Callable[[Path], Callable[[], Frames] | None], ...] = (polycam, record3d, metashape, realityscan)
 """Functions that recognise a folder of another program, in order of preference, and return what reads its frames."""
@@ -130,9 +128,9 @@ def _load(source: SceneSource, room: int | None, is_divided: bool, is_built_in: 
     division = among_processes() if is_divided else None
     with sharing_errors(division):
         if division is not None:
-            options = [f"scene={SYNTHETIC if is_built_in else 'from files'}"]
-            options += [f"{name}={value}" for name, value in vars(source).items() if name != "path"]
-            division.check_same(options, "options of the scene")
+            given = [f"scene={SYNTHETIC if is_built_in else 'from files'}"]
+            given += [f"{name}={value}" for name, value in vars(source).items() if name != "path"]
+            division.check_same(given, "options of the scene")
         check_literal("alpha", source.alpha, AlphaMeaning)
         check_literal("lens", source.lens, LensUse)
         if source.downscale < 1 or source.downscale != int(source.downscale):
@@ -144,14 +142,13 @@ def _load(source: SceneSource, room: int | None, is_divided: bool, is_built_in: 
             sizes = dict(zip(("width", "height"), SYNTHETIC_SIZE, strict=True))
             scene = synthetic_scene(downscale=source.downscale, test_every=source.test_every, **sizes)
         else:
-            options_of_readers = Options(int(source.downscale), source.test_every, source.lens, Shelf(room), division)
+            shelf = Shelf(room)
             try:
-                scene = _read(located(source.path), options_of_readers)
+                options = Options(int(source.downscale), source.test_every, source.alpha, source.lens, shelf, division)
+                scene = _read(located(source.path), options)
             finally:
                 forget_rays()
             warn_of_lenses(scene)
-            if source.alpha == "mask":
-                scene = _alpha_as_mask(scene, str(source.path), options_of_readers)
         return with_validation_views(scene) if source.validation else scene
 
 
@@ -212,27 +209,3 @@ def _loader(path: Path) -> Callable[[Options], Scene] | None:
 def _frames(path: Path) -> Callable[[], Frames] | None:
     """Return the function that reads the frames of another program in a folder or a file, or None."""
     return next(filter(None, (recognise(path) for recognise in OTHER_PROGRAMS)), None)
-
-
-def _alpha_as_mask(scene: Scene, source: str, options: Options) -> Scene:
-    """Return the scene with the alpha of its photographs as masks, of which only opaque pixels count."""
-    views = [*scene.train, *scene.test]
-
-    def mask_of(number: int) -> Mask | None:
-        view = views[number]
-        if not view.has_alpha:
-            return view.mask
-        is_opaque = view.picture.read()[..., 3] == 255
-        mask = Mask.of(is_opaque if view.mask is None else is_opaque & view.mask.read())
-        check_left(mask, view.name, source)
-        return mask
-
-    def opaque(view: View, mask: Mask | None) -> View:
-        picture, (height, width) = view.picture, view.picture.size
-        if view.has_alpha:
-            picture = dataclasses.replace(picture, shape=(height, width, 3), read=lambda: view.picture.read()[..., :3])
-        return dataclasses.replace(view, picture=picture, mask=mask)
-
-    masks = divided(options.division, [view.name for view in views], mask_of, "views")
-    masked = [opaque(view, mask) for view, mask in zip(views, masks, strict=True)]
-    return dataclasses.replace(scene, train=tuple(masked[: len(scene.train)]), test=tuple(masked[len(scene.train) :]))

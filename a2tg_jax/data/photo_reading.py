@@ -17,7 +17,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -27,13 +27,17 @@ from a2tg_jax.data.decoding import MAX_PIXELS, picture_size, read_grey, read_pix
 from a2tg_jax.data.division import Division, divided
 from a2tg_jax.data.image_files import find_image, map_in_threads, on_disk
 from a2tg_jax.data.lenses import Lens, LensUse, resize_pixels
-from a2tg_jax.data.photo_store import DepthMap, Mask, Shelf, check_left
+from a2tg_jax.data.photo_store import DepthMap, Mask, Shelf
 from a2tg_jax.host.npz import read_npy
 from a2tg_jax.host.regular_files import is_folder
 from a2tg_jax.host.remote_files import Unreachable, is_remote
 from a2tg_jax.host.text import shortened
 
 MASKS, DEPTHS = "masks", "depths"
+AlphaMeaning = Literal["transparency", "mask"]
+"""Meaning of the alpha channel: transparency over a background, or a mask, of which only opaque pixels count."""
+Counted = Callable[[np.ndarray], np.ndarray]
+"""Function from a view's pixels [H, W, C] to [H, W] bool, True where they count."""
 MAX_ASPECT_ERROR = 0.01
 """Largest relative difference of aspect between an image and its camera, beyond one pixel of rounding."""
 MAX_DEPTH_ASPECT_ERROR = 0.02
@@ -47,6 +51,7 @@ class Options(NamedTuple):
 
     downscale: int
     test_every: int
+    alpha: AlphaMeaning
     lens: LensUse
     shelf: Shelf
     """Store of the pixels."""
@@ -72,6 +77,8 @@ class Photo(NamedTuple):
     """Mask that the scene names."""
     depths: Path | None = None
     """Depth map that the scene names."""
+    counted: Counted | None = None
+    """What finds the pixels that count, for photographs without a mask."""
     panorama: int | None = None
     """Number of the panorama that it was cut from."""
 
@@ -125,7 +132,7 @@ def read_photos(
         return facts
 
     told = [f"{own.photo.name} downscaled by {own.downscale}" for own in found]
-    facts = divided(options.division, told, own_share, "photographs", place)
+    facts = divided(options.division, told, own_share, place)
     # All of them are read here if there is one process.
     others = [number for number in range(len(found)) if number not in read]
     fitting = options.shelf.fitting([math.prod(facts[number].shape) for number in others])
@@ -144,7 +151,20 @@ def read_photos(
 
     read.update(zip(others, map_in_threads(of_another, others, fitting, place=place), strict=True))
     shots = [read[number] for number in range(len(found))]
-    _check_masks(shots, str(place), {photo.below_images[0] for photo in photos if photo.below_images})
+    lacking = [own.photo.name for own in found if own.mask is None]
+    if len(lacking) == len(found):
+        folders = {photo.below_images[0].with_name(MASKS) for photo in photos if photo.below_images}
+        for folder in filter(is_folder, folders):
+            message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
+            warnings.warn(message, stacklevel=3)
+    elif lacking:
+        message = f"{place}: {len(lacking)} of {len(shots)} photographs have no mask, such as {lacking[0]}"
+        warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
+    for shot in shots:
+        if shot.mask is not None and shot.mask.num == 0:
+            raise ValueError(
+                f"{place}: the mask of {shot.name} excludes every pixel; remove the photograph or correct the mask"
+            )
     return shots
 
 
@@ -168,7 +188,8 @@ def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple
     _check_aspect(file, stored, lens.size)
 
     def view(pixels: np.ndarray) -> np.ndarray:
-        return lens.view_pixels(pixels, downscale)[0]
+        made = lens.view_pixels(pixels, downscale)[0]
+        return made[..., :3] if options.alpha == "mask" else made
 
     try:
         size, K = lens.view_of(stored, downscale)
@@ -176,10 +197,18 @@ def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple
     except ValueError as error:
         raise ValueError(f"{photo.what}: its camera model {error}") from None
     if facts is None:
-        pixels = view(photograph)
-        mask = None if found.mask is None else _read_mask(*found.mask, lens, stored, size)
-        facts = _Facts(stored, pixels.shape, pixels is photograph, mask)
-        picture = options.shelf.keep(pixels, file, None if facts.is_stored else view)
+        pixels = lens.view_pixels(photograph, downscale)[0]
+        is_stored, counts = pixels is photograph, None
+        if found.mask is not None:
+            counts = _read_mask(*found.mask, lens, stored, size)
+        elif photo.counted is not None:
+            counts = photo.counted(pixels)
+        if options.alpha == "mask" and pixels.shape[2] == 4:
+            is_opaque = pixels[..., 3] == 255
+            counts = is_opaque if counts is None else is_opaque & counts
+            pixels, is_stored = np.ascontiguousarray(pixels[..., :3]), False
+        facts = _Facts(stored, pixels.shape, is_stored, None if counts is None else Mask.of(counts))
+        picture = options.shelf.keep(pixels, file, None if is_stored else view)
     else:
         picture = options.shelf.read_later(facts.shape, file, None if facts.is_stored else view)
     depth = None if depths is None else _depth_map(depths, lens, stored, size)
@@ -296,26 +325,10 @@ def _check_aspect(path: Path, stored: tuple[int, int], camera: tuple[int, int]) 
         )
 
 
-def _check_masks(shots: Sequence[Shot], source: str, images: set[Path]) -> None:
-    """Warn of photographs without a mask if others have one, or of a folder of masks without any photograph's.
-
-    Raise ValueError, naming the photograph, if its mask leaves nothing.
-    """
-    lacking = [shot.name for shot in shots if shot.mask is None]
-    if len(lacking) == len(shots):
-        for folder in (each.with_name(MASKS) for each in images if is_folder(each.with_name(MASKS))):
-            message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
-            warnings.warn(message, stacklevel=4)
-    elif lacking:
-        message = f"{source}: {len(lacking)} of {len(shots)} photographs have no mask, such as {lacking[0]}"
-        warnings.warn(f"{message}: all of their pixels count", stacklevel=4)
-    for shot in shots:
-        if shot.mask is not None:
-            check_left(shot.mask, shot.name, source)
-
-
-def _read_mask(file: Path, downscale: int, lens: Lens, stored: tuple[int, int], view_size: tuple[int, int]) -> Mask:
-    """Return the mask of a view, undistorted and downscaled as its photograph was.
+def _read_mask(
+    file: Path, downscale: int, lens: Lens, stored: tuple[int, int], view_size: tuple[int, int]
+) -> np.ndarray:
+    """Return the mask [H, W] of a view, undistorted and downscaled as its photograph was.
 
     A pixel counts if all its source pixels count. Sizes are (width, height), of the photograph's file and of the view.
     """
@@ -334,7 +347,7 @@ def _read_mask(file: Path, downscale: int, lens: Lens, stored: tuple[int, int], 
         raise ValueError(f"{file}: is {told[0]}, but its photograph is {told[1]}; a mask must be of the same size")
     planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
     planes, _ = lens.view_pixels(planes, downscale)
-    return Mask.of(resize_pixels(planes, *view_size)[..., 0] == 255)
+    return np.asarray(resize_pixels(planes, *view_size)[..., 0] == 255)
 
 
 def find_depths(images: Path, name: str) -> Path | None:

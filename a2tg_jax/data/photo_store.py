@@ -135,14 +135,6 @@ class Mask:
         return np.unpackbits(bits, count=self.shape[0] * self.shape[1]).view(bool).reshape(self.shape)
 
 
-def check_left(mask: Mask, name: str, source: str) -> None:
-    """Raise ValueError, naming the photograph, if its mask leaves nothing."""
-    if mask.num == 0:
-        raise ValueError(
-            f"{source}: the mask of {name} excludes every pixel; remove the photograph or correct the mask"
-        )
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class DepthMap:
     """A depth map of a view, loaded each time it is read."""

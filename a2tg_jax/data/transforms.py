@@ -7,7 +7,6 @@ change of COLMAP's world before the file was written. Poses and points of `ply_f
 both are in the file's own world, which is the original world here.
 """
 
-import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Sequence
@@ -19,11 +18,9 @@ import numpy as np
 from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_viewmat
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.division import divided
 from a2tg_jax.data.image_files import inside
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
-from a2tg_jax.data.photo_reading import Options, Photo, read_photos
-from a2tg_jax.data.photo_store import Mask
+from a2tg_jax.data.photo_reading import Counted, Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
@@ -49,8 +46,7 @@ class Frames(NamedTuple):
     """File that messages name; paths of images start from its folder."""
     frames: list[dict[str, Any]]
     cloud: PointCloud | None = None
-    counted: Callable[[np.ndarray], np.ndarray] | None = None
-    """Function from pixels [H, W, C] to a mask [H, W] of the pixels that count."""
+    counted: Counted | None = None
 
 
 def load_transforms(file: Path, options: Options) -> Scene:
@@ -61,8 +57,22 @@ def load_transforms(file: Path, options: Options) -> Scene:
     """
     meta = _read_json(file)
     (shots,) = _read_shots([(file, meta)], options)
-    listed = {key: set(meta[key]) for key in SPLIT_KEYS if key in meta}
-    train, test = _listed_split(file, shots, listed) if listed else every_kth(shots, options.test_every)
+    train, test = every_kth(shots, options.test_every)
+    if listed := {key: set(meta[key]) for key in SPLIT_KEYS if key in meta}:
+        names = {shot.name for shot in shots}
+        for key, own in listed.items():
+            if unknown := sorted(own - names):
+                raise ValueError(
+                    f"{file}: {key} names {shortened(unknown[0])}, which is no frame; write names as file_path has "
+                    f"them, such as {shots[0].name}"
+                )
+        test_names = listed.get("test_filenames") or listed.get("val_filenames") or set()
+        train_names = listed.get("train_filenames", names) - test_names
+        if unused := sorted(names - train_names - test_names):
+            only = "; val_filenames count only without test_filenames" if listed.get("val_filenames") else ""
+            told = f"{len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}"
+            warnings.warn(f"{file}: {told}", stacklevel=3)
+        train, test = ([shot for shot in shots if shot.name in chosen] for chosen in (train_names, test_names))
     cloud = _points_beside(file, meta)
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
 
@@ -86,18 +96,7 @@ def load_frames(made: Frames, options: Options) -> Scene:
     """Make a scene of frames of another program."""
     meta = {"frames": made.frames}
     _check_meta(made.file, meta)
-    (shots,) = _read_shots([(made.file, meta)], options)
-    shots = sorted(shots, key=lambda shot: shot.name)
-
-    def mask_of(number: int) -> Mask | None:
-        """Return the mask of a photograph, or of its own pixels if it has none."""
-        shot = shots[number]
-        counts = made.counted(shot.picture.read()) if made.counted and shot.mask is None else None
-        return shot.mask if counts is None or counts.all() else Mask.of(counts)
-
-    if made.counted is not None:
-        masks = divided(options.division, [shot.name for shot in shots], mask_of, "views")
-        shots = [dataclasses.replace(shot, mask=mask) for shot, mask in zip(shots, masks, strict=True)]
+    (shots,) = _read_shots([(made.file, meta)], options, made.counted)
     name = scene_name(made.file.resolve().parent)
     return assemble_scene(name, *every_kth(shots, options.test_every), made.cloud, source=str(made.file))
 
@@ -116,24 +115,6 @@ def _points_beside(file: Path, *metas: dict[str, Any]) -> PointCloud | None:
     named = [meta["ply_file_path"] for meta in metas if meta.get("ply_file_path")]
     usual = [name for name in POINT_FILES if not named and is_regular(file.parent / name)]
     return next((read_ply_points(file.parent / name) for name in (*named, *usual)), None)
-
-
-def _listed_split(file: Path, shots: Sequence[Shot], listed: dict[str, set[str]]) -> tuple[list[Shot], list[Shot]]:
-    """Return (train, test) of lists by their keys. Warn of frames that they leave out."""
-    names = {shot.name for shot in shots}
-    for key, own in listed.items():
-        if unknown := sorted(own - names):
-            raise ValueError(
-                f"{file}: {key} names {shortened(unknown[0])}, which is no frame; write names as file_path has them, "
-                f"such as {shots[0].name}"
-            )
-    test_names = listed.get("test_filenames") or listed.get("val_filenames") or set()
-    train_names = listed.get("train_filenames", names) - test_names
-    if unused := sorted(names - train_names - test_names):
-        only = "; val_filenames count only without test_filenames" if listed.get("val_filenames") else ""
-        message = f"{file}: {len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}"
-        warnings.warn(message, stacklevel=3)
-    return [shot for shot in shots if shot.name in train_names], [shot for shot in shots if shot.name in test_names]
 
 
 def _read_json(file: Path) -> dict[str, Any]:
@@ -170,7 +151,9 @@ def _check_meta(file: Path, meta: object) -> None:
                 values[key] = [inside(file.parent, name) for name in names]
 
 
-def _read_shots(files: Sequence[tuple[Path, dict[str, Any]]], options: Options) -> list[list[Shot]]:
+def _read_shots(
+    files: Sequence[tuple[Path, dict[str, Any]]], options: Options, counted: Counted | None = None
+) -> list[list[Shot]]:
     """Return the frames of each transforms file of a scene, downscaled, in the file's order.
 
     The files come with their contents, which `_check_meta` has checked. Values of a frame override the file's.
@@ -187,7 +170,7 @@ def _read_shots(files: Sequence[tuple[Path, dict[str, Any]]], options: Options) 
         mask, depths = (folder / frame[key] if frame.get(key) else None for key in ("mask_path", "depth_file_path"))
         below = (images, path.relative_to(images).as_posix()) if path.is_relative_to(images) else None
         viewmat = _viewmat(frame["transform_matrix"], what)
-        photos.append(Photo(name, viewmat, (path.parent, path.name), below, lens, what, mask, depths))
+        photos.append(Photo(name, viewmat, (path.parent, path.name), below, lens, what, mask, depths, counted))
     place = files[0][0]
     shots = iter(read_photos(photos, options, place, place.parent, lambda name: f"remove its frame from {place}"))
     return [[next(shots) for _ in meta["frames"]] for _, meta in files]
