@@ -15,7 +15,7 @@ from a2tg_jax.data.colmap import find_models, load_colmap
 from a2tg_jax.data.division import among_processes, sharing_errors
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.phone_captures import polycam, record3d
-from a2tg_jax.data.photo_folder import check_no_video, holds_photos, told_of_capture
+from a2tg_jax.data.photo_folder import holds_photos, is_video, told_of_capture
 from a2tg_jax.data.photo_reading import AlphaMeaning, Options
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.photogrammetry import metashape, realityscan
@@ -160,7 +160,10 @@ def _read(path: Path, options: Options) -> Scene:
         raise FileNotFoundError(f"{path}: no such scene folder{built_in}")
     is_json = path.suffix.lower() == ".json"
     if is_here:
-        check_no_video(path)
+        if is_video(path):
+            raise ValueError(
+                f"{path}: is a video; to make a scene of it, run `a2tg sfm {as_argument(path)} SCENE` first"
+            )
         is_json = is_json and is_regular(path) and told_of_capture(path) is None
     else:
         check_reachable(path.parent if path.suffix.lower() in (".json", ".xml") else path)

@@ -120,12 +120,6 @@ def _files_below(folder: Path) -> Iterator[Path]:
     return (file for file in folder.rglob("*") if file.name[0] != "." and file.is_file())
 
 
-def check_no_video(path: Path) -> None:
-    """Raise ValueError if the path is a video; the message says how it becomes a scene."""
-    if is_video(path):
-        raise ValueError(f"{path}: is a video; to make a scene of it, run `a2tg sfm {as_argument(path)} SCENE` first")
-
-
 def _skipped(folder: Path, files: list[Path]) -> str:
     """Return the number of skipped files by suffix, the formats that are read, and how to convert."""
     counts = Counter(file.suffix.lower() or "without suffix" for file in files)

@@ -185,7 +185,15 @@ def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple
             if not is_remote(file) and (original := find_image(*photo.image)) is not None:
                 full = picture_size(original)
         lens = lens(full)
-    _check_aspect(file, stored, lens.size)
+    (width, height), (camera_width, camera_height) = stored, lens.size
+    ratio = (width * camera_height) / (height * camera_width)
+    if abs(ratio - 1) > max(MAX_ASPECT_ERROR, 1 / min(stored)):
+        is_turned = (height, width) == lens.size
+        advice = "write it turned as EXIF says (magick mogrify -auto-orient FILE), or " if is_turned else ""
+        raise ValueError(
+            f"{file}: is {width}x{height}, but its camera is {camera_width}x{camera_height}, of another aspect; "
+            f"{advice}use the image that the camera was estimated from"
+        )
 
     def view(pixels: np.ndarray) -> np.ndarray:
         made = lens.view_pixels(pixels, downscale)[0]
@@ -310,19 +318,6 @@ def _find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) 
         else:
             found[folder] = smaller
     return found
-
-
-def _check_aspect(path: Path, stored: tuple[int, int], camera: tuple[int, int]) -> None:
-    """Raise ValueError if the image's aspect differs from the camera's; both are (width, height)."""
-    (image_width, image_height), (width, height) = stored, camera
-    ratio = (image_width * height) / (image_height * width)
-    if abs(ratio - 1) > max(MAX_ASPECT_ERROR, 1 / min(image_width, image_height)):
-        is_turned = (image_height, image_width) == camera
-        advice = "write it turned as EXIF says (magick mogrify -auto-orient FILE), or " if is_turned else ""
-        raise ValueError(
-            f"{path}: is {image_width}x{image_height}, but its camera is {width}x{height}, of another aspect; "
-            f"{advice}use the image that the camera was estimated from"
-        )
 
 
 def _read_mask(

@@ -39,9 +39,6 @@ TICK = 0.5
 """Seconds between two readings of the clock of a phase without countable progress."""
 ADVICE = "take more, sharp and closer together: they should overlap by two thirds and show texture, unlike blank walls"
 
-NO_DEPTH = "photographs match, but show no depth: walk between them; "
-NO_FEATURES = "COLMAP finds no features, as in blank or very blurred pictures,"
-
 
 class SfmSummary(NamedTuple):
     """Result of `run_sfm`."""
@@ -223,26 +220,22 @@ def _check_models(
 ) -> None:
     """Raise ValueError without a usable model, and warn of the photographs that the largest one leaves out.
 
-    Args:
-      models: the reconstructions, the largest first.
-      names: of all photographs.
-      told: name of the sources in messages.
-      matching: how pairs were chosen.
-      num_matched: number of pairs with verified matches.
-      blank: names of the photographs without features.
+    The models are sorted, the largest first; `told` names the sources in messages; `blank` are the names of the
+    photographs without features.
     """
     placed = {models[0].image(number).name for number in models[0].reg_image_ids()} if models else set()
     left_out = [name for name in names if name not in placed]
     if not left_out:
         return
     has_no_depth = len(placed) < MIN_REGISTERED and num_matched >= len(names)
-    advice = (NO_DEPTH if has_no_depth else "") + ADVICE
+    advice = ("photographs match, but show no depth: walk between them; " if has_no_depth else "") + ADVICE
     if matching == "sequential":
         advice += "; only neighbours by name were matched: name them in the order of taking, or match all "
         advice += "pairs (matching='exhaustive')"
     reasons = []
     if blank:
-        reasons.append(f"{NO_FEATURES} in {len(blank)} of them ({first_names(blank)})")
+        found = f"in {len(blank)} of them ({first_names(blank)})"
+        reasons.append(f"COLMAP finds no features, as in blank or very blurred pictures, {found}")
     if len(models) > 1:
         sizes = ", ".join(str(model.num_reg_images()) for model in models)
         reasons.append(f"they fall into parts of {sizes} that do not connect, and the largest is kept")

@@ -4,7 +4,7 @@ Its patterns have details of about 4 to 10 pixels, finer than one or two thousan
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
@@ -82,7 +82,14 @@ def synthetic_scene(
         for index, viewmat in enumerate(viewmats)
     ]
     cloud = sample_points(surfaces, shots, num_points, rng)
-    shots = [observing(shot, cloud.points, [surface.shape for surface in surfaces]) for shot in shots]
+    for index, shot in enumerate(shots):  # They observed the points that no shape hides from them.
+        own = before_camera(cloud.points, shot.viewmat)
+        xy, depths = pinhole_pixels(own, K), own[:, 2]
+        rays = _directions(shot.viewmat, K, *xy.T)
+        hits, _ = nearest_hits([surface.shape for surface in surfaces], _center(shot.viewmat), rays)
+        is_seen = depths <= (1 + SAME_SURFACE) * hits
+        points = observed_points(xy[is_seen], depths[is_seen], shot.picture.size)
+        shots[index] = dataclasses.replace(shot, points=points)
     return assemble_scene("synthetic", *every_kth(shots, test_every), cloud, source="the synthetic scene")
 
 
@@ -153,15 +160,6 @@ def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: n
         colors.append(pixels[row, column])
     is_hit = np.isfinite(np.concatenate(points)).all(axis=1)
     return PointCloud(np.concatenate(points)[is_hit], np.concatenate(colors)[is_hit])
-
-
-def observing(shot: Shot, points: np.ndarray, shapes: Sequence[ParametricSurface]) -> Shot:
-    """Return a shot that observed the points of [P, 3] that no shape hides from it."""
-    own = before_camera(points, shot.viewmat)
-    xy, depths = pinhole_pixels(own, shot.K), own[:, 2]
-    hits, _ = nearest_hits(shapes, _center(shot.viewmat), _directions(shot.viewmat, shot.K, *xy.T))
-    is_seen = depths <= (1 + SAME_SURFACE) * hits
-    return dataclasses.replace(shot, points=observed_points(xy[is_seen], depths[is_seen], shot.picture.size))
 
 
 def exact_points(scene: Scene) -> np.ndarray:

@@ -169,24 +169,19 @@ def _read_shots(
             lens = _lens(frame, what, options.lens, (0, 0))
         mask, depths = (folder / frame[key] if frame.get(key) else None for key in ("mask_path", "depth_file_path"))
         below = (images, path.relative_to(images).as_posix()) if path.is_relative_to(images) else None
-        viewmat = _viewmat(frame["transform_matrix"], what)
+        try:
+            pose = np.asarray(frame["transform_matrix"], np.float64)
+        except (TypeError, ValueError, OverflowError):
+            pose = np.empty(0)
+        if pose.shape not in ((3, 4), (4, 4)):
+            raise ValueError(f"{what}: its transform_matrix must be 4x4 numbers; got shape {pose.shape}")
+        camera_to_world = np.eye(4)
+        camera_to_world[:3] = pose[:3] * [1.0, -1.0, -1.0, 1.0]  # from OpenGL's camera to OpenCV's
+        viewmat = np.linalg.inv(rigid_viewmat(camera_to_world, what))
         photos.append(Photo(name, viewmat, (path.parent, path.name), below, lens, what, mask, depths, counted))
     place = files[0][0]
     shots = iter(read_photos(photos, options, place, place.parent, lambda name: f"remove its frame from {place}"))
     return [[next(shots) for _ in meta["frames"]] for _, meta in files]
-
-
-def _viewmat(transform_matrix: object, what: str) -> np.ndarray:
-    """Return world to camera (OpenCV) from camera to world (OpenGL)."""
-    try:
-        pose = np.asarray(transform_matrix, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        pose = np.empty(0)
-    if pose.shape not in ((3, 4), (4, 4)):
-        raise ValueError(f"{what}: its transform_matrix must be 4x4 numbers; got shape {pose.shape}")
-    camera_to_world = np.eye(4)
-    camera_to_world[:3] = pose[:3] * [1.0, -1.0, -1.0, 1.0]
-    return np.linalg.inv(rigid_viewmat(camera_to_world, what))
 
 
 def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int]) -> Lens:
