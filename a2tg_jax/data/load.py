@@ -161,9 +161,8 @@ def _read(path: Path, options: Options) -> Scene:
     is_json = path.suffix.lower() == ".json"
     if is_here:
         if is_video(path):
-            raise ValueError(
-                f"{path}: is a video; to make a scene of it, run `a2tg sfm {as_argument(path)} SCENE` first"
-            )
+            command = f"`a2tg sfm {as_argument(path)} SCENE`"
+            raise ValueError(f"{path}: is a video; to make a scene of it, run {command} first")
         is_json = is_json and is_regular(path) and told_of_capture(path) is None
     else:
         check_reachable(path.parent if path.suffix.lower() in (".json", ".xml") else path)

@@ -91,8 +91,6 @@ def run_sfm(
       FileNotFoundError: if there is no such folder of photographs.
       FileExistsError: if `out` is a file, or holds a scene already.
       ValueError: if there are fewer than 3 photographs, or fewer than 3 could be registered, or one cannot be read.
-
-    Warns of photographs that could not be placed, and of files that are not taken for photographs.
     """
     check_literal("matching", matching, Matching)
     check_literal("panorama", panorama, Panorama)
