@@ -105,7 +105,7 @@ def write_json(folder, frames, name="transforms.json", **values):
 def write_scene(folder, **values):
     """A sound nerfstudio scene with sparse points."""
     write_ply(folder / "sparse_pc.ply")
-    write_json(folder, write_frames(folder), ply_file_path="sparse_pc.ply", **{**FOCAL, **SIZE, **values})
+    write_json(folder, write_frames(folder), **{"ply_file_path": "sparse_pc.ply", **FOCAL, **SIZE, **values})
 
 
 def write_blender(folder, splits=("train", "test")):

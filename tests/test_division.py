@@ -159,12 +159,12 @@ def test_every_process_is_told_of_a_photograph_that_one_cannot_read(tmp_path, to
     assert told.startswith(f"{broken}: cannot be read as an image")
 
 
-@pytest.mark.parametrize(("alpha", "room"), [("transparency", 0), ("mask", 0), ("transparency", None)])
-def test_a_photograph_of_another_size_than_elsewhere_is_told_to_all(tmp_path, together, alpha, room):
-    """The size is compared after the common reading. The other process waits at the end, or for masks."""
+@pytest.mark.parametrize("room", [0, None])
+def test_a_photograph_of_another_size_than_elsewhere_is_told_to_all(tmp_path, together, room):
+    """The size is compared after the common reading. The other process waits at the end."""
     folders = copies(write_scene(tmp_path / "scene", alpha=True), 2)
     Image.fromarray(np.zeros((64, 80, 4), np.uint8)).save(share(folders[1], 0)[0])
-    told = error_of_all(together(*loading(folders, room=room, alpha=alpha), seconds=20))
+    told = error_of_all(together(*loading(folders, room=room), seconds=20))
     assert "is 80x64, but 40x32 where another process reads it" in told
 
 
