@@ -71,6 +71,7 @@ def test_scores_with_colours_fitted_do_not_see_an_exposure(scene, model):
     assert evaluate(darker, model).psnr < again.psnr - 3
 
 
+@pytest.mark.long
 def test_a_disturbed_test_camera_comes_back(scene, model):
     """To within a quarter of a pixel, where the photographs are the model's own."""
     drawn = [np.clip(np.rint(255 * model.render(view.camera).color), 0, 255).astype(np.uint8) for view in scene.test]

@@ -169,6 +169,7 @@ def masked():
     return clean, dataclasses.replace(scene, train=(*map(with_noise, train), scene.train[-1]))
 
 
+@pytest.mark.long
 def test_masked_pixels_do_not_reach_training(masked):
     system = Gaussians2dMcmc(stage1_iterations=24, initial_gaussians=60, batch_size=2)
     clean, noisy = (fit(scene, system, progress=False) for scene in masked)
@@ -181,7 +182,6 @@ def test_masked_pixels_do_not_reach_training(masked):
     assert first == second
 
 
-@pytest.mark.long
 def test_a_view_counts_by_its_pixels(masked):
     """The PSNR of a step is that of the pixels that count."""
     scene = dataclasses.replace(masked[0], train=masked[0].train[:1])

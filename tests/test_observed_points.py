@@ -136,6 +136,7 @@ def test_right_depth_costs_nothing_and_no_points_neither():
     assert PointDepths(1.0)(None, target, wrong) > 0.1
 
 
+@pytest.mark.long
 def test_views_of_the_built_in_scene_see_points_on_its_surfaces():
     scene = a2tg.synthetic_scene(num_views=5, num_points=2_000)
     for view, depth in zip(scene.train, exact_depths(scene), strict=True):

@@ -96,6 +96,7 @@ def test_batches_are_of_the_same_bits_wherever_photographs_are(tmp_path, kind, c
     assert not cache.is_dir() or not [path for path in cache.iterdir() if path.is_file()], "the file has a name"
 
 
+@pytest.mark.long
 def test_training_gives_the_same_bits_wherever_photographs_are(tmp_path, monkeypatch):
     """Compared with photographs in memory, brought to the device batch by batch. The threads end with training."""
     monkeypatch.setattr(loop, "PhotoStore", lambda *given: PhotoStore(*given, room=0))

@@ -138,6 +138,7 @@ class TestBilateralGrid:
         np.testing.assert_allclose(projected.mean(axis=0), correction.neutral, atol=1e-6)
         np.testing.assert_allclose(projected[1] - projected[0], rows[1] - rows[0], atol=1e-5)
 
+    @pytest.mark.long
     def test_a_training_learns_grids(self, scene, trained):
         origin = trained.model.origin
         grids = origin.corrections["bilateral_grid"]
@@ -184,6 +185,7 @@ class TestDepthPrior:
         wrong = a2tg.Target(None, None, None, depth_map=depth)
         assert DepthPrior(1.0)(None, wrong, output) > 0.05
 
+    @pytest.mark.long
     def test_a_training_needs_some_and_may_lack_others(self, scene, trained):
         told = r"loss.depth_weight, or a custom term, needs depth maps, but no training view has one"
         with pytest.raises(ValueError, match=told):
@@ -277,6 +279,7 @@ class TestFloaters:
         unseen = dataclasses.replace(wide, camera=dataclasses.replace(wide.camera, rays=jnp.full_like(rays, np.nan)))
         assert not are_near(points, [unseen], near).any()
 
+    @pytest.mark.long
     def test_a_training_without_them(self, scene, trained):
         model = trained.model
         assert len(scene.points) / 2 < model.num <= len(scene.points)
