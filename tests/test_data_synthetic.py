@@ -1,7 +1,5 @@
 """The built-in scene: its geometry agrees with its images, and it is made quickly and reproducibly."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -57,17 +55,6 @@ def test_seed_and_downscale():
     half = synthetic_scene(0, **options, downscale=2).train[0]
     assert (half.camera.width, half.camera.height) == (32, 24)
     np.testing.assert_allclose(half.camera.K[:2], np.asarray(first.train[0].camera.K)[:2] / 2)
-
-
-@pytest.mark.long
-def test_default_is_made_in_seconds():
-    start = time.process_time()
-    scene = synthetic_scene()
-    assert time.process_time() - start < 20  # about 4 s on an idle core
-    assert (len(scene.train), len(scene.test)) == (24, 4)
-    assert scene.train[0].image.shape == (240, 320, 3)
-    assert len(scene.points) == 2500
-    assert all(40 < view.image.mean() < 200 and view.image.std() > 30 for view in scene.train)
 
 
 @pytest.mark.parametrize("options", [{"num_views": 1}, {"num_points": 1}, {"downscale": 0}, {"width": 0}])
