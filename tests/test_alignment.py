@@ -120,7 +120,7 @@ def test_exposures_win_back_what_known_ones_took(scene, system, model):
 
 
 @pytest.mark.long
-def test_a_run_tells_both_scores_and_what_it_learned(tmp_path, capsys):
+def test_a_run_reports_both_scores_and_what_it_learned(tmp_path, capsys):
     out = tmp_path / "run"
     arguments = "train synthetic --system gaussians-2d-mcmc --preset smoke --downscale 8 --stage1-iterations 12 "
     arguments += "--exposure --refine-poses --initial-gaussians 200 --densify.cap 210 --out"

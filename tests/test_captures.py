@@ -176,7 +176,7 @@ def test_metashape(tmp_path, within):
     assert load_scene(tmp_path / "cameras.xml").name == tmp_path.name
 
 
-def test_cameras_of_metashape_that_are_not_used_are_told(tmp_path):
+def test_cameras_of_metashape_that_are_not_used(tmp_path):
     write_metashape(tmp_path)
     file = tmp_path / "cameras.xml"
     unaligned = '<camera id="9" sensor_id="0" label="9.png"/>'
@@ -331,7 +331,7 @@ def test_realityscan(tmp_path):
 
 
 @pytest.mark.parametrize("writer", [write_polycam, write_record3d, write_metashape, write_realityscan])
-def test_cameras_without_an_image_are_told(tmp_path, writer):
+def test_cameras_without_an_image(tmp_path, writer):
     writer(tmp_path)
     images = sorted(tmp_path.rglob("*.[jp][pn]g"))
     images[0].unlink()
@@ -418,7 +418,7 @@ def test_a_world_of_a_map_stays_there(tmp_path):
         ("database.db", "colmap mapper"),
     ],
 )
-def test_a_capture_that_is_not_read_is_told_what_to_do(tmp_path, name, words):
+def test_a_capture_that_is_not_read(tmp_path, name, words):
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).touch()
     for path in (tmp_path, tmp_path / name):

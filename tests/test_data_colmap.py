@@ -47,7 +47,7 @@ def dot_place(image):
 
 
 def write_scene(folder, *, models=("PINHOLE",), num_views=9, num_points=50, text=False, names=None):
-    """Writes images and sparse/0; view i has a camera of its own, of the i-th model (taken in turns)."""
+    """Writes images and sparse/0; view i has its own camera, of the i-th model (taken in turns)."""
     colmap = pycolmap()
     reconstruction = colmap.Reconstruction()
     names = names or [f"img_{index:02d}.png" for index in range(num_views)]
@@ -459,7 +459,7 @@ def test_names_from_windows(tmp_path, text):
 
 
 def test_two_images_of_one_file_are_refused(tmp_path):
-    """Where capitals were lost, one photograph would stand for two."""
+    """Where capitals were lost, one file would serve two photographs."""
     write_scene(tmp_path, names=["a.png", "A.png", *(f"{index}.png" for index in range(4))])
     (tmp_path / "images" / "A.png").unlink()
     with pytest.raises(ValueError, match=r"a\.png: is the only file for (a|A)\.png and (a|A)\.png; put both there"):

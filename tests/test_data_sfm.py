@@ -88,7 +88,7 @@ def cameras_of(found, work):
         return opened.read_all_cameras(), opened.read_all_frames()
 
 
-def test_cameras_are_told_apart_and_exif_gives_their_focal_length(tmp_path):
+def test_cameras_are_distinguished_and_exif_gives_their_focal_length(tmp_path):
     """Photographs of one folder, size and lens share a camera. One that is turned keeps its EXIF data."""
     image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8))
     for name, size in (("a/1.png", (64, 48)), ("a/2.png", (64, 48)), ("a/3.png", (32, 24)), ("b/1.png", (64, 48))):
@@ -185,7 +185,7 @@ def test_colmap_reads_and_writes_every_photograph(tmp_path, name, mode, options)
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])
-def test_photographs_that_lose_their_alpha_are_told(tmp_path, mode):
+def test_photographs_that_lose_their_alpha(tmp_path, mode):
     """Two photographs have transparent pixels; the alpha channel of another is opaque."""
     image = Image.fromarray(np.full((48, 64, 4), 255, np.uint8))
     for index in range(4):
@@ -198,7 +198,7 @@ def test_photographs_that_lose_their_alpha_are_told(tmp_path, mode):
 
 
 def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):
-    """A photograph that is written anew, here one in a format of its own, may get the name of another."""
+    """A photograph that is written again, here one in another format, may get the name of another."""
     names = ["a.bmp", "a.bmp.jpg", "A.BMP.JPG", "a.bmp~2.jpg"]
     photos = tmp_path / "photos"
     photos.mkdir()

@@ -235,7 +235,7 @@ def test_intrinsics_without_a_size_belong_to_the_full_images(tmp_path, values, i
 
 
 def test_reduced_images_that_are_rounded(tmp_path):
-    """Reduced images of 8 pixels stand for 23, not 24."""
+    """Reduced images of 8 pixels are of 23, not 24."""
     frames = write_frames(tmp_path)
     for frame in frames:
         save(tmp_path / frame["file_path"], np.zeros((23, 23, 3), np.uint8))

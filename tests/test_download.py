@@ -138,7 +138,7 @@ def test_nothing_is_written_outside_the_folder(server, tmp_path, name):
 
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE])
 def test_links_in_archives_are_refused(server, tmp_path, kind):
-    """Even Pythons that know no filters write nothing through a link, and the archive is not fetched anew."""
+    """Even Pythons without filters write nothing through a link, and the archive is not fetched again."""
     archive = archive_of(server, {}, "set.tar.gz")
     with tarfile.open(server.folder / "set.tar.gz", "w:gz") as packed:
         link = tarfile.TarInfo("garden")

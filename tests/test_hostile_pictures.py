@@ -163,7 +163,7 @@ def test_results_never_share_a_file():
 
 
 def test_results_of_photographs_with_long_names_are_files(tmp_path):
-    """The names have 79 letters of 3 bytes, lie in nested folders, or differ only at their end."""
+    """The names have 79 letters of 3 bytes, are in nested folders, or differ only at their end."""
     folders = "/".join(["f" * 80] * 3)
     names = ["\u5834" * 79 + ".png", f"{folders}/a.png", f"{folders}/A.png", f"{folders}/b.png", "x" * 190 + ".jpg"]
     found = picture_names(names)

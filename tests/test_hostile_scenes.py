@@ -1,4 +1,4 @@
-"""Scenes that are cut off, lie about their lengths, or hold numbers that no camera has: one clear line each."""
+"""Scenes that are cut off, have wrong counts, or hold numbers that no camera has: one clear line each."""
 
 import json
 import os
@@ -53,7 +53,7 @@ def test_every_cut_of_a_binary_file_is_noticed(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [2**64 - 1, 2**32, 10])
-def test_counts_that_lie_are_refused(tmp_path, kind, count):
+def test_wrong_counts_are_refused(tmp_path, kind, count):
     write_colmap(tmp_path, num_points=5)
     file = tmp_path / "sparse" / "0" / f"{kind}.bin"
     file.write_bytes(struct.pack("<Q", count) + file.read_bytes()[8:])
@@ -106,14 +106,14 @@ def test_lines_that_are_cut_off_are_noticed(tmp_path, kind):
         ("points3D", "1 0 0 zero 1 2 3 0.5", "line 1"),
     ],
 )
-def test_lines_of_text_that_lie_are_refused(tmp_path, kind, line, message):
+def test_wrong_lines_of_text_are_refused(tmp_path, kind, line, message):
     file = tmp_path / f"{kind}.txt"
     file.write_text(line)
     with pytest.raises(ValueError, match=rf"{kind}\.txt: line 1.*" if message == "line 1" else message):
         read_file(file, kind)
 
 
-def test_a_text_that_ends_too_early_is_told(tmp_path):
+def test_a_text_that_ends_too_early(tmp_path):
     """Comments may be copied from elsewhere, so that it is no error."""
     write_colmap(tmp_path, num_points=5, text=True)
     for kind, size in (("points3D", 1), ("images", 2)):
@@ -267,7 +267,7 @@ def test_json_made_to_do_harm(tmp_path, text, message):
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("count", ["2000000000", str(2**64 - 1), "-1", "1" * 30, "many", "5"])
-def test_counts_of_point_files_that_lie(tmp_path, encoding, count):
+def test_wrong_counts_of_point_files(tmp_path, encoding, count):
     file = tmp_path / "points.ply"
     write_ply(file, encoding)
     file.write_bytes(file.read_bytes().replace(b"element vertex 4", b"element vertex " + count.encode()))
@@ -288,7 +288,7 @@ def test_counts_of_point_files_that_lie(tmp_path, encoding, count):
         (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "has no attribute y, z"),
     ],
 )
-def test_headers_of_point_files_that_lie(tmp_path, header, message):
+def test_wrong_headers_of_point_files(tmp_path, header, message):
     file = tmp_path / "points.ply"
     file.write_bytes(header)
     with pytest.raises(ValueError, match=message):
@@ -359,7 +359,7 @@ def test_a_text_of_colmap_of_one_endless_line(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:.*views see none of its points")
 def test_points_that_are_nowhere_in_the_normalised_world_are_left_out(tmp_path):
-    """Cameras that stand close together make its unit small."""
+    """Cameras that are close together make its unit small."""
     frames = write_frames(tmp_path)
     for frame in frames:
         for row in frame["transform_matrix"][:3]:

@@ -98,7 +98,7 @@ def test_a_mask_in_an_alpha_channel(tmp_path, pixels, top_only):
         np.testing.assert_array_equal(view.mask.read(), wanted)
 
 
-def test_what_is_wrong_with_masks_is_told(tmp_path):
+def test_what_is_wrong_with_masks(tmp_path):
     write_scene(tmp_path)
     write_mask(tmp_path / "masks" / "other.png", left_half())
     with pytest.warns(UserWarning, match="masks: holds no mask of a photograph of the scene"):
@@ -150,7 +150,7 @@ def test_alpha_is_transparency_or_a_mask(tmp_path):
 
 @pytest.fixture(scope="module")
 def masked():
-    """A scene with a mask of its own for each training view but one, and the same with noise where they exclude."""
+    """A scene with a different mask for each training view but one, and the same with noise where they exclude."""
     scene = synthetic_scene(num_views=6, width=40, height=30, num_points=150)
     rng = np.random.default_rng(0)
 
@@ -183,7 +183,7 @@ def test_masked_pixels_do_not_reach_training(masked):
 
 
 def test_a_view_counts_by_its_pixels(masked):
-    """The PSNR of a step is that of the pixels that count."""
+    """The PSNR of a step counts only the pixels of the mask."""
     scene = dataclasses.replace(masked[0], train=masked[0].train[:1])
     system = Gaussians2dMcmc(stage1_iterations=1, initial_gaussians=60)
     start = initial_model(scene, system)
@@ -219,7 +219,7 @@ def test_metrics_of_the_pixels_that_count(x64, seed):
 
 
 @pytest.mark.long
-def test_lpips_does_not_see_masked_pixels(shared):
+def test_lpips_does_not_depend_on_masked_pixels(shared):
     weights = load_lpips(shared / "lpips" / "lpips_squeeze.npz")
     rng = np.random.default_rng(0)
     image, target = jnp.asarray(rng.uniform(0, 1, (2, 48, 48, 3)), jnp.float32)

@@ -109,7 +109,7 @@ def test_what_would_lose_something_is_named(message, call):
 
 
 def test_pytrees_may_hold_anything_else():
-    """What JAX and its users put in place of arrays is left as it is."""
+    """What JAX and its users put instead of arrays is not changed."""
     spec = jax.sharding.PartitionSpec("rows")
     for leaf in (None, 0, 1.5, "name", (5, 3), spec, [spec], jax.ShapeDtypeStruct((2,), jnp.float32), object()):
         filled = jax.tree.map(lambda _, leaf=leaf: leaf, (GAUSSIANS, CAMERA, TEXTURES))

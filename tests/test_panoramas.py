@@ -83,7 +83,7 @@ def test_views_show_every_direction():
     assert is_seen.all()
 
 
-def test_panoramas_are_told_by_their_seam(panorama):
+def test_panoramas_are_recognised_by_their_seam(panorama):
     assert is_panorama(panorama)
     assert not is_panorama(panorama[:, 1:])
     assert not is_panorama(np.asarray(Image.fromarray(panorama[100:250, 100:400])))

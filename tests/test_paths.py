@@ -14,7 +14,7 @@ from a2tg_jax.io.path_file import load_views
 
 @pytest.mark.parametrize(("width", "height"), [(80, 60), (60, 80)])
 def test_a_camera_looks_at_its_target_with_a_level_horizon(width, height):
-    """The target lies in the middle, what is above it above, and the image's border at half the angle of view."""
+    """The target is in the middle, what is above it above, and the image's border at half the angle of view."""
     position, target = np.asarray([1.0, -3.0, 0.5]), np.asarray([0.2, 0.4, -0.3])
     camera = look_at(position, target, width=width, height=height, fov=50)
 
@@ -76,7 +76,7 @@ def test_a_flight_begins_and_ends_at_views_and_passes_the_others():
         np.testing.assert_allclose(path[end].K, views[end].K, rtol=1e-5)
 
 
-def test_one_view_stands_still_and_equal_views_do_no_harm():
+def test_one_view_is_a_still_flight_and_equal_views_do_no_harm():
     (view,) = some_views(1)
     assert path_through([view], 3) == [view] * 3
     still = path_through([view, view, view], 4)

@@ -103,7 +103,7 @@ def test_gradients_through_rays_are_those_of_finite_differences(x64, compositor)
 @pytest.mark.long
 @pytest.mark.parametrize("statistic", ["position", "center", "screen"])
 def test_statistics_do_not_depend_on_the_image_plane(x64, statistic):
-    """The rays of a pinhole camera, told in the image plane of a focal length four times shorter."""
+    """The rays of a pinhole camera, in the image plane of a focal length four times shorter."""
     scene = draw_scene(8, num=20)
     camera, gaussians = as_camera(scene, "float64"), as_gaussians(scene, "float64")
     wide = dataclasses.replace(camera, K=camera.K * jnp.asarray([[0.25], [0.25], [1.0]]))

@@ -1,4 +1,4 @@
-"""Scenes in object storage: the same as in a folder, in few requests, read ahead and again, and told of where not."""
+"""Scenes in object storage: the same as in a folder, in few requests, read ahead and again; and errors."""
 
 import collections
 import os
@@ -54,7 +54,7 @@ class Store:
         return asked
 
     def put(self, folder):
-        """Put what is in a folder in place of what was there before."""
+        """Replace what was there by what is in a folder."""
         if self.fs.exists(ROOT):
             self.fs.rm(ROOT, recursive=True)
         for file in folder.rglob("*"):
@@ -194,7 +194,7 @@ def test_large_files_are_fetched_in_pieces(store, monkeypatch, size, num):
 
 
 def listed_as(monkeypatch, **told):
-    """Let the store's listings tell something else of files."""
+    """Change what the store lists about files."""
     ls = fsspec.filesystem("memory").ls
     listed = lambda fs, path, **options: [{**entry, **told} for entry in ls(path, **options)]  # noqa: E731
     monkeypatch.setattr(type(fsspec.filesystem("memory")), "ls", listed)
@@ -215,7 +215,7 @@ def test_the_bound_of_a_file_holds_whatever_its_store_lists(store, monkeypatch, 
 
 
 def test_a_slow_listing_holds_up_no_other(store, monkeypatch):
-    """Threads that want the same folder wait for one request."""
+    """Threads that need the same folder wait for one request."""
     for name in ("slow", "quick"):
         store.fs.pipe_file(f"{ROOT}/{name}/file", b"")
     path, is_asked, may_go, ls = remote_files.located(URL), threading.Event(), threading.Event(), type(store.fs).ls
@@ -287,7 +287,7 @@ SECRETS = {
 
 
 @pytest.mark.parametrize("url", SECRETS)
-def test_secrets_are_refused_and_not_told(monkeypatch, capsys, url):
+def test_secrets_are_refused_and_not_printed(monkeypatch, capsys, url):
     for read in (load_scene, scene_place):
         with pytest.raises(ValueError, match=f"^{re.escape(SECRETS[url])}: has a password, token"):
             read(url)
@@ -319,7 +319,7 @@ def write_nothing_known(folder):
         ("nothing://bucket/fox", ValueError, "nothing://bucket/fox: cannot be opened .*nothing"),
     ],
 )
-def test_what_cannot_be_read_is_told(tmp_path, monkeypatch, store, url, error, message):
+def test_what_cannot_be_read(tmp_path, monkeypatch, store, url, error, message):
     write_nothing_known(tmp_path / "fox")
     store.put(tmp_path / "fox")
     for name in ("nolibrary", "s3fs"):

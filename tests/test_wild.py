@@ -214,7 +214,7 @@ class TestDepthFiles:
         assert find_depths(images, "z.jpg") is None
 
     def test_they_are_undistorted_and_resized_with_their_photographs(self, tmp_path):
-        """A step in a map of twice the size lies where that in the photograph's undistorted mask does."""
+        """A step in a map of twice the size is where the step in the photograph's undistorted mask is."""
         write_scene(tmp_path, models=("OPENCV_FISHEYE",), num_views=3)
         (tmp_path / "depths").mkdir()
         (tmp_path / "masks").mkdir()
@@ -253,7 +253,7 @@ class TestFloaters:
         assert change.model.num == (found.num_views >= 2).sum()
         np.testing.assert_array_equal(change.model.live.gaussians.means, model.gaussians.means[found.num_views >= 2])
 
-    def test_what_stands_close_before_a_camera(self, scene):
+    def test_what_is_close_before_a_camera(self, scene):
         camera = scene.train[0].camera
         forward, right = np.asarray(camera.viewmat)[2, :3], np.asarray(camera.viewmat)[0, :3]
         center = np.asarray(camera.center)
@@ -262,8 +262,8 @@ class TestFloaters:
         )
         np.testing.assert_array_equal(are_near(points, scene.train[:1], 0.2), [True, False, False, False])
 
-    def test_what_stands_close_before_a_fisheye(self, scene):
-        """Its rays lie far outside the picture in the plane of K; some of its pixels have none."""
+    def test_what_is_close_before_a_fisheye(self, scene):
+        """Its rays are far outside the picture in the plane of K; some of its pixels have none."""
         view = scene.train[0]
         width, height = view.camera.width, view.camera.height
         column, row = np.meshgrid(np.linspace(-2 * width, 3 * width, width), np.linspace(-height, 2 * height, height))
@@ -295,7 +295,7 @@ class TestFloaters:
         (stage,) = small(floaters={"near": 0.2, "at": [0.5, 1.0]}).stages()
         assert stage.events[-1].at == (0.5, 1.0), "nothing grows"
 
-    def test_pruning_that_would_leave_nothing_is_told(self, scene):
+    def test_pruning_that_would_leave_nothing(self, scene):
         system = small()
         model = initial_model(scene, system)
         moments = adam_init(a2tg.partition(model)[0])
