@@ -426,7 +426,7 @@ def test_run_folder_is_complete(tiny_run):
 
 @pytest.mark.skipif(not TENSORBOARD, reason="the extra [tensorboard] is not installed")
 def test_tensorboard_has_the_rows_of_the_histories_once(tiny_run):
-    from tensorboard_events import scalars
+    from run_folders import tensorboard_scalars as scalars
 
     run, found = tiny_run[0], scalars(tiny_run[0].tensorboard)
     for name in ("a2tg-gaussians", "a2tg-textures", "gaussians-2d-mcmc-continued"):

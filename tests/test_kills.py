@@ -1,5 +1,6 @@
-"""Two kills of a tiny run at random moments. `tests/kills.py` has more, and docs/reliability.md what came of them."""
+"""Two kills of a tiny run at random moments; `tests/kills.py` does more, and docs/reliability.md has its results."""
 
+import pytest
 from kills import kill_runs
 
 TINY = (
@@ -8,6 +9,7 @@ TINY = (
 )
 
 
+@pytest.mark.long
 def test_killed_runs_end_as_if_left_alone(tmp_path):
     result = kill_runs(tmp_path, 2, seed=0, options=TINY)
     assert len(result["kills"]) == 2 and not result["differences"]

@@ -1,4 +1,4 @@
-"""A training that does not learn is noticed: while it runs, and in what is written of it."""
+"""A training that does not learn is reported, while it runs and in its results."""
 
 import dataclasses
 import warnings
@@ -39,46 +39,40 @@ def frozen(scene, **changes):
     return black, a2tg.Gaussians2dMcmc(**{**numbers, "rates": NO_RATES, **changes})
 
 
-def test_training_that_does_not_learn_is_told(scene):
+def test_a_warning_if_training_does_not_learn(scene):
     black, system = frozen(scene)
     with pytest.warns(UserWarning, match=r"does not learn: [\d.]+ dB .* after 200 iterations, .* flat colour .* try "):
         a2tg.fit(black, system, progress=False)
 
 
-def test_training_that_learns_is_left_alone(scene):
+@pytest.mark.long
+def test_no_warning_if_training_learns(scene):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=210, initial_opacity=0.5), progress=False)
 
 
-def test_short_and_later_stages_are_not_judged(scene):
-    order = BatchOrder(scene.train, 1, 0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for iterations, is_first in ((199, True), (600, False)):
-            check = LearningCheck(scene.train, order, iterations, "black", is_first=is_first)
-            for iteration in range(1, iterations + 1):
-                check.observe(iteration, 0.0)
-
-
-def test_the_check_comes_after_a_fifth_and_once(scene):
-    check = LearningCheck(scene.train, BatchOrder(scene.train, 1, 0), 1_000, "black", is_first=True)
-    told = []
-    for iteration in range(1, 1_001):
+def checks_of(views, psnr, iterations=200, is_first=True, **options):
+    """Iterations at which a check of these training views warns, if the PSNR stays the same, and its last warning."""
+    check = LearningCheck(views, BatchOrder(views, 1, 0), iterations, "black", is_first=is_first, **options)
+    warned, text = [], ""
+    for iteration in range(1, iterations + 1):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            check.observe(iteration, 3.0)
-        told += [iteration] * len(caught)
-    assert told == [200]
+            check.observe(iteration, psnr)
+        warned += [iteration] * len(caught)
+        text = str(caught[-1].message) if caught else text
+    return warned, text
 
 
-def test_photographs_of_one_colour_prove_nothing(scene):
-    views = tuple(dataclasses.replace(view, picture=np.full((18, 24, 3), 90, np.uint8)) for view in scene.train)
-    check = LearningCheck(views, BatchOrder(views, 1, 0), 200, "black", is_first=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for iteration in range(1, 201):
-            check.observe(iteration, 20.0)
+def test_long_first_stages_are_checked_once_after_a_fifth(scene):
+    assert checks_of(scene.train, 3.0, 1000)[0] == [200]
+    assert checks_of(scene.train, 0.0, 199)[0] == [] == checks_of(scene.train, 0.0, 600, is_first=False)[0]
+    assert checks_of(scene.train, 3.0, small_budget="room for 3 Gaussians")[1].endswith(
+        "dB. room for 3 Gaussians: raise it"
+    )
+    one_colour = np.full((18, 24, 3), 90, np.uint8)
+    assert checks_of(tuple(dataclasses.replace(view, picture=one_colour) for view in scene.train), 20.0)[0] == []
 
 
 def test_evaluation_knows_what_a_flat_colour_reaches(scene):
@@ -87,11 +81,3 @@ def test_evaluation_knows_what_a_flat_colour_reaches(scene):
     assert not found.has_learned
     flat = [-10 * np.log10(np.mean((own - own.mean((0, 1))) ** 2)) for own in map(a2tg.view_image, scene.train)]
     assert found.flat_psnr == pytest.approx(np.mean(flat), rel=1e-4)
-
-
-def test_a_small_budget_is_the_advice(scene):
-    order = BatchOrder(scene.train, 1, 0)
-    check = LearningCheck(scene.train, order, 200, "black", is_first=True, small_budget="room for 3 Gaussians")
-    with pytest.warns(UserWarning, match=r"dB\. room for 3 Gaussians: raise it$"):
-        for iteration in range(1, 201):
-            check.observe(iteration, 3.0)

@@ -9,20 +9,14 @@ import pytest
 
 from a2tg_jax import fit, synthetic_scene
 from a2tg_jax.host import machine
-from a2tg_jax.host.machine import (
-    keep_room_for_programs,
-    memory_limit,
-    memory_peak,
-    tidy_memory,
-)
+from a2tg_jax.host.machine import keep_room_for_programs, memory_limit, memory_peak, tidy_memory
 from a2tg_jax.host.operating_system import trim_heap
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training.session import Session
-from a2tg_jax.training.step import jitted_step
 
 
-def told(folder, count: int, limit: str):
-    """A folder in which the system tells of a process with so many pieces of memory."""
+def proc(folder, count: int, limit: str):
+    """A /proc of a process with this number of memory mappings."""
     for name in ("self", "sys/vm"):
         (folder / name).mkdir(parents=True)
     (folder / "self/maps").write_text("00-01 rw-p\n" * count)
@@ -34,26 +28,30 @@ def told(folder, count: int, limit: str):
 def test_programs_are_dropped_before_there_is_no_room_for_more(tmp_path, count, limit, is_dropped):
     double = jax.jit(lambda x: 2 * x)
     double(jnp.ones(3))
-    assert keep_room_for_programs(told(tmp_path, count, limit)) == is_dropped
+    assert keep_room_for_programs(proc(tmp_path, count, limit)) == is_dropped
     assert double._cache_size() == (0 if is_dropped else 1)
     assert float(double(jnp.ones(3))[0]) == 2
 
 
-def test_without_such_a_system_nothing_happens(tmp_path):
+def test_without_proc_nothing_happens(tmp_path):
     assert not keep_room_for_programs(tmp_path / "nowhere")
     trim_heap()
 
 
-@pytest.mark.parametrize("session", [None, Session(tidy_memory)])
-def test_training_drops_programs_only_if_its_session_does(session, monkeypatch):
-    """With so small a share of memory's pieces that every compilation exceeds it."""
+def test_training_calls_its_session_after_compiling(monkeypatch):
+    """A limit of 0 memory mappings makes every compilation exceed it."""
     monkeypatch.setattr(machine, "LARGEST_SHARE", 0)
-    scene = synthetic_scene(num_views=3, width=24, height=16, num_points=40)
-    jitted_step().clear_cache()
+    scene, dropped = synthetic_scene(num_views=3, width=24, height=16, num_points=40), []
     double = jax.jit(lambda x: 2 * x)
     double(jnp.ones(3))
-    fit(scene, Gaussians2dMcmc(stage1_iterations=2), progress=False, session=session)
-    assert double._cache_size() == (1 if session is None else 0)
+
+    def tidy():
+        dropped.append(double._cache_size())
+        tidy_memory()
+        dropped.append(double._cache_size())
+
+    fit(scene, Gaussians2dMcmc(stage1_iterations=2), progress=False, session=Session(tidy))
+    assert dropped[:2] == [1, 0]
 
 
 GROUPS = {

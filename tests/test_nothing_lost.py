@@ -1,9 +1,8 @@
-"""Run folders through everything that ends a process or damages a file; training itself only where it takes part."""
+"""Run folders survive everything that ends a process or damages a file."""
 
 import contextlib
 import dataclasses
 import json
-import multiprocessing
 import os
 import re
 import shutil
@@ -12,7 +11,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ import pytest
 from run_folders import create_run
 
 from a2tg_jax import Change, StepEvent
-from a2tg_jax.cli import main as cli
+from a2tg_jax.cli import __main__ as entry, main as cli
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host import atomic, signals
 from a2tg_jax.host.atomic import replacing
@@ -31,7 +30,7 @@ from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results import forecast, run_evaluation, run_training
-from a2tg_jax.results.folder import OLD, RunFolder, check_apart, claimed, old_run, opened, put_back_old, set_aside
+from a2tg_jax.results.folder import OLD, RunFolder, check_apart, old_run, opened, put_back_old, set_aside
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.results.run_training import MOST_RESTORED, RunOptions, train_run
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
@@ -52,7 +51,7 @@ TRAIN = [
 
 @pytest.fixture(autouse=True)
 def no_signal_is_ignored():
-    """As nohup has SIGHUP ignored, and shells SIGINT in what they run in the background."""
+    """nohup ignores SIGHUP, and shells ignore SIGINT in background processes."""
     wanted = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
     before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
     yield
@@ -69,7 +68,7 @@ pytestmark = pytest.mark.usefixtures("untouched_jax")
 
 
 def filled(path) -> RunFolder:
-    """A folder with a few files of a run, and one of somebody else."""
+    """A folder with a few files of a run, and a foreign one."""
     run = create_run(path)
     write_record(run, RECORD)
     for file in (run.model(NAME), run.checkpoint(NAME, 20), run.report):
@@ -80,9 +79,29 @@ def filled(path) -> RunFolder:
 
 
 def files_of(run: RunFolder) -> dict[str, bytes]:
-    """The files of a folder and what is in them, the marker left out."""
+    """The contents of the files in a folder, except its marker."""
     paths = [path for path in run.path.rglob("*") if path.is_file() and path != run.marker]
     return {path.relative_to(run.path).as_posix(): path.read_bytes() for path in paths}
+
+
+def saving_until(*iterations, noted=None):
+    """A `save_checkpoint` that stops the training after checkpoints of these iterations."""
+
+    def save_and_stop(path, checkpoint):
+        save_checkpoint(path, checkpoint)
+        if noted is not None:
+            noted.append((checkpoint.iteration, checkpoint.num_restored))
+        if checkpoint.iteration in iterations:
+            raise KeyboardInterrupt
+
+    return save_and_stop
+
+
+def raising(error):
+    def fail(*arguments, **options):
+        raise error
+
+    return fail
 
 
 # Files
@@ -98,7 +117,8 @@ def test_files_are_on_the_disk_before_they_are_renamed(tmp_path, monkeypatch):
     assert done == ["flush", "rename", "flush"] and (tmp_path / "file").read_text() == "whole"
 
 
-def test_left_over_partial_files_go_and_others_stay(tmp_path):
+def test_left_over_partial_files_are_deleted_and_others_stay(tmp_path):
+    """A young partial file may belong to a living process."""
     run = filled(tmp_path / "run")
     left = run.checkpoint(NAME, 20).with_name(f".{run.checkpoint(NAME, 20).name}.123.partial")
     others = [run.path / ".notes.txt.123.partial", run.path / "models" / ".mine.npz.1.partial"]
@@ -106,23 +126,21 @@ def test_left_over_partial_files_go_and_others_stay(tmp_path):
         path.write_text("half")
     with opened(run.path):
         assert not left.exists() and all(path.is_file() for path in others)
-
-
-def test_a_write_deletes_old_partial_files_of_the_same_file(tmp_path):
-    """A young one may be that of a living process."""
-    old, young, other = (tmp_path / f".{name}.partial" for name in ("a.npz.1", "a.npz.2", "a.npz.txt.1"))
+    folder = tmp_path / "files"
+    folder.mkdir()
+    old, young, other = (folder / f".{name}.partial" for name in ("a.npz.1", "a.npz.2", "a.npz.txt.1"))
     for path in (old, young, other):
         path.touch()
     for path in (old, other):
         os.utime(path, (0, 0))
-    with replacing(tmp_path / "a.npz") as temporary:
+    with replacing(folder / "a.npz") as temporary:
         temporary.touch()
-    assert {path.name for path in tmp_path.iterdir()} == {"a.npz", young.name, other.name}
+    assert {path.name for path in folder.iterdir()} == {"a.npz", young.name, other.name}
 
 
 @pytest.mark.parametrize("name", ["iterdir", "unlink"])
-def test_old_partial_files_that_stay_keep_nothing_from_being_written(tmp_path, monkeypatch, name):
-    """A partial file may belong to another user, or lie in a folder that cannot be listed."""
+def test_partial_files_that_cannot_be_deleted_are_ignored(tmp_path, monkeypatch, name):
+    """A partial file may belong to another user, or be in a folder that cannot be listed."""
     partial = tmp_path / ".a.npz.1.partial"
     partial.touch()
     os.utime(partial, (0, 0))
@@ -149,25 +167,24 @@ def test_many_writes_list_their_folder_once(tmp_path):
     assert atomic._left_over_once.cache_info().misses == before + 1
 
 
-@pytest.mark.parametrize("filename", ["/", b"x.npz", 7, None, "/no/such/folder/x.npz", Path("x.npz")])
-@pytest.mark.parametrize("free", [0, 1 << 40, None])
-def test_a_full_disk_is_told_whatever_the_file(monkeypatch, filename, free):
+@pytest.mark.parametrize("filename", ["/", b"x.npz", None, "/no/such/folder/x.npz", Path("x.npz")])
+def test_a_full_disk_is_one_line_whatever_the_file(monkeypatch, filename):
     def disk_usage(folder):
         if free is None:
             raise OSError(5, "Input/output error")
         return SimpleNamespace(free=free)
 
     monkeypatch.setattr(shutil, "disk_usage", disk_usage)
-    told = error_text(OSError(28, "No space left on device", filename), "")
-    state = {0: "full, 0.0 MB are free", 1 << 40: "full or has no inodes left, 1099511.6 MB are free", None: "full"}
-    is_named = isinstance(filename, str | Path)
-    start = f"{filename}: the disk is {state[free]}" if is_named else "the disk is full"
-    assert told == f"{start}: make room, or write to another disk"
+    states = {0: "full, 0.0 MB are free", 1 << 40: "full or has no inodes left, 1099511.6 MB are free", None: "full"}
+    for free, state in states.items():  # noqa: B007 - `disk_usage` reads it
+        start = f"{filename}: the disk is {state}" if isinstance(filename, str | Path) else "the disk is full"
+        text = error_text(OSError(28, "No space left on device", filename), "")
+        assert text == f"{start}: make room, or write to another disk"
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="/dev/full is Linux's")
 @pytest.mark.parametrize("is_ours", [True, False])
-def test_a_full_disk_is_told_with_the_file_and_what_to_do(tmp_path, monkeypatch, capsys, is_ours):
+def test_the_error_of_a_full_disk_names_the_file(tmp_path, monkeypatch, capsys, is_ours):
     def write(self):
         writing = replacing(tmp_path / "x.npz") if is_ours else contextlib.nullcontext()
         with writing, open("/dev/full", "wb", buffering=0) as file:
@@ -193,24 +210,20 @@ def test_names_of_checkpoints_sort_by_iteration(tmp_path):
 # Two processes
 
 
-def hold(path, is_held, may_end):
-    with claimed(RunFolder(path)):
-        is_held.set()
-        may_end.wait(60)
-
-
 def test_a_second_process_is_refused_and_a_killed_one_holds_nothing(tmp_path, capsys):
     run = filled(tmp_path / "run")
-    context = multiprocessing.get_context("spawn")
-    is_held, may_end = context.Event(), context.Event()
-    process = context.Process(target=hold, args=(run.path, is_held, may_end))
-    process.start()
-    assert is_held.wait(60)
+    lock = (
+        "import sys\nfrom a2tg_jax.host.operating_system import try_lock\n"
+        "file = open(sys.argv[1], 'a')\nprint(try_lock(file.fileno()), flush=True)\ninput()"
+    )
+    command = [sys.executable, "-c", lock, str(run.marker)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdout.readline() == b"True\n"
     for command in (["eval", str(run.path)], ["train", "--out", str(run.path), "--resume"]):
         assert cli.main(command) == 2
         assert "another process is training or measuring" in capsys.readouterr().err
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
+    process.kill()
+    process.communicate()
     with opened(run.path):
         assert run.report.is_file()
 
@@ -229,31 +242,21 @@ def test_the_old_run_waits_until_the_new_one_has_its_report(tmp_path, capsys):
     assert set(old) - set(files_of(run)) == {f"checkpoints/{NAME}-0000000020.npz"}
 
 
-@pytest.mark.parametrize("error", [ValueError("no room"), KeyboardInterrupt()])
+@pytest.mark.parametrize("error", [pytest.param(ValueError("no room"), marks=pytest.mark.long), KeyboardInterrupt()])
 def test_a_run_without_a_checkpoint_replaces_nothing(tmp_path, monkeypatch, capsys, error):
     run = filled(tmp_path / "run")
     before = files_of(run)
-
-    def fail(*_, **__):
-        raise error
-
-    monkeypatch.setattr(run_training, "fit_stage", fail)
+    monkeypatch.setattr(run_training, "fit_stage", raising(error))
     assert cli.main([*TRAIN, "--out", str(run.path), "--overwrite"]) in (2, 130)
     assert files_of(run) == before
     assert f"the run that was in {run.path} is untouched" in capsys.readouterr().err
 
 
-def test_a_replacement_that_was_stopped_keeps_the_old_run_and_goes_on(tmp_path, monkeypatch, capsys):
+@pytest.mark.long
+def test_a_replacement_that_was_stopped_keeps_the_old_run_and_continues(tmp_path, monkeypatch, capsys):
     run = filled(tmp_path / "run")
-    save = run_training.save_checkpoint
-
-    def save_and_stop(path, checkpoint):
-        save(path, checkpoint)
-        if checkpoint.iteration == 4:
-            raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(run_training, "save_checkpoint", save_and_stop)
+        patch.setattr(run_training, "save_checkpoint", saving_until(4))
         assert cli.main([*TRAIN, "--seed", "5", "--out", str(run.path), "--overwrite"]) == 130
     assert f"{NAME}-0000000004.npz; continue with: a2tg train --out {run.path} --resume" in capsys.readouterr().err
     kept = old_run(run)
@@ -264,23 +267,24 @@ def test_a_replacement_that_was_stopped_keeps_the_old_run_and_goes_on(tmp_path, 
     assert old_run(run) is None and read_record(run).options.seed == 5
 
 
-@pytest.mark.parametrize("after", range(7))
-def test_a_process_killed_while_it_sets_a_run_aside_loses_nothing(tmp_path, monkeypatch, after):
+def test_a_process_killed_while_it_sets_a_run_aside_loses_nothing(tmp_path, monkeypatch):
     """Killed after any of its renamings; the next process puts all of it back."""
-    run = filled(tmp_path / "run")
-    before, left, replace = files_of(run), iter(range(after)), os.replace
+    replace = os.replace
+    for after in range(7):
+        run = filled(tmp_path / f"run-{after}")
+        before, left = files_of(run), iter(range(after))
 
-    def rename(*paths):
-        if next(left, None) is None:
-            raise SystemExit
-        replace(*paths)
+        def rename(*paths, left=left):
+            if next(left, None) is None:
+                raise SystemExit
+            replace(*paths)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", rename)
-        with contextlib.suppress(SystemExit):
-            set_aside(run)
-    put_back_old(run)
-    assert files_of(run) == before
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "replace", rename)
+            with contextlib.suppress(SystemExit):
+                set_aside(run)
+        put_back_old(run)
+        assert files_of(run) == before, after
 
 
 def test_an_unfinished_replacement_never_costs_the_finished_run(tmp_path):
@@ -294,7 +298,7 @@ def test_an_unfinished_replacement_never_costs_the_finished_run(tmp_path):
 # Before training
 
 
-def test_the_run_folder_and_the_scene_lie_apart(tmp_path):
+def test_the_run_folder_and_the_scene_must_not_overlap(tmp_path):
     for out, scene in ((tmp_path / "scene/run", tmp_path / "scene"), (tmp_path, tmp_path / "scene")):
         with pytest.raises(ValueError, match="overlap: choose an output folder"):
             check_apart(out, scene)
@@ -305,10 +309,8 @@ def test_a_full_disk_is_seen_before_training(tmp_path, monkeypatch, capsys):
     usage = shutil.disk_usage(tmp_path)._replace(free=50_000)
     monkeypatch.setattr(forecast.shutil, "disk_usage", lambda path: usage)
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
-    assert (
-        "for models and checkpoints, but the disk has 50.0 kB" in capsys.readouterr().err
-        and not (tmp_path / "run").exists()
-    )
+    assert "for models and checkpoints, but the disk has 50.0 kB" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 # Checkpoints
@@ -318,14 +320,7 @@ def test_a_full_disk_is_seen_before_training(tmp_path, monkeypatch, capsys):
 def stopped(scene, tmp_path_factory):
     """A run with two checkpoints, stopped at iteration 8, and what it would have become."""
     folder = tmp_path_factory.mktemp("stopped")
-    save = run_training.save_checkpoint
-
-    def save_and_stop(path, checkpoint):
-        save(path, checkpoint)
-        if checkpoint.iteration == 8:
-            raise KeyboardInterrupt
-
-    for name, function in (("whole", save), ("run", save_and_stop)):
+    for name, function in (("whole", save_checkpoint), ("run", saving_until(8))):
         run = create_run(folder / name)
         write_record(run, RECORD)
         with pytest.MonkeyPatch.context() as patch:
@@ -341,7 +336,7 @@ def assert_same(run, whole):
         np.testing.assert_array_equal(found, wanted)
 
 
-def test_a_damaged_newest_checkpoint_is_said_and_the_one_before_used(scene, stopped, tmp_path):
+def test_the_checkpoint_before_a_damaged_one_is_used_with_a_warning(scene, stopped, tmp_path):
     run, whole = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run")), stopped[1]
     *_, older, newest = run.checkpoints(NAME)
     newest.write_bytes(newest.read_bytes()[:1000])
@@ -351,18 +346,16 @@ def test_a_damaged_newest_checkpoint_is_said_and_the_one_before_used(scene, stop
     assert not list((run.path / "checkpoints").glob("*"))
 
 
-def test_without_a_checkpoint_that_can_be_read_nothing_begins_anew(scene, stopped, tmp_path):
+def test_training_does_not_restart_if_all_checkpoints_are_damaged(scene, stopped, tmp_path):
     run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
     for path in run.checkpoints(NAME):
         path.write_bytes(b"")
-    with pytest.raises(
-        ValueError, match=rf"there is no other checkpoint: delete it to train {NAME} from its beginning"
-    ):
+    with pytest.raises(ValueError, match=rf"there is no other checkpoint: delete it to train {NAME} from its begin"):
         train_run(run, scene, QUIET)
     assert run.checkpoints(NAME)
 
 
-def test_other_threads_are_said(scene, stopped, tmp_path, monkeypatch):
+def test_a_change_of_threads_is_a_warning(scene, stopped, tmp_path, monkeypatch):
     run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
     threads = this_machine().threads
     monkeypatch.setenv("A2TG_NUM_THREADS", str(threads + 1))
@@ -373,6 +366,7 @@ def test_other_threads_are_said(scene, stopped, tmp_path, monkeypatch):
 # LPIPS
 
 
+@pytest.mark.long
 def test_lpips_is_kept_while_the_models_are_the_same(scene, stopped, tmp_path, monkeypatch):
     run = RunFolder(shutil.copytree(stopped[0].path, tmp_path / "run"))
     train_run(run, scene, QUIET)
@@ -467,17 +461,10 @@ def test_restoring_takes_another_order_and_resuming_repeats_it(scene, tmp_path, 
     run = trapped_run(scene, tmp_path / "run", "restore")
     with pytest.warns(UserWarning, match=r"restarts from iteration 10 with the views in another order \(1 of 5"):
         train_run(run, scene, QUIET)
-    other, save, numbers = trapped_run(scene, tmp_path / "other", "restore"), save_checkpoint, []
-
-    def save_and_stop(path, checkpoint):
-        save(path, checkpoint)
-        numbers.append((checkpoint.iteration, checkpoint.num_restored))
-        if checkpoint.iteration in (8, 14):
-            raise KeyboardInterrupt
-
+    other, numbers = trapped_run(scene, tmp_path / "other", "restore"), []
     with monkeypatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr(run_training, "save_checkpoint", save_and_stop)
+        patch.setattr(run_training, "save_checkpoint", saving_until(8, 14, noted=numbers))
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 train_run(other, scene, QUIET)
@@ -488,6 +475,7 @@ def test_restoring_takes_another_order_and_resuming_repeats_it(scene, tmp_path, 
         np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.long
 def test_restoring_has_an_end(scene, tmp_path):
     run = trapped_run(scene, tmp_path / "run", "restore", always=True)
     with (
@@ -510,8 +498,10 @@ def test_a_signal_outside_training_ends_with_one_line(monkeypatch, capsys, numbe
     assert capsys.readouterr().err == "a2tg: interrupted\n" and signal.getsignal(number) == before
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_in_training_keeps_the_state_of_that_moment(stopped, tmp_path, monkeypatch, capsys, number, code):
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.long)]
+)
+def test_a_signal_in_training_keeps_its_state(scene, stopped, tmp_path, monkeypatch, capsys, number, code):
     launch, out = StageRun._launch, tmp_path / "run"
 
     def launch_and_signal(self, iteration):
@@ -528,11 +518,25 @@ def test_a_signal_in_training_keeps_the_state_of_that_moment(stopped, tmp_path, 
         f"a2tg: interrupted; the last checkpoint is {run.checkpoint(NAME, 7)}; "
         f"continue with: a2tg train --out {out} --resume"
     )
-    assert cli.main(["train", "--out", str(out), "--resume"]) == 0
+    train_run(run, scene, QUIET)
     assert_same(run, stopped[1])
 
 
-def test_a_second_signal_is_obeyed_at_once():
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (None, 7)])
+def test_a_signal_during_the_imports_ends_the_program_in_one_line(monkeypatch, capsys, number, code):
+    def main_of(name):
+        if number is not None and name == "main":
+            signal.raise_signal(number)
+        return lambda: 7
+
+    module = ModuleType("a2tg_jax.cli.main")
+    module.__getattr__ = main_of
+    monkeypatch.setitem(sys.modules, "a2tg_jax.cli.main", module)
+    assert entry.main() == code
+    assert capsys.readouterr().err == ("" if number is None else "a2tg: interrupted\n")
+
+
+def test_a_second_signal_ends_the_program_at_once():
     with pytest.raises(signals.Stopped) as raised, signals.noted() as is_asked:
         assert not is_asked()
         os.kill(os.getpid(), signal.SIGINT)
@@ -542,6 +546,7 @@ def test_a_second_signal_is_obeyed_at_once():
     assert raised.value.exit_code == 143
 
 
+@pytest.mark.long
 def test_a_closed_pipe_is_quiet(tmp_path):
     run = filled(tmp_path / "run")
     run.model(NAME).unlink()
@@ -553,11 +558,8 @@ def test_a_closed_pipe_is_quiet(tmp_path):
     assert done.stderr.strip() == "141"
 
 
-def test_errors_of_training_tell_how_to_go_on(tmp_path, monkeypatch, capsys):
-    def full(path, checkpoint):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(run_training, "save_checkpoint", full)
+def test_errors_of_training_come_with_advice(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(run_training, "save_checkpoint", raising(OSError(28, "No space left on device")))
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     told = "the disk is full: make room, or write to another disk"
@@ -574,15 +576,8 @@ LACKS = {
 }
 
 
-def raising(error):
-    def fail(*arguments, **options):
-        raise error
-
-    return fail
-
-
-@pytest.mark.parametrize("told", LACKS)
-def test_a_lack_of_memory_in_training_tells_how_to_go_on(told, tmp_path, monkeypatch, capsys):
+def test_a_lack_of_memory_in_training_comes_with_advice(tmp_path, monkeypatch, capsys):
+    told = next(iter(LACKS))
     monkeypatch.setattr(run_training, "fit_stage", raising(LACKS[told]))
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
@@ -598,7 +593,7 @@ def test_a_lack_of_memory_outside_training_is_one_line(name, advice, monkeypatch
         assert f"a2tg: error: {told}{advice}" in capsys.readouterr().err
 
 
-def test_an_error_of_the_program_itself_is_not_told_as_the_users(monkeypatch):
+def test_an_internal_error_is_not_reported_as_a_mistake_of_the_user(monkeypatch):
     monkeypatch.setattr(cli.Info, "run", raising(jax.errors.JaxRuntimeError("INTERNAL: a bug")))
     with pytest.raises(jax.errors.JaxRuntimeError, match="a bug"):
         cli.main(["info", "run"])

@@ -1,4 +1,4 @@
-"""Places to write to, and budgets too small to show a scene, are told before any work."""
+"""Output paths are checked before any work, and `a2tg info` reports what a folder holds."""
 
 import contextlib
 import json
@@ -16,56 +16,39 @@ from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.results.folder import check_export, check_new, check_output
-from a2tg_jax.results.forecast import RunForecast
 from a2tg_jax.results.info import describe_run
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
-from a2tg_jax.training.cost import Bytes
 
 
-def test_a_file_in_the_way_is_told(tmp_path):
+def test_places_that_cannot_be_written_are_named(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match=r"run cannot be made, for .*file is a file$"):
         check_output(tmp_path / "file" / "run")
     check_output(tmp_path / "file")
+    if sys.platform == "linux":
+        with pytest.raises(ValueError, match=r"^/proc/x cannot be made, for nothing can be written in /proc: "):
+            check_output(Path("/proc/x"))
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="/proc is Linux's")
-def test_a_folder_that_takes_nothing_is_told():
-    with pytest.raises(ValueError, match=r"^/proc/x cannot be made, for nothing can be written in /proc: "):
-        check_output(Path("/proc/x"))
-
-
-def test_only_several_levels_are_told(tmp_path, capsys):
+def test_new_folders_on_several_levels_elsewhere_are_reported(tmp_path, monkeypatch, capsys):
     for path in (tmp_path, tmp_path / "run"):
         check_output(path)
     assert capsys.readouterr().err == ""
     check_output(tmp_path / "usb stick" / "runs" / "run")
     assert capsys.readouterr().err == f"a2tg: {tmp_path / 'usb stick'} does not exist and will be made\n"
-    assert not list(tmp_path.iterdir())
-
-
-def test_levels_below_the_current_folder_are_not_told(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     check_output(Path("runs/demo"))
-    assert capsys.readouterr().err == ""
+    assert capsys.readouterr().err == "" and not list(tmp_path.iterdir())
 
 
-def test_a_budget_for_few_gaussians_is_said():
+def test_a_budget_for_few_gaussians_is_reported():
     assert not a2tg.A2tg(memory_budget="1MB").small_budget and not a2tg.A2tg().small_budget
     assert a2tg.A2tg(memory_budget="1kB").small_budget == "memory_budget has room for 4 Gaussians of 232 bytes"
 
 
-def test_a_limit_below_the_program_itself_says_so():
-    forecast = RunForecast({"evaluation": Bytes(program=1.1e9, pixels=1e6)}, 1e6)
-    with pytest.raises(
-        ValueError, match=r"20.0 MB may be used: the program itself takes about 1.10 GB of it: allow more"
-    ):
-        forecast.check_memory(20e6)
-
-
-def test_sizes_have_three_digits_and_a_unit_that_suits_them():
-    told = {1: "1 byte", 999: "999 bytes", 9_996: "10.0 kB", 999_600: "1.00 MB", 2.5e6: "2.50 MB", 12.34e9: "12.3 GB"}
-    assert {size: in_bytes(size) for size in told} == told and in_bytes(1234e9) == "1,234 GB"
+def test_sizes_have_three_digits_and_a_suitable_unit():
+    texts = {1: "1 byte", 999: "999 bytes", 9_996: "10.0 kB", 999_600: "1.00 MB", 2.5e6: "2.50 MB", 12.34e9: "12.3 GB"}
+    assert {size: in_bytes(size) for size in texts} == texts and in_bytes(1234e9) == "1,234 GB"
 
 
 def test_info_shows_what_is_intact_and_names_what_is_damaged(tmp_path):
@@ -177,11 +160,3 @@ def test_the_mesh_of_a_run_is_replaced_unasked_once_it_was_written_so(tmp_path, 
     assert "mesh.glb exists; add --overwrite" in capsys.readouterr().err
     for words in (["--overwrite"], [], ["--out", str(out)]):
         assert cli.main(["mesh", str(tmp_path), *words]) == 0 and out.read_text() == "mesh"
-
-
-def test_a_page_in_a_folder_is_not_replaced_unasked(tmp_path):
-    check_new(tmp_path / "index.html", "--web", overwrite=False)
-    (tmp_path / "index.html").touch()
-    with pytest.raises(FileExistsError, match=r"index\.html exists; add --overwrite"):
-        check_new(tmp_path / "index.html", "--web", overwrite=False)
-    check_new(tmp_path / "index.html", "--web", overwrite=True)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_results import circle
+from run_folders import circle
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import (

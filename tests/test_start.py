@@ -54,10 +54,10 @@ def test_the_camera_that_sees_a_splat_largest_decides():
     assert (np.asarray(one) < 0.5).all()
 
 
-@pytest.mark.parametrize(("opacity", "least"), [(0.5, 0.1), (0.1, 0.1), (0.04, 0.04)])
-def test_no_splat_becomes_fainter_than_3dgs_begins(opacity, least):
-    opacities = fainter_where_dense(splats([1e-2, 1e-3], opacity), [camera_at(DEPTH)]).opacities
-    np.testing.assert_allclose(opacities, least, rtol=1e-5)
+def test_no_splat_becomes_fainter_than_3dgs_begins():
+    for opacity, least in ((0.5, 0.1), (0.1, 0.1), (0.04, 0.04)):
+        opacities = fainter_where_dense(splats([1e-2, 1e-3], opacity), [camera_at(DEPTH)]).opacities
+        np.testing.assert_allclose(opacities, least, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("num_points", "least", "most"), [(300, 0.0, 0.1), (9_000, 0.5, 1.0)])
