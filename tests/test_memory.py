@@ -38,6 +38,7 @@ def test_without_proc_nothing_happens(tmp_path):
     trim_heap()
 
 
+@pytest.mark.long
 def test_training_calls_its_session_after_compiling(monkeypatch):
     """A limit of 0 memory mappings makes every compilation exceed it."""
     monkeypatch.setattr(machine, "LARGEST_SHARE", 0)

@@ -139,14 +139,14 @@ def test_exports_into_a_run_are_replaced_by_default_or_if_asked(tmp_path, name, 
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.touch()
-    with pytest.raises(FileExistsError, match="add --overwrite"):
+    with pytest.raises(FileExistsError, match="add `overwrite`"):
         check_export(path, path, "--out", overwrite=False)
     run.own(path)
     check_export(path, path, "--out", overwrite=False)
     with contextlib.nullcontext() if is_export else pytest.raises(ValueError, match="belongs to the run"):
         check_export(path, tmp_path / "other", "--out", overwrite=True)
     if is_export:
-        with pytest.raises(FileExistsError, match="add --overwrite"):
+        with pytest.raises(FileExistsError, match="add `overwrite`"):
             check_new(path, "OUT", overwrite=False)
 
 

@@ -239,18 +239,18 @@ def test_outliers_leave_the_colours_of_depth_to_the_scene(share, factor):
     """A far background, and splats before the camera."""
     depth = np.broadcast_to(np.linspace(1, 3, 100, dtype=np.float32), (100, 100)).copy()
     depth[: round(100 * share)] *= factor
-    colors = depth_picture(shown(np.ones_like(depth), depth)).picture[-1].astype(int)
+    colors = depth_picture(shown(np.ones_like(depth), depth))[0][-1].astype(int)
     assert np.abs(colors[5] - colors[94]).max() > 150
 
 
 def test_without_a_hit_there_is_a_picture_of_depth():
     nothing = jnp.zeros((4, 4))
-    assert depth_picture(shown(nothing, nothing)).picture.shape == (4, 4, 3)
+    assert depth_picture(shown(nothing, nothing))[0].shape == (4, 4, 3)
 
 
 def test_maps_show_what_varies_between_gaussians():
     def legends(model: Model) -> dict[str, list[str]]:
-        return {one.file: list(one.names) for one in level_maps(model)}
+        return {file: names for file, _, _, names in level_maps(model)}
 
     textured = some_model()
     assert legends(textured) == {"resolutions.png": ["1 or none", "2", "4", "8"]}

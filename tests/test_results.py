@@ -100,7 +100,7 @@ def test_folders_in_use_are_refused_and_unused_ones_free(tmp_path):
     run = RunFolder(tmp_path / "run")
     run.own(run.report).touch()
     (tmp_path / "photo.jpg").touch()
-    with pytest.raises(FileExistsError, match=r"is not empty; add --resume .* --overwrite"):
+    with pytest.raises(FileExistsError, match=r"is not empty; add `resume` .* `overwrite`"):
         check_free(run.path)
     check_free(run.path, overwrite=True)
     for path, words in ((tmp_path, "not a run folder"), (tmp_path / "photo.jpg", "is a file")):
@@ -216,7 +216,7 @@ def test_command_repeats_the_run(tmp_path, name, system, compare, preset):
     """run.toml holds every number, so other defaults, or a preset, change nothing; None where a preset has a value."""
     record = RunRecord(SceneSource(str(tmp_path / "a b"), downscale=4), name, system, compare, preset)
     run = with_record(tmp_path / "run c", record)
-    assert read_record(run) == record
+    assert read_run_file(run.record) == record
     assert tomllib.loads(run.record.read_text())["options"]["stage1_iterations"] == system.stage1_iterations
     a2tg, command, *arguments = shlex.split(repeating_command(run))
     again = cli.parsed(command, arguments)

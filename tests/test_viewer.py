@@ -326,7 +326,7 @@ def test_a_folder_and_a_single_file(tmp_path):
     assert one.read_text(encoding="utf-8") == viewer_html_with(scene)
     with pytest.raises(ValueError, match="no photographs"):
         export_web(source, tmp_path / "with", photographs=True)
-    with pytest.raises(ValueError, match="leave out --single-file"):
+    with pytest.raises(ValueError, match="leave out `single_file`"):
         export_web(source, tmp_path / "with.html", photographs=True)
 
 

@@ -3,6 +3,7 @@ download, doctor."""
 
 import inspect
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -139,9 +140,14 @@ def _add_current_folder() -> None:
 
 def _fail(message: str) -> int:
     """Print an error as one line and return its exit code."""
-    print(f"a2tg: error: {shortened(message, LONGEST_ERROR)}", file=sys.stderr)
+    print(f"a2tg: error: {shortened(_with_flags(message), LONGEST_ERROR)}", file=sys.stderr)
     return 2
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"a2tg: warning: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"a2tg: warning: {' '.join(_with_flags(str(message)).split())}", file=sys.stderr)
+
+
+def _with_flags(message: str) -> str:
+    """Replace the names of options, which messages have in backticks, by their flags."""
+    return re.sub(r"`([a-z][\w.]*)`", lambda name: f"--{name[1].replace('_', '-')}", message)

@@ -64,7 +64,7 @@ def convert(
     """
     writer_of(out)  # Baking takes minutes.
     if float64 and format_of(out).save is not save_ply:
-        raise ValueError(f"--float64 needs an OUT that ends in .ply and is not packed; got {out}")
+        raise ValueError(f"`float64` needs an OUT that ends in .ply and is not packed; got {out}")
     sources = {file.resolve() for file in files_of(source)}
     for file in files_written(out):
         if file.is_dir():
@@ -99,7 +99,7 @@ def convert(
 def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str]:
     """Return a plain model, and a line about the baking."""
     if model.origin is None or not model.origin.cameras:
-        raise ValueError(f"--bake needs a model with cameras; {source} has none")
+        raise ValueError(f"`bake` needs a model with cameras; {source} has none")
     shown = model.appearance
     if shown.is_portable and shown.texture is None and shown.exponents is None:
         return model, "baked: nothing, for the model is plain"
@@ -127,7 +127,7 @@ def cameras_apart(origin: Origin) -> tuple[list[Camera], list[Camera]]:
 def check_ply(out: Path) -> None:
     """Raise ValueError if `out` is a folder or has another suffix than ply."""
     if out.is_dir() or out.suffix.lower() != ".ply":
-        raise ValueError(f"--ply must be the path of a file that ends in .ply; got {out}")
+        raise ValueError(f"`ply` must be the path of a file that ends in .ply; got {out}")
 
 
 def export_ply(source: Source, out: Path, *, float64: bool = False) -> str:

@@ -6,9 +6,8 @@ They use matplotlib's object interface, without windows or global state.
 import dataclasses
 import io
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -103,10 +102,10 @@ def write_figures(
             add("textures", "textures.png", learned, caption, "texels")
         caption = "Number of Gaussians with a texture of each resolution."
         add("textures", "sizes.png", sizes_figure(model.textures.sizes), caption, "chart")
-    for shown in level_maps(model):
-        legend = list(zip(map(to_hex, level_colors(len(shown.names))), shown.names, strict=True))
-        caption = f"The first view, every Gaussian by {shown.varying}; {NOT_HIT}."
-        add("maps", shown.file, level_picture(model, shown.levels, camera, settings), caption, legend=legend)
+    for file, varying, levels, names in level_maps(model):
+        legend = list(zip(map(to_hex, level_colors(len(names))), names, strict=True))
+        caption = f"The first view, every Gaussian by {varying}; {NOT_HIT}."
+        add("maps", file, level_picture(model, levels, camera, settings), caption, legend=legend)
     output = Renderer(model, settings=settings)(camera)
     picture, stops = depth_picture(output)
     legend = [(to_hex(tuple(color)), f"{distance:.3g}") for distance, color in stops]
@@ -212,23 +211,17 @@ def learned_textures(model: Model) -> np.ndarray | None:
     return sheet
 
 
-class DepthPicture(NamedTuple):
-    """Depths as colours, evenly in inverse depth, so that a far background uses few colours."""
-
-    picture: np.ndarray
-    """uint8 [H, W, 3], near bright; chequered where little or nothing is hit."""
-    stops: list[tuple[float, np.ndarray]]
-    """Depths in the legend, nearest first, and their colours, [3] in [0, 1]. Depths beyond the ends are clipped."""
-
-
-def depth_picture(output: RenderOutput) -> DepthPicture:
+def depth_picture(output: RenderOutput) -> tuple[np.ndarray, list[tuple[float, np.ndarray]]]:
+    """Return depths as colours, uint8 [H, W, 3], near bright, chequered where nearly nothing is hit; and some depths,
+    nearest first, with their colours [3] in [0, 1]. Depths beyond these are clipped."""
     is_hit = _is_hit(output)
+    # Colours are even in inverse depth, so that a far background uses few of them.
     inverse = np.asarray(output.alpha) / np.where(is_hit, np.asarray(output.depth), 1.0)
     far, near = np.percentile(inverse[is_hit], DEPTH_RANGE) if is_hit.any() else (1.0, 1.0)
     colors = colormaps["viridis"](np.clip((inverse - far) / max(near - far, 1e-9), 0, 1))[..., :3]
     shares = np.linspace(1, 0, DEPTH_STOPS if near > far else 1)
     stops = [(1 / (far + share * (near - far)), colormaps["viridis"](share)[:3]) for share in shares]
-    return DepthPicture(_on_hit(colors, is_hit), stops)
+    return _on_hit(colors, is_hit), stops
 
 
 def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
@@ -239,29 +232,17 @@ def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
     return _on_hit(0.5 + 0.5 * normal / np.where(is_seen[..., None], length, 1.0), is_seen)
 
 
-class LevelMap(NamedTuple):
-    """Levels of the Gaussians in a varying property, such as their degree."""
-
-    file: str
-    varying: str
-    """The property in words."""
-    levels: np.ndarray
-    """[N] integers, each with its own colour."""
-    names: Sequence[str]
-    """Meanings of levels 0, 1, …"""
-
-
-def level_maps(model: Model) -> list[LevelMap]:
-    """Return the maps of numbers of texels and of degrees, each only if it varies."""
-    maps = []
+def level_maps(model: Model) -> Iterator[tuple[str, str, np.ndarray, list[str]]]:
+    """Yield file name, property, levels [N] and their meanings, for the number of texels and the degree of Gaussians
+    if they vary."""
     if model.textures is not None and model.appearance.texture_options is not None:
         levels = np.rint(np.log2(np.maximum(model.textures.sizes.prod(axis=1), 1))).astype(int)
-        names = ["1 or none", *(str(2**level) for level in range(1, levels.max() + 1))]
-        maps.append(LevelMap("resolutions.png", "the number of its texels", levels, names))
-    if model.appearance.bands is not None:
+        if len(np.unique(levels)) > 1:
+            names = ["1 or none", *(str(2**level) for level in range(1, levels.max() + 1))]
+            yield "resolutions.png", "the number of its texels", levels, names
+    if model.appearance.bands is not None and len(np.unique(model.degrees)) > 1:
         names = [str(degree) for degree in range(model.degrees.max() + 1)]
-        maps.append(LevelMap("degrees.png", "the degree of its view dependence", model.degrees, names))
-    return [one for one in maps if len(np.unique(one.levels)) > 1]
+        yield "degrees.png", "the degree of its view dependence", model.degrees, names
 
 
 def level_colors(num_levels: int) -> np.ndarray:

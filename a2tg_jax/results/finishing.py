@@ -57,7 +57,7 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     model, scene = load_model(path), record.scene.load()
     can_polish = options.polish_steps > 0 and model.appearance.is_linear
     if can_polish and planned.system.exposure:  # Photographs of changing exposure would pull at the colours.
-        raise ValueError("the run learned exposures, which polishing does not support: add --polish-steps 0")
+        raise ValueError("the run learned exposures, which polishing does not support: add `polish_steps` 0")
     if not can_polish and not (options.max_loss and can_shrink(model)):
         raise ValueError(f"{planned.name} shows nothing that these options can shrink or polish")
     finished_stages(source, record.plan)
@@ -95,7 +95,7 @@ def _is_written(run: RunFolder, content: Mapping[str, object]) -> bool:
     with contextlib.suppress(ValueError):
         if is_begun and read_json(run.finish) == content:
             return run.record.is_file()
-    check_free(run.path, in_use="is not empty; choose another --out")
+    check_free(run.path, in_use="is not empty; choose another `out`")
     return False
 
 

@@ -46,7 +46,7 @@ DAMAGED = ".damaged"
 OLD = ".a2tg-old"
 EXPORTS = (".a2tgz", ".glb")
 """Suffixes of files that `a2tg compress` and `a2tg mesh` write into a run folder, which the run does not need."""
-IN_USE = "is not empty; add --resume to continue it, --overwrite to start again, or choose another --out"
+IN_USE = "is not empty; add `resume` to continue it, `overwrite` to start again, or choose another `out`"
 """Error text of training for a folder that already holds a run."""
 MOST_NAMES = 100_000
 """Largest number of files in a marker."""
@@ -95,11 +95,11 @@ class RunFolder:
         data = read_regular(self.marker, MOST_MARKER_BYTES)
         first, *names = data.decode("utf-8", errors="replace").splitlines()
         if first != MARKER:
-            raise ValueError(f"{self.marker} is not the marker of a run; choose another folder with --out")
+            raise ValueError(f"{self.marker} is not the marker of a run; choose another folder with `out`")
         if len(names) > MOST_NAMES:
             raise ValueError(
                 f"{self.marker} lists {len(names):,} files, and {MOST_NAMES:,} are the most that a run writes; "
-                "choose another folder with --out"
+                "choose another folder with `out`"
             )
         return names
 
@@ -171,14 +171,14 @@ def check_free(path: Path, *, overwrite: bool = False, in_use: str = IN_USE) -> 
     """Raise FileExistsError if `path` is anything but a free folder, which may hold the run.toml of a run that never
     began, or a run that may be replaced (`overwrite`). `in_use` is the error text for a run."""
     if path.exists() and not path.is_dir():
-        raise FileExistsError(f"{path} is a file; choose another folder with --out")
+        raise FileExistsError(f"{path} is a file; choose another folder with `out`")
     run = RunFolder(path)
     unused = {run.marker.name, run.record.name} if run.marker.is_file() else set()
     unused |= {partial.name for partial, whole in left_over(path).items() if whole.name in run.written()}
     if not path.is_dir() or all(entry.name in unused for entry in path.iterdir()):
         return
     if not run.written():
-        raise FileExistsError(f"{path} is not empty and not a run folder; choose another folder with --out")
+        raise FileExistsError(f"{path} is not empty and not a run folder; choose another folder with `out`")
     if not overwrite:
         raise FileExistsError(f"{path} {in_use}")
 
@@ -232,7 +232,7 @@ def claimed(run: RunFolder) -> Iterator[None]:
     with open(run.marker, "a", encoding="utf-8") as file:
         if not try_lock(file.fileno()):
             raise FileExistsError(
-                f"another process is training or measuring in {run.path}: wait until it ends, or choose another --out"
+                f"another process is training or measuring in {run.path}: wait until it ends, or choose another `out`"
             )
         run.own(run.marker)
         put_back_old(run)
@@ -356,7 +356,7 @@ def check_new(path: Path, option: str, *, overwrite: bool) -> None:
     if run is not None and path.suffix.lower() not in EXPORTS:
         raise ValueError(f"{path} belongs to the run in {run}; choose another {option}")
     if not overwrite:
-        raise FileExistsError(f"{path} exists; add --overwrite to replace it, or choose another {option}")
+        raise FileExistsError(f"{path} exists; add `overwrite` to replace it, or choose another {option}")
 
 
 def check_export(path: Path, default: Path, option: str, *, overwrite: bool) -> None:

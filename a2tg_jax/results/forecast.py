@@ -41,11 +41,11 @@ PICTURE_PER_PIXEL = 2
 QUICK_SIDE = 640
 """Longer side of the photographs, in pixels, with which the preset quick takes minutes on two cores."""
 OPTIONS = {
-    "photographs": ("--downscale", "batch_size"),
+    "photographs": ("downscale", "batch_size"),
     "model": ("memory_budget", "sh_degree"),
     "gradients": ("memory_budget", "batch_size", "sh_degree"),
-    "pixels": ("--downscale",),
-    "corrections": ("corrections.grid.size", "--downscale"),
+    "pixels": ("downscale",),
+    "corrections": ("corrections.grid.size", "downscale"),
 }
 """Options to change, by what needs most of the memory; those that limit the number of Gaussians come before."""
 
@@ -88,7 +88,7 @@ class RunForecast:
             advice = f"change {self._options(largest)}, or"
         raise ValueError(
             f"the run would need about {in_bytes(needed.total)} of memory ({phase}: {_parts(needed)}), and "
-            f"{in_bytes(limit)} may be used: {advice} allow more with --max-memory"
+            f"{in_bytes(limit)} may be used: {advice} allow more with `max_memory`"
         )
 
     def check_one_device(self, limit: float) -> None:
@@ -108,13 +108,13 @@ class RunForecast:
         if self.disk_bytes > free:
             raise ValueError(
                 f"{out} needs about {in_bytes(self.disk_bytes)} for models and checkpoints, but the disk has "
-                f"{in_bytes(free)}: make room, or choose another --out, fewer Gaussians or fewer --compare"
+                f"{in_bytes(free)}: make room, or choose another `out`, fewer Gaussians or fewer `compare`"
             )
 
     def _options(self, largest: str) -> str:
         """Return the options to change if this part of the memory is the largest."""
-        names = dict.fromkeys((*(self.limits if largest in ("model", "gradients") else ()), *OPTIONS[largest]))
-        *others, last = names
+        limits = self.limits if largest in ("model", "gradients") else ()
+        *others, last = dict.fromkeys(f"`{name}`" for name in (*limits, *OPTIONS[largest]))
         return f"{', '.join(others)} or {last}" if others else last
 
 
@@ -146,7 +146,7 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
         model=sum(model_bytes),
         pixels=EVALUATION_PER_PIXEL * largest_view((*scene.test, *scene.train)),
     )
-    limits = [] if num_given is None else ["the --init file (to a smaller one)"]
+    limits = [] if num_given is None else ["init"]
     limits += [name for planned in plan.stages for name in planned.system.limits()]
     # Models stay, checkpoints of one stage at a time, and sheets of photograph, renders and error.
     pixels = sum(view.camera.width * view.camera.height for view in scene.test or scene.train)
@@ -190,7 +190,7 @@ def quick_flags(longest_side: int, downscale: int = 1) -> str:
 
 def bytes_allowed(max_memory: float | str | None) -> int | None:
     """Return the bytes of a memory limit, written like a memory budget. Raises ValueError if it is invalid."""
-    megabytes = megabytes_of(max_memory, "--max-memory")
+    megabytes = megabytes_of(max_memory, "max_memory")
     return None if megabytes is None else bytes_of(megabytes)
 
 

@@ -56,7 +56,7 @@ class FrameFolder:
     def check(self, names: Iterable[str], *, overwrite: bool) -> None:
         """Raise FileExistsError if a file exists that no render wrote, unless `overwrite` is set."""
         for name in set(names) - set(self.listed):
-            check_new(self.path / name, "--out", overwrite=overwrite)
+            check_new(self.path / name, "`out`", overwrite=overwrite)
 
     @contextlib.contextmanager
     def writing(self, name: str) -> Iterator[Path]:
@@ -120,7 +120,7 @@ def render_frames(
     if num_frames < 1:
         raise ValueError(f"the number of frames must be at least 1; got {num_frames}")
     if out.exists() and not out.is_dir():
-        raise FileExistsError(f"{out} is a file; choose a folder for the frames with --out")
+        raise FileExistsError(f"{out} is a file; choose a folder for the frames with `out`")
     source = open_source(run.path, name)
     cameras = dict(_cameras(source.model, route, num_frames))
     if size is not None:
@@ -191,7 +191,7 @@ def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tup
         path = smooth_path if route == "smooth" else turntable
         return numbered(path([camera for _, _, camera in views], num_frames))
     if not model.origin.is_test.any():
-        raise ValueError("the run has no test views; render a path instead with --path smooth")
+        raise ValueError("the run has no test views; render a path instead with `path` smooth")
     tests = {name: camera for name, is_test, camera in views if is_test}
     names = picture_names(tests)
     return ((names[name], camera) for name, camera in tests.items())

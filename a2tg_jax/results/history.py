@@ -69,7 +69,7 @@ def read_history(path: Path) -> History:
 def check_tensorboard() -> None:
     """Raise ValueError unless the library that writes the files is installed."""
     if importlib.util.find_spec(LIBRARY) is None:
-        raise ValueError(f"--tensorboard needs {LIBRARY}: pip install 'a2tg-jax[tensorboard]'")
+        raise ValueError(f"`tensorboard` needs {LIBRARY}: pip install 'a2tg-jax[tensorboard]'")
 
 
 class EventWriter:

@@ -33,9 +33,9 @@ GRID_SHARE = 0.5
 """Default share of the free memory for voxels."""
 TEXTURED_FACES = 100_000
 """Default number of faces of a mesh with a texture."""
-GRID_FULL = "lower --resolution or --radius, or raise --max-memory"
-NO_SURFACE = "give a larger --radius, or --unbounded"
-SMALL_PARTS = "raise --resolution or lower --voxel, or train longer or from more views"
+GRID_FULL = "lower `resolution` or `radius`, or raise `max_memory`"
+NO_SURFACE = "give a larger `radius`, or `unbounded`"
+SMALL_PARTS = "raise `resolution` or lower `voxel`, or train longer or from more views"
 """Advice of the command line for each kind of error."""
 TextureSource = Literal["none", "renders", "photographs"]
 
@@ -75,9 +75,9 @@ class MeshOptions:
 
     def check(self, out: Path) -> None:
         """Raise ValueError before anything is computed if an option is invalid or a library is missing."""
-        check_mesh_suffix(out, "--out")
+        check_mesh_suffix(out, "`out`")
         if self.resolution is not None and self.voxel is not None:
-            raise ValueError("--resolution and --voxel both say the size of voxels: leave one out")
+            raise ValueError("`resolution` and `voxel` both say the size of voxels: leave one out")
         check_lengths(self.resolution, self.voxel, self.radius)
         if self.clusters < 1:
             raise ValueError(f"clusters must be at least 1; got {self.clusters}")
@@ -86,10 +86,10 @@ class MeshOptions:
             raise ValueError(f"max_memory must be at most {in_bytes(most)}, the free memory; got {self.max_memory}")
         if self.texture != "none":
             if out.suffix.lower() == ".ply":
-                raise ValueError("a PLY file holds no texture: choose --out NAME.glb or NAME.obj, or --texture none")
+                raise ValueError("a PLY file holds no texture: choose `out` NAME.glb or NAME.obj, or `texture` none")
             check_texture(self.texture_size)
         elif self.texture_size != MeshOptions.texture_size:
-            raise ValueError("texture_size has no effect without a texture: add --texture renders or photographs")
+            raise ValueError("texture_size has no effect without a texture: add `texture` renders or photographs")
         if self.most_faces is not None:
             check_simplifying(self.most_faces)
 
@@ -148,13 +148,13 @@ def _photographs(source: Source, origin: Origin) -> Iterator[Picture]:
     scene = source.load_scene()
     if scene is None:
         raise ValueError(
-            f"the photographs of {source.title} are missing; choose --texture renders, or give the run folder while "
+            f"the photographs of {source.title} are missing; choose `texture` renders, or give the run folder while "
             "its scene is in place"
         )
     if any(view.camera.rays is not None for view in scene.train):
         raise ValueError(
-            f"the photographs of {source.title} are distorted by their lens (--lens keep), and a texture needs "
-            "pinhole photographs: choose --texture renders"
+            f"the photographs of {source.title} are distorted by their lens (`lens` keep), and a texture needs "
+            "pinhole photographs: choose `texture` renders"
         )
     cameras = dict(zip(origin.names, origin.cameras, strict=True))
     views = [view for view in scene.train if view.name in cameras]

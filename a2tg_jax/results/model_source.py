@@ -114,7 +114,7 @@ def open_source(path: Path, name: str | None = None) -> Source:
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such file or folder")
     if name is not None:
-        raise ValueError(f"--model needs a run folder; {path} is not a folder")
+        raise ValueError(f"`model` needs a run folder; {path} is not a folder")
     if not path.name.lower().endswith(tuple(FORMATS)):
         raise ValueError(f"{path}: is not a scene to show; give {SHOWN}")
     with warnings.catch_warnings(record=True) as caught:
@@ -163,7 +163,7 @@ def check_init(file: Path, out: Path, system: System) -> Model:
         raise ValueError(f"init: there is no file {file}")
     format_of(file)
     if RunFolder(out).is_begun:
-        raise ValueError(f"init begins a new run, and {out} holds one: choose another --out")
+        raise ValueError(f"init begins a new run, and {out} holds one: choose another `out`")
     splats, degree = load_splats(file), system.initial_sh_degree
     needed, budget = splats.num * system.initial_bytes, system.budget_bytes
     if budget is not None and needed > budget:
@@ -180,7 +180,7 @@ def check_init(file: Path, out: Path, system: System) -> Model:
     if splats.sh.shape[1] > NUM_BASES[degree]:
         lost.append(f"its spherical harmonics above degree {degree}")
     if lost:
-        warnings.warn(f"--init {file} leaves out {' and '.join(lost)}", stacklevel=2)
+        warnings.warn(f"`init` {file} leaves out {' and '.join(lost)}", stacklevel=2)
     return splats
 
 

@@ -64,12 +64,12 @@ from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.start import check_loss_data, check_start
 
 LESS_MEMORY = (
-    "close other programs, or start another run with a larger --downscale, or a smaller --memory-budget or --batch-size"
+    "close other programs, or start another run with a larger `downscale`, or a smaller `memory_budget` or `batch_size`"
 )
 """Advice of the command line for trainings that have run out of memory."""
 MOST_RESTORED = 5
 """Largest number of times a diverged stage is restored, each time with another order of the views."""
-DIFFERING = ("options", "--devices", "views, cameras or points")
+DIFFERING = ("options", "`devices`", "views, cameras or points")
 """Facts that several processes compare with the first one."""
 Watched = Callable[[Scene], AbstractContextManager[Watch]]
 """Function that gives the watcher of a scene's training."""
@@ -268,7 +268,7 @@ def _train_stage(
             save_checkpoint(path, before)
             text, num_restored = f"{error}, in {path}", before.num_restored + 1
             if on_nan == "stop":
-                raise ValueError(f"{text}; --on-nan restore continues with the views in another order") from error
+                raise ValueError(f"{text}; `on_nan` restore continues with the views in another order") from error
             if num_restored > MOST_RESTORED:
                 raise ValueError(f"{text}; the stage was restored {MOST_RESTORED} times already") from error
             back = f"iteration {iteration_of(checkpoints[-1])}" if checkpoints else "its beginning"

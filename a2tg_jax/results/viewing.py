@@ -194,16 +194,16 @@ def check_page(out: Path, *, single_file: bool, photographs: bool, overwrite: bo
     `export_web`."""
     single_file = single_file or (out.suffix.lower() == ".html" and not out.is_dir())
     if single_file and photographs:
-        raise ValueError("--photographs needs a folder: leave out --single-file, and .html at the end of --web")
+        raise ValueError("`photographs` needs a folder: leave out `single_file`, and .html at the end of `web`")
     if single_file and out.is_dir():
-        raise FileExistsError(f"{out} is a folder; with --single-file, --web must be the path of a file")
+        raise FileExistsError(f"{out} is a folder; with `single_file`, `web` must be the path of a file")
     if not single_file and out.is_file():
-        raise FileExistsError(f"{out} is a file; choose a folder with --web, or a name that ends in .html for one file")
+        raise FileExistsError(f"{out} is a file; choose a folder with `web`, or a name that ends in .html for one file")
     if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
-        raise ValueError(f"{out} holds a page other than the viewer's; choose another folder with --web")
+        raise ValueError(f"{out} holds a page other than the viewer's; choose another folder with `web`")
     files = [out] if single_file else [out / name for name in ("index.html", SCENE_NAME, PHOTOGRAPHS_NAME)]
     for file in files:
-        check_new(file, "--web", overwrite=overwrite)
+        check_new(file, "`web`", overwrite=overwrite)
     return files
 
 
@@ -234,12 +234,12 @@ def export_web(
             found = ServedPhotographs(source.model.origin, source.load_scene, source.model.background)
             views = sorted(found.views)
             if not views:
-                raise ValueError("there are no photographs of the model's cameras: leave out --photographs")
+                raise ValueError("there are no photographs of the model's cameras: leave out `photographs`")
             files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in views}
         files[out / PHOTOGRAPHS_NAME] = json.dumps(views).encode()
         files[page] = viewer_html().encode()  # Last, so that it never shows files that are not there yet.
         for path in files:
-            check_new(path, "--web", overwrite=overwrite)
+            check_new(path, "`web`", overwrite=overwrite)
         with contextlib.suppress(OSError, ValueError, TypeError):  # There may be no page.
             old = {out / photograph_name(int(index)) for index in read_json(out / PHOTOGRAPHS_NAME)}
     for path, content in files.items():
