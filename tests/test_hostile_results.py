@@ -149,24 +149,9 @@ def with_lines(run, **lines):
         ({"system": json.dumps("x:" + "y" * 5000)}, "cannot be imported"),
     ],
 )
-def test_records_of_options_out_of_range(bytewise_run, capsys, monkeypatch, lines, message):
-    with_lines(bytewise_run, **lines)
-    check_refused(bytewise_run, capsys, monkeypatch, message)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.1])
-@pytest.mark.parametrize("at", ["[nan]", "[inf]", "[1e400]", "[-inf, 0.5]", "[0.1, nan]", '["0.1"]', "[[0.1]]", "nan"])
-def test_times_of_pruning_that_are_none(bytewise_run, capsys, monkeypatch, at, share):
-    """They are looked at even if nothing is pruned."""
-    text = bytewise_run.record.read_text()
-    start, end = text.index("[options.prune]"), text.index("[options.view_dependence]")
-    text = text[:start] + f"[options.prune]\nshare = {share}\nat = {at}\n\n" + text[end:]
-    bytewise_run.record.write_text(text)
-    check_refused(bytewise_run, capsys, monkeypatch, r"prune\.at must be")
-
-
-def check_refused(run, capsys, monkeypatch, message):
-    """Every command that reads a record tells one line."""
+def test_every_command_refuses_options_out_of_range_in_one_line(bytewise_run, capsys, monkeypatch, lines, message):
+    run = bytewise_run
+    with_lines(run, **lines)
     with pytest.raises(ValueError, match=message):
         read_record(open_run(run.path))
     monkeypatch.setattr(cli, "configure_cpu", lambda: None)

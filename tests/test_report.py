@@ -91,13 +91,6 @@ def test_the_main_model_comes_first_and_the_best_of_each_figure_is_marked(report
     assert marked["a&lt;b.png"] == ["23.00 / 0.5000"]
 
 
-def test_every_comparison_of_psnr_names_bytes(report):
-    """The gains, the headline table, and the table of each view."""
-    assert "at equal bytes" in report or "times its bytes" in report
-    for table in re.findall("<table.*?</table>", report, re.DOTALL)[:3]:
-        assert ("PSNR" in table and "memory (MB)" in table) or table.count(" MB)</th>") == len(NAMES)
-
-
 def test_cards_show_gains_and_the_models_own_training_time(report):
     cards = dict(re.findall(r'<div class="card">([^<]*)<b>([^<]*)</b>', report))
     gain = "Gain over gaussians-2d-mcmc-continued, with 1.2 times its bytes (0.03 MB and 0.02 MB)"
@@ -135,44 +128,28 @@ def test_the_report_says_what_is_special_about_a_run(tmp_path):
     assert "4 views, 2 held out" in usual and "test views: " in usual and "test views: " not in report
 
 
-@pytest.mark.parametrize(
-    ("commit", "told"),
-    [
-        (None, r"repository at version [\d.]+:"),
-        ("abc-dirty", r"repository at commit <code>abc</code>, with local changes \(version [\d.]+\):"),
-    ],
-)
-def test_repeating_a_run_needs_no_package_index(tmp_path, monkeypatch, commit, told):
-    monkeypatch.setattr("a2tg_jax.results.report.source_commit", lambda: commit)
-    report = written_report(tmp_path, some_result())
-    assert re.search(told, " ".join(report.split()))
-    assert "<pre>pip install .\na2tg train --config" in report
+def test_the_report_names_the_commit(tmp_path, monkeypatch):
+    """A checkout's own, or the one that pip noted: a repository may have site-packages of another commit in it."""
 
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
-def git(folder, *words: str) -> str:
-    command = ["git", "-C", str(folder), "-c", "user.name=a", "-c", "user.email=a@b", *words]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-
-
-def test_the_commit_is_that_of_the_checkout(tmp_path, monkeypatch):
     monkeypatch.setattr("a2tg_jax.host.source_commit.CHECKOUT", tmp_path)
-    git(tmp_path, "init")
+    git("init")
     assert source_commit() is None
     (tmp_path / "a").write_text("1")
-    git(tmp_path, "add", "a")
-    git(tmp_path, "commit", "-m", "1")
-    commit = git(tmp_path, "rev-parse", "HEAD")
+    git("add", "a")
+    git("commit", "-m", "1")
+    commit = git("rev-parse", "HEAD")
     assert source_commit() == commit
     (tmp_path / "a").write_text("2")
     assert source_commit() == f"{commit}-dirty"
-
-
-def test_the_commit_of_an_installation_is_the_one_that_pip_noted(tmp_path, monkeypatch):
-    """A folder of a repository holds site-packages often, and its commit is another."""
-    git(tmp_path, "init")
+    report = written_report(tmp_path / "run", some_result())
+    assert f"commit <code>{commit}</code>, with local changes (version" in " ".join(report.split())
+    assert "<pre>pip install .\na2tg train --config" in report
     monkeypatch.setattr("a2tg_jax.host.source_commit.CHECKOUT", tmp_path / "site-packages")
-    noted = {"vcs_info": {"commit_id": "abc"}}
-    for note, commit in ((noted, "abc"), ({"dir_info": {}}, None)):
+    for note, commit in (({"vcs_info": {"commit_id": "abc"}}, "abc"), ({"dir_info": {}}, None)):
         found = SimpleNamespace(read_text=lambda _, note=note: json.dumps(note))
         monkeypatch.setattr("a2tg_jax.host.source_commit.distribution", lambda _, found=found: found)
         assert source_commit() == commit
@@ -202,13 +179,8 @@ def test_learned_textures_are_shown_as_their_gaussians_wear_them():
     assert wide[0, 0].tolist() == [255, 128, 128, 255] and wide[0, 63].tolist() == [128, 128, 128, 255]
     tall = next(part for part in (sheet[:, :64], sheet[:, 72:]) if part[63, 0, 3])
     assert {int(grey) for grey in tall[:16, :32, 0].ravel()} == {140, 191}  # transparent: the chequered ground
-
-
-def test_without_larger_textures_there_is_no_sheet():
-    model = some_model()
-    assert learned_textures(Model(model.gaussians)) is None
-    textures = textures_from_arrays([np.ones((1, 1, 4), np.float32)] * 4)
-    assert learned_textures(model.with_textures(textures)) is None
+    model, textures = some_model(), textures_from_arrays([np.ones((1, 1, 4), np.float32)] * 4)
+    assert learned_textures(Model(model.gaussians)) is learned_textures(model.with_textures(textures)) is None
 
 
 def shown(alpha, depth, normal=None) -> RenderOutput:
@@ -241,9 +213,6 @@ def test_outliers_leave_the_colours_of_depth_to_the_scene(share, factor):
     depth[: round(100 * share)] *= factor
     colors = depth_picture(shown(np.ones_like(depth), depth))[0][-1].astype(int)
     assert np.abs(colors[5] - colors[94]).max() > 150
-
-
-def test_without_a_hit_there_is_a_picture_of_depth():
     nothing = jnp.zeros((4, 4))
     assert depth_picture(shown(nothing, nothing))[0].shape == (4, 4, 3)
 
@@ -275,16 +244,13 @@ def test_figures_are_drawn_within_their_canvas(tmp_path):
     assert colors.shape == (5, 3) and len(np.unique(colors, axis=0)) == 5 and level_colors(1).shape == (1, 3)
 
 
-def test_a_flight_is_a_small_animation():
+def test_a_flight_is_a_small_animation_in_order():
     cameras = circle(6)
     model = dataclasses.replace(some_model(), origin=Origin.of_cameras(cameras))
     moving = Image.open(io.BytesIO(flight(model, RenderSettings())))
     # Pictures that are alike are one.
     assert FLIGHT_FRAMES / 2 < moving.n_frames <= FLIGHT_FRAMES and moving.size == (cameras[0].width, cameras[0].height)
     assert flight(some_model(), RenderSettings()) is None
-
-
-def test_an_animation_keeps_its_pictures_in_order():
     pictures = (Image.new("RGB", (8, 8), (level,) * 3) for level in (0, 72, 144))
     save_animation(buffer := io.BytesIO(), pictures, 15)
     moving = Image.open(buffer)
