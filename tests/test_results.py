@@ -230,56 +230,51 @@ def a_model():
 
 
 @pytest.mark.parametrize(
-    ("command", "name"), [("export {} --ply", "x.ply"), ("export {} --web", "x.html"), ("compress {} --out", "x.a2tgz")]
+    ("words", "mine", "message"),
+    [
+        (
+            "export model.npz --ply x.ply",
+            "x.ply",
+            "x.ply exists; add --overwrite to replace it, or choose another --ply",
+        ),
+        ("export model.npz --web x.html", "x.html", "x.html exists; add --overwrite"),
+        ("export model.npz --ply site/x.ply --web site", "site/scene.a2tgw", "scene.a2tgw exists; add --overwrite"),
+        ("export model.npz --ply site/x.ply --web site", "site/photographs.json", "photographs.json exists"),
+        ("compress model.npz --out x.a2tgz", "x.a2tgz", "x.a2tgz exists; add --overwrite"),
+        ("mesh run", "run/mesh.glb", "mesh.glb exists; add --overwrite"),
+        ("export scene.ply --overwrite --ply scene.ply", "", "scene.ply is the model itself; choose another --ply"),
+        ("export scene.ply --overwrite --single-file --web scene.ply", "", "the model itself; choose another --web"),
+    ],
 )
-def test_a_file_is_not_replaced_unasked(tmp_path, capsys, command, name):
-    model, out = tmp_path / "model.npz", tmp_path / name
-    a2tg.save_model(model, a_model())
-    out.write_text("mine")
-    words = [*command.format(model).split(), str(out)]
-    assert cli.main(words) == 2
-    assert f"{name} exists; add --overwrite to replace it, or choose another {words[2]}" in capsys.readouterr().err
-    assert out.read_text() == "mine"
-    if name == "x.ply":
-        assert cli.main([*words, "--overwrite"]) == 0 and out.read_bytes().startswith(b"ply")
-
-
-@pytest.mark.parametrize("words", ["--ply", "--single-file --web"])
-def test_export_does_not_replace_what_it_reads(tmp_path, capsys, words):
-    source = tmp_path / "scene.ply"
-    a2tg.save_ply(source, a_model())
-    before = source.read_bytes()
-    assert cli.main(["export", str(source), "--overwrite", *words.split(), str(source)]) == 2
-    assert f"scene.ply is the model itself; choose another {words.split()[-1]}" in capsys.readouterr().err
-    assert source.read_bytes() == before
-
-
-def test_export_tells_what_ply_does_not_keep(tmp_path, capsys):
-    appearance = allocate_appearance(MovableKernels(), jax.random.key(0), a_model().gaussians)
-    model = a2tg.Model(a_model().gaussians, appearance)
-    for name, given in (("kernels", model), ("plain", a_model())):
-        a2tg.save_model(tmp_path / f"{name}.npz", given)
-        out = tmp_path / f"{name}.compressed.ply"
-        assert cli.main(["export", str(tmp_path / f"{name}.npz"), "--ply", str(out)]) == 0
-        told = "not kept by this format: what MovableKernels shows besides Gaussians\n" * (given is model)
-        assert capsys.readouterr().out == f"file: {out}: 3 Gaussians\n{told}"
-
-
-@pytest.mark.parametrize("name", ["scene.a2tgw", "photographs.json"])
-def test_no_file_of_a_page_is_replaced_unasked(tmp_path, capsys, name):
+def test_files_are_not_replaced_without_a_flag(tmp_path, monkeypatch, capsys, words, mine, message):
     """Nor is another output of the same command written then."""
-    model, site = tmp_path / "model.npz", tmp_path / "site"
-    a2tg.save_model(model, a_model())
-    site.mkdir()
-    (site / name).write_text("mine")
-    assert cli.main(["export", str(model), "--ply", str(site / "x.ply"), "--web", str(site)]) == 2
-    assert f"{name} exists; add --overwrite to replace it, or choose another --web" in capsys.readouterr().err
-    assert [(path.name, path.read_text()) for path in site.iterdir()] == [(name, "mine")]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(runs, "open_source", lambda *_: None)
+    with_record(tmp_path / "run", RunRecord(SceneSource("synthetic")))
+    a2tg.save_model("model.npz", a_model())
+    a2tg.save_ply("scene.ply", a_model())
+    if mine:
+        Path(mine).parent.mkdir(exist_ok=True)
+        Path(mine).write_text("mine")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert cli.main(words.split()) == 2
+    assert re.search(message, capsys.readouterr().err)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_export_reports_what_ply_does_not_keep(tmp_path, capsys):
+    appearance = allocate_appearance(MovableKernels(), jax.random.key(0), a_model().gaussians)
+    model, lost = a2tg.Model(a_model().gaussians, appearance), "what MovableKernels shows besides Gaussians"
+    for given, line in ((model, f"not kept by this format: {lost}\n"), (a_model(), "")):
+        a2tg.save_model(tmp_path / "a.npz", given)
+        words = ["export", str(tmp_path / "a.npz"), "--overwrite", "--ply", str(out := tmp_path / "a.compressed.ply")]
+        assert cli.main(words) == 0
+        assert capsys.readouterr().out == f"file: {out}: 3 Gaussians\n{line}"
 
 
 @pytest.mark.parametrize(("name", "is_export"), [("models/x.a2tgz", True), ("mesh.glb", True), ("models/x.npz", False)])
-def test_exports_into_a_run_are_replaced_by_default_or_if_asked(tmp_path, name, is_export):
-    """Files that the run itself wrote are not, even if asked."""
+def test_exports_into_a_run_are_replaced_by_default_or_on_request(tmp_path, name, is_export):
+    """Files that the run itself wrote are never replaced."""
     run = create_run(tmp_path)
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
@@ -295,14 +290,12 @@ def test_exports_into_a_run_are_replaced_by_default_or_if_asked(tmp_path, name, 
             check_new(path, "OUT", overwrite=False)
 
 
-def test_the_mesh_of_a_run_is_replaced_unasked_once_it_was_written_so(tmp_path, monkeypatch, capsys):
+def test_the_mesh_of_a_run_is_replaced_by_default_once_the_command_has_written_it(tmp_path, monkeypatch):
     with_record(tmp_path, RunRecord(SceneSource("synthetic")))
     out = tmp_path / "mesh.glb"
     monkeypatch.setattr(runs, "open_source", lambda *_: None)
     monkeypatch.setattr(runs, "write_mesh", lambda source, out, options: out.write_text("mesh"))
     out.write_text("mine")
-    assert cli.main(["mesh", str(tmp_path)]) == 2 and out.read_text() == "mine"
-    assert "mesh.glb exists; add --overwrite" in capsys.readouterr().err
     for words in (["--overwrite"], [], ["--out", str(out)]):
         assert cli.main(["mesh", str(tmp_path), *words]) == 0 and out.read_text() == "mesh"
 
