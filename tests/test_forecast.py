@@ -12,7 +12,6 @@ import pytest
 from toy_system import Toy
 
 import a2tg_jax as a2tg
-from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.data import Picture
@@ -129,18 +128,6 @@ def test_a_budget_is_the_size_of_what_is_left(name):
     assert 0.5 * 0.3 * MB < last.model_bytes < 1.1 * 0.3 * MB
 
 
-@pytest.mark.parametrize(
-    ("event", "expected"),
-    [
-        (Upscale("fraction", 0.25, at=(0.2,), cap=4), 100 * (232 + 16 * 1.75)),
-        (Upscale("threshold", threshold=1e-5, at=(0.2, 0.4), cap=4), 100 * (232 + 16 * 4.75)),
-        (Upscale("budget", budget_mb=0.05, at=(0.2,)), 50_000),
-    ],
-)
-def test_textures_grow_to(event, expected):
-    assert event.most_bytes(100 * 248, 100, 60) == expected
-
-
 def test_more_of_anything_takes_more():
     scene, large, system = scene_of(600, 400), scene_of(2400, 1600), a2tg.Gaussians2dMcmc(densify=a2tg.Mcmc(cap=50_000))
     before = peak_of(scene, system)
@@ -211,6 +198,24 @@ def test_a_system_names_its_own_limit(system, option):
     with pytest.raises(ValueError, match=option):
         found.check_memory(4e9)
     assert run_of(SMALL, system).limits == system.limits()
+
+
+@pytest.mark.parametrize(
+    ("preset", "size", "flags"),
+    [
+        ("paper", (1600, 1067), "--preset quick --downscale 6"),
+        ("paper", (320, 213), "--preset quick --downscale 2"),
+        ("quick", (3200, 2133), "--preset quick --downscale 10"),
+        ("quick", (320, 213), None),
+    ],
+)
+def test_the_forecast_of_a_long_run_has_quicker_flags(monkeypatch, capsys, tmp_path, preset, size, flags):
+    monkeypatch.setattr(forecast, "memory_limit", lambda: 10**12)
+    record = RunRecord(SceneSource("fox", downscale=2), "a2tg", a2tg.A2tg.preset(preset), preset=preset)
+    print_forecast(scene_of(*size), record, None, out=tmp_path)
+    assert (f"\nquicker on CPUs: {flags} takes minutes\n" in capsys.readouterr().out) == (flags is not None)
+    print_forecast(scene_of(*size), record, None)
+    assert "quicker" not in capsys.readouterr().out, "a resumed run keeps its options"
 
 
 def test_the_downscale_of_quick_runs():

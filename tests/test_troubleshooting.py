@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from a2tg_jax.cli.main import _with_flags
+
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
 NOT_OURS = {"Killed", "a2tg render"}
@@ -20,7 +22,7 @@ QUOTED = {
 
 @cache
 def texts() -> tuple[str, ...]:
-    """All texts of the package; what an f-string fills in is …."""
+    """All texts of the package, options as flags; what an f-string fills in is …."""
     found = []
     for path in (ROOT / "a2tg_jax").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -29,7 +31,7 @@ def texts() -> tuple[str, ...]:
                 found.append("".join(map(str, parts)))
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.append(node.value)
-    return tuple(found)
+    return tuple(_with_flags(text) for text in found)
 
 
 def pieces(message: str) -> list[str]:

@@ -133,7 +133,7 @@ def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -
         for name, history in histories.items():
             x, y = _thinned(starts[name] + history.iteration), _thinned(getattr(history, field))
             if field in ("loss", "psnr") and len(y) >= 2 * RUNNING_MEANS:
-                # A noisy curve is pale, with its running mean over it.
+                # Loss and PSNR jump from view to view: the curve is pale, with its running mean over it.
                 axes.plot(x, y, color=colors[name], alpha=0.2, linewidth=0.8)
                 window = len(y) // RUNNING_MEANS
                 x, y = (np.convolve(column, np.full(window, 1 / window), mode="valid") for column in (x, y))
@@ -162,7 +162,7 @@ def sizes_figure(sizes: np.ndarray) -> Figure:
     counts = np.array([[np.sum((sizes == (tv, tu)).all(axis=1)) for tu in sides] for tv in sides])
     figure = Figure(figsize=(1.2 + 0.95 * len(sides), 0.9 + 0.75 * len(sides)), layout="constrained")
     axes = figure.add_subplot()
-    shown = np.log10(1.0 + counts)
+    shown = np.log10(1.0 + counts)  # Most Gaussians have the smallest size; others would be invisible.
     axes.imshow(shown, cmap="Blues", vmin=0, vmax=1.3 * shown.max(), aspect="auto")
     for (row, column), count in np.ndenumerate(counts):
         text = f"{count:,}\n{count / len(sizes):.1%}" if count else "–"
@@ -294,6 +294,7 @@ def flight(model: Model, settings: RenderSettings) -> bytes | None:
     for camera in smooth_path(cameras, FLIGHT_FRAMES):
         scale = min(1.0, FLIGHT_SIDE / max(camera.width, camera.height))
         path.append(resize_camera(camera, *(max(1, round(scale * side)) for side in (camera.width, camera.height))))
+    # Room for splats is planned from some of the cameras; it grows where another one needs more.
     renderer = Renderer(model, cameras=path[::10], settings=settings, has_geometry=False)
     buffer = io.BytesIO()
     pictures = (Image.fromarray(to_uint8(renderer(camera).color)) for camera in path)

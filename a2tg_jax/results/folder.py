@@ -82,6 +82,7 @@ class RunFolder:
         if not lines:
             return
         self.path.mkdir(parents=True, exist_ok=True)
+        # Names reach the disk before their files, so a crash never leaves a file that the run does not list.
         with named_if_full(self.marker), open(self.marker, "a", encoding="utf-8") as file:
             file.writelines(lines if os.fstat(file.fileno()).st_size else [f"{MARKER}\n", *lines])
             file.flush()
@@ -173,6 +174,7 @@ def check_free(path: Path, *, overwrite: bool = False, in_use: str = IN_USE) -> 
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"{path} is a file; choose another folder with `out`")
     run = RunFolder(path)
+    # A process that was killed early leaves a marker, a record or partial files: nothing that could be lost.
     unused = {run.marker.name, run.record.name} if run.marker.is_file() else set()
     unused |= {partial.name for partial, whole in left_over(path).items() if whole.name in run.written()}
     if not path.is_dir() or all(entry.name in unused for entry in path.iterdir()):

@@ -38,6 +38,8 @@ KEPT_STATES = 3
 """Number of checkpoints on disk while a new one is written."""
 PICTURE_PER_PIXEL = 2
 """Bytes on disk of each picture of a sheet."""
+LONG = 10_000
+"""Iterations of a system that take hours on CPUs."""
 QUICK_SIDE = 640
 """Longer side of the photographs, in pixels, with which the preset quick takes minutes on two cores."""
 OPTIONS = {
@@ -132,6 +134,7 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     for chain in plan.chains.values():
         num = num_given if chain[0] == plan.main[0] else None
         stages |= zip(chain, forecast_stages(scene, plan[chain[-1]].system, num, num_devices), strict=True)
+    # Programs stay in memory once they are compiled, so each stage adds to those before it.
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
     for name, stage in stages.items():
         if stage.is_trained:
@@ -180,6 +183,12 @@ def print_forecast(
     if out is not None:
         found.check_disk(out)
     print(found.text(limit), flush=True)
+    side = max(max(view.camera.width, view.camera.height) for view in scene.train)
+    is_long = sum(stage.iterations for stage in record.options.stages()) > LONG
+    is_long |= record.preset == "quick" and side > QUICK_SIDE
+    has_quick = default_platform() == "cpu" and "quick" in type(record.options).presets()
+    if out is not None and is_long and has_quick:
+        print(f"quicker on CPUs: {quick_flags(side, record.scene.downscale)} takes minutes", flush=True)
 
 
 def quick_flags(longest_side: int, downscale: int = 1) -> str:

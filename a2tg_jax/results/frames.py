@@ -162,6 +162,7 @@ def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER
         if program is None:
             save_animation(temporary, opened(), frames_per_second, quality=WEBP_QUALITY)
             return path
+        # Most players decode yuv420p only, which needs even sides.
         even_sides = "pad=ceil(iw/2)*2:ceil(ih/2)*2"
         source = ["-framerate", str(frames_per_second), "-i", str(frames[0].with_name(FRAME_NAME))]
         made = ["-frames:v", str(len(frames)), "-vf", even_sides, "-pix_fmt", "yuv420p", "-f", "mp4"]

@@ -60,6 +60,7 @@ def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> t
     errors = [np.sum((image.astype(np.float32) - target) ** 2, axis=-1) for image in (before, after)]
 
     def in_squares(error: np.ndarray) -> np.ndarray:
+        # The origin moves each window from around its pixel to below and right of it: the pixel is the corner.
         means: np.ndarray = uniform_filter(error, size=side, mode="constant", origin=-(side // 2))
         return means[: max(1, height - side + 1), : max(1, width - side + 1)]
 
@@ -122,6 +123,7 @@ def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
     picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
     picture.thumbnail((LONGEST_SIDE, LONGEST_SIDE))
     buffer = io.BytesIO()
+    # Full colour resolution: differences in texture are often differences in colour only.
     picture.save(buffer, format="JPEG", quality=quality, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
 

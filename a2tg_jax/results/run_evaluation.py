@@ -159,6 +159,7 @@ def _evaluations(
     """Return the metrics of a model by split. All models of a run get metrics up to exposure and pose if any of its
     systems learns these."""
     settings = settings_of(system)
+    # Test and training views are measured together, so that each size compiles once.
     measure = functools.partial(evaluate, settings=settings, lpips_weights=lpips_weights)
     both = measure((*scene.test, *scene.train), model)
     splits: dict[str, tuple[View, ...]] = {held_out: scene.test} if scene.test else {}

@@ -245,6 +245,7 @@ def _train_stage(
         resume = _newest_checkpoint(run, planned)
         if events is not None and resume is not None:
             events.skip(resume.history)
+        # Other processes get files, not arrays: they read them as the first one does.
         resumed = None if resume is None else run.checkpoint(planned.name, resume.iteration)
         model, start = None, None if planned.start is None else run.model(planned.start)
         if start is not None:
@@ -379,6 +380,7 @@ def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> N
         path.write_bytes(data)
         return path if data else None
 
+    # The first process reports warnings; those of the others would only repeat them.
     with warnings.catch_warnings(), signals.noted() as is_stopped, tempfile.TemporaryDirectory() as folder:
         warnings.simplefilter("ignore")
         while (header := json.loads(broadcast(b"")))["name"] is not None:

@@ -127,7 +127,7 @@ class LiveView:
             began = self._now()
             background, origin = BACKGROUNDS[run.system.background], origin_of_scene(self._scene)
             model = dataclasses.replace(jax.device_get(run.state.model), background=background, origin=origin)
-            self._due = np.inf
+            self._due = np.inf  # The thread sets it when it is done.
             self._encoder = threading.Thread(target=self._encode, args=(model, began), daemon=True)
             self._encoder.start()
         began = self._now()
