@@ -1,7 +1,7 @@
 """The files that the reference readers are tried on: `python tests/reference_files.py tests/data`.
 
-One small model in each published format, its numbers as text, and the checksums of all. They are kept as they were
-written, for coders of later versions may code the same bytes otherwise.
+One small model in each published format, its numbers as text, and the checksums of all. Files of earlier versions are
+kept as they were written.
 """
 
 import dataclasses
@@ -13,14 +13,14 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax import CompactChoices, load_compact, load_gltf, load_model, save_compact, save_gltf, save_model
+from a2tg_jax import load_compact, load_gltf, load_model, save_compact
 from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture
 from a2tg_jax.appearance.parts import bands_of_dense, log_exponents_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.io.web_scene import encode_web_scene, rounded_model
+from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.texture import textures_from_arrays
 
@@ -28,22 +28,21 @@ NUM = 10
 BACKGROUND = 0.25, 0.5, 0.75
 SUMS = "SHA256SUMS"
 SIZES = [(0, 0), (1, 1), (2, 3), (4, 1)]
-SHAPED = ("shaped.a2tgz", "shaped.a2tgw")
-FILES = (
-    "model.npz", "lzma.a2tgz", "zstd.a2tgz", "webp.a2tgz", "floats.a2tgz", "model.a2tgw", "model.glb", "bytes.glb",
-    *SHAPED,
-)  # fmt: skip
-FLOATS = CompactChoices(
-    means="float32", log_scales="float16", quats="float32", opacities="float32", sh_0="float16", texels="float32",
-    coder="none",
-)  # fmt: skip
+SHAPED = "shaped-web.a2tgz"
+OLD = ("model.npz", "lzma.a2tgz", "zstd.a2tgz", "webp.a2tgz", "floats.a2tgz", "shaped.a2tgz", "model.glb", "bytes.glb")
+"""Files that versions up to 0.2 wrote."""
+FILES = (*OLD, "smallest.a2tgz", "web.a2tgz", SHAPED)
 
 
-def reference_model() -> Model:
+def reference_model(has_alpha: bool = True) -> Model:
     """Splats of all degrees, with textures of several sizes, in a world of its own."""
     rng = np.random.default_rng(11)
     draw = lambda *shape, scale=1.0: np.asarray(scale * rng.normal(size=shape), np.float32)  # noqa: E731
-    textures = textures_from_arrays([draw(*SIZES[i % len(SIZES)], 4, scale=0.3) for i in range(NUM)])
+    arrays = [draw(*SIZES[i % len(SIZES)], 4, scale=0.3) for i in range(NUM)]
+    if not has_alpha:
+        for array in arrays:
+            array[..., 3] = 1.0
+    textures = textures_from_arrays(arrays)
     sh = draw(NUM, 16, 3, scale=0.4)
     bands = bands_of_dense(sh[:, 1:], np.arange(NUM) % 4, 0)
     gaussians = Gaussians(
@@ -60,16 +59,13 @@ def reference_model() -> Model:
 
 
 def shaped_model() -> Model:
-    """The same splats with kernels from long tails to sharp edges."""
-    model = reference_model()
+    """The same splats with kernels from long tails to sharp edges, and textures of equal alpha factors."""
+    model = reference_model(has_alpha=False)
     appearance = dataclasses.replace(model.appearance, exponents=Exponents(jnp.linspace(-3.0, 3.0, NUM)))
     return dataclasses.replace(model, appearance=appearance)
 
 
 def load(path: Path) -> Model:
-    """Read a file with this library, which only writes scenes for browsers."""
-    if path.suffix == ".a2tgw":
-        return rounded_model(shaped_model() if path.name in SHAPED else reference_model())
     return {".npz": load_model, ".a2tgz": load_compact, ".glb": load_gltf}[path.suffix](path)
 
 
@@ -84,20 +80,15 @@ def numbers(model: Model) -> dict[str, np.ndarray]:
 
 
 def write(folder: Path) -> None:
+    """Write what today's program writes, into the folder of the old files."""
     model = reference_model()
-    save_model(folder / "model.npz", model)
-    for coder in ("lzma", "zstd", "webp"):
-        save_compact(folder / f"{coder}.a2tgz", model, choices=CompactChoices(coder=coder))
-    save_compact(folder / "floats.a2tgz", model, choices=FLOATS)
-    (folder / "model.a2tgw").write_bytes(encode_web_scene(model, title="reference"))
-    save_gltf(folder / "model.glb", model)
-    save_gltf(folder / "bytes.glb", model, texels="uint8")
-    save_compact(folder / SHAPED[0], shaped_model(), choices=CompactChoices(coder="zstd"))
-    (folder / SHAPED[1]).write_bytes(encode_web_scene(shaped_model(), title="shaped"))
+    save_compact(folder / "smallest.a2tgz", model)
+    (folder / "web.a2tgz").write_bytes(encode_web_scene(model, title="reference"))
+    (folder / SHAPED).write_bytes(encode_web_scene(shaped_model(), title="shaped"))
     found = {name: numbers(load(folder / name)) for name in FILES}
     text = {name: {key: np.round(x, 6).ravel().tolist() for key, x in held.items()} for name, held in found.items()}
-    kept = {name: held for name, held in text.items() if name in ("model.npz", "model.a2tgw")}
-    kept[SHAPED[1]] = {"exponents": text[SHAPED[1]]["exponents"]}
+    kept = {name: held for name, held in text.items() if name in ("model.npz", "web.a2tgz")}
+    kept[SHAPED] = {name: text[SHAPED][name] for name in ("exponents", "texels")}
     (folder / "numbers.json").write_text(json.dumps(kept) + "\n")
     (folder / SUMS).write_text("".join(f"{checksum(folder / name)}  {name}\n" for name in (*FILES, "numbers.json")))
 

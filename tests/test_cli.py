@@ -20,13 +20,13 @@ import numpy as np
 import pytest
 from PIL import Image
 from run_folders import create_run
-from web_header import web_header
 
 from a2tg_jax.cli import doctor, main as cli
 from a2tg_jax.cli.train import train_defaults
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host import startup
 from a2tg_jax.host.regular_files import sha256_of
+from a2tg_jax.io.compact import unframed
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.ply import load_ply
 from a2tg_jax.results import finishing, frames, run_training, viewing
@@ -542,7 +542,7 @@ def test_export_and_what_view_would_serve(tiny_run, tmp_path, monkeypatch, capsy
     assert cli.main(["export", str(run.path), "--web", str(tmp_path / "site"), "--overwrite"]) == 0
     assert [path.name for path in (tmp_path / "site" / "photographs").iterdir()] == ["mine.jpg"]
     routes = routes_of(open_source(run.path, "a2tg-gaussians"))
-    assert web_header(routes["/scene.a2tgw"].read())["num_texels"] is None
+    assert "sizes" not in unframed(routes["/scene.a2tgz"].read())[0]
     assert json.loads(routes["/photographs.json"].read()) == listed
 
 

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 from test_compact import plain, textured
-from web_header import web_header
 
 from a2tg_jax import Gaussians2dMcmc, synthetic_scene
 from a2tg_jax.appearance import Billboards, allocate_appearance
+from a2tg_jax.io.compact import unframed
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.model import Model
 from a2tg_jax.results.run_training import unseen
@@ -57,11 +57,11 @@ def test_snapshots_and_figures():
     clock = Clock()
     live, run = LiveView(SCENE, "scene", clock), stage_run()
     assert b'<html data-training="yes" ' in live.routes["/"].read()
-    assert live.routes["/scene.a2tgw"].read() is None and status(live)["version"] == 0
+    assert live.routes["/scene.a2tgz"].read() is None and status(live)["version"] == 0
     assert live(run, never) == 0
     encoded(live)
-    scene = web_header(live.routes["/scene.a2tgw"].read())
-    assert scene["title"] == "scene" and scene["num"] == run.state.model.num
+    scene, _ = unframed(live.routes["/scene.a2tgz"].read())
+    assert scene["page"]["title"] == "scene" and scene["num"] == run.state.model.num
     found = status(live)
     assert (found["version"], found["stage"], found["iteration"], found["psnr"]) == (1, "textures", 20, 17.0)
     assert found["bytes"] == 1.25e6 and not found["is_paused"]

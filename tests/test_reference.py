@@ -12,9 +12,11 @@ from reference_files import FILES, NUM, SUMS, checksum, load, numbers, reference
 
 from a2tg_jax import save_splats
 from a2tg_jax.appearance import TextureOptions
+from a2tg_jax.io.compact import unframed
 from a2tg_jax.io.web_scene import encode_web_scene
 
 DATA = Path(__file__).parent / "data"
+KEPT = DATA / "web.a2tgz"
 READER = Path(__file__).parents[1] / "docs" / "reference" / "read_model.py"
 
 
@@ -71,18 +73,17 @@ def test_the_kept_files_hold_the_model():
     np.testing.assert_array_equal(found["sizes"], wanted["sizes"][order])
 
 
-def test_web_scenes_are_still_written_so():
+def test_scenes_for_browsers_are_still_written_so():
     """All but what zlib codes."""
-    length = int.from_bytes((DATA / "model.a2tgw").read_bytes()[10:14], "little")
-    wanted = json.loads((DATA / "model.a2tgw").read_bytes()[22 : 22 + length])
-    data = encode_web_scene(reference_model(), title="reference")
-    found = json.loads(data[22 : 22 + int.from_bytes(data[10:14], "little")])
+    (found, _), (wanted, _) = map(unframed, (encode_web_scene(reference_model(), title="reference"), KEPT.read_bytes()))
+    for header in (found, wanted):
+        header["parts"] = [name for name, *_ in header["parts"]]
     assert found == wanted
 
 
 def test_the_reference_reader_takes_nothing_of_this_library():
     sources = [path.read_text() for path in READER.parent.glob("*.py")]
     assert not any("a2tg_jax" in source for source in sources)
-    assert max(source.count("\n") for source in sources) <= 120
+    assert max(source.count("\n") for source in sources) <= 130
     command = [sys.executable, str(READER), str(DATA / "webp.a2tgz")]
     assert "means: float64 [10, 3]" in subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -238,7 +238,7 @@ def a_model():
             "x.ply exists; add --overwrite to replace it, or choose another --ply",
         ),
         ("export model.npz --web x.html", "x.html", "x.html exists; add --overwrite"),
-        ("export model.npz --ply site/x.ply --web site", "site/scene.a2tgw", "scene.a2tgw exists; add --overwrite"),
+        ("export model.npz --ply site/x.ply --web site", "site/scene.a2tgz", "scene.a2tgz exists; add --overwrite"),
         ("export model.npz --ply site/x.ply --web site", "site/photographs.json", "photographs.json exists"),
         ("compress model.npz --out x.a2tgz", "x.a2tgz", "x.a2tgz exists; add --overwrite"),
         ("mesh run", "run/mesh.glb", "mesh.glb exists; add --overwrite"),

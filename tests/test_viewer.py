@@ -19,14 +19,13 @@ from PIL import Image
 from run_folders import create_run
 from small_values import some_gaussians
 from test_compact import textured
-from web_header import web_header
 
 from a2tg_jax.appearance import parts
 from a2tg_jax.cli.main import main
 from a2tg_jax.data import synthetic_scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host.text import in_bytes
-from a2tg_jax.io.compact import save_compact
+from a2tg_jax.io.compact import save_compact, unframed
 from a2tg_jax.io.model_file import save_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.results import viewing
@@ -70,7 +69,7 @@ def test_known_paths_are_answered():
     assert (status, body, headers["Content-Length"]) == (200, b"", "4")
 
 
-@pytest.mark.parametrize("path", ["/none", "/../etc/passwd", "//", "/lazy/", "/%2e%2e/", "lazy", "/scene.a2tgw?x"])
+@pytest.mark.parametrize("path", ["/none", "/../etc/passwd", "//", "/lazy/", "/%2e%2e/", "lazy", "/scene.a2tgz?x"])
 def test_other_paths_are_not(path):
     assert ask(APP, path)[0] == 404
 
@@ -269,7 +268,7 @@ def test_models_compact_scenes_and_point_clouds_are_opened(tmp_path):
     for name, num in (("a.npz", model.num), ("b.a2tgz", model.num), ("c.ply", some_gaussians().num)):
         source = open_source(tmp_path / name)
         assert source.model.num == num and source.title == name[0] and not source.note
-        assert web_header(source.encoded)["title"] == name[0]
+        assert unframed(source.encoded)[0]["page"]["title"] == name[0]
 
 
 def test_3d_gaussians_are_said_to_be_shown_flat(tmp_path):
@@ -284,7 +283,7 @@ def test_3d_gaussians_are_said_to_be_shown_flat(tmp_path):
     with pytest.warns(UserWarning, match="thinnest axis is dropped"):
         source = open_source(path)
     assert "3D Gaussians" in source.note and str(path) not in source.note
-    assert web_header(source.encoded)["note"] == source.note
+    assert unframed(source.encoded)[0]["page"]["note"] == source.note
 
 
 @pytest.mark.parametrize("name", ["nowhere.npz", "nowhere.a2tgz", "nowhere.ply", "nowhere"])
@@ -313,9 +312,9 @@ def test_a_folder_and_a_single_file(tmp_path):
     source = Source(dataclasses.replace(textured(), origin=origin_of_scene(scene)), "a")
     text, page = export_web(source, tmp_path / "site"), tmp_path / "site" / "index.html"
     assert page.read_text(encoding="utf-8") == viewer_html()
-    scene = (tmp_path / "site" / "scene.a2tgw").read_bytes()
+    scene = (tmp_path / "site" / "scene.a2tgz").read_bytes()
     assert f"whose scene takes {in_bytes(len(scene))}, " in text and "dB of PSNR lost, for a model of 30 dB" in text
-    assert web_header(scene)["num"] == source.model.num
+    assert unframed(scene)[0]["num"] == source.model.num
     total = sum(file.stat().st_size for file in page.parent.iterdir())
     assert text.endswith(f"{page}: {in_bytes(total)} with 2 files next to it")
     assert (tmp_path / "site" / "photographs.json").read_bytes() == b"[]"

@@ -1,6 +1,6 @@
 """What the viewer's own tests read: a small scene with its numbers, and scenes with pictures of the JAX renderer.
 
-    python tests/viewer_cases.py small web/test        # web/test/small.a2tgw and small.json, which are committed
+    python tests/viewer_cases.py small web/test        # web/test/small.a2tgz and small.json, which are committed
 
 `write_case` writes a folder that web/browser/compare.test.ts compares the page with.
 """
@@ -19,7 +19,8 @@ from a2tg_jax.appearance.parts import bands_of_dense
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import Origin
-from a2tg_jax.io.web_scene import rounded_model
+from a2tg_jax.io.compact import decode_model
+from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.render import RenderOutput
 from a2tg_jax.renderer import Renderer
@@ -59,13 +60,13 @@ def shaped_model() -> Model:
 def write_small(folder: Path) -> None:
     """A scene's file, and what is in it."""
     source = Source(small_model(), "small", "a note")
-    (folder / "small.a2tgw").write_bytes(source.encoded)
+    (folder / "small.a2tgz").write_bytes(source.encoded)
     (folder / "small.json").write_text(json.dumps(small_numbers(source.model)) + "\n")
 
 
 def small_numbers(model: Model) -> dict[str, list]:
     """What a reader must find in the file, rounded, by row."""
-    model = rounded_model(model)
+    model = decode_model(encode_web_scene(model))
     found = {
         "means": model.gaussians.means,
         "log_scales": model.gaussians.log_scales,
@@ -89,9 +90,9 @@ def write_case(
     """A scene, its views, and of each the colours that the JAX renderer gives the model itself, from which the file is
     made, and those of what the file holds."""
     folder.mkdir(parents=True)
-    (folder / "scene.a2tgw").write_bytes(source.encoded)
+    (folder / "scene.a2tgz").write_bytes(source.encoded)
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
-    models = {"the model": source.model, "the file": rounded_model(source.model)}
+    models = {"the model": source.model, "the file": decode_model(source.encoded)}
     views = []
     for name in of:
         for mode in modes:

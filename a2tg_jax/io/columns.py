@@ -1,8 +1,8 @@
 """Columns of numbers as small integers and coded bytes, and back.
 
 Numbers become even steps between two ends, positions steps along a Z curve, and both become planes of one byte each,
-which lossless coders from established libraries make smaller. `ColumnWriter` and `ColumnReader` go through named
-columns in one order; the reader unpacks no more than it may, whatever the bytes claim.
+which lossless coders from established libraries make smaller. `ColumnReader` finds the named columns of a
+`ColumnWriter`, and unpacks no more than it may, whatever the bytes claim.
 
 All arrays are numpy's, on the host; C columns of n numbers are [C, n]. A precision is a number of bits or a float type.
 """
@@ -10,7 +10,8 @@ All arrays are numpy's, on the host; C columns of n numbers are [C, n]. A precis
 import io
 import lzma
 import math
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
@@ -19,9 +20,9 @@ import zstandard
 from PIL import Image
 
 Precision = int | Literal["float32", "float16"]
-Choice = Literal["smallest", "lzma", "zstd", "webp", "none"]
-"""Name of a coder, or "smallest" for the one with fewest bytes."""
-CODERS = ("lzma", "zstd", "none", "webp")
+Choice = Literal["smallest", "lzma", "zstd", "webp", "deflate", "none"]
+"""Name of a coder, or "smallest" for the one with fewest bytes. Browsers decode deflate and none."""
+CODERS = ("lzma", "zstd", "deflate", "none", "webp")
 MOST_BITS = 16
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 LEAST_OPACITY = 1e-7
@@ -50,6 +51,8 @@ def encode(coder: str, planes: np.ndarray) -> bytes:
         return planes.tobytes()
     if coder == "lzma":
         return lzma.compress(planes.tobytes(), format=lzma.FORMAT_RAW, filters=LZMA_FILTERS)
+    if coder == "deflate":
+        return zlib.compress(planes.tobytes(), 9)
     if coder == "zstd":  # In one frame, a plane begins a block of its own, with tables of its own.
         stream = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compressobj(size=planes.size)
         pieces = [stream.compress(row.tobytes()) + stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for row in planes]
@@ -90,8 +93,9 @@ def _decoded(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarra
     size = num_planes * length
     if coder == "none":
         return np.frombuffer(data, np.uint8)
-    if coder == "lzma":
-        stream = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=LZMA_FILTERS)
+    if coder in ("lzma", "deflate"):
+        is_lzma = coder == "lzma"
+        stream: Any = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=LZMA_FILTERS) if is_lzma else zlib.decompressobj()
         found = stream.decompress(data, size + 1)  # One byte more shows that there is too much.
         if not stream.eof or stream.unused_data:
             raise ValueError("it does not end where it should")
@@ -291,14 +295,15 @@ class ColumnWriter:
 
     Args:
       coder: of all parts.
-      ends: ends of groups kept in bits, as in `layout`; ends of other groups follow from their numbers.
+      ends: ends of groups kept in bits; ends of other groups follow from their numbers.
     """
 
     def __init__(self, coder: Choice, ends: Mapping[str, Sequence[float]] = MappingProxyType({})):
         self.coder = coder
-        self.layout: dict[str, dict[str, Any]] = {"lengths": {}, "coders": {}, "ends": {}}
-        """Coded bytes and coder of each part, in order; and the first and the last step of each group kept in bits, for
-        each axis of the means after centre and spread."""
+        self.parts: list[tuple[str, str, int]] = []
+        """Name, coder and coded bytes of each part, in order."""
+        self.ends: dict[str, list[float]] = {}
+        """First and last step of each group kept in bits, for each axis of the means after centre and spread."""
         self.num_unpacked = 0
         """Bytes before coding."""
         self._known_ends = ends
@@ -316,7 +321,7 @@ class ColumnWriter:
         coded = {coder: encode(coder, planes) for coder in (fitting if self.coder == "smallest" else (self.coder,))}
         coder, piece = min(coded.items(), key=lambda pair: len(pair[1]))
         self._pieces.append(piece)
-        self.layout["coders"][name], self.layout["lengths"][name] = coder, len(piece)
+        self.parts.append((name, coder, len(piece)))
         self.num_unpacked += planes.size
 
     def exact(self, name: str, values: np.ndarray) -> None:
@@ -337,7 +342,7 @@ class ColumnWriter:
             self.planes(name, to_byte_planes(_finite(name, np.asarray(values), precision)))
             return
         ends = Ends(*self._known_ends[name]) if name in self._known_ends else ends_of(values, precision)
-        self.layout["ends"][name] = list(ends)
+        self.ends[name] = list(ends)
         if ends.low == ends.high:
             self.planes(name, np.zeros((0, values.shape[1]), np.uint8))
             self.num_unpacked += values.size
@@ -345,56 +350,50 @@ class ColumnWriter:
         codes = quantised(values, ends, precision)
         self.planes(name, to_planes(with_green(codes, precision, -1) if is_color else codes, precision))
 
-    def means(self, name: str, values: np.ndarray, precision: Precision) -> np.ndarray:
-        """Write positions [3, n], and return their order [n] along the Z curve."""
-        bits = precision if isinstance(precision, int) else MOST_BITS
-        known = np.reshape(self._known_ends.get(name, ()), (-1, 4)).tolist()
-        axes = [AxisSteps(*own) for own in known] or [AxisSteps.of(x, bits) for x in values]
-        key = morton(np.stack([axis.codes(x, bits) for axis, x in zip(axes, values, strict=True)]), bits)
-        order = np.argsort(key, kind="stable")
-        if precision != bits:
-            self.numbers(name, values[:, order], precision)
-        else:
-            self.layout["ends"][name] = [number for axis in axes for number in axis]
-            # Neighbours on the curve have keys that differ little: most high bytes of the differences are 0.
-            self.planes(name, to_planes(np.diff(key[order], prepend=0), 3 * bits))
-        return order
+    def means(self, axes: Sequence[AxisSteps], keys: np.ndarray, bits: int) -> None:
+        """Write positions as places [n] along the Z curve, which ascend."""
+        self.ends["means"] = [number for axis in axes for number in axis]
+        # Neighbours on the curve have keys that differ little: most high bytes of the differences are 0.
+        self.planes("means", to_planes(np.diff(keys, prepend=0), 3 * bits))
 
 
 class ColumnReader:
-    """Reads what a `ColumnWriter` wrote, in the same order.
+    """Reads what a `ColumnWriter` wrote; parts of one name in their order.
 
     Args:
       body: the coded bytes.
-      layout: `ColumnWriter.layout`.
+      parts: `ColumnWriter.parts`.
+      ends: `ColumnWriter.ends`.
       room: largest number of bytes to unpack.
 
     Raises:
       ValueError: if the lengths do not fit the body.
     """
 
-    def __init__(self, body: bytes, layout: Mapping[str, Any], room: int):
-        lengths = list(layout["lengths"].values())
-        if not all(type(length) is int and length >= 0 for length in lengths) or sum(lengths) != len(body):
-            raise ValueError(f"its parts must have {len(body)} bytes in all; got {lengths}")
-        self._layout, self._room = layout, room
-        self._body, self._at = body, 0
-        self._names = list(layout["lengths"])
+    def __init__(self, body: bytes, parts: Iterable[Sequence[Any]], ends: Mapping[str, Any], room: int):
+        self._ends_by_name, self._room = ends, room
+        self._parts: dict[str, list[tuple[str, bytes]]] = {}
+        start = 0
+        for name, coder, length in parts:
+            if type(length) is not int or not 0 <= length <= len(body) - start:
+                raise ValueError(f"its parts must have {len(body)} bytes in all; the part {name} has {length}")
+            self._parts.setdefault(name, []).append((coder, body[start : start + length]))
+            start += length
+        if start != len(body):
+            raise ValueError(f"its parts must have {len(body)} bytes in all; got {start}")
 
     def planes(self, name: str, num_planes: int, length: int) -> np.ndarray:
         """Read uint8 [num_planes, length].
 
         Raises:
-          ValueError: if the next part is another, is damaged, or there is no room left.
+          ValueError: if the part is missing or damaged, or there is no room left.
         """
         self._take_room(name, num_planes * length)
-        if not self._names or self._names[0] != name:
-            raise ValueError(f"the part {name} is missing; {self._names[:1]} came")
-        size, coder = self._layout["lengths"][self._names.pop(0)], self._layout["coders"][name]
+        if not self._parts.get(name):
+            raise ValueError(f"the part {name} is missing")
+        coder, data = self._parts[name].pop(0)
         if coder not in CODERS:
-            raise ValueError(f"the part {name} is of the coder {coder}, which is not known here")
-        data = self._body[self._at : self._at + size]
-        self._at += size
+            raise ValueError(f"the part {name} has the unknown coder {coder}")
         try:
             return decode(coder, data, num_planes, length)
         except ValueError as error:
@@ -408,8 +407,8 @@ class ColumnReader:
 
     def end(self) -> None:
         """Raise ValueError unless all parts were read."""
-        if self._names:
-            raise ValueError(f"the part {self._names[0]} is not known")
+        if left := [name for name, parts in self._parts.items() if parts]:
+            raise ValueError(f"the part {left[0]} is not known")
 
     def exact(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         planes = self.planes(name, np.dtype(dtype).itemsize, math.prod(shape))
@@ -442,19 +441,19 @@ class ColumnReader:
         codes = with_green(codes, precision) if is_color else codes
         return _finite(name, dequantised(codes, ends, precision))
 
-    def means(self, name: str, length: int, precision: Precision) -> np.ndarray:
+    def means(self, length: int, precision: Precision) -> np.ndarray:
         """Read float32 [3, length]."""
         if not isinstance(precision, int):
-            return self.numbers(name, 3, length, precision)
-        known = np.reshape(self._ends(name, 12), (3, 4)).tolist()
-        planes = self.planes(name, num_bytes_of(3 * precision), length)
+            return self.numbers("means", 3, length, precision)
+        known = np.reshape(self._ends("means", 12), (3, 4)).tolist()
+        planes = self.planes("means", num_bytes_of(3 * precision), length)
         with np.errstate(over="ignore"):
             codes = from_morton(np.cumsum(from_planes(planes, 1)[0]), precision)
             axes = [AxisSteps(*own).values(axis, precision) for axis, own in zip(codes, known, strict=True)]
-        return _finite(name, np.stack(axes))
+        return _finite("means", np.stack(axes))
 
     def _ends(self, name: str, count: int) -> list[float]:
-        found = self._layout["ends"][name]
+        found = self._ends_by_name[name]
         is_right = isinstance(found, list) and len(found) == count and all(type(x) in (int, float) for x in found)
         if not is_right or not all(abs(x) <= LARGEST_FLOAT for x in found):
             raise ValueError(f"the ends of {name} must be {count} numbers; got {found}")

@@ -1,12 +1,8 @@
 """Compact scene files, *.a2tgz: a model in few bytes, with a chosen number of bits for each group of numbers.
 
 docs/formats.md describes the file. Rows come back in the order of a Z curve through the means, with quaternions of unit
-length; the model shows the same up to rounding.
-
-Files for browsers (`io.web_scene`, *.a2tgw) are another format. This one is smaller: it sorts rows by place, codes each
-group of numbers as a whole with LZMA, zstd or WebP, and restores the model with its appearance, origin and float64
-cameras. It must be read to its end before anything can be drawn, and browsers have no decoder for LZMA. Both share the
-steps and planes of `io.columns` and the tables of `io.model_rows`.
+length; the model shows the same up to rounding. Files for browsers (`io.web_scene`) have a coder that browsers decode,
+and several chunks of rows, the most visible first, so that a page draws while it loads.
 """
 
 import dataclasses
@@ -14,7 +10,7 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Self
 
 import numpy as np
@@ -25,14 +21,17 @@ from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.io.columns import (
+    MOST_BITS,
+    AxisSteps,
     Choice,
     ColumnReader,
     ColumnWriter,
     Precision,
     check_precision,
     decode,
-    encode,
+    ends_of,
     logits_of,
+    morton,
     opacities_of,
     room_of,
     with_w,
@@ -46,19 +45,22 @@ from a2tg_jax.io.model_file import (
     origin_of,
     origin_shapes,
 )
-from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, ordered, rows_of_model
+from a2tg_jax.io.model_rows import Rows, check_encodable, joined, model_of, ordered, rows_of_model
 from a2tg_jax.io.validate import check_suffix, existing_bytes, reading
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.texture import MAX_SIDE
 
 MAGIC = b"a2tgz\r\n\x1a"
-VERSION, SHAPED_VERSION = 1, 2
-"""Versions of files without and with shapes of kernels, which readers of version 1 refuse."""
+VERSION, OLD_VERSIONS = 3, (1, 2)
+"""Version 1 and 2, without and with shapes of kernels, had one chunk, a header in zstd, and a table for each property
+of the parts."""
 HEAD = struct.Struct("<8sHIII")
 """Magic, version, bytes of the header as coded and as text, checksum of all that follows."""
 ORIGIN_DTYPES = {
     "viewmats": "f8", "Ks": "f8", "sizes": "i4", "is_test": "u1", "scale": "f8", "rotation": "f8", "translation": "f8",
 }  # fmt: skip
+LARGEST_CHUNK, LEAST_CHUNK = 16384, 256
+"""Numbers of rows in a chunk of a file for browsers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +86,8 @@ class CompactChoices:
     shapes: Precision = 8
     """Precision of the logarithms of the kernels' exponents as bits, or of their shapes as floats."""
     coder: Choice = "smallest"
-    """Coder of all parts: lzma (Python's own), zstd, webp (lossless images), none, or the smallest for each part."""
+    """Coder of all parts: lzma (Python's own), zstd, webp (lossless images), deflate, none, or the smallest for each
+    part. Browsers show files of the coders deflate and none that have at most 8 bits in all groups but the means."""
 
     def keeping(self, others: Mapping[str, Any]) -> Self:
         """Return the choices with some changed, by name."""
@@ -150,21 +153,107 @@ def load_compact(path: str | os.PathLike[str]) -> Model:
     return decode_model(existing_bytes(path, "compact scene"), os.fspath(path))
 
 
-def encode_model(model: Model, choices: CompactChoices = DEFAULT_CHOICES, grids: Grids | None = None) -> bytes:
+def encode_model(
+    model: Model,
+    choices: CompactChoices = DEFAULT_CHOICES,
+    grids: Grids | None = None,
+    *,
+    order: np.ndarray | None = None,
+    page: Mapping[str, object] | None = None,
+) -> bytes:
     """Return the bytes of `save_compact`. Raises as it does.
 
     Args:
       model: as there; with grids as `half_turned` gives it, with numbers that may have changed since.
       choices: as there.
       grids: as there (`grids_of`); numbers beyond their ends are cut to them.
+      order: indices [N] of existing rows, for chunks that can be drawn one after the other; None for a single chunk.
+      page: entry of the header for the viewer.
     """
     choices.check()
     check_gaussians(model.gaussians, "model.gaussians")
     check_encodable(model.appearance)
-    data, num_unpacked = _encoded(model.live, choices, grids)
-    if num_unpacked > room_of(len(data)):  # So alike are its numbers that the file would be taken for a bomb.
-        data, _ = _encoded(model.live, dataclasses.replace(choices, coder="none"), grids)
-    return data
+    model = model.live
+    rows = rows_of_model(model)
+    num = len(rows.means)
+    chunk, order = (max(num, 1), np.arange(num)) if order is None else (_chunk_of(num), order)
+    bits = choices.means if isinstance(choices.means, int) else MOST_BITS
+    known = np.reshape((grids or {}).get("means", ()), (-1, 4)).tolist()
+    axes = [AxisSteps(*own) for own in known] or [AxisSteps.of(x, bits) for x in rows.means.T]
+    keys = morton(np.stack([axis.codes(x, bits) for axis, x in zip(axes, rows.means.T, strict=True)]), bits)
+    starts = range(0, max(num, 1), chunk)
+    order = np.concatenate([part[np.argsort(keys[part], kind="stable")] for part in np.split(order, starts[1:])])
+    rows, keys = ordered(rows, order, turns=grids is None), keys[order]
+    header: dict[str, Any] = {
+        "num": num,
+        "chunk": chunk,
+        "base_degree": model.gaussians.sh_degree,
+        "choices": config_to_dict(choices),
+        "appearance": appearance_to_dict(model.appearance),
+        "background": list(model.background),
+    }
+    header["degrees"], header["degree_counts"] = (x.tolist() for x in np.unique(rows.degrees, return_counts=True))
+    if rows.sizes is not None:
+        header["sizes"], header["size_counts"] = (x.tolist() for x in np.unique(rows.sizes, axis=0, return_counts=True))
+    if page is not None:
+        header["page"] = dict(page)
+    ends = dict(grids or {})
+    if len(starts) > 1:  # All chunks have the same steps.
+        for name, values, precision, _ in _columns(rows, choices):
+            if isinstance(precision, int):
+                ends.setdefault(name, ends_of(values, precision))
+
+    def encoded(coder: Choice) -> tuple[bytes, int]:
+        """Return the file and the number of bytes it unpacks to."""
+        writer = ColumnWriter(coder, ends)
+        if model.origin is not None:
+            header["origin"] = {"names": list(model.origin.names)}
+            for name, array in origin_arrays(model.origin).items():
+                writer.exact(f"origin_{name}", np.asarray(array, ORIGIN_DTYPES[name]))
+        for start in starts:
+            places = np.arange(start, min(start + chunk, num))
+            part = rows if len(starts) == 1 else ordered(rows, places, turns=False)
+            if isinstance(choices.means, int):
+                writer.means(axes, keys[places], bits)
+            else:
+                writer.numbers("means", part.means.T, choices.means)
+            _write(writer, part, choices, header)
+        return framed(header | {"parts": writer.parts, "ends": writer.ends}, writer.body), writer.num_unpacked
+
+    data, num_unpacked = encoded(choices.coder)
+    # Where numbers are so alike that the file would be taken for a bomb, it is not coded.
+    return data if num_unpacked <= room_of(len(data)) else encoded("none")[0]
+
+
+def _write(writer: ColumnWriter, rows: Rows, choices: CompactChoices, header: Mapping[str, Any]) -> None:
+    """Write all of a chunk but its means."""
+    writer.indices("degrees", np.searchsorted(header["degrees"], rows.degrees), len(header["degrees"]))
+    if rows.sizes is not None:
+        table, found = (np.asarray(sizes).reshape(-1, 2) @ [MAX_SIDE + 1, 1] for sizes in (header["sizes"], rows.sizes))
+        writer.indices("sizes", np.searchsorted(table, found), len(table))
+    for name, values, precision, is_color in _columns(rows, choices):
+        writer.numbers(name, values, precision, is_color=is_color)
+
+
+def _chunk_of(num: int) -> int:
+    return int(np.clip(-(-num // 16), LEAST_CHUNK, LARGEST_CHUNK))
+
+
+def _columns(rows: Rows, choices: CompactChoices) -> Iterator[tuple[str, np.ndarray, Precision, bool]]:
+    """Yield name, numbers [C, n], precision, and whether they are colours, of each group besides the means."""
+    yield "log_scales", rows.log_scales.T, choices.log_scales, False
+    yield "quats", rows.quats[:, 1:].T, choices.quats, False
+    opacities = opacities_of(rows.logit_opacities) if isinstance(choices.opacities, int) else rows.logit_opacities
+    yield "opacities", opacities[None], choices.opacities, False
+    for degree, band in enumerate(rows.bands):
+        name = f"sh_{degree}"
+        yield name, band.transpose(2, 1, 0).reshape(3, -1), choices.of_part(name), True
+    if rows.texels is not None:
+        yield "texel_colors", rows.texels[:, :3].T, choices.texels, True
+        yield "texel_alphas", rows.texels[:, 3:].T, choices.texels, False
+    if rows.shapes is not None:
+        is_bits = isinstance(choices.shapes, int)
+        yield "shapes", (log_exponents_of(rows.shapes) if is_bits else rows.shapes)[None], choices.shapes, False
 
 
 def half_turned(model: Model) -> Model:
@@ -175,19 +264,25 @@ def half_turned(model: Model) -> Model:
 
 def grids_of(model: Model, choices: CompactChoices) -> Grids:
     """Return the grids of a file of these choices, for each group kept in bits of which the model has numbers."""
-    header, _ = _unframed(encode_model(model, dataclasses.replace(choices, coder="none")))
+    header, _ = unframed(encode_model(model, dataclasses.replace(choices, coder="none")))
     return {name: tuple(ends) for name, ends in header["ends"].items()}
 
 
 def decode_model(data: bytes, where: str = "the compact scene") -> Model:
     """Return the model of the bytes of a file; errors call it `where`. Raises as `load_compact` does."""
     with reading(where):
-        header, body = _unframed(data)
+        header, body = unframed(data)
         choices = config_from_dict(CompactChoices, header["choices"], "choices").check()
         appearance = appearance_from_dict(header["appearance"])
         check_encodable(appearance)
-        reader = ColumnReader(body, header, room_of(len(data)))
-        rows = _rows_of(reader, header, choices, appearance)
+        reader = ColumnReader(body, header["parts"], header["ends"], room_of(len(data)))
+        num, chunk = header["num"], header.get("chunk", max(header["num"], 1))
+        if type(num) is not int or num < 0 or type(chunk) is not int or chunk < 1:
+            raise ValueError(f"must have a number of rows, in chunks; got {num!r}, {chunk!r}")
+        parts = [
+            _rows_of(reader, min(chunk, num - start), header, choices, appearance)
+            for start in range(0, max(num, 1), chunk)
+        ]
         origin = None
         if "origin" in header:
             shapes = origin_shapes(len(header["origin"]["names"]))
@@ -196,93 +291,54 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
             }
             origin = origin_of(header["origin"], arrays | {"is_test": arrays["is_test"].astype(bool)})
         reader.end()
-        return model_of(rows, header["base_degree"], appearance, origin, background_of(header))
+        return model_of(joined(parts), header["base_degree"], appearance, origin, background_of(header))
 
 
 def bytes_by_part(data: bytes) -> dict[str, int]:
     """Return how many bytes each part of a whole file takes, the header included."""
-    header, body = _unframed(data)
-    return {"header": len(data) - len(body), **header["lengths"]}
+    header, body = unframed(data)
+    found = {"header": len(data) - len(body)}
+    for name, _, length in header["parts"]:
+        found[name] = found.get(name, 0) + length
+    return found
 
 
-# From a model to bytes
-
-
-def _encoded(model: Model, choices: CompactChoices, grids: Grids | None) -> tuple[bytes, int]:
-    """Return the file, and how many bytes it unpacks to."""
-    writer, rows = ColumnWriter(choices.coder, grids or {}), rows_of_model(model)
-    rows = ordered(rows, writer.means("means", rows.means.T, choices.means), turns=grids is None)
-    writer.numbers("log_scales", rows.log_scales.T, choices.log_scales)
-    writer.numbers("quats", rows.quats[:, 1:].T, choices.quats)
-    opacities = opacities_of(rows.logit_opacities) if isinstance(choices.opacities, int) else rows.logit_opacities
-    writer.numbers("opacities", opacities[None], choices.opacities)
-    degrees = np.unique(rows.degrees)
-    writer.indices("degrees", np.searchsorted(degrees, rows.degrees), len(degrees))
-    for degree, band in enumerate(rows.bands):
-        name, columns = f"sh_{degree}", band.transpose(2, 1, 0).reshape(3, -1)
-        writer.numbers(name, columns, choices.of_part(name), is_color=True)
-    header: dict[str, Any] = {
-        "num": len(rows.means),
-        "base_degree": model.gaussians.sh_degree,
-        "degrees": degrees.tolist(),
-        "choices": config_to_dict(choices),
-        "appearance": appearance_to_dict(model.appearance),
-    }
-    if rows.sizes is not None and rows.texels is not None:
-        sizes, indices = np.unique(rows.sizes, axis=0, return_inverse=True)
-        header["sizes"] = sizes.tolist()
-        writer.indices("sizes", indices.reshape(-1), len(sizes))
-        writer.numbers("texel_colors", rows.texels[:, :3].T, choices.texels, is_color=True)
-        writer.numbers("texel_alphas", rows.texels[:, 3:].T, choices.texels)
-    if rows.shapes is None:
-        del header["choices"]["shapes"]
-    else:
-        is_bits = isinstance(choices.shapes, int)
-        writer.numbers("shapes", (log_exponents_of(rows.shapes) if is_bits else rows.shapes)[None], choices.shapes)
-    header["background"] = list(model.background)
-    if model.origin is not None:
-        header["origin"] = {"names": list(model.origin.names)}
-        for name, array in origin_arrays(model.origin).items():
-            writer.exact(f"origin_{name}", np.asarray(array, ORIGIN_DTYPES[name]))
-    version = VERSION if rows.shapes is None else SHAPED_VERSION
-    return _framed(header | writer.layout, writer.body, version), writer.num_unpacked
-
-
-def _framed(header: Mapping[str, object], body: bytes, version: int = VERSION) -> bytes:
+def framed(header: Mapping[str, object], body: bytes) -> bytes:
     text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
-    coded = encode("zstd", np.frombuffer(text, np.uint8)[None])
+    coded = zlib.compress(text, 9)
     rest = coded + body
-    return HEAD.pack(MAGIC, version, len(coded), len(text), zlib.crc32(rest)) + rest
+    return HEAD.pack(MAGIC, VERSION, len(coded), len(text), zlib.crc32(rest)) + rest
 
 
-# From bytes to a model
-
-
-def _unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
+def unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
     """Return the header and the body of a whole file."""
     if len(data) < HEAD.size or data[: len(MAGIC)] != MAGIC:
         raise ValueError("is not a compact scene of a2tg-jax")
     _, version, num_coded, num_text, checksum = HEAD.unpack_from(data)
-    if version not in (VERSION, SHAPED_VERSION):
-        versions = f"{VERSION} and {SHAPED_VERSION}"
-        raise ValueError(f"is a compact scene of version {version}; this program reads versions {versions}")
+    if version not in (*OLD_VERSIONS, VERSION):
+        raise ValueError(f"is a compact scene of version {version}; this program reads versions 1 to {VERSION}")
     rest = data[HEAD.size :]
     if zlib.crc32(rest) != checksum:
         raise ValueError("is damaged or cut off")
     if num_coded > len(rest) or num_text > room_of(len(data)):
         raise ValueError(f"announces a header of {num_coded} bytes, {num_text} unpacked")
-    header = parse_json(decode("zstd", rest[:num_coded], 1, num_text).tobytes())
+    coder = "zstd" if version in OLD_VERSIONS else "deflate"
+    header = parse_json(decode(coder, rest[:num_coded], 1, num_text).tobytes())
     if not isinstance(header, dict):
         raise ValueError("has no header")
+    if version in OLD_VERSIONS:
+        header["parts"] = [(name, header["coders"][name], length) for name, length in header["lengths"].items()]
     return header, rest[num_coded:]
 
 
-def _rows_of(reader: ColumnReader, header: Mapping[str, Any], choices: CompactChoices, appearance: Appearance) -> Rows:
-    """Return the tables of a file, of no more rows than it can hold."""
-    num, base, table = header["num"], header["base_degree"], header["degrees"]
-    if type(num) is not int or num < 0 or type(base) is not int or not 0 <= base <= MAX_DEGREE:
-        raise ValueError(f"must be of a number of rows, and of a base degree in 0..3; got {num!r}, {base!r}")
-    means = reader.means("means", num, choices.means).T
+def _rows_of(
+    reader: ColumnReader, num: int, header: Mapping[str, Any], choices: CompactChoices, appearance: Appearance
+) -> Rows:
+    """Return the tables of a chunk, of no more rows than the file can hold."""
+    base, table = header["base_degree"], header["degrees"]
+    if type(base) is not int or not 0 <= base <= MAX_DEGREE:
+        raise ValueError(f"must have a base degree in 0..{MAX_DEGREE}; got {base!r}")
+    means = reader.means(num, choices.means).T
     log_scales = reader.numbers("log_scales", 2, num, choices.log_scales).T
     quats = with_w(reader.numbers("quats", 3, num, choices.quats))
     opacities = reader.numbers("opacities", 1, num, choices.opacities)[0]

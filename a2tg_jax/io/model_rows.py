@@ -5,6 +5,8 @@ of its own axes if that makes its rotation smaller, and its texture is mirrored 
 """
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -107,6 +109,16 @@ def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:
         texels=None if rows.texels is None or rows.sizes is None else rows.texels[_texels(rows.sizes, order, axis)],
         shapes=None if rows.shapes is None else rows.shapes[order],
     )
+
+
+def joined(parts: Sequence[Rows]) -> Rows:
+    """Return the splats of all parts, of which each has the same tables."""
+    if len(parts) == 1:
+        return parts[0]
+    values = {field.name: [getattr(part, field.name) for part in parts] for field in dataclasses.fields(Rows)}
+    bands = tuple(map(np.concatenate, zip(*values.pop("bands"), strict=True)))
+    tables: dict[str, Any] = {name: None if rows[0] is None else np.concatenate(rows) for name, rows in values.items()}
+    return Rows(bands=bands, **tables)
 
 
 def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarray:

@@ -25,7 +25,8 @@ from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_on_views
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import counted, in_bytes
-from a2tg_jax.io.web_scene import encode_web_scene, rounded_model
+from a2tg_jax.io.compact import decode_model
+from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.folder import check_new, read_json, remove_if_empty
 from a2tg_jax.results.images import to_uint8
@@ -46,8 +47,6 @@ SHARE = 0.03
 WAIT = 0.1
 MOST_VIEWS = 8
 """Largest number of views for measuring the loss of an exported scene, evenly chosen."""
-QUICK = 1
-"""Compression level; a scene viewed once need not be small."""
 
 
 class ServedPhotographs:
@@ -167,7 +166,7 @@ class LiveView:
 
     def _encode(self, model: Model, began: float) -> None:
         try:
-            found = encode_web_scene(model, title=self._title, level=QUICK)
+            found = encode_web_scene(model, title=self._title, coder="none")  # Viewed once, on this machine.
             with self._lock:
                 self._scene_bytes = found
                 self._status |= {"version": self._status["version"] + 1, "message": ""}
@@ -262,7 +261,7 @@ def losses_of(source: Source) -> dict[str, float]:
     if not model.num:
         return {}
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
-    again, scene = rounded_model(model), source.load_scene_or_warn()
+    again, scene = decode_model(source.encoded), source.load_scene_or_warn()
     if scene is not None:
         views = {"training views": scene.train, "test views": scene.test}
         chosen = {name: found[:: -(-len(found) // MOST_VIEWS)] for name, found in views.items() if found}

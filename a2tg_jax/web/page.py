@@ -3,7 +3,7 @@
 import base64
 from importlib import resources
 
-SCENE_NAME = "scene.a2tgw"
+SCENE_NAME = "scene.a2tgz"
 """Name of the scene file beside the page."""
 PHOTOGRAPHS_NAME = "photographs.json"
 """Name of the list of cameras with photographs beside the page, as `photograph_name` names them."""

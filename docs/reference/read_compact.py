@@ -14,8 +14,17 @@ from splats import dense, expanded, exponents, sigmoid, with_w
 
 def read_compact(path):
     header, body = unframed(path.read_bytes())
-    parts, num, choices = Parts(header, body), header["num"], header["choices"]
-    model = {"header": header, "means": parts.means(num, choices["means"])}
+    parts, num, chunks = Parts(header, body), header["num"], []
+    chunk = header.get("chunk", max(num, 1))
+    for start in range(0, max(num, 1), chunk):
+        chunks.append(read_chunk(parts, header, min(chunk, num - start)))
+    return {"header": header} | {name: np.concatenate([rows[name] for rows in chunks]) for name in chunks[0]}
+
+
+def read_chunk(parts, header, num):
+    """Return the splats of a chunk."""
+    choices, names = header["choices"], {name for name, _, _ in header["parts"]}
+    model = {"means": parts.means(num, choices["means"])}
     model["log_scales"] = parts.numbers("log_scales", 2, num, choices["log_scales"]).T
     model["quats"] = with_w(parts.numbers("quats", 3, num, choices["quats"]))
     opacities = parts.numbers("opacities", 1, num, choices["opacities"])[0]
@@ -23,7 +32,7 @@ def read_compact(path):
     model["degrees"] = parts.entries("degrees", header["degrees"], num)
     bands = []
     for degree in range(4):
-        if f"sh_{degree}" in header["lengths"]:
+        if f"sh_{degree}" in names:
             count = int(np.sum(model["degrees"] >= degree))
             precision = choices["sh_rest" if degree else "sh_0"]
             columns = parts.numbers(f"sh_{degree}", 3, (2 * degree + 1) * count, precision, is_color=True)
@@ -35,7 +44,7 @@ def read_compact(path):
         colors = parts.numbers("texel_colors", 3, count, choices["texels"], is_color=True)
         alphas = parts.numbers("texel_alphas", 1, count, choices["texels"])
         model["texels"] = np.concatenate([colors, alphas]).T
-    if "shapes" in choices:
+    if "shapes" in names:
         values = parts.numbers("shapes", 1, num, choices["shapes"])[0]
         model["exponents"] = exponents(np.tanh(values) if isinstance(choices["shapes"], str) else values)
     return model
@@ -45,21 +54,27 @@ def unframed(data):
     """Return header and body."""
     magic, version, num_coded, _, checksum = struct.unpack_from("<8sHIII", data)
     rest = data[22:]
-    if magic != b"a2tgz\r\n\x1a" or version not in (1, 2) or zlib.crc32(rest) != checksum:
-        raise ValueError("is no whole compact scene of version 1 or 2")
-    return json.loads(zstandard.ZstdDecompressor().decompress(rest[:num_coded])), rest[num_coded:]
+    if magic != b"a2tgz\r\n\x1a" or version not in (1, 2, 3) or zlib.crc32(rest) != checksum:
+        raise ValueError("is no whole compact scene of version 1 to 3")
+    header = json.loads(unpacked("deflate" if version == 3 else "zstd", rest[:num_coded], 1, None))
+    if version < 3:
+        header["parts"] = [(name, header["coders"][name], length) for name, length in header["lengths"].items()]
+    return header, rest[num_coded:]
 
 
 class Parts:
-    """The parts of the body, one after the other."""
+    """The parts of the body by name, of which each has one in each chunk."""
 
     def __init__(self, header, body):
-        self.header, self.body = header, io.BytesIO(body)
+        self.header, self.found, start = header, {}, 0
+        for name, coder, length in header["parts"]:
+            self.found.setdefault(name, []).append((coder, body[start : start + length]))
+            start += length
 
     def planes(self, name, num_planes, length):
         """Return bytes [num_planes, length]."""
-        data = self.body.read(self.header["lengths"][name])
-        data = unpacked(self.header["coders"][name], data, num_planes, length) if data else data
+        coder, data = self.found[name].pop(0)
+        data = unpacked(coder, data, num_planes, length) if data else data
         return np.frombuffer(data, np.uint8).reshape(num_planes, length)
 
     def codes(self, name, columns, length, bits):
@@ -97,6 +112,8 @@ class Parts:
 
 def unpacked(coder, data, num_planes, length):
     """Return the bytes of planes."""
+    if coder == "deflate":
+        return zlib.decompress(data)
     if coder == "zstd":
         return zstandard.ZstdDecompressor().decompress(data)
     if coder == "lzma":

@@ -1,5 +1,4 @@
-"""Reads the files of a2tg-jax without it: models (*.npz), compact scenes (*.a2tgz), scenes for browsers (*.a2tgw), and
-glTF with textures (*.glb).
+"""Reads the files of a2tg-jax without it: models (*.npz), compact scenes (*.a2tgz), and glTF with textures (*.glb).
 
     python docs/reference/read_model.py scene.a2tgz
 
@@ -14,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from read_compact import read_compact
 from read_gltf import read_gltf
-from read_web import read_web
 from splats import dense, sigmoid
 
 
@@ -48,7 +46,7 @@ def read_npz(path):
     return model | {"opacities": sigmoid(arrays["logit_opacities"]), "degrees": degrees, "sh": dense(bands, degrees)}
 
 
-READERS = {".npz": read_npz, ".a2tgz": read_compact, ".a2tgw": read_web, ".glb": read_gltf}
+READERS = {".npz": read_npz, ".a2tgz": read_compact, ".glb": read_gltf}
 
 if __name__ == "__main__":
     for name, values in read_model(sys.argv[1]).items():

@@ -10,7 +10,7 @@ import { CHROMIUM, DESK, launch, serve } from "./chromium";
 import type { Served } from "./chromium";
 
 const PAGE = readFileSync(new URL("../../a2tg_jax/web/viewer.html", import.meta.url), "utf8");
-const SCENE = Uint8Array.from(readFileSync(new URL("../test/small.a2tgw", import.meta.url)));
+const SCENE = Uint8Array.from(readFileSync(new URL("../test/small.a2tgz", import.meta.url)));
 const PHONE: BrowserContextOptions = { viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true };
 
 describe.skipIf(CHROMIUM === undefined)("the page", () => {
@@ -18,7 +18,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
   let served: Served;
   beforeAll(async () => {
     browser = await launch();
-    served = await serve({ "/": PAGE, "/scene.a2tgw": SCENE });
+    served = await serve({ "/": PAGE, "/scene.a2tgz": SCENE });
   });
   afterAll(async () => {
     await browser.close();

@@ -35,7 +35,7 @@ export interface Served {
   close(): void;
 }
 
-/** Serve files by path, such as "/scene.a2tgw". A function is called for each request. */
+/** Serve files by path, such as "/scene.a2tgz". A function is called for each request. */
 export function serve(files: Readonly<Record<string, Uint8Array | string | (() => string)>>): Promise<Served> {
   const server = createServer((request, response) => {
     const found = Object.entries(files).find(([path]) => path === request.url)?.[1];

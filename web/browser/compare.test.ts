@@ -1,6 +1,6 @@
 /**
  * Comparison of the page with the JAX renderer. A2TG_CASES is a folder with one folder per scene. Each holds
- * scene.a2tgw, views.json and, for view i, the renderer's colours as float32 in i.f32. tests/viewer_cases.py writes
+ * scene.a2tgz, views.json and, for view i, the renderer's colours as float32 in i.f32. tests/viewer_cases.py writes
  * these files.
  */
 
@@ -65,7 +65,7 @@ describe.skipIf(CHROMIUM === undefined || NAMES.length === 0)("the page shows wh
   test.each(NAMES)("%s", async (name) => {
     const folder = join(FOLDER, name);
     const { background, views } = JSON.parse(readFileSync(join(folder, "views.json"), "utf8")) as Case;
-    const served = await serve({ "/": readFileSync(PAGE), "/scene.a2tgw": readFileSync(join(folder, "scene.a2tgw")) });
+    const served = await serve({ "/": readFileSync(PAGE), "/scene.a2tgz": readFileSync(join(folder, "scene.a2tgz")) });
     // The canvas is drawn too, slowly in software, so keep it small.
     const page = await browser.newPage({ viewport: { width: 160, height: 120 }, deviceScaleFactor: 0.25 });
     const errors: string[] = [];

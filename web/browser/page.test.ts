@@ -18,14 +18,14 @@ import { CHROMIUM, DESK, launch, serve } from "./chromium";
 import type { Served } from "./chromium";
 
 const PAGE = readFileSync(new URL("../../a2tg_jax/web/viewer.html", import.meta.url), "utf8");
-const SCENE = Uint8Array.from(readFileSync(new URL("../test/small.a2tgw", import.meta.url)));
+const SCENE = Uint8Array.from(readFileSync(new URL("../test/small.a2tgz", import.meta.url)));
 
 describe.skipIf(CHROMIUM === undefined)("the page", () => {
   let browser: Browser;
   let served: Served;
   beforeAll(async () => {
     browser = await launch();
-    served = await serve({ "/": PAGE, "/scene.a2tgw": SCENE, "/photographs.json": "[0]", "/photographs/0.jpg": "" });
+    served = await serve({ "/": PAGE, "/scene.a2tgz": SCENE, "/photographs.json": "[0]", "/photographs/0.jpg": "" });
   });
   afterAll(async () => {
     await browser.close();
@@ -189,7 +189,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
       "/",
       "/photographs.json",
       "/photographs/0.jpg",
-      "/scene.a2tgw",
+      "/scene.a2tgz",
     ]);
     await page.close();
   });
@@ -209,7 +209,7 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     const tell = (is_paused: boolean): string => JSON.stringify(Object.assign(status, { is_paused }));
     const other = await serve({
       "/": PAGE.replace("<html ", '<html data-training="yes" '),
-      "/scene.a2tgw": SCENE,
+      "/scene.a2tgz": SCENE,
       "/training.json": () => tell(status.is_paused),
       "/pause": () => tell(true),
       "/resume": () => tell(false),
@@ -281,16 +281,16 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
   }
 
   test("damaged scenes give clear errors", async () => {
-    expect(await message({ "/scene.a2tgw": SCENE.subarray(0, SCENE.length - 100) })).toContain("cut off");
+    expect(await message({ "/scene.a2tgz": SCENE.subarray(0, SCENE.length - 100) })).toContain("cut off");
     expect(
-      await message({ "/scene.a2tgw": SCENE.map((byte, i) => (i === SCENE.length - 2000 ? byte ^ 85 : byte)) }),
+      await message({ "/scene.a2tgz": SCENE.map((byte, i) => (i === SCENE.length - 2000 ? byte ^ 85 : byte)) }),
     ).toContain("damaged");
-    expect(await message({ "/scene.a2tgw": "<script>alert(1)</script> and more text" })).toContain("not a scene");
-    expect(await message({})).toContain("no scene.a2tgw");
+    expect(await message({ "/scene.a2tgz": "<script>alert(1)</script> and more text" })).toContain("not a scene");
+    expect(await message({})).toContain("no scene.a2tgz");
   });
 
   test("a browser without WebGL 2 gives a clear error", async () => {
-    const found = await message({ "/scene.a2tgw": SCENE }, (page) =>
+    const found = await message({ "/scene.a2tgz": SCENE }, (page) =>
       page.addInitScript(() => {
         HTMLCanvasElement.prototype.getContext = () => null;
       }),

@@ -1,5 +1,5 @@
 /**
- * Prints the numbers of a scene: `npm run reader`, then `node dist/read.js scene.a2tgw`.
+ * Prints the numbers of a scene: `npm run reader`, then `node dist/read.js scene.a2tgz`.
  *
  * One line of JSON, with the names of `Numbers`; `--summary` prints their lengths instead.
  */
@@ -11,7 +11,7 @@ import { readNumbers } from "../src/decode";
 const names = process.argv.slice(2).filter((argument) => argument !== "--summary");
 const [name] = names;
 if (name === undefined || names.length > 1) {
-  console.error("usage: node dist/read.js [--summary] scene.a2tgw");
+  console.error("usage: node dist/read.js [--summary] scene.a2tgz");
   process.exit(2);
 }
 try {

@@ -1,15 +1,17 @@
-/** Streaming reader for the body of a scene file. */
+/** Chunks of consecutive rows, read from the parts of a file. */
 
-import { SceneError, fixedColumns } from "./format";
-import type { Header } from "./format";
+import { at, joined } from "./arrays";
+import { damaged } from "./format";
+import type { Header, Quantity } from "./format";
+import type { PartReader } from "./parts";
 
-/** Columns of consecutive rows, encoded as in the file. */
+/** Columns of consecutive rows. Codes are bytes, encoded as in the file. */
 export interface Chunk {
   /** Index of the first row. */
   readonly start: number;
   readonly num: number;
-  /** [6, n] low bytes of x, y, z, then high bytes. */
-  readonly means: Uint8Array;
+  /** [n, 3] positions. */
+  readonly means: Float32Array<ArrayBuffer>;
   /** [9, n] log-scales u, v; quaternion x, y, z; opacity; degree 0: red − green, green, blue − green. */
   readonly numbers: Uint8Array;
   /** [n] degrees of the spherical harmonics. */
@@ -24,129 +26,63 @@ export interface Chunk {
   readonly texels: Uint8Array;
 }
 
-/** Splits a stream of bytes into chunks. */
-export class ChunkReader {
-  private readonly header: Header;
-  private row = 0;
-  private numRead = 0;
-  private fixed: Uint8Array | null = null;
-  private buffer: Uint8Array;
-  private filled = 0;
-
-  constructor(header: Header) {
-    this.header = header;
-    this.buffer = new Uint8Array(this.fixedBytes);
-  }
-
-  /** Return the chunks that these bytes complete. */
-  push(bytes: Uint8Array): Chunk[] {
-    const found: Chunk[] = [];
-    let place = 0;
-    while (place < bytes.length) {
-      if (this.row >= this.header.num) throw new SceneError("The scene is damaged: there is data after the last row.");
-      const taken = Math.min(bytes.length - place, this.buffer.length - this.filled);
-      this.buffer.set(bytes.subarray(place, place + taken), this.filled);
-      place += taken;
-      this.filled += taken;
-      // The second part of a chunk may be empty, and is then complete at once.
-      for (let i = 0; i < 2 && this.filled === this.buffer.length && this.row < this.header.num; i++) {
-        const chunk = this.advance();
-        if (chunk !== null) found.push(chunk);
-      }
-    }
-    return found;
-  }
-
-  /** Throw a SceneError if rows are missing. */
-  end(): void {
-    if (this.row < this.header.num || this.numRead !== this.header.bytes) {
-      throw new SceneError("The scene is cut off: rows are missing.");
+/** Read the next chunk, which starts at the given row. */
+export async function readChunk(parts: PartReader, header: Header, start: number): Promise<Chunk> {
+  const num = Math.min(header.chunk, header.num - start);
+  const codes = async (name: Quantity, columns: number, length: number): Promise<Uint8Array> => {
+    const isConstant = header.ends[name].step === 0; // Then there are no bytes.
+    const planes = await parts.planes(name, isConstant ? 0 : columns, length);
+    return isConstant ? new Uint8Array(columns * length) : planes;
+  };
+  const means = positions(await parts.planes("means", Math.ceil((3 * header.meanBits) / 8), num), num, header);
+  const degreeIndices = await parts.indices("degrees", num, header.degrees.length);
+  const degrees = Uint8Array.from(degreeIndices, (index) => at(header.degrees, index));
+  const sizes = new Uint8Array(2 * num);
+  let numTexels = 0;
+  if (header.sizes !== null) {
+    for (const [i, index] of (await parts.indices("sizes", num, header.sizes.length)).entries()) {
+      const [height, width] = at(header.sizes, index);
+      [sizes[i], sizes[num + i]] = [height, width];
+      numTexels += height * width;
     }
   }
-
-  private get numRows(): number {
-    return Math.min(this.header.chunk, this.header.num - this.row);
+  const numbers = [await codes("log_scales", 2, num), await codes("quats", 3, num), await codes("opacities", 1, num)];
+  numbers.push(await codes("sh_0", 3, num));
+  const bands: Uint8Array[] = [];
+  for (const [i, name] of (["sh_1", "sh_2", "sh_3"] as const).slice(0, header.numBands - 1).entries()) {
+    const count = degrees.reduce((sum, degree) => sum + Number(degree > i), 0);
+    bands.push(await codes(name, 3, (2 * i + 3) * count));
   }
-
-  private get fixedBytes(): number {
-    return fixedColumns(this.header) * this.numRows;
-  }
-
-  /** Handle a full buffer. The fixed columns give the size of the second part; the second part completes a chunk. */
-  private advance(): Chunk | null {
-    this.numRead += this.filled;
-    const full = this.buffer;
-    if (this.fixed === null) {
-      this.fixed = full;
-      const rest = this.restBytes(full);
-      if (this.numRead + rest > this.header.bytes) {
-        throw new SceneError("The scene is damaged: a chunk is larger than the rest of the body.");
-      }
-      this.room(rest);
-      return null;
-    }
-    const chunk = this.chunkOf(this.fixed, full);
-    this.row += chunk.num;
-    this.fixed = null;
-    this.room(this.fixedBytes);
-    return chunk;
-  }
-
-  private room(bytes: number): void {
-    this.buffer = new Uint8Array(bytes);
-    this.filled = 0;
-  }
-
-  private parts(fixed: Uint8Array): Pick<Chunk, "means" | "numbers" | "degrees" | "sizes" | "shapes"> {
-    const n = this.numRows;
-    const { numTexels, hasShapes } = this.header;
-    return {
-      means: fixed.subarray(0, 6 * n),
-      numbers: fixed.subarray(6 * n, 15 * n),
-      degrees: fixed.subarray(15 * n, 16 * n),
-      sizes: numTexels === null ? new Uint8Array(2 * n) : fixed.subarray(16 * n, 18 * n),
-      shapes: hasShapes ? fixed.subarray(fixed.length - n) : new Uint8Array(n),
-    };
-  }
-
-  private restBytes(fixed: Uint8Array): number {
-    const { degrees, sizes } = this.parts(fixed);
-    const { baseDegree, numBands } = this.header;
-    if (degrees.some((degree) => degree < baseDegree || degree >= numBands)) {
-      throw new SceneError("The scene is damaged: a spherical harmonics degree is out of range.");
-    }
-    return this.bandLengths(degrees).reduce((a, b) => a + b, 0) + 4 * numTexelsOf(sizes, this.numRows);
-  }
-
-  private bandLengths(degrees: Uint8Array): number[] {
-    const counted = (least: number): number => {
-      let count = 0;
-      for (const degree of degrees) if (degree >= least) count++;
-      return count;
-    };
-    return Array.from({ length: this.header.numBands - 1 }, (_, i) => 3 * (2 * i + 3) * counted(i + 1));
-  }
-
-  private chunkOf(fixed: Uint8Array, rest: Uint8Array): Chunk {
-    const parts = this.parts(fixed);
-    const bands: Uint8Array[] = [];
-    let place = 0;
-    for (const length of this.bandLengths(parts.degrees)) {
-      bands.push(rest.subarray(place, place + length));
-      place += length;
-    }
-    return { start: this.row, num: this.numRows, ...parts, bands, texels: rest.subarray(place) };
-  }
+  const texels =
+    header.sizes === null ? [] : [await codes("texel_colors", 3, numTexels), await codes("texel_alphas", 1, numTexels)];
+  const shapes = header.hasShapes ? await codes("shapes", 1, num) : new Uint8Array(num);
+  return { start, num, means, numbers: joined(numbers), degrees, sizes, shapes, bands, texels: joined(texels) };
 }
 
-function numTexelsOf(sizes: Uint8Array, num: number): number {
-  let total = 0;
+/**
+ * Return positions [n, 3] from the bytes of places along a Z curve, each less the one before. A place holds the bits of
+ * the three axes by turns, up to 48 in all.
+ */
+function positions(planes: Uint8Array, num: number, { means, meanBits }: Header): Float32Array<ArrayBuffer> {
+  const found = new Float32Array(3 * num);
+  const steps = means.map(([, , low, high]) => (high - low) / (2 ** meanBits - 1));
+  let place = 0;
   for (let i = 0; i < num; i++) {
-    const [height, width] = [sizes[i]!, sizes[num + i]!];
-    if (height > 16 || width > 16 || (height === 0) !== (width === 0)) {
-      throw new SceneError("The scene is damaged: a texture size is out of range.");
-    }
-    total += height * width;
+    for (let k = 0; k * num < planes.length; k++) place += planes[k * num + i]! * 256 ** k;
+    if (place >= 2 ** (3 * meanBits)) throw damaged("a position is out of range");
+    const [lower, upper] = [place % 2 ** 24, Math.floor(place / 2 ** 24)];
+    means.forEach(([centre, spread, low], axis) => {
+      const code = everyThird(lower >> axis) | (everyThird(upper >> axis) << 8);
+      found[3 * i + axis] = centre + spread * Math.sinh(low + code * steps[axis]!);
+    });
   }
-  return total;
+  return found;
+}
+
+/** Return bits 0, 3, …, 21 next to each other. */
+function everyThird(bits: number): number {
+  let x = bits & 0x249249;
+  x = (x | (x >> 2)) & 0x0c30c3;
+  x = (x | (x >> 4)) & 0x00f00f;
+  return (x | (x >> 8)) & 0x0000ff;
 }

@@ -6,9 +6,9 @@ const TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
   return c;
 });
 
-/** Return the checksum of `bytes` as an unsigned integer. */
-export function crc32(bytes: Uint8Array): number {
-  let c = 0xffffffff;
+/** Return the checksum of `bytes` as an unsigned integer; `before` is the checksum of the bytes before them. */
+export function crc32(bytes: Uint8Array, before = 0): number {
+  let c = before ^ 0xffffffff;
   for (const byte of bytes) c = TABLE[(c ^ byte) & 255]! ^ (c >>> 8);
   return (c ^ 0xffffffff) >>> 0;
 }

@@ -1,12 +1,12 @@
 /**
- * Reference reader of *.a2tgw files (docs/formats.md): all numbers of a scene, without a browser.
+ * Reference reader of *.a2tgz files (docs/formats.md): all numbers of a scene, without a browser.
  *
  * The viewer itself leaves numbers in bytes (packing.ts). This module decodes them, and needs neither DOM nor WebGL.
  */
 
 import { at } from "./arrays";
 import type { Chunk } from "./chunks";
-import type { Axis, Ends, Header, Quantity } from "./format";
+import type { Header, Quantity } from "./format";
 import { fromBytes, readScene } from "./source";
 
 /** Number of coefficients of degrees 0 to 3. */
@@ -17,7 +17,7 @@ const BANDS: readonly Quantity[] = ["sh_1", "sh_2", "sh_3"];
 export interface Numbers {
   readonly header: Header;
   /** [N, 3]. */
-  readonly means: Float64Array;
+  readonly means: Float32Array;
   /** [N, 4] unit quaternions w, x, y, z. */
   readonly quats: Float64Array;
   /** [N, 2]. */
@@ -51,7 +51,7 @@ export async function readNumbers(bytes: Uint8Array<ArrayBuffer>): Promise<Numbe
 
 class Decoder implements Numbers {
   readonly header: Header;
-  readonly means: Float64Array;
+  readonly means: Float32Array;
   readonly quats: Float64Array;
   readonly logScales: Float64Array;
   readonly opacities: Float64Array;
@@ -65,30 +65,22 @@ class Decoder implements Numbers {
   constructor(header: Header) {
     const { num } = header;
     this.header = header;
-    this.means = new Float64Array(3 * num);
+    this.means = new Float32Array(3 * num);
     this.quats = new Float64Array(4 * num);
     this.logScales = new Float64Array(2 * num);
     this.opacities = new Float64Array(num);
     this.degrees = new Uint8Array(num);
     this.sh = new Float64Array(3 * BASES * num);
     this.sizes = new Uint8Array(2 * num);
-    this.texels = new Float64Array(4 * (header.numTexels ?? 0));
+    this.texels = new Float64Array(4 * header.numTexels);
     this.exponents = new Float64Array(num);
   }
 
   add(chunk: Chunk): void {
     const { start, num } = chunk;
     this.degrees.set(chunk.degrees, start);
-    for (let i = 0; i < num; i++) {
-      const row = start + i;
-      this.header.means.forEach((axis, k) => {
-        this.means[3 * row + k] = position(
-          axis,
-          at(chunk.means, k * num + i) + 256 * at(chunk.means, (3 + k) * num + i),
-        );
-      });
-      this.row(chunk, i, row);
-    }
+    this.means.set(chunk.means, 3 * start);
+    for (let i = 0; i < num; i++) this.row(chunk, i, start + i);
     chunk.bands.forEach((codes, index) => this.band(chunk, codes, index + 1));
     this.addTexels(chunk.texels);
   }
@@ -126,14 +118,13 @@ class Decoder implements Numbers {
     const num = planes.length / 4;
     for (let i = 0; i < num; i++) {
       const code = (channel: number): number => at(planes, channel * num + i);
-      const roots = this.color("colors", code(0), code(1), code(2));
-      const texel = [...roots.map((root) => root * Math.abs(root)), this.value("alphas", code(3))];
-      this.texels.set(texel, 4 * this.numTexels++);
+      const color = this.color("texel_colors", code(0), code(1), code(2));
+      this.texels.set([...color, this.value("texel_alphas", code(3))], 4 * this.numTexels++);
     }
   }
 
   private value(name: Quantity, code: number): number {
-    const { low, step }: Ends = this.header.ends[name];
+    const { low, step } = this.header.ends[name];
     return low + step * code;
   }
 
@@ -141,8 +132,4 @@ class Decoder implements Numbers {
   private color(name: Quantity, red: number, green: number, blue: number): number[] {
     return [red + green, green, blue + green].map((code) => this.value(name, code & 255));
   }
-}
-
-function position([centre, spread, low, high]: Axis, code: number): number {
-  return centre + spread * Math.sinh(low + (code * (high - low)) / 65535);
 }

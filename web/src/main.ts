@@ -37,19 +37,18 @@ async function load(viewer: Viewer, panel: Panel, source: Source): Promise<void>
   const progress = element("progress", HTMLProgressElement);
   progress.hidden = false;
   let splats: Splats | null = null;
-  let [numBytes, numShown] = [1, 0];
+  let numShown = 0;
   const isFirst = viewer.splats === null;
   await readScene(source, {
-    onHeader: (header, length) => {
-      numBytes = length;
+    onHeader: (header) => {
       splats = viewer.begin(header);
       if (isFirst) panel.begin(header);
     },
     onChunk: async (chunk, numRead) => {
       if (splats === null) return;
       splats.add(chunk);
-      progress.value = numRead / numBytes;
-      if (isFirst || splats.num === splats.header.num) tell(splats, numBytes);
+      progress.value = numRead / splats.header.numBytes;
+      if (isFirst || splats.num === splats.header.num) tell(splats);
       if (numShown === 0 && isFirst) {
         viewer.splats = splats;
         panel.ready();
@@ -75,15 +74,15 @@ function nextFrame(): Promise<void> {
   });
 }
 
-function tell(splats: Splats, numBytes: number): void {
+function tell(splats: Splats): void {
   const { header } = splats;
   const figures: [string, string][] = [
     [
       "Gaussians",
       splats.num < header.num ? `${countText(splats.num)} of ${countText(header.num)}` : countText(header.num),
     ],
-    ["Texels", countText(header.numTexels ?? 0)],
-    ["File", bytesText(numBytes)],
+    ["Texels", countText(header.numTexels)],
+    ["File", bytesText(header.numBytes)],
     ["GPU memory", bytesText(splats.numBytes)],
   ];
   setFigures(figures);

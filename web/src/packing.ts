@@ -9,10 +9,7 @@
  * four bytes.
  */
 
-import { at } from "./arrays";
 import type { Chunk } from "./chunks";
-import { fixedColumns } from "./format";
-import type { Axis, Header } from "./format";
 
 export const ROW_WORDS = 8;
 /** Number of groups of four words for the coefficients above degree 0, by degree. */
@@ -33,19 +30,13 @@ export interface Packed {
 
 /** Packs successive chunks, counting texels and harmonics across them. */
 export class Packer {
-  private readonly header: Header;
   private numTexels = 0;
   private numHarmonics = 0;
 
-  constructor(header: Header) {
-    this.header = header;
-  }
-
   pack(chunk: Chunk): Packed {
-    const means = positions(chunk, this.header.means);
     const rows = new Uint32Array(ROW_WORDS * chunk.num);
     const floats = new Float32Array(rows.buffer);
-    const { num, numbers, degrees, sizes, shapes } = chunk;
+    const { num, means, numbers, degrees, sizes, shapes } = chunk;
     let texel = this.numTexels;
     let harmonic = this.numHarmonics;
     for (let i = 0; i < num; i++) {
@@ -75,29 +66,9 @@ export class Packer {
   }
 }
 
-/** Return an upper bound on the groups of four harmonics words in a file. */
-export function mostHarmonics(header: Header): number {
-  const most = at(HARMONIC_TEXELS, header.numBands - 1);
-  const fixed = fixedColumns(header) * header.num + 4 * (header.numTexels ?? 0);
-  return Math.min(most * header.num, Math.ceil(Math.max(header.bytes - fixed, 0) / 9));
-}
-
 /** Pack four numbers modulo 256 into a word, the first one lowest. */
 function word(a: number, b: number, c: number, d: number): number {
   return ((a & 255) | ((b & 255) << 8) | ((c & 255) << 16) | ((d & 255) << 24)) >>> 0;
-}
-
-function positions(chunk: Chunk, axes: readonly Axis[]): Float32Array<ArrayBuffer> {
-  const { num, means } = chunk;
-  const found = new Float32Array(3 * num);
-  axes.forEach(([centre, spread, low, high], k) => {
-    const step = (high - low) / 65535;
-    for (let i = 0; i < num; i++) {
-      const code = means[k * num + i]! | (means[(3 + k) * num + i]! << 8);
-      found[3 * i + k] = centre + spread * Math.sinh(low + code * step);
-    }
-  });
-  return found;
 }
 
 /** Reorder coefficients by row. The file orders them by band, colour and coefficient. */

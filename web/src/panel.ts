@@ -80,7 +80,7 @@ export class Panel {
       (camera, index) => new Option(camera.isTest ? `${camera.name} (test)` : camera.name, String(index)),
     );
     this.camera.replaceChildren(new Option("free", "-1"), ...choices);
-    const hasTextures = (header.numTexels ?? 0) > 0;
+    const hasTextures = header.numTexels > 0;
     element("compare", HTMLElement).hidden = !hasTextures;
     for (const option of this.mode.options) {
       option.disabled = !hasTextures && ["plain", "texture", "resolution"].includes(option.value);

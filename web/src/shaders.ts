@@ -22,12 +22,11 @@ uniform vec2 colorEnds, alphaEnds;
 vec4 texelAt(uint index) {
   ivec2 place = ivec2(int(index) & ((1 << widthBits) - 1), int(index >> widthBits));
   vec4 code = texelFetch(texels, place, 0) * 255.0;
-  vec3 root = colorEnds.x + code.rgb * colorEnds.y;
-  return vec4(root * abs(root), alphaEnds.x + code.a * alphaEnds.y);
+  return vec4(colorEnds.x + code.rgb * colorEnds.y, alphaEnds.x + code.a * alphaEnds.y);
 }
 `;
 
-/** Falloff of kernels with shapes: exp(-scale ((rho + OFFSET)^exponent - start)), as in a2tg_jax/appearance/shaped.py. */
+/** Falloff of kernels with shapes: exp(-scale ((rho + OFFSET)^exponent - start)), as in a2tg_jax/appearance/parts.py. */
 const KERNEL = `
 uniform bool isShaped;
 const float OFFSET = 0.02, LARGEST_LOG_EXPONENT = 1.0;

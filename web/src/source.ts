@@ -1,11 +1,17 @@
 /** Loading of a scene, embedded in the page or in a file beside it, as a stream of bytes. */
 
-import { ChunkReader } from "./chunks";
+import { at } from "./arrays";
+import type { Intrinsics, Viewmat } from "./camera";
+import { readChunk } from "./chunks";
 import type { Chunk } from "./chunks";
-import { HEAD_BYTES, SceneError, parseHead, parseHeader } from "./format";
-import type { Header } from "./format";
+import { HEAD_BYTES, SceneError, damaged, parseHead, parseHeader } from "./format";
+import type { FileHeader, Head, Header, SceneCamera } from "./format";
+import { isVector } from "./math";
+import type { Vec2 } from "./math";
+import { HARMONIC_TEXELS } from "./packing";
+import { ByteReader, PartReader, inflated } from "./parts";
 
-export const SCENE_FILE = "scene.a2tgw";
+export const SCENE_FILE = "scene.a2tgz";
 
 export interface Source {
   readonly bytes: ReadableStream<Uint8Array<ArrayBuffer>>;
@@ -48,94 +54,77 @@ function fromBase64(text: string): Uint8Array<ArrayBuffer> {
 
 export interface Listener {
   /** Handler called once, before any chunk. */
-  readonly onHeader: (header: Header, numBytes: number) => void;
+  readonly onHeader: (header: Header) => void;
   /** Handler called for each chunk. Reading continues when the promise resolves. */
   readonly onChunk: (chunk: Chunk, numBytesRead: number) => Promise<void>;
 }
 
 /** Read a whole scene. Throws a SceneError if it is damaged, before allocating memory for missing data. */
-export async function readScene(source: Source, listener: Listener): Promise<void> {
-  const { bytes, length } = source.length === null ? await gathered(source.bytes) : source;
-  const reader = bytes.getReader();
-  const start = await firstBytes(reader, HEAD_BYTES);
-  const head = parseHead(start);
-  const announced = HEAD_BYTES + head.headerBytes + head.bodyBytes;
-  if (length !== announced) {
-    await reader.cancel();
-    throw new SceneError(`The scene is cut off or damaged: it has ${length} bytes, but should have ${announced}.`);
+export async function readScene({ bytes, length }: Source, listener: Listener): Promise<void> {
+  const reader = new ByteReader(bytes);
+  try {
+    await readFrom(reader, length, listener);
+  } finally {
+    await reader.cancel().catch(() => undefined);
   }
-  const more = await firstBytes(reader, HEAD_BYTES + head.headerBytes, start);
-  const header = headerOf(more.subarray(HEAD_BYTES, HEAD_BYTES + head.headerBytes), head);
-  listener.onHeader(header, announced);
-  await readBody(reader, more.subarray(HEAD_BYTES + head.headerBytes), header, listener);
 }
 
-function headerOf(text: Uint8Array, head: ReturnType<typeof parseHead>): Header {
+async function readFrom(reader: ByteReader, length: number | null, listener: Listener): Promise<void> {
+  const head = parseHead(await reader.take(HEAD_BYTES));
+  reader.checksum = 0;
+  const written = headerOf(await inflated(await reader.take(head.codedBytes), head.textBytes), head);
+  if (length !== null && length !== written.numBytes) {
+    throw new SceneError(
+      `The scene is cut off or damaged: it has ${length} bytes, but should have ${written.numBytes}.`,
+    );
+  }
+  const parts = new PartReader(reader, written.parts, written.room);
+  const header = { ...written, cameras: await camerasOf(parts, written.names) };
+  listener.onHeader(header);
+  let [numTexels, numHarmonics] = [0, 0];
+  for (let start = 0; start < Math.max(header.num, 1); start += header.chunk) {
+    const chunk = await readChunk(parts, header, start);
+    numTexels += chunk.texels.length / 4;
+    for (const degree of chunk.degrees) numHarmonics += at(HARMONIC_TEXELS, degree);
+    if (numTexels > header.numTexels || numHarmonics > header.numHarmonics) throw damaged("it has too many numbers");
+    await listener.onChunk(chunk, reader.numRead);
+  }
+  parts.end();
+  await reader.end();
+  if (reader.checksum !== head.checksum) throw damaged("its checksum does not match");
+}
+
+function headerOf(text: Uint8Array, head: Head): FileHeader {
   try {
     return parseHeader(text, head);
   } catch (error) {
-    throw error instanceof SceneError ? error : new SceneError("The scene is damaged: its header cannot be read.");
+    throw error instanceof SceneError ? error : damaged("its header cannot be read");
   }
 }
 
-type Reader = ReadableStreamDefaultReader<Uint8Array<ArrayBuffer>>;
-
-async function readBody(
-  reader: Reader,
-  first: Uint8Array<ArrayBuffer>,
-  header: Header,
-  listener: Listener,
-): Promise<void> {
-  let numRead = first.length;
-  const coded = new ReadableStream<Uint8Array<ArrayBuffer>>({
-    start: (controller) => controller.enqueue(first),
-    pull: async (controller) => {
-      const { value, done } = await reader.read();
-      if (done) {
-        controller.close();
-        return;
-      }
-      numRead += value.length;
-      controller.enqueue(value);
-    },
-    cancel: () => reader.cancel(),
-  });
-  const chunks = new ChunkReader(header);
-  try {
-    const pieces = coded.pipeThrough(new DecompressionStream("deflate")).getReader();
-    for (let piece = await pieces.read(); !piece.done; piece = await pieces.read()) {
-      for (const chunk of chunks.push(piece.value)) await listener.onChunk(chunk, numRead);
+/** Read the cameras; further numbers of the origin are read and dropped. */
+async function camerasOf(parts: PartReader, names: FileHeader["names"]): Promise<SceneCamera[]> {
+  if (names === null) return [];
+  const num = names.length;
+  const viewmats = await parts.exact("origin_viewmats", 16 * num, Float64Array);
+  const Ks = await parts.exact("origin_Ks", 9 * num, Float64Array);
+  const sizes = await parts.exact("origin_sizes", 2 * num, Int32Array);
+  const areTests = await parts.exact("origin_is_test", num, Uint8Array);
+  for (const [name, count] of [
+    ["scale", 1],
+    ["rotation", 9],
+    ["translation", 3],
+  ] as const) {
+    await parts.planes(`origin_${name}`, 8, count);
+  }
+  return names.map((name, i) => {
+    const viewmat = Array.from(viewmats.subarray(16 * i, 16 * i + 16));
+    const K = Array.from(Ks.subarray(9 * i, 9 * i + 9));
+    const size = Array.from(sizes.subarray(2 * i, 2 * i + 2));
+    const isRight = isVector<Viewmat>(viewmat, 16) && isVector<Intrinsics>(K, 9) && isVector<Vec2>(size, 2);
+    if (!isRight || Math.min(size[0], size[1]) < 1 || Math.min(K[0], K[4]) <= 0) {
+      throw damaged(`the numbers of camera ${i} are out of range`);
     }
-  } catch (error) {
-    throw error instanceof SceneError ? error : new SceneError("The scene is damaged: it cannot be decompressed.");
-  }
-  chunks.end();
-}
-
-/** Read until at least `num` bytes are there, counting those of `before`. */
-async function firstBytes(
-  reader: Reader,
-  num: number,
-  before: Uint8Array = new Uint8Array(0),
-): Promise<Uint8Array<ArrayBuffer>> {
-  const pieces: Uint8Array[] = [before];
-  let total = before.length;
-  while (total < num) {
-    const { value, done } = await reader.read();
-    if (done) throw new SceneError("The scene is cut off within its header.");
-    pieces.push(value);
-    total += value.length;
-  }
-  const joined = new Uint8Array(total);
-  let place = 0;
-  for (const piece of pieces) {
-    joined.set(piece, place);
-    place += piece.length;
-  }
-  return joined;
-}
-
-async function gathered(bytes: Source["bytes"]): Promise<Source> {
-  const blob = await new Response(bytes).blob();
-  return { bytes: blob.stream(), length: blob.size };
+    return { name, isTest: areTests[i] === 1, size, viewmat, K };
+  });
 }

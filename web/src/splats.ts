@@ -4,7 +4,7 @@ import type { Chunk } from "./chunks";
 import type { Header } from "./format";
 import { LongTexture } from "./gl";
 import type { Row4 } from "./math";
-import { Packer, mostHarmonics } from "./packing";
+import { Packer } from "./packing";
 import SortWorker from "./sort.worker?worker&inline";
 import type { AddMessage, OrderMessage, SortMessage } from "./sort.worker";
 
@@ -27,7 +27,7 @@ export class Splats {
   onFail: (reason: string) => void = () => undefined;
 
   private readonly gl: WebGL2RenderingContext;
-  private readonly packer: Packer;
+  private readonly packer = new Packer();
   private readonly worker: Worker;
   private isSorting = false;
   private wanted: Row4 | null = null;
@@ -39,10 +39,9 @@ export class Splats {
     this.header = header;
     this.widthBits = Math.min(12, Math.floor(Math.log2(gl.getParameter(gl.MAX_TEXTURE_SIZE) as number)));
     this.rows = new LongTexture(gl, 2 * header.num, this.widthBits, true, "Gaussians");
-    this.harmonics = new LongTexture(gl, mostHarmonics(header), this.widthBits, true, "colours");
-    this.texels = new LongTexture(gl, header.numTexels ?? 0, this.widthBits, false, "texels");
+    this.harmonics = new LongTexture(gl, header.numHarmonics, this.widthBits, true, "colours");
+    this.texels = new LongTexture(gl, header.numTexels, this.widthBits, false, "texels");
     this.order = gl.createBuffer();
-    this.packer = new Packer(header);
     this.worker = new SortWorker();
     this.worker.addEventListener("message", (event: MessageEvent<OrderMessage>) => this.receive(event.data));
     this.worker.addEventListener("error", (event) => this.onFail(event.message));

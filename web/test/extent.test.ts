@@ -1,19 +1,18 @@
 import { describe, expect, test } from "vitest";
 
-import { HEAD_BYTES, parseHead, parseHeader } from "../src/format";
+import { parseHead, parseHeader } from "../src/format";
 import { WHOLE, clipOf, extentOf, halfAlong } from "../src/extent";
 import type { Extent } from "../src/extent";
 import { cross, dot } from "../src/math";
 import type { Vec3 } from "../src/math";
 import { expectClose } from "./close";
-import { NUMBERS, SMALL } from "./small";
+import { NUMBERS, SMALL, headerText } from "./small";
 
 const UP: Vec3 = [0, 0.6, 0.8];
 const EXTENT: Extent = { centre: [1, 2, 3], half: [2, 1, 4] };
 
 test("the extent of a scene is about its 5th to 95th percentile", () => {
-  const head = parseHead(SMALL);
-  const { means } = parseHeader(SMALL.subarray(HEAD_BYTES, HEAD_BYTES + head.headerBytes), head);
+  const { means } = parseHeader(new TextEncoder().encode(headerText(SMALL)), parseHead(SMALL));
   const { centre, half } = extentOf(means);
   for (const k of [0, 1, 2] as const) {
     const values = NUMBERS.means.filter((_, i) => i % 3 === k);
