@@ -1,6 +1,6 @@
 """Reads changed files, one a line of standard input, in a process of limited memory that is watched.
 
-    python tests/fuzz_worker.py FOLDER [--render]
+    python tests/fuzz_worker.py FOLDER
 
 FOLDER gets the sound files first. A line says number of reader and file; the answer is a line of JSON: what happened,
 how long it took, and how much more memory the process has had than before, in MB.
@@ -88,9 +88,8 @@ def main() -> None:
     warnings.simplefilter("ignore")
     answers, sys.stdout = sys.stdout, sys.stderr
     import fuzz_seeds
-    from fuzz_readers import READERS, read
-
-    is_rendering = "--render" in sys.argv
+    from fuzz_readers import READERS
+    from fuzz_targets import TARGETS
 
     seeds = work / "seeds"
     if not seeds.is_dir():
@@ -98,7 +97,7 @@ def main() -> None:
         os.rename(work / "new", seeds)
     for reader in READERS:
         for name in reader.files:
-            read(reader, seeds / reader.folder, seeds / reader.folder / name, is_rendering)
+            TARGETS[reader.target](seeds / reader.folder, seeds / reader.folder / name)
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, size + ROOM))
     watch = Watch(work)
@@ -109,7 +108,7 @@ def main() -> None:
         folder = seeds / reader.folder
         before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
         watch.is_on = True
-        kind, where = outcome(read, reader, folder, folder / name, is_rendering)
+        kind, where = outcome(TARGETS[reader.target], folder, folder / name)
         watch.is_on = False
         strayed = watch.taken()
         if strayed:

@@ -44,17 +44,33 @@ except {error} as error:
 """
 
 
-def run_script(part: str, error: str, more: str = "0") -> subprocess.CompletedProcess:
+ON_XLA = "0 * (jnp.ones((2000, 2000)) @ jnp.ones((2000, 2000)))[0, :3]"
+"""Zeros for which a call waits, so that one of XLA's threads runs it."""
+CTRL_C = "time.sleep(0.1); index or os.kill(os.getpid(), signal.SIGINT); time.sleep(0.2)"
+NOTICED = "0; signal.signal(signal.SIGINT, lambda *_: print('noticed'))"
+CASES = {
+    "an error": ("if index == 1: raise ValueError('no such thing')", "Exception", "0", "met INTERNAL"),
+    "Ctrl-C on the caller's thread": (CTRL_C, "KeyboardInterrupt", "0", "met"),
+    "Ctrl-C on a thread of XLA's": (CTRL_C, "KeyboardInterrupt", ON_XLA, "met"),
+    "Ctrl-C with a handler": (CTRL_C, "ZeroDivisionError", NOTICED, "noticed\n[7. 7. 7.]"),
+    "an interrupt that is raised": ("if index == 0: raise KeyboardInterrupt", "KeyboardInterrupt", "0", "met"),
+}
+SHORT = ("an error", "Ctrl-C on a thread of XLA's")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in SHORT else pytest.param(name, marks=pytest.mark.long) for name in CASES]
+)
+def test_the_caller_meets_what_happens_in_a_function_whatever_the_hook_does(name):
+    part, error, more, printed = CASES[name]
     script = SCRIPT.format(part=part, error=error, more=more)
-    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120)
-
-
-@pytest.mark.parametrize("index", [0, 1])
-def test_an_error_is_told_with_type_message_and_place_whatever_the_hook_does(index):
-    done = run_script(f"if index == {index}: raise ValueError('no such thing')", "Exception")
-    assert "met INTERNAL" in done.stdout and "ValueError: no such thing" in done.stdout
-    assert "in part" in done.stdout
-    assert done.returncode == 0 and done.stderr == ""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    assert done.stdout.startswith(printed)
+    if name == "an error":  # Type, message and place.
+        assert "ValueError: no such thing" in done.stdout and "in part" in done.stdout
+    else:
+        assert done.stdout.strip() == printed
 
 
 def test_an_error_that_cannot_be_written_is_told_all_the_same():
@@ -68,30 +84,6 @@ def test_an_error_that_cannot_be_written_is_told_all_the_same():
     name = ffi.registered("test silent", None, lambda: handler)
     with pytest.raises(jax.errors.JaxRuntimeError, match=r"Silent: .*failed"):
         jax.block_until_ready(jax.ffi.ffi_call(name, jax.ShapeDtypeStruct((3,), jnp.float32))(jnp.zeros(1)))
-
-
-@pytest.mark.parametrize("more", ["0", "0 * (jnp.ones((2000, 2000)) @ jnp.ones((2000, 2000)))[0, :3]"])
-def test_ctrl_c_while_a_function_runs_is_one_for_the_caller(more):
-    """On the caller's thread, and on one of XLA's, which runs what waits for another result."""
-    part = "time.sleep(0.1); index or os.kill(os.getpid(), signal.SIGINT); time.sleep(0.2)"
-    done = run_script(part, "KeyboardInterrupt", more)
-    assert done.stdout.split() == ["met"], done.stdout + done.stderr
-    assert done.returncode == 0 and done.stderr == ""
-
-
-def test_ctrl_c_goes_to_the_handler_that_the_program_has_set():
-    part = """if index == 0:
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.1)"""
-    done = run_script(part, "ZeroDivisionError", "0; signal.signal(signal.SIGINT, lambda *_: print('noticed'))")
-    assert done.stdout.split() == ["noticed", "[7.", "7.", "7.]"], done.stdout + done.stderr
-
-
-@pytest.mark.parametrize("index", [0, 1])
-def test_an_interrupt_that_is_raised_is_one_for_the_caller(index):
-    done = run_script(f"if index == {index}: raise KeyboardInterrupt", "KeyboardInterrupt")
-    assert done.stdout.split() == ["met"], done.stdout + done.stderr
-    assert done.returncode == 0 and done.stderr == ""
 
 
 def test_results_are_views_of_the_buffers():
@@ -129,6 +121,7 @@ raise SystemExit(3)
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "waiting",
     [

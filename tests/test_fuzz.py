@@ -1,7 +1,8 @@
-"""500 changed files go through every reader (tests/fuzz.py tries more), and whoever watches them is watched."""
+"""Changed files go through every reader (tests/fuzz.py tries more), and whoever watches them is watched."""
 
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import fuzz
@@ -11,30 +12,29 @@ from fuzz_mutate import of_bytes, of_json, of_text
 from fuzz_readers import READERS
 from fuzz_worker import outcome
 
-NUM_CASES = 500
+NUM_CASES = 400
 MOST_MEGABYTES = 300
 
 
+@pytest.mark.long
 def test_changed_files_are_read_or_refused(tmp_path):
     """The worker that reads them is restarted when it hangs and when it crashes."""
-    worker = fuzz.Worker(tmp_path)
+    worker = fuzz.Worker(tmp_path, seconds=0.0)
     try:
         worker.start()
-        worker.seconds = 0.0
         assert worker.ask(0, READERS[0].files[0])["kind"] == "hang"
         worker.seconds = fuzz.SECONDS_A_CASE
         worker.start()
         worker._process.kill()
         assert worker.ask(0, READERS[0].files[0])["kind"] == "crash -9"
-        counts = fuzz.run(worker, range(NUM_CASES))
+        found = list(fuzz.run(worker, range(NUM_CASES)))
     finally:
         worker.stop()
-    assert not counts["bad"], counts["bad"]
-    assert sum(sum(found.values()) for found in counts["readers"].values()) == NUM_CASES
-    assert set(counts["readers"]) == {reader.name for reader in READERS}
-    assert counts["most_megabytes"] < MOST_MEGABYTES
-    totals = {kind: sum(found.get(kind, 0) for found in counts["readers"].values()) for kind in fuzz.WELL}
-    assert totals["read"] > 20 and totals["refused"] > 200
+    assert not [answer for answer in found if answer["kind"] not in fuzz.WELL]
+    assert {answer["reader"] for answer in found} == {reader.name for reader in READERS}
+    assert max(answer["megabytes"] for answer in found) < MOST_MEGABYTES
+    kinds = Counter(answer["kind"] for answer in found)
+    assert kinds["read"] > 20 and kinds["refused"] > 200
 
 
 def raising(error):
@@ -53,7 +53,6 @@ def raising(error):
         (raising(ValueError("x\ny")), "many lines"),
         (raising(ValueError("x" * 10_000)), "many lines"),
         (raising(ValueError()), "many lines"),
-        (raising(KeyError("x")), "other error"),
         (raising(RecursionError()), "other error"),
         (raising(SystemExit()), "other error"),
         (raising(MemoryError()), "memory"),
@@ -64,37 +63,38 @@ def test_outcomes_are_told_apart(read, kind):
     assert outcome(read)[0] == kind
 
 
-@pytest.mark.parametrize(
-    ("code", "found"),
-    [
-        ("open('inside/x', 'w').close()", ""),
-        ("open('outside', 'w').close()", "wrote open"),
-        ("import os; os.mkdir('outside')", "wrote os.mkdir"),
-        ("import os; os.rename('inside/y', 'inside/z')", ""),
-        ("import os; os.rename('inside/y', 'outside')", "wrote os.rename"),
-        ("import os; os.remove('x')", "wrote os.remove"),
-        ("import subprocess; subprocess.run(['true'])", "ran subprocess.Popen"),
-        ("import pickle; pickle.loads(b'cos\\ngetcwd\\n.')", "ran pickle.find_class"),
-        ("import os; os.system('true')", "ran os.system"),
-    ],
-)
-def test_what_a_reader_does_besides_is_seen(tmp_path, code, found):
+CODES = {
+    "open('inside/x', 'w').close()": "",
+    "open('outside', 'w').close()": "wrote open",
+    "os.mkdir('other')": "wrote os.mkdir",
+    "os.rename('inside/y', 'inside/z')": "",
+    "os.rename('inside/z', 'outside')": "wrote os.rename",
+    "os.remove('x')": "wrote os.remove",
+    "subprocess.run(['true'])": "ran subprocess.Popen",
+    "pickle.loads(b'cos\\ngetcwd\\n.')": "ran pickle.find_class",
+    "os.system('true')": "ran os.system",
+}
+
+
+def test_what_a_reader_does_besides_is_seen(tmp_path):
     (tmp_path / "inside").mkdir()
     (tmp_path / "x").touch()
     (tmp_path / "inside" / "y").touch()
     script = f"""
-import sys
+import os, pickle, subprocess, sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from fuzz_worker import Watch
 watch = Watch(Path("inside"))
-watch.is_on = True
-{code}
-watch.is_on = False
-print("; ".join(watch.taken()))
+for code in {list(CODES)!r}:
+    watch.is_on = True
+    exec(code)
+    watch.is_on = False
+    print("; ".join(found for found in watch.taken() if "compile" not in found))
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert found in done.stdout if found else not done.stdout.strip()
+    for found, wanted in zip(done.stdout.split("\n"), CODES.values(), strict=False):
+        assert wanted in found if wanted else not found
 
 
 def test_a_case_is_the_same_every_time_and_a_change_changes():

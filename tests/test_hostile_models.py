@@ -6,22 +6,28 @@ import pickle
 import tracemalloc
 import zipfile
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hostile_files import put
 from small_models import NUM, some_checkpoint, some_gaussians, some_model
 
 import a2tg_jax as a2tg
+from a2tg_jax import load_compact, save_compact, save_gltf
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.table import check_places
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.npz import read_npz
+from a2tg_jax.io import ply
 from a2tg_jax.io.archive import FORMAT as CHECKPOINT, read_archive, write_archive
 from a2tg_jax.io.model_file import FORMAT as MODEL, load_model, save_model
 from a2tg_jax.io.ply import load_ply, save_ply
 from a2tg_jax.io.validate import check_model
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model
+from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.renderer import plan_render
 from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.texture import Textures, check_textures
 from a2tg_jax.training import load_checkpoint, save_checkpoint
@@ -61,18 +67,23 @@ def with_header(**values):
 GAUSSIANS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", [*GAUSSIANS, "appearance/texels"])
-def test_models_with_numbers_that_are_not_finite(tmp_path, name, value):
-    path = tmp_path / "m.npz"
+def test_models_with_numbers_that_are_not_finite_or_too_large(tmp_path, name):
+    path, field = tmp_path / "m.npz", name.removeprefix("appearance/")
     save_model(path, some_model())
-    spoiled(path, MODEL, with_number(name, value))
-    refused(load_model, path, "must be finite; .* rows have NaN or infinite numbers")
+    whole, limit = path.read_bytes(), rf"{field}.* within ±1e\+12; got"
+    for value in (np.nan, np.inf, -np.inf, 1e38, -2e12):
+        path.write_bytes(whole)
+        spoiled(path, MODEL, with_number(name, value))
+        wanted = limit if np.isfinite(value) else "must be finite; .* rows have NaN or infinite numbers"
+        refused(load_model, path, "must" if name == "log_scales" else wanted)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (with_number("log_scales", 28.0), "up to 27.63"),
+        (with_number("log_scales", -1e38), r"within ±1e\+12; got"),
         (with_number("log_scales", 100.0), "logarithms of finite scales"),
         (lambda _, a: a.update({name: a[name].astype(np.float16) for name in GAUSSIANS}), "must be float32 or float64"),
         (with_array("appearance/texels", lambda x: x.astype(np.float16)), "must be floats, float32 or float64"),
@@ -156,18 +167,62 @@ def test_textures_lie_within_their_buckets_and_apart():
             check_model(Model(some_gaussians()[:3], a2tg.Appearance(texture=a2tg.Texture(placed(bucket, row)))))
 
 
+# Numbers at the limit, and files that are none
+
+
+@pytest.mark.long
+def test_numbers_at_the_limit_are_drawn_and_have_gradients(tmp_path):
+    gaussians = some_gaussians()
+    extreme = dataclasses.replace(
+        gaussians,
+        means=gaussians.means.at[0].set(jnp.asarray([1e12, -1e12, 1e12])).at[1].set(jnp.asarray([0, 0, 1e12])),
+        log_scales=gaussians.log_scales.at[2].set(27.6),
+        quats=gaussians.quats.at[3].set(1e12),
+        sh=gaussians.sh.at[4].set(1e12),
+    )
+    save_model(tmp_path / "m.npz", Model(extreme))
+    model = load_model(tmp_path / "m.npz")
+    viewmat = jnp.eye(4).at[2, 3].set(4.0)
+    camera = a2tg.Camera(viewmat, jnp.asarray([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]]), 32, 24)
+
+    settings = plan_render(extreme, [camera], appearance=model.appearance)
+
+    def brightness(gaussians):
+        return render_traced(gaussians, camera, model.appearance, jnp.zeros(3), settings)[0].color.sum()
+
+    gradient = jax.grad(brightness)(model.gaussians)
+    assert np.isfinite(np.asarray(model.render(camera).color)).all()
+    assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_files_with_numbers_that_are_too_large(tmp_path, monkeypatch):
+    gaussians = some_gaussians()
+    gaussians = dataclasses.replace(gaussians, means=gaussians.means.at[0, 0].set(-1e13))
+    with monkeypatch.context() as patch:
+        patch.setattr(ply, "check_model", lambda model: None)
+        save_ply(tmp_path / "g.ply", gaussians)
+    refused(load_ply, tmp_path / "g.ply", r"gaussians\.means must lie within ±1e\+12; got")
+    for save, name in ((save_model, "m.npz"), (save_compact, "m.a2tgz"), (save_ply, "m.ply"), (save_gltf, "m.glb")):
+        with pytest.raises(ValueError, match=r"gaussians\.means must lie within ±1e\+12; got"):
+            save(tmp_path / name, Model(gaussians))
+        assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe", "sparse"])
+def test_models_that_are_no_files(tmp_path, kind):
+    for name, load in (("m.npz", load_model), ("m.a2tgz", load_compact), ("m.ply", load_ply)):
+        put(tmp_path / name, kind)
+        refused(load, tmp_path / name, "is not a regular file" if kind != "sparse" else "has 100,000,000,000 bytes")
+
+
 # Checkpoints
 
 MU, EVENTS = "[1][0][0].mu.gaussians.means", "[1][0][2]"
 
 
-@pytest.fixture(scope="module", params=["a2tg", "bytewise", "gaussians-2d"])
+@pytest.fixture(scope="module", params=["a2tg", pytest.param("bytewise", marks=pytest.mark.long)])
 def checkpoint_file(request, tmp_path_factory):
-    system = {
-        "a2tg": a2tg.A2tg(sh_degree=0),
-        "bytewise": Bytewise(),
-        "gaussians-2d": a2tg.Gaussians2d(sh_degree=0),
-    }[request.param]  # fmt: skip
+    system = {"a2tg": a2tg.A2tg(sh_degree=0), "bytewise": Bytewise()}[request.param]
     path = tmp_path_factory.mktemp(request.param) / "c.npz"
     save_checkpoint(path, some_checkpoint(system))
     return path
