@@ -78,7 +78,8 @@ def _command(arguments: list[str]) -> str:
 def _stub() -> None:
     """Has commands end where work would begin."""
     from a2tg_jax.cli import main as cli
-    from a2tg_jax.results import frames, record, run_evaluation, run_training
+    from a2tg_jax.data import load
+    from a2tg_jax.results import frames, run_evaluation, run_training
 
     def reached(*arguments, **options):
         raise ValueError(REACHED)
@@ -87,4 +88,4 @@ def _stub() -> None:
     run_training.train_run = reached
     run_evaluation._evaluations = reached
     frames.Renderer = reached
-    record.synthetic_scene = functools.cache(functools.partial(record.synthetic_scene, num_points=100))
+    load.synthetic_scene = functools.cache(functools.partial(load.synthetic_scene, num_points=100))

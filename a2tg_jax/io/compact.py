@@ -45,7 +45,7 @@ from a2tg_jax.io.model_file import (
     origin_of,
     origin_shapes,
 )
-from a2tg_jax.io.model_rows import Rows, check_encodable, joined, model_of, ordered, rows_of_model
+from a2tg_jax.io.model_rows import Rows, check_encodable, joined_rows, model_of, ordered, rows_of_model
 from a2tg_jax.io.validate import check_suffix, existing_bytes, reading
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.texture import MAX_SIDE
@@ -291,7 +291,7 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
             }
             origin = origin_of(header["origin"], arrays | {"is_test": arrays["is_test"].astype(bool)})
         reader.end()
-        return model_of(joined(parts), header["base_degree"], appearance, origin, background_of(header))
+        return model_of(joined_rows(parts), header["base_degree"], appearance, origin, background_of(header))
 
 
 def bytes_by_part(data: bytes) -> dict[str, int]:

@@ -111,7 +111,7 @@ def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:
     )
 
 
-def joined(parts: Sequence[Rows]) -> Rows:
+def joined_rows(parts: Sequence[Rows]) -> Rows:
     """Return the splats of all parts, of which each has the same tables."""
     if len(parts) == 1:
         return parts[0]
