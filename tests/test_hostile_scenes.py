@@ -92,7 +92,7 @@ def test_lines_that_are_cut_off_are_noticed(tmp_path, kind):
         ("cameras", "1 PINHOLE 128 96 110 120 70", "PINHOLE has 4 parameters; got 3"),
         ("cameras", "1 MAGIC 128 96 110", "COLMAP has no camera model MAGIC"),
         ("cameras", "1 PINHOLE wide 96 110 120 70 40", "line 1"),
-        ("images", "1 1 0 0 0 0 0 0 1", "it is cut off after 9 words"),
+        ("images", "1 1 0 0 0 0 0 0 1", "it is cut off"),
         ("images", "1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 0 1 b.png\n", "the line of its points is missing"),
         (
             "images",

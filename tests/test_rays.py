@@ -56,6 +56,7 @@ def test_rays_of_a_pinhole_camera_show_what_it_shows(x64, compositor, tile_size)
         np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
+@pytest.mark.long
 def test_every_pixel_of_a_fisheye_sees_along_its_own_ray(x64):
     """It shows what a pinhole camera of that pixel alone does. Splats are larger than pixels: no filter decides."""
     scene = draw_scene(4, num=12)

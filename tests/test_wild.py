@@ -237,6 +237,7 @@ class TestDepthFiles:
 
 
 class TestFloaters:
+    @pytest.mark.long
     def test_views_are_counted_as_each_alone_says(self):
         scene = draw_scene(0)._replace(textures=None)
         model, camera = a2tg.Model(as_gaussians(scene, "float32")), as_camera(scene, "float32")
@@ -305,6 +306,7 @@ class TestFloaters:
 
 
 class TestSupersampling:
+    @pytest.mark.long
     def test_a_pixel_is_the_mean_of_a_finer_view(self):
         scene = draw_scene(0)._replace(textures=None)
         model, camera = a2tg.Model(as_gaussians(scene, "float32")), as_camera(scene, "float32")

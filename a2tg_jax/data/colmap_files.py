@@ -21,7 +21,7 @@ import os
 import re
 import struct
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -100,9 +100,9 @@ def read_file(path: Path, kind: str) -> Any:
         if path.suffix.lower() != ".bin":
             return _read_text(opened, path, kind)
         if os.fstat(opened.fileno()).st_size == 0:  # Nothing can be mapped.
-            return _Binary(path, kind, b"").records()
+            return _Binary(path, b"").read(kind)
         with mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            return _Binary(path, kind, data).records()
+            return _Binary(path, data).read(kind)
 
 
 @functools.cache
@@ -129,25 +129,24 @@ _little_endian = functools.cache(lambda format: struct.Struct(f"<{format}"))
 
 
 class _Binary:
-    """Position in a binary file, which cannot pass the file's end. Methods return the next values."""
+    """Position in a binary file, which cannot pass the file's end. Methods with names of kinds return a record."""
 
-    def __init__(self, path: Path, kind: str, data: mmap.mmap | bytes):
-        self.path, self.kind, self.data, self.at = path, kind, data, 0
-        self.num_records, self.record = 0, 0
+    def __init__(self, path: Path, data: mmap.mmap | bytes):
+        self.path, self.data, self.at, self.place = path, data, 0, "the count"
 
-    def records(self) -> Any:
+    def read(self, kind: str) -> Any:
         """Return all records; of points3D an array [P] of `POINT`."""
-        self.num_records = self.whole("Q")
-        read, found = READERS[self.kind], list[Any]()
-        for self.record in range(1, self.num_records + 1):  # noqa: B020 - each is named in an error
-            found.append(read(self))
+        (num,) = self.take("Q")
+        record, found = getattr(self, kind), list[Any]()
+        for number in range(1, num + 1):
+            self.place = f"number {number} of {num} {kind}"
+            found.append(record())
         if left := len(self.data) - self.at:
             raise self.error(f"is followed by {left} bytes")
-        return np.frombuffer(b"".join(found), POINT) if self.kind == "points3D" else found
+        return np.frombuffer(b"".join(found), POINT) if kind == "points3D" else found
 
     def error(self, what: str) -> ValueError:
-        place = f"number {self.record} of {self.num_records} {self.kind}" if self.record else "the count"
-        return ValueError(f"{self.path}: is cut off or damaged: {place} {what}; export the model again")
+        return ValueError(f"{self.path}: is cut off or damaged: {self.place} {what}; export the model again")
 
     def skip(self, num_bytes: int) -> int:
         """Return the position from before."""
@@ -161,100 +160,44 @@ class _Binary:
         numbers = _little_endian(format)
         return numbers.unpack_from(self.data, self.skip(numbers.size))
 
-    def whole(self, format: str) -> int:
-        return int(self.take(format)[0])
-
-    def floats(self, count: int) -> list[float]:
-        return list(self.take(f"{count}d"))
-
-    def model(self) -> tuple[str, int]:
-        """Return the name of a camera model and the number of its parameters."""
-        model = self.whole("i")
+    def cameras(self) -> tuple[int, Any]:
+        number, model = self.take("Ii")
         if model not in _camera_models():
             raise self.error(f"has the model {model}, which COLMAP does not have")
-        return _camera_models()[model]
+        name, count = _camera_models()[model]
+        width, height, *params = self.take(f"2Q{count}d")
+        return number, pycolmap().Camera(model=name, width=width, height=height, params=params)
 
-    def name(self) -> str:
+    def images(self) -> ImageRecord:
+        number, *pose, camera = self.take("I7dI")
         end = self.data.find(b"\0", self.at, self.at + LONGEST_NAME)
         if end < 0:
             raise self.error("has a name that does not end")
-        return _decoded_name(self.path, self.data[self.skip(end + 1 - self.at) : end])
-
-    def point_ids(self) -> np.ndarray:
-        count = self.whole("Q")
+        name = _decoded_name(self.path, self.data[self.skip(end + 1 - self.at) : end])
+        (count,) = self.take("Q")
         start = self.skip(FEATURE.itemsize * count)
         features = np.frombuffer(self.data, FEATURE, count, start) if count else np.empty(0, FEATURE)
-        return features["id"].copy()
+        return ImageRecord(number, pose, camera, name, features["id"].copy())
 
-    def point(self) -> bytes:
+    def points3D(self) -> bytes:
         start = self.skip(POINT.itemsize)
         point = self.data[start : self.at]
-        self.skip(8 * self.whole("Q"))
+        self.skip(8 * self.take("Q")[0])
         return point
 
-    def is_camera(self) -> bool:
-        """Return whether a sensor takes images."""
-        return bool(self.take("iI")[0] == CAMERA_SENSOR)
+    def rigs(self) -> RigRecord:
+        number, count = self.take("II")
+        translations: list[list[float] | None] = []
+        for index in range(count):
+            self.take("iI")
+            if index:
+                translations.append(list(self.take("7d")[4:]) if self.take("B")[0] else None)
+        return RigRecord(number, translations)
 
-
-class _Text:
-    """Position in the words of a record: a line, and of images the line of features after it. Methods return the next
-    values; formats of numbers are for binary files."""
-
-    def __init__(self, path: Path, line: bytes, features: bytes):
-        self.path, self.line, self.features, self.words, self.at = path, line, features, line.split(), 0
-
-    def take(self, count: int) -> list[bytes]:
-        words = self.words[self.at : self.at + count]
-        if len(words) < count:
-            raise ValueError(f"it is cut off after {len(self.words)} words")
-        self.at += count
-        return words
-
-    def whole(self, format: str) -> int:
-        return _whole(*self.take(1))
-
-    def floats(self, count: int) -> list[float]:
-        return [float(word) for word in self.take(count)]
-
-    def model(self) -> tuple[str, int]:
-        """Return the name of a camera model and the number of its parameters, which end the line."""
-        name = self.take(1)[0].decode("ascii", "replace")
-        count = dict(_camera_models().values()).get(name)
-        if count is None:
-            raise ValueError(f"COLMAP has no camera model {shortened(name)}")
-        if len(self.words) != 4 + count:
-            raise ValueError(f"{name} has {count} parameters; got {len(self.words) - 4}")
-        return name, count
-
-    def name(self) -> str:
-        """Return the rest of the line, which may have spaces."""
-        before = self.at
-        self.take(1)
-        self.at = len(self.words)
-        return _decoded_name(self.path, self.line.split(None, before)[before].strip())
-
-    def point_ids(self) -> np.ndarray:
-        try:
-            # Each feature has x, y and the id of its point; -1 stands for none.
-            features = zip(*[iter(self.features.split())] * 3, strict=True)
-            ids = [NO_POINT if word == b"-1" else _whole(word) for _, _, word in features]
-        except ValueError:
-            raise ValueError("the line of its points is missing or cut off") from None
-        return np.array(ids, np.uint64)
-
-    def point(self) -> tuple[int, list[float], list[int], float]:
-        words, self.at = self.words, len(self.words)
-        if len(words) < 8 or len(words) % 2:
-            raise ValueError(f"a point needs 8 words and pairs of its track; got {len(words)}")
-        color = [min(max(round(float(word)), 0), 255) for word in words[4:7]]
-        return _whole(words[0]), [float(word) for word in words[1:4]], color, float(words[7])
-
-    def is_camera(self) -> bool:
-        """Return whether a sensor takes images."""
-        kind, number = self.take(2)
-        _whole(number)
-        return kind == b"CAMERA"
+    def frames(self) -> FrameRecord:
+        number, rig, *_, count = self.take("II7dI")
+        data = [self.take("iIQ") for _ in range(count)]
+        return FrameRecord(number, rig, [image for kind, _, image in data if kind == CAMERA_SENSOR])
 
 
 def _whole(word: bytes) -> int:
@@ -265,40 +208,57 @@ def _whole(word: bytes) -> int:
     return int(number)
 
 
-Source = _Binary | _Text
+def _text_record(kind: str, path: Path, line: bytes, features: bytes) -> Any:
+    """Return the record in a line, and of images in the line of features after it."""
+    words = iter(line.split())
 
+    def whole() -> int:
+        return _whole(next(words))
 
-def _camera(source: Source) -> tuple[int, Any]:
-    """Return the id of a camera, and its pycolmap.Camera."""
-    number, (name, count) = source.whole("I"), source.model()
-    width, height, params = source.whole("Q"), source.whole("Q"), source.floats(count)
-    return number, pycolmap().Camera(model=name, width=width, height=height, params=params)
+    def floats(count: int) -> list[float]:
+        return [float(next(words)) for _ in range(count)]
 
-
-def _image(source: Source) -> ImageRecord:
-    return ImageRecord(source.whole("I"), source.floats(7), source.whole("I"), source.name(), source.point_ids())
-
-
-def _rig(source: Source) -> RigRecord:
-    number = source.whole("I")
-    translations: list[list[float] | None] = []
-    for index in range(source.whole("I")):
-        source.is_camera()
-        if index:
-            translations.append(source.floats(7)[4:] if source.whole("B") else None)
-    return RigRecord(number, translations)
-
-
-def _frame(source: Source) -> FrameRecord:
-    number, rig, _ = source.whole("I"), source.whole("I"), source.floats(7)
-    data = [(source.is_camera(), source.whole("Q")) for _ in range(source.whole("I"))]
-    return FrameRecord(number, rig, [image for is_camera, image in data if is_camera])
-
-
-READERS: dict[str, Callable[[Any], Any]] = {
-    "cameras": _camera, "images": _image, "points3D": lambda source: source.point(), "rigs": _rig, "frames": _frame,
-}  # fmt: skip
-"""Function that reads one record of a file, by kind."""
+    record: Any
+    if kind == "cameras":
+        number, name = whole(), next(words).decode("ascii", "replace")
+        count = dict(_camera_models().values()).get(name)
+        if count is None:
+            raise ValueError(f"COLMAP has no camera model {shortened(name)}")
+        width, height, params = whole(), whole(), [float(word) for word in words]
+        if len(params) != count:
+            raise ValueError(f"{name} has {count} parameters; got {len(params)}")
+        record = number, pycolmap().Camera(model=name, width=width, height=height, params=params)
+    elif kind == "images":
+        number, pose, camera, _ = whole(), floats(7), whole(), next(words)
+        name = _decoded_name(path, line.split(None, 9)[9].strip())  # The rest of the line, which may have spaces.
+        words = iter(())
+        try:
+            # Each feature has x, y and the id of its point; -1 stands for none.
+            triples = zip(*[iter(features.split())] * 3, strict=True)
+            ids = [NO_POINT if word == b"-1" else _whole(word) for _, _, word in triples]
+        except ValueError:
+            raise ValueError("the line of its points is missing or cut off") from None
+        record = ImageRecord(number, pose, camera, name, np.array(ids, np.uint64))
+    elif kind == "points3D":
+        number, position, color, error = whole(), floats(3), floats(3), floats(1)[0]
+        if len(list(words)) % 2:
+            raise ValueError("the track of a point must be pairs")
+        record = number, position, [min(max(round(value), 0), 255) for value in color], error
+    elif kind == "rigs":
+        translations: list[list[float] | None] = []
+        number = whole()
+        for index in range(whole()):
+            _, _ = next(words), whole()
+            if index:
+                translations.append(floats(7)[4:] if whole() else None)
+        record = RigRecord(number, translations)
+    else:
+        number, rig, _, count = whole(), whole(), floats(7), whole()
+        data = [(next(words), whole(), whole()) for _ in range(count)]
+        record = FrameRecord(number, rig, [image for sensor, _, image in data if sensor == b"CAMERA"])
+    if next(words, None) is not None:
+        raise ValueError("it continues past its end")
+    return record
 
 
 def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
@@ -310,15 +270,12 @@ def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
             announced = int(match[1])
         if not _has_record(line):
             continue
-        source = _Text(path, line, next(lines, (0, b""))[1] if kind == "images" else b"")
         try:
-            found.append(READERS[kind](source))
-            if source.at < len(source.words):
-                raise ValueError("it continues past its end")
-        except (ValueError, OverflowError) as error:
+            found.append(_text_record(kind, path, line, next(lines, (0, b""))[1] if kind == "images" else b""))
+        except (ValueError, OverflowError, StopIteration) as error:
             if str(error).startswith(str(path)):
                 raise
-            told = shortened(str(error))
+            told = "it is cut off" if isinstance(error, StopIteration) else shortened(str(error))
             raise ValueError(f"{path}: line {number} cannot be read ({told}); export the model again") from None
     if announced not in (None, len(found)):
         message = f"{path}: says that it has {announced} {kind}, and has {len(found)}: if it is cut off, export it"
