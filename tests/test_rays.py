@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
-from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, fisheye
+from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_scene, fisheye
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Appearance
@@ -23,7 +23,6 @@ from a2tg_jax.training import batches
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.cost import fed_bytes
 from a2tg_jax.training.losses import normal_consistency
-from a2tg_jax.training.start import initial_model
 
 WIDTH, HEIGHT = 43, 30
 BOTH = pytest.mark.parametrize("compositor", [pytest.param("xla", marks=pytest.mark.long), "native"])
@@ -102,7 +101,7 @@ def test_gradients_through_rays_are_those_of_finite_differences(x64, compositor)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("statistic", ["position", "center", "screen"])
+@pytest.mark.parametrize("statistic", ["position", "screen"])
 def test_statistics_do_not_depend_on_the_image_plane(x64, statistic):
     """The rays of a pinhole camera, in the image plane of a focal length four times shorter."""
     scene = draw_scene(8, num=20)
@@ -160,13 +159,18 @@ def test_pixels_without_a_ray_see_the_background(x64):
     hidden = np.zeros((HEIGHT, WIDTH), bool)
     hidden[:8, :8], hidden[20, 30] = True, True
     blind = dataclasses.replace(camera, rays=jnp.where(hidden[..., None], jnp.nan, camera.rays))
-    found, wanted = draw(scene, blind), draw(scene, camera)
+    gaussians, textures = as_gaussians(scene, "float64"), as_textures(scene, "float64")
+    settings = a2tg.RenderSettings(capacity=CAPACITY)
+
+    @jax.jit
+    def seen(means, camera):
+        return a2tg.render_image(dataclasses.replace(gaussians, means=means), camera, textures, settings=settings)
+
+    found, wanted = seen(gaussians.means, blind), seen(gaussians.means, camera)
     assert np.asarray(wanted.alpha)[hidden].max() > 0.1 and not np.asarray(found.alpha)[hidden].any()
     # A tile's frame, and with it the low-pass filter, follows from the rays that it has.
     np.testing.assert_allclose(np.asarray(found.color)[~hidden], np.asarray(wanted.color)[~hidden], atol=1e-5)
-    gradient = jax.grad(lambda means: jnp.sum(a2tg.render_image(
-        dataclasses.replace(as_gaussians(scene, "float64"), means=means), blind,
-    ).color))(as_gaussians(scene, "float64").means)  # fmt: skip
+    gradient = jax.jit(jax.grad(lambda means: jnp.sum(seen(means, blind).color)))(gaussians.means)
     assert np.isfinite(gradient).all()
 
 
@@ -261,7 +265,6 @@ def test_training_through_lenses_learns_and_prunes(kept):
         a2tg.Gaussians2dMcmc.preset("smoke"), stage1_iterations=60, initial_gaussians=200, sh_degree=0,
         prune=Prune(share=0.3, at=(0.5,)),
     )  # fmt: skip
-    model = a2tg.fit(mixed, system, progress=False).model
-    before, after = (a2tg.evaluate(mixed.train, known).psnr for known in (initial_model(mixed, system), model))
-    assert after > before + 1
-    assert np.isfinite(a2tg.evaluate(mixed.test, model).psnr)
+    result = a2tg.fit(mixed, system, progress=False)
+    assert np.mean(result.history.psnr[-2:]) > result.history.psnr[0] + 1
+    assert result.model.num < 200 and np.isfinite(a2tg.evaluate(mixed.test, result.model).psnr)
