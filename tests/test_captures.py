@@ -72,9 +72,15 @@ def write_polycam_with_depth(folder):
         Image.fromarray(confidence).save(keyframes / "confidence" / f"{index}.png")
 
 
-def test_depth_maps_of_polycam_are_points(tmp_path):
+@pytest.mark.parametrize("has_size", [True, False])
+def test_depth_maps_of_polycam_are_points(tmp_path, has_size):
+    """Present exports have no width and height."""
     write_polycam_with_depth(tmp_path)
+    for file in () if has_size else tmp_path.rglob("*.json"):
+        values = json.loads(file.read_text())
+        file.write_text(json.dumps({key: value for key, value in values.items() if key not in ("width", "height")}))
     scene = load_scene(tmp_path)
+    check_dots(scene, 0.1)
     assert len(scene.points) == 3 * WIDTH * HEIGHT
     points = scene.transform.inverse().apply(scene.points)
     nearest = np.linalg.norm(points - TARGET, axis=1).argsort()[:3]
@@ -112,6 +118,9 @@ def write_record3d(folder, metadata="metadata", images="rgbd", **changes):
 def test_record3d(tmp_path, metadata, images, changes):
     write_record3d(tmp_path, metadata, images, **changes)
     check_dots(load_scene(tmp_path), 0.1)
+    save_dot(tmp_path / images / f"{COUNT}.jpg", (9, 9))
+    with pytest.warns(UserWarning, match=rf"1 of {COUNT + 1} images have no pose, such as {COUNT}\.jpg: not used"):
+        assert len(load_scene(tmp_path, test_every=0).train) == COUNT
     write_record3d(tmp_path, metadata, images, poses=[[0, 0, 0, 1, 0, 0]])
     with pytest.raises(ValueError, match="poses must be rows of 7 finite numbers"):
         load_scene(tmp_path)
@@ -152,6 +161,7 @@ def metashape_xml(world, within="component", lens=LENS):
             <transform>{numbers(local)}</transform></camera>"""
     return f"""<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="Chunk 1">
         <sensors next_id="1"><sensor id="0" label="Phone" type="frame"><resolution width="{WIDTH}" height="{HEIGHT}"/>
+        {'<calibration type="frame" class="initial"><f>50</f></calibration>' if lens else ""}
         <calibration type="frame" class="adjusted"><resolution width="{WIDTH}" height="{HEIGHT}"/>{lens}</calibration>
         </sensor></sensors><components>{component}</components>
         <cameras><group id="0" label="g">{cameras}</group></cameras>
