@@ -139,8 +139,9 @@ def _load(source: SceneSource, room: int | None, is_divided: bool, is_built_in: 
         if room is not None and room < 0:
             raise ValueError(f"room must be at least 0 bytes; got {room}")
         if is_built_in:
-            sizes = dict(zip(("width", "height"), SYNTHETIC_SIZE, strict=True))
-            scene = synthetic_scene(downscale=source.downscale, test_every=source.test_every, **sizes)
+            width, height = SYNTHETIC_SIZE
+            k, every = source.downscale, source.test_every
+            scene = synthetic_scene(width=width, height=height, downscale=k, test_every=every)
         else:
             shelf = Shelf(room)
             try:
