@@ -32,7 +32,7 @@ def _points(results: Sequence[tables.Result], label: str, x: str, y: str) -> lis
     groups: dict[tuple[int, bool], list[tables.Result]] = {}
     for result in results:
         if result.run.method.label == label:
-            groups.setdefault((result.run.cell.gaussians, result.run.is_at_equal_bytes), []).append(result)
+            groups.setdefault((result.run.cell.gaussians, result.run.equal), []).append(result)
     return [(tables.mean(group, x), tables.mean(group, y)) for group in groups.values()]
 
 

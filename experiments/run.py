@@ -28,7 +28,7 @@ from a2tg_jax import configure_cpu
 from a2tg_jax.host.text import did_you_mean
 
 MODULES = (
-    "summary", "equal_bytes", "larger_pictures", "ablation", "texture_resolution", "memory_charts",
+    "choose_plain", "summary", "equal_bytes", "larger_pictures", "ablation", "texture_resolution", "memory_charts",
     "resolution_shares", "decomposition", "comparison_pictures", "upscale_gains", "polish", "shrink", "on_disk",
     "efficiency", "equal_bytes_speed",
 )  # fmt: skip

@@ -20,7 +20,7 @@ CELL = Cell(SceneAt("fox", "fox", 2), 100, 0, (10, 10))
 GRID = Grid("x", "X", "small", "quick", (CELL,), Method("own", "a2tg"), (), ())
 
 
-def result(label, psnr, seed=0, equal=False, **others):
+def result(label, psnr, seed=0, equal="", **others):
     job = Job("fox", 2, a2tg.A2tg(), 0)
     run = Run(Method(label, "a2tg"), dataclasses.replace(CELL, seed=seed), equal, job)
     return tables.Result(run, record(psnr, **others))

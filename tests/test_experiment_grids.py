@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from experiment_records import CELL, record, result
 from lab import tables
@@ -14,9 +15,9 @@ from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.figures import figures_table
 from lab.fingerprint import fingerprint
 from lab.grid import Method, has_scale, read_grid, splats_in
-from lab.grid_file import GRIDS, Block
-from lab.jobs import Folders
-from lab.scenes import SceneAt, chosen_scenes, own_scene
+from lab.grid_file import GRIDS, SCALES, Block
+from lab.jobs import Folders, step_seconds
+from lab.scenes import SceneAt, chosen_scenes, few_views, own_scene
 from run import chosen, experiments, main, parse_arguments
 
 import a2tg_jax as a2tg
@@ -24,16 +25,14 @@ from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.training.terms import Term
 
 NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("methods", "scales"))
-LONG = sorted(name for name in NAMES if has_scale(name, "long"))
-"""Grids of the paper's length on small photographs."""
 
 
 @pytest.mark.parametrize(
     ("name", "scale"),
     [
-        *itertools.product(NAMES, ("smoke", "small")),
-        *(pytest.param(name, "full", marks=pytest.mark.long) for name in NAMES),
-        *(pytest.param(name, "long", marks=pytest.mark.long) for name in LONG),
+        pytest.param(name, scale, marks=pytest.mark.long if scale in ("full", "long") else ())
+        for name, scale in itertools.product(NAMES, SCALES)
+        if has_scale(name, scale) and (name, scale) != ("bytewise", "protocol")  # It needs choices.
     ],
 )
 def test_every_grid_names_runs_that_can_be_trained(name, scale):
@@ -44,7 +43,7 @@ def test_every_grid_names_runs_that_can_be_trained(name, scale):
         job.system.check()
     finished = {key: record(mb=job.system.densify.cap * 290e-6) for key, job in first.items()}
     runs = list(grid.runs(finished))
-    places = [(run.cell, run.method.label, run.is_at_equal_bytes) for run in runs]
+    places = [(run.cell, run.label) for run in runs]
     methods = dict.fromkeys((grid.reference, *grid.methods))
     at_equal_number = sum((method.most or 10**9) >= cell.gaussians for cell in grid.cells for method in methods)
     assert len(set(places)) == len(places) == at_equal_number + len(grid.cells) * len(grid.at_equal_bytes)
@@ -104,7 +103,7 @@ def test_a_method_whose_gaussians_differ_in_size_fills_the_bytes_of_the_referenc
     grid = read_grid("fixed_memory", "long", scenes=["fox"])
     finished = {grid.reference_job(grid.cells[0]).key: record(mb=0.7123)}
     (run,) = (run for run in grid.runs(finished) if run.method.label == "Bytewise, Gaussian kernels")
-    assert run.is_at_equal_bytes and run.job.system.memory_budget == 0.7123
+    assert run.equal == "bytes" and run.job.system.memory_budget == 0.7123
     assert run.cell.budget is None, "it stays in the cell of the others"
 
 
@@ -121,7 +120,8 @@ def test_all_experiments_of_a_scale_are_those_whose_grids_have_it():
     known = experiments()
     names = {found.name for found in chosen(known, parse_arguments(known, ["all", "--scale", "long"]))}
     assert {"fixed_memory", "ablation"} <= names < set(known)
-    assert len(chosen(known, parse_arguments(known, ["all"]))) == len(known)
+    everywhere = {found.name for found in chosen(known, parse_arguments(known, ["all", "--scale", "smoke"]))}
+    assert everywhere == set(known)
 
 
 def test_scenes_are_chosen_and_held_out():
@@ -189,10 +189,10 @@ def test_a_grid_file_of_ones_own_names_scenes_and_table(tmp_path):
         ("gains", "gain", "table must be one of quality, gains, choices"),
         ("2DGS*-MCMC", "2DGS-MCMC", r"no method '2DGS-MCMC'; did you mean 2DGS\*-MCMC"),
         ("budgets", "budget", "mine.toml: small.budget is an unknown key; did you mean budgets"),
-        ("budgets = [0.3]", "seeds = [1]", "needs gaussians or budgets"),
+        ("budgets = [0.3]", "seeds = [1]", "needs gaussians, budgets or bytes_per_pixel"),
         ("budgets = [0.3]", "blocks = [{ budget = [0.3] }]", r"small.blocks\[0\].budget is an unknown key"),
         ("[small.scenes]", "[smal]\n[small.scenes]", "mine.toml: smal is an unknown key; did you mean small"),
-        ("path =", "folder =", "small.scenes.'mine'.folder is an unknown key; it has path, downscale"),
+        ("path =", "place =", "small.scenes.'mine'.place is an unknown key; it has path, downscale"),
         ("downscale = 4", "downscale = 0", "small.scenes.'mine'.downscale must be at least 1; got 0"),
         ("downscale = 4", "downscale = 0.5", "small.scenes.'mine'.downscale must be int; got 0.5"),
         ('options.background = "white"', "options = 3", "small.scenes.'mine'.options must be dict; got 3"),
@@ -352,7 +352,7 @@ def test_the_smoke_scale_has_few_runs():
     for name in NAMES:
         for job in read_grid(name, "smoke").jobs({}):
             jobs |= {job.key, *([job.start.key] if job.start else [])}
-    assert len(jobs) <= 24
+    assert len(jobs) <= 36
 
 
 def test_a_fingerprint_is_of_what_decides_the_result():
@@ -393,3 +393,40 @@ def test_functions_without_a_name_have_no_fingerprint():
 
     with pytest.raises(ValueError, match="make it a function of a module"):
         fingerprint(Nameless(), 0)
+
+
+def test_bytes_for_each_pixel_are_a_budget_or_a_number_of_gaussians():
+    grid = read_grid("degree_0", "protocol160", scenes=["fox"])
+    (job,) = (job for job in grid.jobs({}) if job.system.seed == 1)
+    assert grid.cells[0].budget == pytest.approx(60 * 90 * 160 / 1e6)
+    assert job.system.memory_budget is None and job.system.densify.cap == int(0.864e6) // (4 * 25)
+    mb = 0.71
+    plain = [run for run in grid.runs({job.key: record(mb=mb)}) if run.equal == "bytes"]
+    assert [run.job.system.memory_budget for run in plain] == [mb, mb]
+
+
+def test_a_method_of_equal_time_has_the_iterations_that_fill_the_time_of_the_reference():
+    grid = read_grid("bytewise", "smoke")
+    reference, plain = grid.jobs({})
+    found = {job.key: record(step_seconds=seconds) for job, seconds in ((reference, 12.0), (plain, 4.0))}
+    found |= {job.start.key: record(step_seconds=seconds) for job, seconds in ((reference, 6.0), (plain, 2.0))}
+    (run,) = (run for run in grid.runs(found) if run.equal)
+    assert run.label == "2DGS*-MCMC, degree 0, equal time" and run.job.all_iterations == (90, 60)
+
+
+@pytest.mark.parametrize(("num", "kept", "scored"), [(25, 20, 5), (67, 21, 12)])
+def test_few_views_are_folds_of_small_captures_and_parts_of_others(num, kept, scored):
+    scene = a2tg.synthetic_scene(num_views=num, width=8, height=8, num_points=20)
+    folds = [few_views(scene, fold) for fold in range(5)]
+    assert {(len(fold.train), len(fold.test)) for fold in folds} == {(kept, scored)}
+    for fold in folds:
+        assert not {view.name for view in fold.train} & {view.name for view in fold.test}
+    if num < 30:
+        assert len({view.name for fold in folds for view in fold.test}) == num
+
+
+def test_the_time_of_steps_leaves_compilation_out():
+    iteration = np.arange(10, 310, 10)
+    seconds = 0.02 * iteration + 5.0 * (iteration >= 100)  # A program is compiled before the 100th iteration.
+    history = dataclasses.replace(a2tg.History.empty(), iteration=iteration, seconds=seconds)
+    assert step_seconds(history) == pytest.approx(6.0)

@@ -269,8 +269,9 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--scenes", type=Path, default=Path("scenes"), help="folder of the scenes that grids/scales.toml names")
-    add("--scale", type=_scale, default="small", metavar="{full,long,small,smoke}",
-        help="full is the paper's, for a GPU; long has its options and length on small photographs")  # fmt: skip
+    add("--scale", type=_scale, default="small", metavar=f"{{{','.join(SCALES)}}}",
+        help="full is the paper's, for a GPU; long has its options and length on small photographs; protocol and "
+        "protocol160 are those of PROTOCOL.md")  # fmt: skip
     add("--only", action="append", metavar="SCENE", help="run this scene of the scale only; may be repeated")
     add("--scene", action="append", type=Path, default=[], metavar="PATH",
         help="run this scene folder instead of the scale's; may be repeated")  # fmt: skip

@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import a2tg_jax as a2tg
-from a2tg_jax.core.budget import BYTES_PER_FLOAT
+from a2tg_jax.core.budget import BYTES_PER_FLOAT, MEGABYTE
 from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.io.config_json import merged
+from a2tg_jax.results.folder import read_json
 from a2tg_jax.training.registry import with_changes
 from lab.grid_file import (
     GRIDS,
+    SIZES,
     SUFFIX,
     GridFile,
     MethodTable,
@@ -47,6 +49,10 @@ class Method:
     """Floats of a Gaussian; None if Gaussians differ in size, so that the system must take a memory budget."""
     most: int | None = None
     """Largest number of Gaussians of the cells that have this method."""
+    by_number: bool = False
+    """Whether bytes are given as a number of Gaussians, `floats` being about those of a Gaussian with its texture."""
+    choices: Mapping[str, "Method"] | None = dataclasses.field(default=None, hash=False)
+    """Methods by scene, of which the method is the one of its scene."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,9 +79,15 @@ class Run:
 
     method: Method
     cell: Cell
-    is_at_equal_bytes: bool
+    equal: str
+    """What the run shares with the reference beyond the cell: "", "bytes" (its final ones) or "time"."""
     job: Job
     """Job of its last stage."""
+
+    @property
+    def label(self) -> str:
+        """Label of the method, unique within its cell."""
+        return f"{self.method.label}, equal {self.equal}" if self.equal else self.method.label
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +104,8 @@ class Grid:
     """Methods at the cell's number of Gaussians."""
     at_equal_bytes: tuple[Method, ...]
     """Methods at the final bytes of the reference."""
+    at_equal_time: tuple[Method, ...] = ()
+    """Methods with as many iterations as take the time of the reference."""
     validation: bool = False
     """Whether validation views are held out in place of the test views."""
     table: str = "quality"
@@ -103,10 +117,16 @@ class Grid:
             for method in dict.fromkeys((self.reference, *self.methods)):
                 if method.most is not None and cell.gaussians > method.most:
                     continue
-                yield Run(method, cell, False, self._job(method, cell, cell.gaussians))
+                yield Run(method, cell, "", self._job(method, cell))
             reference = self.reference_record(cell, records)
             for method in self.at_equal_bytes if reference else ():
-                yield Run(method, cell, True, self._job_in(method, cell, reference["mb"]))
+                yield Run(method, cell, "bytes", self._job_in(method, cell, reference["mb"]))
+            wanted = seconds_of(self.reference_job(cell), records)
+            for method in self.at_equal_time if wanted else ():
+                if taken := seconds_of(self._job(method, cell), records):
+                    first, second = (max(1, round(count * wanted / taken)) for count in cell.iterations)
+                    longer = dataclasses.replace(cell, iterations=(first, second))
+                    yield Run(method, cell, "time", self._job(method, longer))
 
     def reference_record(self, cell: Cell, records: Mapping[str, Record]) -> Record | None:
         """Return the record of the reference in a cell, or None before it is finished."""
@@ -114,34 +134,50 @@ class Grid:
 
     def reference_job(self, cell: Cell) -> Job:
         """Return the last job of the reference in a cell."""
-        return self._job(self.reference, cell, cell.gaussians)
+        return self._job(self.reference, cell)
 
     def jobs(self, records: Mapping[str, Record]) -> Iterator[Job]:
         """Return the last job of every run."""
         return (run.job for run in self.runs(records))
 
     def _job_in(self, method: Method, cell: Cell, mb: float) -> Job:
-        """Return the job of a method in so many MB."""
-        if method.floats is None:
-            return self._job(method, dataclasses.replace(cell, budget=mb), 0)
-        return self._job(method, cell, splats_in(mb, method))
+        """Return the job of a method in so many MB: a budget, which growth fills, or the Gaussians that fit."""
+        if method.floats is None or cell.budget is not None:
+            return self._job(method, dataclasses.replace(cell, budget=mb))
+        return self._job(method, dataclasses.replace(cell, budget=None, gaussians=splats_in(mb, method)))
 
-    def _job(self, method: Method, cell: Cell, num: int) -> Job:
-        system = _system(f"{self.name}{SUFFIX}: {method.label!r}", self.preset, method, cell, num)
-        return Job(cell.scene.path, cell.scene.downscale, system, len(system.stages()) - 1, self.validation)
+    def _job(self, method: Method, cell: Cell) -> Job:
+        scene, place = cell.scene, f"{self.name}{SUFFIX}: {method.label!r}"
+        if method.choices is not None:
+            if scene.label not in method.choices:
+                raise ValueError(f"{place} has no choice for {scene.label!r}: run choose_plain --validation first")
+            method = method.choices[scene.label]
+        if method.by_number and cell.budget is not None:
+            cell = dataclasses.replace(cell, budget=None, gaussians=splats_in(cell.budget, method))
+        system = _system(place, self.preset, method, cell)
+        return Job(scene.path, scene.downscale, system, len(system.stages()) - 1, self.validation, scene.fold)
 
 
 @functools.lru_cache(maxsize=10_000)
-def _system(place: str, preset: str, method: Method, cell: Cell, num: int) -> a2tg.System:
-    """Return the system of a method in a cell, with a number of Gaussians."""
+def _system(place: str, preset: str, method: Method, cell: Cell) -> a2tg.System:
+    """Return the system of a method in a cell."""
     first, second = cell.iterations
     system = type(a2tg.find_system(method.system)).preset(preset)
-    size = {"densify": {"cap": num}} if cell.budget is None else {"memory_budget": cell.budget}
+    size = {"densify": {"cap": cell.gaussians}} if cell.budget is None else {"memory_budget": cell.budget}
     basis = {"seed": cell.seed, **size, "stage1_iterations": first, "stage2_iterations": second}
     told = {"": basis, f" options on {cell.scene.label!r}": cell.scene.options, " options": method.options}
     for part, changes in told.items():
         system = with_changes(system, changes, f"{place}{part}")
     return system
+
+
+def seconds_of(job: Job, records: Mapping[str, Record]) -> float | None:
+    """Return the time of the steps of a job and of those before it; None if one has not been timed."""
+    chain = [job]
+    while chain[-1].start is not None:
+        chain.append(chain[-1].start)
+    times = [records.get(one.key, {}).get("step_seconds") for one in chain]
+    return None if None in times else sum(times)
 
 
 def splats_in(mb: float, method: Method) -> int:
@@ -203,7 +239,7 @@ def read_grid(
         cells = [_shortened(cells[0])]
     return Grid(
         path.stem, file.title, scale, settings.preset, tuple(dict.fromkeys(cells)), reference, tuple(others),
-        methods_in("at_equal_bytes"), validation, file.table,
+        methods_in("at_equal_bytes"), methods_in("at_equal_time"), validation, file.table,
     )  # fmt: skip
 
 
@@ -237,6 +273,11 @@ def _methods(file: GridFile, place: str) -> dict[str, Method]:
             missing = f"{label!r} is like {table.like!r}, which is no method above it"
             base = _found(table.like, methods, place, missing)
         methods[label] = _method(label, table, base, place)
+        if table.chosen_in is not None:
+            path = GRIDS / table.chosen_in
+            choices = read_json(path) if path.is_file() else {}
+            found = {scene: _found(choice, methods, path.name) for scene, choice in choices.items()}
+            methods[label] = dataclasses.replace(methods[label], choices=found)
     return methods
 
 
@@ -246,7 +287,7 @@ def _method(label: str, table: MethodTable, base: Method | None, place: str) -> 
         system, options = system or base.system, merged(base.options, options)
     if system is None:
         raise ValueError(f"{place}: method {label!r} has neither a system nor a method that it is like")
-    return Method(label, system, options, table.floats, table.most)
+    return Method(label, system, options, table.floats, table.most, table.by_number)
 
 
 def _found(label: str, methods: Mapping[str, Method], place: str, missing: str | None = None) -> Method:
@@ -259,11 +300,16 @@ def _found(label: str, methods: Mapping[str, Method], place: str, missing: str |
 
 def _cells(block: Scale, scenes: Sequence[SceneAt], place: str) -> list[Cell]:
     """Return a cell for every number of Gaussians or budget, every seed and every scene of a block."""
-    if block.gaussians is None and block.budgets is None:
-        raise ValueError(f"{place}: a scale needs gaussians or budgets")
-    sizes = [(num, None) for num in block.gaussians or ()] + [(0, budget) for budget in block.budgets or ()]
-    pairs = itertools.product(sizes, block.seeds, scenes)
-    return [Cell(scene, num, seed, block.iterations, budget) for (num, budget), seed, scene in pairs]
+    if all(getattr(block, name) is None for name in SIZES):
+        raise ValueError(f"{place}: a scale needs {', '.join(SIZES[:-1])} or {SIZES[-1]}")
+    sizes = [(name, value) for name in SIZES for value in getattr(block, name) or ()]
+    cells = []
+    for (kind, value), seed, scene, fold in itertools.product(sizes, block.seeds, scenes, block.folds or (None,)):
+        num, budget = (value, None) if kind == "gaussians" else (0, value)
+        if kind == "bytes_per_pixel":
+            budget = value * scene.num_pixels / MEGABYTE
+        cells.append(Cell(dataclasses.replace(scene, fold=fold), num, seed, block.iterations, budget))
+    return cells
 
 
 def _shortened(cell: Cell) -> Cell:

@@ -10,13 +10,16 @@ from lab.toml_tables import read_toml, table_as
 
 GRIDS = Path(__file__).resolve().parents[1] / "grids"
 SUFFIX = ".toml"
-SCALES = ("full", "long", "small", "smoke")
+SCALES = ("full", "long", "protocol", "protocol160", "small", "smoke")
 ONE_BYTE = 1e-6
 """A byte in MB."""
 LEAST = {
-    "gaussians": 1, "budgets": ONE_BYTE, "seeds": 0, "iterations": 0, "downscale": 1, "floats": 1, "most": 1,
+    "gaussians": 1, "budgets": ONE_BYTE, "bytes_per_pixel": ONE_BYTE, "seeds": 0, "folds": 0, "iterations": 0,
+    "downscale": 1, "floats": 1, "most": 1,
 }  # fmt: skip
 """Smallest numbers in the tables."""
+SIZES = ("gaussians", "budgets", "bytes_per_pixel")
+"""Ways to give the size of models, of which a block has one."""
 TableT = TypeVar("TableT")
 
 
@@ -26,7 +29,11 @@ class Block:
 
     gaussians: tuple[int, ...] | None = None
     budgets: tuple[float, ...] | None = None
+    bytes_per_pixel: tuple[float, ...] | None = None
+    """Budgets in bytes for each pixel of a photograph."""
     seeds: tuple[int, ...] | None = None
+    folds: tuple[int, ...] | None = None
+    """Splits into few training views and scored ones (`scenes.few_views`)."""
     iterations: tuple[int, int] | None = None
     only: tuple[str, ...] | None = None
     downscale: int | None = None
@@ -42,11 +49,12 @@ class Scale(Block):
     methods: tuple[str, ...] | None = None
     variants: tuple[str, ...] | None = None
     at_equal_bytes: tuple[str, ...] | None = None
+    at_equal_time: tuple[str, ...] | None = None
 
     def changed(self, other: Block) -> "Scale":
         """Return the scale with what another table sets; Gaussians take the place of budgets, and budgets theirs."""
         own = {name: value for name, value in vars(other).items() if value is not None}
-        sizes = {"gaussians": None, "budgets": None}
+        sizes = dict.fromkeys(SIZES)
         return dataclasses.replace(self, **{**(sizes if sizes.keys() & own.keys() else {}), **own})
 
 
@@ -60,9 +68,12 @@ class GridFile:
     """Kind of its tables."""
     methods: tuple[str, ...] = ()
     at_equal_bytes: tuple[str, ...] = ()
+    at_equal_time: tuple[str, ...] = ()
     variants: dict[str, Any] = dataclasses.field(default_factory=dict)
     full: dict[str, Any] | None = None
     long: dict[str, Any] | None = None
+    protocol: dict[str, Any] | None = None
+    protocol160: dict[str, Any] | None = None
     small: dict[str, Any] | None = None
     smoke: dict[str, Any] | None = None
 
@@ -87,6 +98,9 @@ class MethodTable:
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
     floats: int | None = None
     most: int | None = None
+    by_number: bool = False
+    chosen_in: str | None = None
+    """JSON file beside the grids with the label of a method for each scene."""
 
 
 def read_grid_file(path: Path) -> GridFile:
@@ -128,8 +142,8 @@ def part_as(kind: type[TableT], table: Any, where: str) -> TableT:
     values = {name: value for name, value in vars(part).items() if value is not None}
     for name in LEAST.keys() & values.keys():
         _check_numbers(values[name], LEAST[name], f"{where}.{name}")
-    if values.keys() >= {"gaussians", "budgets"}:
-        raise ValueError(f"{where} has gaussians and budgets: leave one out")
+    if len(given := [name for name in SIZES if name in values]) > 1:
+        raise ValueError(f"{where} has {' and '.join(given)}: leave one out")
     return part
 
 

@@ -5,6 +5,7 @@ are equal jobs, so a first stage is trained once for all second stages that foll
 """
 
 import dataclasses
+import datetime
 import functools
 import hashlib
 import math
@@ -19,14 +20,19 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian, no_rows
 from a2tg_jax.core.origin import WHITE
 from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.load import SceneSource
-from a2tg_jax.host.machine import tidy_memory
+from a2tg_jax.host.machine import num_threads, tidy_memory
+from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.registry import differences, reference_of
 from lab.fingerprint import fingerprint, is_same_so_far
+from lab.scenes import few_views
 from lab.versions import is_from_before
 
+TEST, VALIDATION = "test", "validation"
+"""Views that are held out: those of the scene, or every eighth of its training views."""
 MOST_TRAIN_VIEWS = 16
 """Largest number of training views that are measured, evenly chosen."""
 DEFAULT_GAUSSIANS = 100_000
@@ -46,7 +52,15 @@ class Job:
     stage: int
     """Index of the system's stage, from 0."""
     validation: bool = False
-    """Whether validation views are held out in place of the test views."""
+    """Whether validation views, taken from the training views, are held out instead of the test views."""
+    fold: int | None = None
+    """Number of the split of a capture of few views (`scenes.few_views`); None: all training and test views."""
+
+    @property
+    def views(self) -> str:
+        """Return which views are held out, for records."""
+        parts = [] if self.fold is None else [f"fold {self.fold}"]
+        return ", ".join([*parts, VALIDATION] if self.validation else parts or [TEST])
 
     @property
     def start(self) -> "Job | None":
@@ -72,7 +86,7 @@ class Job:
 @functools.lru_cache(maxsize=10_000)
 def _key(job: Job) -> str:
     numbers = [fingerprint(job.system, index) for index in range(job.stage + 1)]
-    held_out = ("validation",) if job.validation else ()
+    held_out = [name for name in (job.views,) if name != TEST]
     digest = hashlib.sha256(repr((job.scene, job.downscale, numbers, *held_out)).encode()).hexdigest()[:12]
     return f"{_readable(job.scene)}-{job.downscale}-{job.system.stages()[job.stage].name}-{digest}"
 
@@ -137,7 +151,10 @@ class Folders:
         """Return a job's scene; `room` as in `SceneSource.load`."""
         is_folder = job.scene != "synthetic"
         path = str(self.scenes / job.scene) if is_folder else job.scene
-        return SceneSource(path, job.downscale, validation=job.validation).load(room)
+        if job.fold is None:
+            return SceneSource(path, job.downscale, validation=job.validation).load(room)
+        scene = few_views(SceneSource(path, job.downscale).load(room), job.fold)
+        return with_validation_views(scene) if job.validation else scene
 
 
 def run_job(job: Job, folders: Folders) -> Record:
@@ -197,6 +214,9 @@ def _told_training(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Rec
         "stage": result.name, "iterations": job.iterations, "num": result.model.num, "mb": result.model.num_bytes / 1e6,
         "published_mb": result.model.num_published_bytes / 1e6, "sizes": texture_sizes(result.model),
         "seconds": result.seconds, "ms_per_step": milliseconds(result.history),
+        "step_seconds": step_seconds(result.history), "seed": job.system.seed, "views": job.views,
+        "commit": source_commit(), "threads": num_threads(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }  # fmt: skip
 
 
@@ -209,6 +229,7 @@ def _quality(scene: a2tg.Scene, model: a2tg.Model, folders: Folders) -> Record:
     return {
         "psnr": on_test.psnr, "ssim": on_test.ssim, "lpips": on_test.lpips, "lpips_network": on_test.lpips_network,
         "train_psnr": on_train.psnr, "fps": on_test.frames_per_second,
+        "per_view": {view.name: [view.psnr, view.ssim, view.lpips] for view in on_test.per_view},
     }  # fmt: skip
 
 
@@ -230,6 +251,17 @@ def milliseconds(history: a2tg.History) -> float | None:
     short to tell."""
     paces = np.diff(history.seconds) / np.diff(history.iteration)
     return 1e3 * float(np.median(paces)) if len(paces) else None
+
+
+def step_seconds(history: a2tg.History) -> float:
+    """Return the time of all steps without compilation: each interval counts the median pace of nine around it."""
+    counts = np.diff(history.iteration)
+    paces = np.diff(history.seconds) / counts
+    if not len(paces):
+        return float(history.last_seconds)
+    padded = np.pad(paces, 4, mode="reflect") if len(paces) > 4 else np.full(len(paces) + 8, np.median(paces))
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(padded, 9), axis=1)
+    return float((smooth * counts).sum() + smooth[0] * history.iteration[0])
 
 
 def _ready(path: Path) -> Path:

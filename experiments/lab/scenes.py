@@ -5,6 +5,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+import a2tg_jax as a2tg
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.host.text import did_you_mean
 from lab.grid_file import Block
@@ -21,12 +24,49 @@ class SceneAt:
     downscale: int = 1
     held_out: bool = False
     """Mark of a scene on which no choice may be made."""
+    size: tuple[int, int] | None = None
+    """Width and height of its photographs in full, where bytes are given for each pixel."""
+    fold: int | None = None
+    """Number of the split of its views into few for training and others to score; None: as the scene has them."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
     """Options of every system, such as its background."""
 
     @property
+    def num_pixels(self) -> int:
+        """Number of pixels of a photograph."""
+        if self.size is None:
+            raise ValueError(f"scene {self.label!r} needs a size, since bytes are given for each pixel")
+        width, height = self.size
+        return (width // self.downscale) * (height // self.downscale)
+
+    @property
     def dataset(self) -> str:
         return self.label.rpartition("/")[0]
+
+
+NUM_FOLDS, FEW_VIEWS, MOST_SCORED = 5, 21, 12
+
+
+def few_views(scene: a2tg.Scene, fold: int) -> a2tg.Scene:
+    """Return a scene of at most 21 training views, with others of its views to score.
+
+    A capture of less than 30 views is cut into five folds, each of which scores every fifth view and trains on the
+    others. Of a larger one 21 views are kept, evenly spaced and shifted by a fifth of their distance from fold to fold;
+    12 views halfway between them are scored.
+    """
+    views = sorted((*scene.train, *scene.test), key=lambda view: view.name)
+    num = len(views)
+    if num < 30:
+        scored = set(range(fold, num, NUM_FOLDS))
+        kept = set(range(num)) - scored
+    else:
+        spacing = num / FEW_VIEWS
+        kept = {int((index + fold / NUM_FOLDS) * spacing) for index in range(FEW_VIEWS)}
+        halfway = (int((index + fold / NUM_FOLDS + 0.5) * spacing) % num for index in range(FEW_VIEWS))
+        others = [index for index in halfway if index not in kept]
+        scored = {others[int(place)] for place in np.linspace(0, len(others) - 1, min(MOST_SCORED, len(others)))}
+    train, test = (tuple(views[index] for index in sorted(found)) for found in (kept, scored))
+    return dataclasses.replace(scene, train=train, test=test)
 
 
 def own_scene(path: Path, downscale: int) -> SceneAt:

@@ -8,9 +8,6 @@ from lab.grid_file import SUFFIX
 from lab.jobs import Job, Record, model_bytes
 from lab.scenes import SceneAt
 
-EQUAL_BYTES = ", equal bytes"
-"""End of the label of a method at the bytes of the reference."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
@@ -22,9 +19,10 @@ class Stage:
     def __str__(self) -> str:
         cell, stage = self.run.cell, self.job.system.stages()[self.job.stage].name
         size = cell.size if cell.budget is not None else f"{cell.size} Gaussians"
-        if self.run.is_at_equal_bytes:
-            size = f"bytes of {size}"
-        return f"{told_scene(cell.scene)}, {self.run.method.label}, stage {stage}, {size}, seed {cell.seed}"
+        if self.run.equal:
+            size = f"{self.run.equal} of {size}"
+        fold = "" if cell.scene.fold is None else f", fold {cell.scene.fold}"
+        return f"{told_scene(cell.scene)}{fold}, {self.run.method.label}, stage {stage}, {size}, seed {cell.seed}"
 
 
 def told_scene(scene: SceneAt) -> str:
@@ -61,7 +59,7 @@ def chain(job: Job) -> Iterator[Job]:
 
 def guessed(grid: Grid, records: Mapping[str, Record]) -> dict[str, Record]:
     """Return the records, with the largest possible bytes of references that are not finished."""
-    references = map(grid.reference_job, grid.cells if grid.at_equal_bytes else ())
+    references = map(grid.reference_job, grid.cells if grid.at_equal_bytes or grid.at_equal_time else ())
     return {**{job.key: {"mb": model_bytes(job.system) / 1e6} for job in references}, **records}
 
 
@@ -70,6 +68,5 @@ def runs_by_cell(grids: Sequence[Grid], records: Mapping[str, Record]) -> dict[C
     cells: dict[Cell, dict[str, Run]] = {}
     for grid in grids:
         for run in grid.runs(guessed(grid, records)):
-            label = run.method.label + (EQUAL_BYTES if run.is_at_equal_bytes else "")
-            cells.setdefault(run.cell, {})[label] = run
+            cells.setdefault(run.cell, {})[run.label] = run
     return cells

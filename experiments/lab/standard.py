@@ -82,5 +82,10 @@ STANDARD = (
     table_experiment("where_textures_pay", "The claim over the number of Gaussians, training length and image size."),
     paper_experiment("fixed_memory", "budget_mb", "Every method in A²TG's final bytes: Table 1 of the paper."),
     paper_experiment("fixed_number", "gaussians", "Every method with one number of Gaussians: Table 2 of the paper."),
+    table_experiment("degree_0", "The paper's claim with every method at degree 0 (PROTOCOL.md)."),
+    table_experiment("degree_1", "The paper's claim with every method at degree 1 (PROTOCOL.md)."),
+    table_experiment("degree_3", "The paper's claim with every method at degree 3 (PROTOCOL.md)."),
+    table_experiment("bytewise", "bytewise against the best plain method of each scene (PROTOCOL.md)."),
+    table_experiment("parts", "What each part of bytewise brings (PROTOCOL.md)."),
     table_experiment("quick_preset", "The preset `quick` with its numbers put back to the paper's, one at a time."),
 )

@@ -20,9 +20,10 @@ from lab.grid import Cell, Grid, Run
 from lab.jobs import Record
 from lab.markdown import table as markdown
 from lab.scenes import SceneAt
-from lab.stages import EQUAL_BYTES
 
 T = TypeVar("T")
+EQUAL_BYTES = ", equal bytes"
+"""End of the label of a method at the bytes of the reference."""
 PAPER: dict[str, list[dict[str, Any]]] = read_json(Path(__file__).with_name("paper.json"))
 """The figures that the paper publishes, by table."""
 MISSING = "–"
@@ -47,7 +48,7 @@ class Result:
     @property
     def label(self) -> str:
         """Return the method's label, unique within its cell."""
-        return self.run.method.label + (EQUAL_BYTES if self.run.is_at_equal_bytes else "")
+        return self.run.label
 
     @property
     def column(self) -> str:
@@ -172,7 +173,7 @@ def _quality_and_size(results: Sequence[Result], scenes: set[SceneAt]) -> str:
 
 def _overhead(results: Sequence[Result]) -> str:
     """Return the bytes above those of as many plain Gaussians in percent; empty where bytes are given, not numbers."""
-    if any(result.run.is_at_equal_bytes or result.run.cell.budget is not None for result in results):
+    if any(result.run.equal or result.run.cell.budget is not None for result in results):
         return ""
     plain = mean(results, "num") * bytes_per_gaussian(PLAIN_DEGREE) / MEGABYTE
     return f" ({100 * (mean(results, 'mb') / plain - 1):+.0f} %)"
