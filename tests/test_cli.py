@@ -550,7 +550,7 @@ def test_export_for_other_programs(tiny_run, tmp_path, capsys):
     """Flat 3D Gaussians, which this program's reader takes for what they were; so is the run's own point cloud."""
     run, *_ = tiny_run
     assert cli.main(["export", str(run.path), "--ply", str(tmp_path / "new" / "fox.ply")]) == 0
-    told = "fox.ply: 60 Gaussians\nnot kept by this format: textures (a2tg convert --bake turns them into plain splats)"
+    told = "fox.ply: 60 Gaussians\nnot kept by this format: textures (bake turns them into plain splats)"
     assert told in capsys.readouterr().out
     for path in (tmp_path / "new" / "fox.ply", run.point_cloud):
         assert b"property float scale_2\n" in path.read_bytes()

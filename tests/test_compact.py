@@ -2,6 +2,7 @@
 visible rows come first in a page, and no damaged file does harm."""
 
 import dataclasses
+import functools
 import json
 import math
 import tracemalloc
@@ -126,7 +127,7 @@ MODELS = {
     "shaped": lambda: shaped(plain()),
     "banded, shaped and textured": lambda: banded(0, shaped(textured(True))),
 }
-FAST = ("plain 1", "textured or not", "banded, shaped and textured")
+FAST = ("plain 1", "banded, shaped and textured")
 every_model = pytest.mark.parametrize(
     "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.long) for name in MODELS]
 )
@@ -183,7 +184,9 @@ def test_floats_come_back_as_they_were_in_another_order(name, tmp_path):
     np.testing.assert_allclose(np.abs(got[:, :, 2]), np.abs(wanted[order][:, :, 2]), atol=2e-6)
 
 
-@every_model
+@pytest.mark.parametrize(
+    "name", [pytest.param("plain 16", marks=pytest.mark.long), "textured or not", "banded, shaped and textured"]
+)
 def test_what_comes_back_looks_the_same(name):
     """Mirrored textures and half-turned splats included; from files on disk and of several chunks for browsers."""
     model = MODELS[name]()
@@ -386,6 +389,7 @@ def test_missing_file(tmp_path):
 # Damage, and malice
 
 
+@functools.cache
 def whole() -> bytes:
     return encode_model(banded(0, shaped(textured(True))))
 
@@ -581,7 +585,7 @@ def test_a_file_of_many_rows_and_few_bytes_is_refused(tmp_path):
 # Parts
 
 
-@pytest.mark.parametrize("bits", [1, 5, 8, 12, 16])
+@pytest.mark.parametrize("bits", [1, 8, 12, 16])
 def test_laws_of_quantisation(bits):
     rng = np.random.default_rng(bits)
     codes = rng.integers(0, 1 << bits, (3, 100))
@@ -646,10 +650,10 @@ def test_textures_are_kept_as_they_are_seen():
     model = dataclasses.replace(base, appearance=dataclasses.replace(base.appearance, texture=texture))
     found = decode_model(encode_web_scene(model))
     assert found.appearance.texture_options == dataclasses.replace(options, rgb="signed", alpha="projected")
-    camera = model.origin.cameras[0]
-    images = [np.asarray(shown.render(camera, settings=SETTINGS).color) for shown in (model, found)]
-    assert np.abs(images[0] - images[1]).mean() < 0.01
-    texels = found.textures.flat()
+    shown = dataclasses.replace(texture, texels=texture.shown())
+    model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=shown))
+    wanted, texels = tables(model, order_of(model, found))["texels"], found.textures.flat()
+    np.testing.assert_allclose(tables(found)["texels"], wanted, atol=half_step(texels, 8))
     assert texels.min() >= 0 and texels[:, 3].max() <= 1 + 1e-6
 
 

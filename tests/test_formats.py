@@ -42,7 +42,7 @@ from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_r
 from a2tg_jax.results.run_training import RunOptions, begin_run
 
 OTHERS = [".ply", ".ksplat", *(f".{kind}" for kind in KINDS)]
-TEXTURES = "textures (--bake turns them into plain splats)"
+TEXTURES = "textures (bake turns them into plain splats)"
 CUT = "colours of 1 Gaussian beyond the format's range (cut)"
 RNG = np.random.default_rng(0)
 
@@ -175,13 +175,13 @@ def test_what_a_format_does_not_keep():
     assert "spherical harmonics above degree 2" in lost_by(Model(some_gaussians()), "a.ksplat")
     assert lost_by(Model(some_gaussians()), "a.splat") == ["spherical harmonics above degree 0", "last digits"]
     shaped = showing(Appearance(texture=Texture(), exponents=Exponents()))
-    assert lost_by(shaped, "a.ply") == ["textures and shapes of kernels (--bake turns them into plain splats)"]
+    assert lost_by(shaped, "a.ply") == ["textures and shapes of kernels (bake turns them into plain splats)"]
     assert lost_by(shaped, "a.glb") == lost_by(shaped, "a.a2tgz") == ["last digits"]
-    unseen = "textures and shapes of kernels (--bake turns them into plain splats)"
+    unseen = "textures and shapes of kernels (bake turns them into plain splats)"
     assert unseen_elsewhere(shaped, "a.glb") == unseen
     assert unseen_elsewhere(shaped, "a.a2tgz") == unseen_elsewhere(Model(some_gaussians()), "a.glb") == ""
     kernels = showing(Appearance(exponents=Exponents()))
-    assert lost_by(kernels, "a.usda")[0] == "shapes of kernels (--bake turns them into plain splats)"
+    assert lost_by(kernels, "a.usda")[0] == "shapes of kernels (bake turns them into plain splats)"
     found = lost_by(showing(MovableKernels(exponents=Exponents())), "a.ply")
     assert found == [lost_by(kernels, "a.ply")[0], "what MovableKernels shows besides Gaussians"]
     learned = {"exposure": np.zeros((0, 3, 4)), "pose": np.zeros((0, 6))}
@@ -248,6 +248,7 @@ def test_bytes_of_an_embedded_buffer_are_those_of_its_file(tmp_path):
     assert files_of(tmp_path / "a.gltf") == [tmp_path / "a.gltf"]
 
 
+@pytest.mark.long
 def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsys, monkeypatch):
     scene, started = synthetic_scene(width=32, height=24, num_views=4, num_points=50), []
 
@@ -277,6 +278,7 @@ def test_training_starts_from_a_file_in_place_of_the_first_stage(tmp_path, capsy
     assert main(command) == 2 and "there is no file" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_file_in_place_of_the_first_stage_is_read_once_and_counted(tmp_path, monkeypatch):
     scene, read, counts = synthetic_scene(width=32, height=24, num_views=4, num_points=50), [], []
 

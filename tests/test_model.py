@@ -103,7 +103,7 @@ def test_only_rows_that_exist_are_kept(tmp_path):
     assert loaded.num_bytes == model.num_bytes == 232 * 4 + 16 * (1 + 8 + 4 + 4)
 
 
-@pytest.mark.parametrize("num", [0, 1])
+@pytest.mark.parametrize("num", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_few_gaussians(tmp_path, num):
     model = Model(some_gaussians(num), Appearance(texture=Texture(textures_from_arrays(some_textures(num)))))
     save_model(tmp_path / "m.npz", model)
@@ -247,7 +247,7 @@ def test_whatever_is_wrong_is_one_error_that_names_the_file(tmp_path, spoil, mes
     assert "bad.npz" in str(raised.value) and "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_flipped_bits_are_found_or_do_no_harm(tmp_path, seed):
     path, rng = tmp_path / "bits.npz", np.random.default_rng(seed)
     save_model(path, textured_model())
@@ -306,6 +306,7 @@ def test_moves_compose():
     np.testing.assert_allclose(back.rotation, np.eye(3), atol=1e-12)
 
 
+@pytest.mark.long
 def test_dead_rows_do_not_show():
     scene = draw_scene(4)
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")

@@ -79,7 +79,13 @@ def assert_rows(found: Model, wanted: list[np.ndarray]) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("name", APPEARANCES)
+SLOW = set(APPEARANCES) - {"plain", "all parts"}
+every_appearance = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] * (name in SLOW)) for name in APPEARANCES]
+)
+
+
+@every_appearance
 def test_rows_are_chosen_by_mask_indices_and_slice(name):
     model = some_model(name)
     rows = rows_of(model)
@@ -91,7 +97,7 @@ def test_rows_are_chosen_by_mask_indices_and_slice(name):
     assert model[keep].num_bytes < model.num_bytes
 
 
-@pytest.mark.parametrize("name", APPEARANCES)
+@every_appearance
 def test_models_are_joined(name):
     first, second = some_model(name), some_model(name, seed=3, num=5)
     assert_rows(concatenate([first, second, first]), rows_of(first) + rows_of(second) + rows_of(first))
@@ -150,9 +156,8 @@ def test_a_loss_may_return_more():
     np.testing.assert_allclose(gradient.gaussians.means, 2 * model.gaussians.means)
 
 
-@pytest.mark.parametrize("name", ["plain", "exponents"])
 @pytest.mark.parametrize("rows", [[0, 5, 3], [1, 1, *range(NUM + 2)]])
-def test_an_event_may_leave_fewer_rows_or_more(name, rows):
+def test_an_event_may_leave_fewer_rows_or_more(rows, name="exponents"):
     model = some_model(name)
     moments = adam_init(partition(model)[0])
     moments = dataclasses.replace(moments, mu=moved(moments.mu))

@@ -36,7 +36,7 @@ def test_the_reference_reader_finds_what_this_library_finds(reference, name):
         np.testing.assert_allclose(found[key], values, atol=2e-6, rtol=2e-6, err_msg=key)
 
 
-@pytest.mark.parametrize("has_shapes", [False, True])
+@pytest.mark.parametrize("has_shapes", [pytest.param(False, marks=pytest.mark.long), True])
 def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path, has_shapes):
     """It follows the rules of the page alone."""
     read_model, draw = reference
@@ -81,6 +81,7 @@ def test_scenes_for_browsers_are_still_written_so():
     assert found == wanted
 
 
+@pytest.mark.long
 def test_the_reference_reader_takes_nothing_of_this_library():
     sources = [path.read_text() for path in READER.parent.glob("*.py")]
     assert not any("a2tg_jax" in source for source in sources)

@@ -53,7 +53,7 @@ def encode(coder: str, planes: np.ndarray) -> bytes:
         return lzma.compress(planes.tobytes(), format=lzma.FORMAT_RAW, filters=LZMA_FILTERS)
     if coder == "deflate":
         return zlib.compress(planes.tobytes(), 9)
-    if coder == "zstd":  # In one frame, a plane begins a block of its own, with tables of its own.
+    if coder == "zstd":  # In one frame, each plane begins a block, which has its own tables.
         stream = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compressobj(size=planes.size)
         pieces = [stream.compress(row.tobytes()) + stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for row in planes]
         return b"".join([*pieces, stream.flush()])
@@ -82,7 +82,7 @@ def decode(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
         return np.zeros((num_planes, length), np.uint8)
     try:
         planes = _decoded(coder, data, num_planes, length)
-    except Exception as error:  # Each library has errors of its own, and Pillow's differ by what is wrong.
+    except Exception as error:  # Each library raises its own errors, and Pillow's differ by what is wrong.
         raise ValueError(f"is not what {coder} wrote ({error})") from error
     if planes.size != size:
         raise ValueError(f"holds {planes.size} bytes; {size} were announced")
@@ -128,13 +128,6 @@ class Ends(NamedTuple):
 
     low: float
     high: float
-
-
-def check_precision(name: str, precision: Precision) -> None:
-    """Raise ValueError, naming the choice, unless it is a number of bits or a float type."""
-    is_bits = isinstance(precision, int) and not isinstance(precision, bool) and 1 <= precision <= MOST_BITS
-    if not is_bits and precision not in ("float32", "float16"):
-        raise ValueError(f"{name} must be 1 to {MOST_BITS} bits, float32 or float16; got {precision!r}")
 
 
 def ends_of(values: np.ndarray, bits: int) -> Ends:

@@ -27,7 +27,6 @@ from a2tg_jax.io.columns import (
     ColumnReader,
     ColumnWriter,
     Precision,
-    check_precision,
     decode,
     ends_of,
     logits_of,
@@ -91,7 +90,7 @@ class CompactChoices:
 
     def keeping(self, others: Mapping[str, Any]) -> Self:
         """Return the choices with some changed, by name."""
-        return dataclasses.replace(self, **dict(others))
+        return dataclasses.replace(self, **others)
 
     def of_part(self, name: str) -> Precision:
         """Return the precision of a part of the file, such as sh_2 or texel_colors."""
@@ -101,9 +100,11 @@ class CompactChoices:
 
     def check(self) -> Self:
         """Raise ValueError, naming the choice, if one is invalid."""
-        for field in dataclasses.fields(self):
-            if field.name != "coder":
-                check_precision(f"choices.{field.name}", getattr(self, field.name))
+        for name in GROUPS:
+            precision = getattr(self, name)
+            is_bits = type(precision) is int and 1 <= precision <= MOST_BITS
+            if not is_bits and precision not in ("float32", "float16"):
+                raise ValueError(f"choices.{name} must be 1 to {MOST_BITS} bits, float32 or float16; got {precision!r}")
         config_from_dict(type(self), config_to_dict(self), "choices")
         return self
 

@@ -132,7 +132,7 @@ def save_splats(path: str | os.PathLike[str], model: Model) -> None:
 
 
 def files_written(path: Path) -> list[Path]:
-    """Return the files that a model is written as: its own first, and the buffer beside a *.gltf."""
+    """Return the files that a model is written as: its own first, then the buffer of a *.gltf."""
     return [path, path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else [path]
 
 
@@ -150,7 +150,7 @@ def _bakeable(model: Model) -> str:
     """Return in words what a model shows besides plain splats that baking turns into these; "" if nothing."""
     has_textures, has_shapes = model.textures is not None, model.appearance.exponents is not None
     found = " and ".join(["textures"] * has_textures + ["shapes of kernels"] * has_shapes)
-    return f"{found} (--bake turns them into plain splats)" if found else ""
+    return f"{found} (bake turns them into plain splats)" if found else ""
 
 
 def unseen_elsewhere(model: Model, path: str | os.PathLike[str]) -> str:

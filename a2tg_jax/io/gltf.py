@@ -1,8 +1,8 @@
-"""glTF files of splats: KHR_gaussian_splatting, as *.glb, or *.gltf with a *.bin beside it.
+"""glTF files of splats: KHR_gaussian_splatting, as *.glb, or *.gltf with a *.bin.
 
 Splats are points of a mesh: means, rotations, scales, opacities and spherical harmonics are its attributes. They stay
 in the model's world; the matrix of their node leads to glTF's, which has +y up. Textures, degrees and kernels of splats
-are in the extension A2TG_splat_textures; programs that do not know it show the plain splats. docs/formats.md describes
+are in the extension A2TG_splat_textures; programs without it show the plain splats. docs/formats.md describes
 both.
 """
 
@@ -63,8 +63,8 @@ def save_gltf(
     """Write a model's live rows as splats of glTF, with its appearance and its origin.
 
     Args:
-      path: the file. *.gltf has its numbers in a *.bin beside it, any other name is one *.glb. Older ones are replaced
-        once the new ones are whole.
+      path: the file. *.gltf has its numbers in a *.bin of the same name, any other name is one *.glb. Older ones are
+        replaced once the new ones are whole.
       model: of Gaussians with or without textures, exponents and bands.
       textures: write textures, degrees and shapes of kernels, too, as the extension A2TG_splat_textures. False writes
         plain splats of any model, as `save_ply` does.
@@ -92,7 +92,7 @@ def save_gltf(
     shown = others.linear_colors(np.clip(splats.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0))
     points = np.rint(255 * np.concatenate([shown, splats.opacities[:, None]], axis=1)).astype(np.uint8)
     attributes["COLOR_0"] = builder.add(points, normalized=True)
-    # The extension stores each coefficient as an attribute of its own, not as one array.
+    # The extension stores one attribute for each coefficient, not one array.
     for degree in range(NUM_BASES.index(splats.sh.shape[1]) + 1):
         for order in range(2 * degree + 1):
             index = NUM_BASES[degree] - 2 * degree - 1 + order

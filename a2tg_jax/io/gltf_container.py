@@ -1,6 +1,7 @@
 """glTF 2.0 as a container of numbers: a builder of files, and a reader of strangers' files.
 
-A file is one *.glb, or a *.gltf with buffers beside it or embedded. Reading takes no more memory than a file can hold.
+A file is one *.glb, or a *.gltf with buffers in further files or embedded. Reading takes no more memory than a file
+can hold.
 """
 
 import base64
@@ -56,7 +57,7 @@ class Builder:
 
         Args:
           values: the numbers, at least one row.
-          normalized: integers stand for numbers in [0, 1] or [-1, 1].
+          normalized: integers encode numbers in [0, 1] or [-1, 1].
           has_bounds: the accessor says the smallest and the largest of each column.
           is_attribute: they are an attribute of a mesh.
         """
@@ -81,7 +82,7 @@ class Builder:
         return len(self._views) - 1
 
     def save(self, path: Path, described: Mapping[str, object]) -> None:
-        """Write the file, *.gltf with a *.bin beside it, any other name as one *.glb.
+        """Write the file, *.gltf with a *.bin, any other name as one *.glb.
 
         Older files are replaced once the new ones are whole. `described` is the JSON without accessors and buffers.
 
@@ -167,7 +168,7 @@ class Document:
         first = start + _count(accessor, "byteOffset", what, 0)
         if count and first + stride * (count - 1) + size > start + length:
             raise ValueError(f"{what} has {count} entries, but its buffer is too short for them")
-        # Several accessors may name the same bytes, each of which takes room of its own.
+        # Several accessors may name the same bytes, each of which takes room for itself.
         if 4 * count * columns > self._room:
             raise ValueError(f"{what} would take {4 * count * columns} bytes, which the file is too small for")
         self._room -= 4 * count * columns
@@ -208,7 +209,7 @@ class Document:
 
 
 def buffer_files(path: Path) -> list[Path]:
-    """Return the files beside a *.gltf that its buffers name; none if it cannot be read."""
+    """Return the files that the buffers of a *.gltf name; none if it cannot be read."""
     try:
         buffers = Document(path).json["buffers"]
         uris = {buffer["uri"]: None for buffer in buffers if not buffer.get("uri", "data:").startswith("data:")}

@@ -1,7 +1,7 @@
 """A model as plain tables of numbers, in the order of a Z curve, and the model again.
 
 Neighbouring rows are near each other in space, so that their numbers are alike. Each splat is turned by half about one
-of its own axes if that makes its rotation smaller, and its texture is mirrored along: it looks the same.
+of its axes if that makes its rotation smaller, and its texture is mirrored along: it looks the same.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
-"""Models as files of other programs hold them: ellipsoids in a world of its own axes, with numbers of limited range.
+"""Models as files of other programs hold them: ellipsoids in a world with other axes, with numbers of limited range.
 
 A model's own world has +z up, and lengths in which its cameras are 1 away. A file's world has the lengths of the
-original one, and the up axis of its format; the model lies where it does in its own. Positions that a format would
+original one, and the up axis of its format; the model keeps its place in it. Positions that a format would
 round too far, such as map coordinates, are relative to an offset.
 """
 
@@ -52,7 +52,7 @@ MOST_PARTS = 256
 
 
 class Ellipsoids(NamedTuple):
-    """N ellipsoids as a renderer wants them; float32 on the host."""
+    """N ellipsoids in activated numbers; float32 on the host."""
 
     means: np.ndarray
     """[N, 3]."""
@@ -118,7 +118,7 @@ def world_gaussians(
 def splats_of(model: Model, *, keeps_shapes: bool = False) -> Ellipsoids:
     """Return the splats of a model of which all rows exist, with a third axis of a thousandth of the shorter.
 
-    If splats have degrees of their own, coefficients go up to the highest of these. `keeps_shapes` is as in
+    If splats differ in degree, coefficients go up to the highest of these. `keeps_shapes` is as in
     `plain_gaussians`.
     """
     gaussians = plain_gaussians(model, keeps_shapes=keeps_shapes)
@@ -187,6 +187,17 @@ def whole_rows(name: str, scales: np.ndarray, *columns: np.ndarray) -> np.ndarra
         )
         warnings.warn(message, stacklevel=4)
     return is_whole
+
+
+def flat_rows(
+    name: str, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, logits: np.ndarray, sh: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Return the same columns of `whole_rows` alone, with two log-scales: three are `flattened`."""
+    kept = whole_rows(name, log_scales, means, quats, logits, sh)
+    means, quats, log_scales, logits, sh = (values[kept] for values in (means, quats, log_scales, logits, sh))
+    if log_scales.shape[1] == 3:
+        quats, log_scales = flattened(quats, log_scales, name)
+    return means, quats, log_scales, logits, sh
 
 
 def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -65,10 +65,10 @@ def save_ply(
       gaussians: N Gaussians; or a model, of which the Gaussians that exist are written, without what they show;
         they are as opaque as `Appearance.opacities` takes them to be (movable kernels and billboards have opacities of
         their own). Kernels of other shapes become the nearest Gaussians.
-      transform: `scene.transform`, which led from the original world to the one the Gaussians live in; given, they are
+      transform: `scene.transform`, which led from the original world to the world of the Gaussians; given, they are
         brought back to the original world first, SH included. None writes Gaussians as they are, and brings those of a
         model back to the original world of its origin, if it has one.
-      third_scale: write scale_2, a thousandth of the shorter scale, which programs for 3DGS want. False leaves it out,
+      third_scale: write scale_2, a thousandth of the shorter scale, which programs for 3DGS need. False leaves it out,
         as 2DGS does.
       float64: write x, y and z as float64, and never relative to an offset.
 
@@ -178,14 +178,11 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     most = np.where(logits > 0, -np.log(others.LEAST_OPACITY), np.log(others.LEAST_OPACITY))
     logits = np.where(np.isinf(logits), most, logits).astype(np.float32)
     sh = _sh_of(vertices, path)
-    kept = others.whole_rows(str(path), log_scales, means, quats, logits, sh)
-    means, quats, log_scales = means[kept], quats[kept], log_scales[kept]
-    if has_third:
-        quats, log_scales = others.flattened(quats, log_scales, str(path))
+    means, quats, log_scales, logits, sh = others.flat_rows(str(path), means, quats, log_scales, logits, sh)
     inside = others.offset_for("ply", means, log_scales)  # Zeros where the file has float32.
     with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
         means = (means - inside).astype(np.float32)
-    gaussians = Gaussians(*(jnp.asarray(rows) for rows in (means, quats, log_scales, logits[kept], sh[kept])))
+    gaussians = Gaussians(*(jnp.asarray(rows) for rows in (means, quats, log_scales, logits, sh)))
     with reading(path):
         check_model(Model(gaussians))
         return Model(gaussians, origin=others.origin_at(inside + ply.offset))
@@ -238,7 +235,7 @@ BOUNDS = tuple(f"{end}_{what}{axis}" for what in ("", "scale_") for end in ("min
 COLOR_BOUNDS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in CHANNELS)
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 SH_RANGE = 8.0
-"""Range of the coefficients that a byte stands for."""
+"""Range of the coefficients that a byte encodes."""
 
 
 def unpacked_vertices(ply: PlyFile) -> np.ndarray:

@@ -25,7 +25,7 @@ import numpy as np
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.other_programs import degree_to_read, flattened, whole_rows
+from a2tg_jax.io.other_programs import degree_to_read, flat_rows
 from a2tg_jax.io.validate import check_model, reading
 from a2tg_jax.model import Model
 
@@ -229,12 +229,8 @@ def _gaussians_of(arrays: Mapping[str, np.ndarray], path: Path) -> Gaussians:
         found = f"{sh.shape[1]} coefficients and {log_scales.shape[-1]} scales of each Gaussian"
         raise ValueError(f"has {found}; SH of degree 0 to 4 have 1, 4, 9, 16 or 25, and Gaussians 2 or 3 scales")
     sh = sh[:, : COEFFICIENTS[degree_to_read(COEFFICIENTS.index(sh.shape[1]), str(path))]]
-    columns = (means.reshape(num, 3), arrays["quats"].reshape(num, 4), arrays["opacities"].reshape(num), sh)
-    kept = whole_rows(str(path), log_scales, *columns)
-    means, quats, logits, sh = (values[kept] for values in columns)
-    log_scales = log_scales[kept]
-    if log_scales.shape[1] == 3:
-        quats, log_scales = flattened(quats, log_scales, str(path))
-    gaussians = Gaussians(*(jnp.asarray(values) for values in (means, quats, log_scales, logits, sh)))
+    quats, logits = arrays["quats"].reshape(num, 4), arrays["opacities"].reshape(num)
+    columns = flat_rows(str(path), means.reshape(num, 3), quats, log_scales, logits, sh)
+    gaussians = Gaussians(*map(jnp.asarray, columns))
     check_model(Model(gaussians))
     return gaussians

@@ -1,7 +1,7 @@
 """OpenUSD files of splats: particle fields with a kernel of planar Gaussians, as *.usdz, *.usdc or *.usda.
 
 A ParticleField of USD 26.03 or later whose kernel is ParticleFieldKernelGaussianSurfletAPI holds exactly these
-Gaussians: the kernel lies in the plane of the first two axes. Textures have no place in it. The library usd-core reads
+Gaussians: the kernel is in the plane of the first two axes. It cannot hold textures. The library usd-core reads
 and writes the files.
 """
 

@@ -136,6 +136,6 @@ def export_ply(source: Source, out: Path, *, float64: bool = False) -> str:
     out.parent.mkdir(parents=True, exist_ok=True)
     save_ply(out, source.model, float64=float64)
     lines = [f"file: {out}: {source.model.num:,} Gaussians"]
-    if lost := lost_by(source.model, ".ply"):  # --bake is an option of another command.
-        lines.append(f"not kept by this format: {', '.join(lost).replace('--bake', 'a2tg convert --bake')}")
+    if lost := lost_by(source.model, ".ply"):
+        lines.append(f"not kept by this format: {', '.join(lost)}")
     return "\n".join(lines)

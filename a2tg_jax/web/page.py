@@ -1,18 +1,18 @@
-"""The viewer's page, one HTML file with script and style inside, and the files beside it."""
+"""The viewer's page, one HTML file with script and style inside, and the files next to it."""
 
 import base64
 from importlib import resources
 
 SCENE_NAME = "scene.a2tgz"
-"""Name of the scene file beside the page."""
+"""Name of the scene file next to the page."""
 PHOTOGRAPHS_NAME = "photographs.json"
-"""Name of the list of cameras with photographs beside the page, as `photograph_name` names them."""
+"""Name of the list of cameras with photographs next to the page, as `photograph_name` names them."""
 STATUS_NAME = "training.json"
 """Name of the status of a running training, which the page polls while it exists."""
 
 
 def viewer_html(*, is_training: bool = False) -> str:
-    """Return the viewer's page, which shows the scene beside it, and follows the training beside it if there is one."""
+    """Return the viewer's page, which shows the scene next to it, or follows a running training."""
     page = resources.files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
     return page.replace("<html ", '<html data-training="yes" ', 1) if is_training else page
 
