@@ -32,7 +32,6 @@ from a2tg_jax.results import viewing
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
-from a2tg_jax.results.report import loss_text
 from a2tg_jax.results.viewing import ServedPhotographs, export_web, losses_of, routes_of
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.web.page import viewer_html, viewer_html_with
@@ -60,28 +59,24 @@ APP = application(
 def test_known_paths_are_answered():
     status, headers, body = ask(APP)
     assert (status, body, headers["Content-Type"], headers["Content-Length"]) == (200, b"page", "text/html", "4")
-    assert (
-        headers["X-Content-Type-Options"] == "nosniff"
-        and "frame-ancestors 'none'" in headers["Content-Security-Policy"]
-    )
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
     assert ask(APP, "/lazy")[2] == b"late"
     status, headers, body = ask(APP, method="HEAD")
     assert (status, body, headers["Content-Length"]) == (200, b"", "4")
 
 
-@pytest.mark.parametrize("path", ["/none", "/../etc/passwd", "//", "/lazy/", "/%2e%2e/", "lazy", "/scene.a2tgz?x"])
-def test_other_paths_are_not(path):
-    assert ask(APP, path)[0] == 404
-
-
-@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:81", "localhost:8080", "", None])
-def test_other_hosts_are_refused(host):
-    assert ask(APP, host=host)[0] == 403
-
-
-def test_other_methods_are_refused():
-    assert [ask(APP, method=method)[0] for method in ("POST", "PUT", "DELETE", "OPTIONS")] == [405] * 4
-    assert ask(APP, host="localhost:80")[0] == 200
+@pytest.mark.parametrize(
+    ("status", "requests"),
+    [
+        (404, [{"path": p} for p in ("/none", "/../etc/passwd", "//", "/lazy/", "/%2e%2e/", "lazy", "/scene.a2tgz?x")]),
+        (403, [{"host": h} for h in ("evil.example", "127.0.0.1", "127.0.0.1:81", "localhost:8080", "", None)]),
+        (405, [{"method": method} for method in ("POST", "PUT", "DELETE", "OPTIONS")]),
+        (200, [{"host": "localhost:80"}]),
+    ],
+)
+def test_other_paths_hosts_and_methods_are_refused(status, requests):
+    assert [ask(APP, **request)[0] for request in requests] == [status] * len(requests)
 
 
 def test_a_server_listens_on_the_loopback_alone():
@@ -107,11 +102,10 @@ def network_app(door):
     return application({"/": Route("text/html", b"page"), "/scene": Route("x/y", b"here"), "/act": act}, door)
 
 
-@pytest.mark.parametrize("path", ["/", "", "/scene", "/secret", "/Secret/", "/secre/", "/secret2/scene", "//secret/"])
-def test_on_a_network_nothing_is_told_without_the_token(path):
+def test_on_a_network_nothing_is_told_without_the_token():
     app = network_app(Door(ANY, ANY, 80, "secret"))
-    assert ask(app, path)[0] == 403
-    assert ask(app, path, method="POST")[0] == 403
+    for path in ("/", "", "/scene", "/secret", "/Secret/", "/secre/", "/secret2/scene", "//secret/"):
+        assert [ask(app, path, method=method)[0] for method in ("GET", "POST")] == [403, 403], path
 
 
 def test_on_a_network_the_token_opens_the_page_and_what_it_fetches():
@@ -129,22 +123,17 @@ def test_on_a_network_the_token_opens_the_page_and_what_it_fetches():
 
 
 @pytest.mark.parametrize(
-    ("name", "address", "host", "status"),
+    ("name", "address", "let_in", "kept_out"),
     [
-        (ANY, ANY, "192.168.1.7:80", 200),
-        (ANY, ANY, "localhost:80", 200),
-        (ANY, ANY, "evil.example:80", 403),
-        (ANY, ANY, "192.168.1.7:81", 403),
-        (ANY, ANY, "192.168.1.7.evil.example:80", 403),
-        ("192.168.1.7", "192.168.1.7", "192.168.1.7:80", 200),
-        ("192.168.1.7", "192.168.1.7", "192.168.1.8:80", 403),
-        ("desk.local", "192.168.1.7", "desk.local:80", 200),
-        ("desk.local", "192.168.1.7", "192.168.1.7:80", 200),
-        ("desk.local", "192.168.1.7", "evil.example:80", 403),
+        (ANY, ANY, "192.168.1.7:80 localhost:80", "evil.example:80 192.168.1.7:81 192.168.1.7.evil.example:80"),
+        ("192.168.1.7", "192.168.1.7", "192.168.1.7:80", "192.168.1.8:80"),
+        ("desk.local", "192.168.1.7", "desk.local:80 192.168.1.7:80", "evil.example:80"),
     ],
 )
-def test_on_a_network_requests_must_name_the_machine(name, address, host, status):
-    assert ask(network_app(Door(name, address, 80, "secret")), "/secret/", host=host)[0] == status
+def test_on_a_network_requests_must_name_the_machine(name, address, let_in, kept_out):
+    app = network_app(Door(name, address, 80, "secret"))
+    assert {ask(app, "/secret/", host=host)[0] for host in let_in.split()} == {200}
+    assert {ask(app, "/secret/", host=host)[0] for host in kept_out.split()} == {403}
 
 
 def test_a_server_on_a_network_has_a_new_token_each_time(monkeypatch):
@@ -345,11 +334,6 @@ def test_a_failed_export_leaves_the_photographs_of_the_old_page(tmp_path, monkey
     assert old.is_file()
     export_web(source, tmp_path, overwrite=True)
     assert not old.parent.exists()
-
-
-def test_a_gain_is_not_called_a_loss():
-    assert loss_text(0.0671) == "0.067 dB of PSNR lost"
-    assert loss_text(-0.0671) == "0.067 dB of PSNR gained"
 
 
 def test_a_page_of_someone_else_is_not_replaced(tmp_path):

@@ -46,12 +46,9 @@ def write_archive(
 def read_archive(
     path: str | os.PathLike[str], *, format: str = FORMAT, names: Collection[str] | None = None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the header and the arrays that `write_archive` was given; `names` selects arrays.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is not such an archive, is damaged, lacks one of the names, or is of another version.
-    """
+    """Return the header and the arrays that `write_archive` was given; `names` selects arrays. FileNotFoundError: there
+    is no such file. ValueError: it is not such an archive, is damaged, lacks one of the names, or is of another
+    version."""
     path = Path(path)
     if is_folder(path):
         found = sorted(path.glob("models/*.npz"))

@@ -70,11 +70,8 @@ def encode(coder: str, planes: np.ndarray) -> bytes:
 
 
 def decode(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
-    """Return the planes [num_planes, length] of uint8 that `encode` was given.
-
-    Raises:
-      ValueError: if the bytes are damaged, or hold more or less than that.
-    """
+    """Return the planes [num_planes, length] of uint8 that `encode` was given. ValueError: the bytes are damaged, or
+    hold more or less than that."""
     size = num_planes * length
     if size == 0:
         if data:
@@ -326,11 +323,8 @@ class ColumnWriter:
         self.planes(name, to_planes(indices, max(count - 1, 0).bit_length()))
 
     def numbers(self, name: str, values: np.ndarray, precision: Precision, *, is_color: bool = False) -> None:
-        """Write floats [C, n]. The three columns of colours are red, green, blue.
-
-        Raises:
-          ValueError: if float16 cannot hold them.
-        """
+        """Write floats [C, n]. The three columns of colours are red, green, blue. ValueError: float16 cannot hold
+        them."""
         if not isinstance(precision, int):
             self.planes(name, to_byte_planes(_finite(name, np.asarray(values), precision)))
             return
@@ -376,11 +370,7 @@ class ColumnReader:
             raise ValueError(f"its parts must have {len(body)} bytes in all; got {start}")
 
     def planes(self, name: str, num_planes: int, length: int) -> np.ndarray:
-        """Read uint8 [num_planes, length].
-
-        Raises:
-          ValueError: if the part is missing or damaged, or there is no room left.
-        """
+        """Read uint8 [num_planes, length]. ValueError: the part is missing or damaged, or there is no room left."""
         self._take_room(name, num_planes * length)
         if not self._parts.get(name):
             raise ValueError(f"the part {name} is missing")

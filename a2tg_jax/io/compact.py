@@ -177,11 +177,14 @@ def encode_model(
     model = model.live
     rows = rows_of_model(model)
     num = len(rows.means)
-    chunk, order = (max(num, 1), np.arange(num)) if order is None else (_chunk_of(num), order)
+    # A page draws after a sixteenth of a small scene; chunks of a large one are short enough to draw after each.
+    chunk = max(num, 1) if order is None else int(np.clip(-(-num // 16), LEAST_CHUNK, LARGEST_CHUNK))
+    order = np.arange(num) if order is None else order
     bits = choices.means if isinstance(choices.means, int) else MOST_BITS
     known = np.reshape((grids or {}).get("means", ()), (-1, 4)).tolist()
     axes = [AxisSteps(*own) for own in known] or [AxisSteps.of(x, bits) for x in rows.means.T]
     keys = morton(np.stack([axis.codes(x, bits) for axis, x in zip(axes, rows.means.T, strict=True)]), bits)
+    # Within each chunk, rows follow the Z curve: neighbours in space have similar numbers, which code well.
     starts = range(0, max(num, 1), chunk)
     order = np.concatenate([part[np.argsort(keys[part], kind="stable")] for part in np.split(order, starts[1:])])
     rows, keys = ordered(rows, order, turns=grids is None), keys[order]
@@ -230,14 +233,11 @@ def _write(writer: ColumnWriter, rows: Rows, choices: CompactChoices, header: Ma
     """Write all of a chunk but its means."""
     writer.indices("degrees", np.searchsorted(header["degrees"], rows.degrees), len(header["degrees"]))
     if rows.sizes is not None:
+        # A pair of sides as one number, which orders pairs as np.unique does.
         table, found = (np.asarray(sizes).reshape(-1, 2) @ [MAX_SIDE + 1, 1] for sizes in (header["sizes"], rows.sizes))
         writer.indices("sizes", np.searchsorted(table, found), len(table))
     for name, values, precision, is_color in _columns(rows, choices):
         writer.numbers(name, values, precision, is_color=is_color)
-
-
-def _chunk_of(num: int) -> int:
-    return int(np.clip(-(-num // 16), LEAST_CHUNK, LARGEST_CHUNK))
 
 
 def _columns(rows: Rows, choices: CompactChoices) -> Iterator[tuple[str, np.ndarray, Precision, bool]]:
@@ -274,6 +274,7 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
     with reading(where):
         header, body = unframed(data)
         choices = config_from_dict(CompactChoices, header["choices"], "choices").check()
+        # Only this package's own classes can be named, so that a file imports nothing.
         appearance = appearance_from_dict(header["appearance"])
         check_encodable(appearance)
         reader = ColumnReader(body, header["parts"], header["ends"], room_of(len(data)))

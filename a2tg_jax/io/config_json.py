@@ -56,11 +56,8 @@ def config_from_dict(
 
 
 def changed_config(config: ConfigT, changes: Mapping[str, object], where: str) -> ConfigT:
-    """Return a dataclass with some fields changed, fields of nested dataclasses by nested dictionaries.
-
-    Raises:
-      ValueError: naming the field, if it is unknown or of another type.
-    """
+    """Return a dataclass with some fields changed, fields of nested dataclasses by nested dictionaries. ValueError,
+    naming the field: it is unknown or of another type."""
     return config_from_dict(type(config), merged(config_to_dict(config), _to_json(changes)), where)
 
 
@@ -135,11 +132,8 @@ def _from_json(hint: object, value: Any, where: str) -> Any:
 
 
 def _as(hint: Any, value: object) -> Any:
-    """Return a JSON value as a plain type; an integer is a good float, a truth value is not a number.
-
-    Raises:
-      TypeError: if it is of another type.
-    """
+    """Return a JSON value as a plain type; an integer is a good float, a truth value is not a number. TypeError: it is
+    of another type."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         for alternative in inner:

@@ -83,11 +83,7 @@ FORMATS = {
 
 
 def format_of(path: str | os.PathLike[str]) -> FileFormat:
-    """Return the format of a file by its suffix.
-
-    Raises:
-      ValueError: if the suffix is unknown.
-    """
+    """Return the format of a file by its suffix. ValueError: the suffix is unknown."""
     name = Path(path).name.lower()
     for suffix, found in FORMATS.items():
         if name.endswith(suffix):
@@ -96,11 +92,8 @@ def format_of(path: str | os.PathLike[str]) -> FileFormat:
 
 
 def writer_of(path: str | os.PathLike[str]) -> Writer:
-    """Return the function that writes a file, chosen by its suffix, once it is sure to have what it needs.
-
-    Raises:
-      ValueError: if the suffix is unknown, an optional library is missing, or the format can only be read.
-    """
+    """Return the function that writes a file, chosen by its suffix, once it is sure to have what it needs. ValueError:
+    the suffix is unknown, an optional library is missing, or the format can only be read."""
     found = format_of(path)
     if found.save is None:
         raise ValueError(f"{shortened(os.fspath(path))}: {found.name} files can be read, but not written")

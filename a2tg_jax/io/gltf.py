@@ -216,11 +216,8 @@ def _splats(document: Document, attributes: Mapping[str, object]) -> others.Elli
 
 
 def _shown(document: Document, described: Mapping[str, Any], splats: others.Ellipsoids) -> tuple[Appearance, Rows, int]:
-    """Return the template, the tables and the degree of all splats, from the object of the extension.
-
-    Raises:
-      ValueError: if a field is missing, out of range, or does not fit the others.
-    """
+    """Return the template, the tables and the degree of all splats, from the object of the extension. ValueError: a
+    field is missing, out of range, or does not fit the others."""
     num, highest = splats.sh.shape[:2]
     base_degree = sh_degree = NUM_BASES.index(highest)
     has_textures, has_degrees, has_shapes = (name in described for name in ("sizes", "degrees", "shapes"))

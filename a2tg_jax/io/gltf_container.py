@@ -115,12 +115,8 @@ class Builder:
 
 
 class Document:
-    """A file that was read: its JSON, and the numbers of its accessors.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is not glTF 2.0, or is damaged.
-    """
+    """A file that was read: its JSON, and the numbers of its accessors. FileNotFoundError: there is no such file.
+    ValueError: it is not glTF 2.0, or is damaged."""
 
     def __init__(self, path: str | os.PathLike[str]):
         self.path = Path(path)
@@ -146,10 +142,7 @@ class Document:
 
     def numbers(self, index: object, kind: str, what: str) -> np.ndarray:
         """Return the numbers of an accessor as float32 [n, columns]; integers that are normalised become fractions.
-
-        Raises:
-          ValueError: naming it `what`, if there is none, it is of another kind, or reaches beyond its buffer.
-        """
+        ValueError, naming it `what`: there is none, it is of another kind, or reaches beyond its buffer."""
         accessor = self.entry("accessors", index)
         if accessor.get("type") != kind or accessor.get("componentType") not in COMPONENTS:
             found = f"{accessor.get('type')} of {accessor.get('componentType')}"

@@ -94,11 +94,7 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
 
 def number_in_file(path: str | os.PathLike[str]) -> int:
     """Return the number of Gaussians in a file of `save_model`, without reading more than their means.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is not a model, is damaged, or is of another version.
-    """
+    FileNotFoundError: there is no such file. ValueError: it is not a model, is damaged, or is of another version."""
     means = read_archive(path, format=FORMAT, names=("means",))[1]["means"]
     check_shape(f"{os.fspath(path)}: means", means, ("N", 3))
     return len(means)
@@ -201,11 +197,8 @@ def origin_shapes(num: int) -> dict[str, tuple[int, ...]]:
 
 
 def origin_of(data: Mapping[str, object], arrays: Mapping[str, Any]) -> Origin:
-    """Return the origin of `origin_arrays`, which may be nested lists, with data["names"].
-
-    Raises:
-      ValueError: if a shape or a number is wrong.
-    """
+    """Return the origin of `origin_arrays`, which may be nested lists, with data["names"]. ValueError: a shape or a
+    number is wrong."""
     names, found = data["names"], dict[str, np.ndarray]()
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"origin/names must be texts; got {shortened(names)}")

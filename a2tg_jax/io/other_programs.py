@@ -255,11 +255,8 @@ def matrix_of(similarity: Similarity) -> np.ndarray:
 
 
 def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
-    """Return the similarity that a matrix [4, 4] for columns is.
-
-    Raises:
-      ValueError: naming it `what`, if it mirrors, shears, or scales axes differently.
-    """
+    """Return the similarity that a matrix [4, 4] for columns is. ValueError, naming it `what`: it mirrors, shears, or
+    scales axes differently."""
     scales = np.linalg.norm(matrix[:3, :3], axis=0)
     largest = float(scales.max())
     if not np.isfinite(matrix).all() or not 0 < largest < np.inf:
@@ -364,10 +361,7 @@ def offset_for(kind: Kind, means: np.ndarray, log_scales: np.ndarray) -> np.ndar
 
 def origin_at(offset: np.ndarray) -> Origin | None:
     """Return the origin, without cameras, of a model whose positions are relative to an offset [3]; None for zeros.
-
-    Raises:
-      ValueError: if the offset is not finite or too large.
-    """
+    ValueError: the offset is not finite or too large."""
     if not offset.any():
         return None
     origin = Origin.of_cameras([], transform=dataclasses.replace(UNMOVED, translation=-offset))

@@ -107,11 +107,7 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
 
 
 def import_gaussforge(path: Path) -> Any:
-    """Return the library for a file.
-
-    Raises:
-      ValueError: if it is not installed.
-    """
+    """Return the library for a file. ValueError: it is not installed."""
     try:
         return importlib.import_module("gaussforge")
     except ImportError as error:
@@ -199,11 +195,8 @@ def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
 
 def load_ksplat(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians of any compression level, in the world of the file. Ellipsoids are flattened as in `load_ply`.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is no such file, is cut off, contradicts itself, or holds no splats.
-    """
+    FileNotFoundError: there is no such file. ValueError: it is no such file, is cut off, contradicts itself, or holds
+    no splats."""
     data = existing_bytes(path, "file")
     with reading(path):
         with np.errstate(over="ignore", invalid="ignore"):  # What is not finite is left out.

@@ -52,12 +52,8 @@ COEFFICIENTS = (1, 4, 9, 16, 25)
 
 def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a checkpoint of gsplat, Nerfstudio, 3DGS or 2DGS. Ellipsoids become flat, with a warning.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is not such a checkpoint, is damaged, pickles anything else than tensors, or a number is not
-        finite.
-    """
+    FileNotFoundError: there is no such file. ValueError: it is not such a checkpoint, is damaged, pickles anything else
+    than tensors, or a number is not finite."""
     path = Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such checkpoint")

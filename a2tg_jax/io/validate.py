@@ -46,11 +46,8 @@ def check_suffix(path: str | os.PathLike[str], function: str) -> None:
 
 
 def live_model(path: str | os.PathLike[str], model: Model, function: str) -> Model:
-    """Return the model of existing rows that a function such as "save_gltf" writes to a file.
-
-    Raises:
-      ValueError: if the suffix is another format's, or the value is no model that can be loaded again.
-    """
+    """Return the model of existing rows that a function such as "save_gltf" writes to a file. ValueError: the suffix is
+    another format's, or the value is no model that can be loaded again."""
     check_suffix(path, function)
     check_is_model(model)
     check_gaussians(model.gaussians, "model.gaussians")

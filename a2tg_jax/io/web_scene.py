@@ -54,6 +54,7 @@ def encode_web_scene(
     num_texels = 0 if model.textures is None else int(np.prod(model.textures.sizes, axis=1).sum())
     if max(model.num, num_texels) > MOST_ROWS:
         raise ValueError(f"model has more Gaussians or texels than the {MOST_ROWS:,} that a web scene may hold")
+    # A single tiny splat must not widen the range that all scales share.
     log_scales = np.asarray(model.gaussians.log_scales)
     raised = np.maximum(log_scales, log_scales.max(initial=-np.inf) - SCALE_RANGE)
     model = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, log_scales=raised))
@@ -63,6 +64,7 @@ def encode_web_scene(
         is_test = model.origin.is_test
         candidates = np.flatnonzero(~is_test) if not np.all(is_test) else np.arange(len(is_test))
         page["first"] = int(candidates[central_camera(model.origin.viewmats[candidates])])
+    # Stable, so that the same model gives the same file.
     order = np.argsort(-importance(model), kind="stable")
     return encode_model(model, dataclasses.replace(CHOICES, coder=coder), order=order, page=page)
 
