@@ -75,6 +75,7 @@ def test_long_first_stages_are_checked_once_after_a_fifth(scene):
     assert checks_of(tuple(dataclasses.replace(view, picture=one_colour) for view in scene.train), 20.0)[0] == []
 
 
+@pytest.mark.long
 def test_evaluation_knows_what_a_flat_colour_reaches(scene):
     black, system = frozen(scene, stage1_iterations=1)
     found = a2tg.evaluate(scene.train, a2tg.fit(black, system, progress=False).model)

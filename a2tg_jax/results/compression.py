@@ -91,6 +91,7 @@ def compress(
     print(f"trying {ways}{tunings}; on a CPU this takes minutes", flush=True)
     trials = measure_choices(model, measures, ladder)
     untuned, found = None, TunedFiles([])
+    # Rounding alone may lose too much, which tuning may make up for: only without tuning is that an error.
     try:
         untuned = smallest_within(model, measures, max_loss, trials)
     except TooMuchLostError:

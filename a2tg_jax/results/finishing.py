@@ -91,6 +91,7 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
 def _is_written(run: RunFolder, content: Mapping[str, object]) -> bool:
     """Return whether a process was killed in a folder after the same finishing, as finish.json says, had written its
     model. Otherwise the folder must be free, unless the same finishing was begun there."""
+    # A report is the last file of an evaluation: with one, the folder holds a finished run.
     is_begun = not run.report.is_file() and run.finish.name in run.written() and is_regular(run.finish)
     with contextlib.suppress(ValueError):
         if is_begun and read_json(run.finish) == content:

@@ -84,7 +84,7 @@ class RunForecast:
         if needed.total <= limit:
             return
         largest = max(needed._asdict().items(), key=lambda item: item[1])[0]
-        if largest == "program":
+        if largest == "program":  # No option makes it smaller.
             advice = f"the program itself takes about {in_bytes(needed.program)} of it:"
         else:
             advice = f"change {self._options(largest)}, or"

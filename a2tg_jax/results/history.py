@@ -21,6 +21,7 @@ NAMES = tuple(History.empty().to_dict())
 """Columns of each file; loss terms follow, such as loss_l1."""
 INTEGERS = ("stage", "iteration", "num_gaussians")
 LARGEST = 1e15
+"""Largest number in a history; larger ones would overflow the integers and axes made from them."""
 MOST_BYTES = 1 << 26
 """Largest file; about a million rows."""
 LIBRARY = "tensorboardX"

@@ -117,6 +117,7 @@ def open_source(path: Path, name: str | None = None) -> Source:
         raise ValueError(f"`model` needs a run folder; {path} is not a folder")
     if not path.name.lower().endswith(tuple(FORMATS)):
         raise ValueError(f"{path}: is not a scene to show; give {SHOWN}")
+    # Warnings of the reader are shown in the viewer as well.
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model = load_splats(path)

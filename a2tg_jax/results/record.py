@@ -179,9 +179,10 @@ def read_run_file(path: Path) -> RunRecord:
             raise ValueError(f"{where} {shortened(key)} is an unknown key{did_you_mean(key, KEYS)}")
     if not isinstance(table.get("scene", ""), str):
         raise ValueError(f"{where} scene must be str; got {shortened(table['scene'])}")
-    table.pop("version", None)
+    table.pop("version", None)  # For people: errors name the version that reads the file.
     source = {name: table.pop(key) for key, name in SCENE_KEYS.items() if key in table}
     scene = config_from_dict(SceneSource, source, where)
+    # The options' class depends on system and preset, so they are read last.
     options = table.pop("options", {})
     record = config_from_dict(RunRecord, table, where, given={"scene": scene, "options": A2tg()})
     tables = {"options": options, **{f"compare_options.{key}": value for key, value in record.compare_options.items()}}

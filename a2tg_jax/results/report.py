@@ -191,6 +191,7 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
     titles, rows = summary_table(result, list(result.models))
     names, *columns = zip(titles, *rows, strict=True)
     width = width or shutil.get_terminal_size().columns
+    # Columns go into as many blocks as the width needs; each repeats the names of the rows.
     blocks = [[names]]
     for column in columns:
         if len(blocks[-1]) > 1 and max(map(len, aligned([*blocks[-1], column]))) > width:
@@ -354,6 +355,7 @@ def _best(row: Sequence[str]) -> list[int]:
     is_higher = any(word in row[0] for word in HIGHER_IS_BETTER)
     if not is_higher and not any(word in row[0] for word in LOWER_IS_BETTER):
         return []
+    # Cells are compared as shown: values that round to the same text are equally good.
     values = {at: float(cell.replace(",", "")) for at, cell in enumerate(row[1:], 1) if cell}
     best = max(values.values()) if is_higher else min(values.values())
     found = [at for at, value in values.items() if value == best]

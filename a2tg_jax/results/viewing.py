@@ -64,7 +64,7 @@ class ServedPhotographs:
     @property
     def views(self) -> dict[int, View]:
         """Views by the index of their cameras."""
-        with self._lock:  # The server's threads ask at the same time.
+        with self._lock:  # Several threads of the server may call this at once; a scene is read once.
             return self._found
 
     @functools.cached_property
@@ -241,6 +241,7 @@ def export_web(
             check_new(path, "`web`", overwrite=overwrite)
         with contextlib.suppress(OSError, ValueError, TypeError):  # There may be no page.
             old = {out / photograph_name(int(index)) for index in read_json(out / PHOTOGRAPHS_NAME)}
+    # Nothing is written before all files were checked and all contents made.
     for path, content in files.items():
         with replacing(path) as temporary:
             temporary.write_bytes(content)
