@@ -122,36 +122,30 @@ def bytewise_run(tmp_path):
     return run
 
 
-def with_lines(run, **lines):
-    """Other values in run.toml, by the key that their line begins with."""
-    text = run.record.read_text()
-    for key, value in lines.items():
-        found = [line for line in text.splitlines() if line.startswith(f"{key} = ")]
-        text = text.replace(found[0], f"{key} = {value}", 1) if found else f"{key} = {value}\n{text}"
-    run.record.write_text(text)
-
-
 @pytest.mark.parametrize(
-    ("lines", "message"),
+    ("key", "value", "message"),
     [
-        ({"base_degree": 7}, "base_degree must be"),
-        ({"base_degree": -9}, "base_degree must be"),
-        ({"base_degree": 2**63}, "base_degree must be"),
-        ({"stage1_iterations": 0}, "at least 1 iteration"),
-        ({"stage1_iterations": -5}, "must"),
-        ({"stage1_iterations": 2**63}, "fewer than 2.31"),
-        ({"seed": -1}, "seed must be"),
-        ({"cap": 0}, "densify.cap must"),
-        ({"memory_budget": "1e-300"}, "memory_budget"),
-        ({"compare": json.dumps(["a" * 5000])}, "there is no system"),
-        ({"compare": '["bytewise"]'}, "two systems of the run"),
-        ({"compare": '[":"]'}, "there is no system|cannot be imported"),
-        ({"system": json.dumps("x:" + "y" * 5000)}, "cannot be imported"),
+        ("base_degree", 7, "base_degree must be"),
+        ("base_degree", -9, "base_degree must be"),
+        ("base_degree", 2**63, "base_degree must be"),
+        ("stage1_iterations", 0, "at least 1 iteration"),
+        ("stage1_iterations", -5, "must"),
+        ("stage1_iterations", 2**63, "fewer than 2.31"),
+        ("seed", -1, "seed must be"),
+        ("cap", 0, "densify.cap must"),
+        ("memory_budget", "1e-300", "memory_budget"),
+        ("compare", json.dumps(["a" * 5000]), "there is no system"),
+        ("compare", '["bytewise"]', "two systems of the run"),
+        ("compare", '[":"]', "there is no system|cannot be imported"),
+        ("system", json.dumps("x:" + "y" * 5000), "cannot be imported"),
     ],
 )
-def test_every_command_refuses_options_out_of_range_in_one_line(bytewise_run, capsys, monkeypatch, lines, message):
+def test_every_command_refuses_options_out_of_range_in_one_line(bytewise_run, capsys, monkeypatch, key, value, message):
     run = bytewise_run
-    with_lines(run, **lines)
+    text = run.record.read_text()
+    found = [line for line in text.splitlines() if line.startswith(f"{key} = ")]
+    text = text.replace(found[0], f"{key} = {value}", 1) if found else f"{key} = {value}\n{text}"
+    run.record.write_text(text)
     with pytest.raises(ValueError, match=message):
         read_record(open_run(run.path))
     monkeypatch.setattr(cli, "configure_cpu", lambda: None)

@@ -55,52 +55,42 @@ def test_training_calls_its_session_after_compiling(monkeypatch):
     assert dropped[:2] == [1, 0]
 
 
+USED = "job/memory.max=900000; job/memory.current=600000"
 GROUPS = {
-    "none": ("", {}, 1000),
-    "version 2": ("0::/job", {"job/memory.max": "900000", "job/memory.current": "600000"}, 100 + 293),
+    "none": ("", "", 1000),
+    "version 2": ("0::/job", USED, 100 + 293),
     "version 2, what can be read again is free": (
-        "0::/job",
-        {
-            "job/memory.max": "900000",
-            "job/memory.current": "600000",
-            "job/memory.stat": "anon 7\ninactive_file 102400",
-        },
-        100 + 293 + 100,
+        "0::/job", f"{USED}; job/memory.stat=anon 7\ninactive_file 102400", 100 + 293 + 100,
     ),
     "version 2, the group around it": (
         "0::/user/job",
-        {
-            "user/memory.max": "512000",
-            "user/memory.current": "307200",
-            "user/job/memory.max": "max",
-            "user/job/memory.current": "307200",
-        },
+        "user/memory.max=512000; user/memory.current=307200; user/job/memory.max=max; user/job/memory.current=307200",
         100 + 200,
     ),
     "version 1": (
         "4:memory:/job\n3:cpu:/",
-        {"memory/job/memory.limit_in_bytes": "409600", "memory/job/memory.usage_in_bytes": "307200"},
-        100 + 100,
+        "memory/job/memory.limit_in_bytes=409600; memory/job/memory.usage_in_bytes=307200", 100 + 100,
     ),
     "a limit beyond the machine's": (
         "4:memory:/job",
-        {"memory/job/memory.limit_in_bytes": str(2**63 - 4096), "memory/job/memory.usage_in_bytes": "0"},
-        1000,
+        f"memory/job/memory.limit_in_bytes={2**63 - 4096}; memory/job/memory.usage_in_bytes=0", 1000,
     ),
-    "over its limit": ("0::/", {"memory.max": "1024", "memory.current": "102400"}, 100),
-}
+    "over its limit": ("0::/", "memory.max=1024; memory.current=102400", 100),
+}  # fmt: skip
+"""Groups of a process, files of their limits, and the kilobytes that it may have."""
 
 
 @pytest.mark.parametrize("name", GROUPS)
 def test_memory_that_a_process_may_have(tmp_path, monkeypatch, name):
-    groups, files, kilobytes = GROUPS[name]
+    groups, limits, kilobytes = GROUPS[name]
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=900 * 1024))
     process = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=100 * 1024))
     monkeypatch.setattr(psutil, "Process", lambda: process)
-    files = {f"sys/fs/cgroup/{path}": text for path, text in files.items()}
-    for path in [path for path in files if path.endswith(("max", "limit_in_bytes"))]:
-        files.setdefault(path.rpartition("/")[0] + "/memory.stat", "anon 0")
-    for path, text in {**files, "proc/self/cgroup": groups}.items():
+    files = {"proc/self/cgroup": groups}
+    for path, _, text in (line.partition("=") for line in limits.split("; ") if line):
+        files[f"sys/fs/cgroup/{path}"] = text
+        files.setdefault(f"sys/fs/cgroup/{path}".rpartition("/")[0] + "/memory.stat", "anon 0")
+    for path, text in files.items():
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text(text + "\n")
     assert abs(memory_limit(tmp_path) / 1024 - kilobytes) < 1
