@@ -51,11 +51,11 @@ def compress(
 
     Args:
       source: a run folder, whose last model is taken; or a model, *.npz.
-      out: the file, *.a2tgz; None: next to the model.
+      out: the file, *.a2tgz; None: next to the model. Files that this function did not write into the run's folder are
+        replaced only with `overwrite`.
       max_loss: largest loss in dB.
       tune_iterations: iterations of training with rounding for each choice of bits that is tuned
         (`finish.tuning.smallest_tuned`); 0: the model's numbers are only rounded.
-      overwrite: whether to replace an existing file that this function did not write into the run's folder.
 
     Raises:
       ValueError, OSError: if the model or the photographs for tuning are missing, the file exists, a compact file
@@ -127,11 +127,7 @@ def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: 
 
 
 def _smaller(model: Model, untuned: Trial | None, found: TunedFiles, max_loss: float) -> tuple[Trial, bytes]:
-    """Return the smaller of two files, the one without tuning and the tuned one, either of which may be missing.
-
-    Raises:
-      TooMuchLostError: if both are missing.
-    """
+    """Return the smaller of the file without tuning and the tuned one. Raises TooMuchLostError if both are missing."""
     tuned = found.chosen
     if found.tuned is not None and tuned is not None and (untuned is None or tuned.num_bytes < untuned.num_bytes):
         return tuned, found.tuned.data

@@ -49,19 +49,9 @@ def convert(
     float64: bool = False,
     overwrite: bool = False,
 ) -> str:
-    """Write a model in the format of another suffix, and return a summary.
-
-    Args:
-      source: a run folder or a file of any known format.
-      out: the file.
-      name: which model of a run; None: the last of its main system.
-      baking: how textured splats become plain ones; None: they are not baked.
-      float64: write the positions of a PLY as float64, as `save_ply` does.
-      overwrite: whether an existing file is replaced.
-
-    Raises:
-      ValueError, OSError: if a format is unknown, or the source cannot be read or the file not be written.
-    """
+    """Write a run's model `name`, or a file of any known format, in the format of another suffix, and return a summary.
+    `baking` is how textured splats become plain ones (None: they do not), `float64` as in `save_ply`. Raises ValueError
+    or OSError if a format is unknown, or the source cannot be read or the file not be written."""
     writer_of(out)  # Baking takes minutes.
     if float64 and format_of(out).save is not save_ply:
         raise ValueError(f"`float64` needs an OUT that ends in .ply and is not packed; got {out}")

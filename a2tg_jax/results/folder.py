@@ -223,11 +223,8 @@ def claimed(run: RunFolder) -> Iterator[None]:
     """Keep other processes from training and measuring in a run folder, which is made if it does not exist.
 
     The lock is the operating system's, on the marker, and ends with the process. Some file systems have no locks.
-    Partial files of a killed process are removed, and a run that it was about to replace is put back.
-
-    Raises:
-      FileExistsError: if another process has claimed it.
-      ValueError: if the marker is not this program's.
+    Partial files of a killed process are removed, and a run that it was about to replace is put back. Raises
+    FileExistsError if another process has claimed it, and ValueError if the marker is not this program's.
     """
     run.written()
     run.path.mkdir(parents=True, exist_ok=True)
@@ -346,12 +343,8 @@ def check_apart(out: Path, other: Path) -> None:
 
 
 def check_new(path: Path, option: str, *, overwrite: bool) -> None:
-    """Raise if a file must not be replaced, naming it and the option that it comes from.
-
-    Raises:
-      FileExistsError: if it exists, and `overwrite` is not set.
-      ValueError: if a run, and no export, wrote it into its folder.
-    """
+    """Raise if a file must not be replaced, naming it and the option that it comes from: FileExistsError if it exists
+    and `overwrite` is not set, ValueError if a run, and no export, wrote it into its folder."""
     if not path.is_file():
         return
     run = _run_that_wrote(path)

@@ -121,14 +121,8 @@ class RunForecast:
 
 
 def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_devices: int = 1) -> RunForecast:
-    """Return a forecast of the bytes that a run will take (host; nothing is compiled).
-
-    Args:
-      scene: the run's scene.
-      plan: its stages.
-      num_given: number of Gaussians of the file that replaces the main system's first stage; None without one.
-      num_devices: number of devices that train together; memory is the sum over all of them.
-    """
+    """Return a forecast of the bytes that a run will take (host; nothing is compiled). `num_given` is the number of
+    Gaussians of the file that replaces the main system's first stage; memory is the sum over all devices."""
     is_host = default_platform() == "cpu"
     stages: dict[str, StageForecast] = {}
     for chain in plan.chains.values():
@@ -166,16 +160,9 @@ def print_forecast(
     scene: Scene, record: RunRecord, max_memory: int | None, num_devices: int = 1, num_given: int | None = None,
     out: Path | None = None,
 ) -> None:  # fmt: skip
-    """Print the forecast of a run. Arguments as in `forecast_run`, and:
-
-    Args:
-      record: its systems.
-      max_memory: bytes that the run may use; None: what the machine has available.
-      out: folder of a new run, whose disk must have room for it; None for a resumed run.
-
-    Raises:
-      ValueError: if the run cannot fit, naming the options to change.
-    """
+    """Print the forecast of a run, for at most `max_memory` bytes (None: what the machine has available). `out` is the
+    folder of a new run, whose disk must have room for it; None for a resumed run. Raises ValueError if the run cannot
+    fit, naming the options to change. Other arguments as in `forecast_run`."""
     found, limit = forecast_run(scene, record.plan, num_given, num_devices), allowed_memory(max_memory, num_devices)
     found.check_memory(limit)
     if num_devices > 1:

@@ -102,17 +102,14 @@ def render_frames(
 ) -> list[Path]:
     """Write one PNG per frame and return their paths. The photographs are not needed.
 
+    The folder gets frame_0000.png … of a path, or NAME.png of the test views. Files of earlier renders are replaced,
+    and frames of a longer path deleted; other files only with `overwrite`.
+
     Args:
-      run: the run folder.
-      out: folder for the frames, made if absent: frame_0000.png … of a path, NAME.png of test views. Files of earlier
-        renders are replaced, and frames of a longer path deleted.
       route: the test views, a smooth path past all cameras, an orbit around the subject, or a path through the views of
         a file that the viewer saved.
-      num_frames: length of the path.
       name: model to render; None: the last one of the run's main system.
       size: width and height of the frames, to which views of another aspect are cropped; None: the cameras' sizes.
-      supersample: factor by which frames are drawn larger and averaged (`RenderSettings.supersample`).
-      overwrite: whether to replace files that no render wrote.
 
     Raises:
       ValueError, OSError: if that stage is not finished, there are no such views or path, or a file is in the way.

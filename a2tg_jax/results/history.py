@@ -35,13 +35,8 @@ def write_history(path: Path, history: History) -> None:
 
 
 def read_history(path: Path) -> History:
-    """Return the history in a file.
-
-    Raises:
-      FileNotFoundError: if there is none.
-      ValueError: naming the file, if it has other columns, or values that are not numbers. Only PSNR may be infinite,
-        and only loss terms NaN.
-    """
+    """Return the history in a file. Raises FileNotFoundError if there is none, and ValueError, naming the file, if it
+    has other columns, or values that are not numbers. Only PSNR may be infinite, and only loss terms NaN."""
     if not is_regular(path):
         raise FileNotFoundError(f"{path} is missing: put it back, or train the stage again")
     with io.TextIOWrapper(open_regular(path, MOST_BYTES), encoding="utf-8", newline="") as file:

@@ -88,16 +88,9 @@ def finished_stage(run: RunFolder, name: str | None = None) -> tuple[RunRecord, 
 
 
 def open_source(path: Path, name: str | None = None) -> Source:
-    """Open a run folder or a file.
-
-    Args:
-      path: a run folder, or a file of any format that `load_splats` reads.
-      name: model of a run, by the name that `a2tg info` prints; None: the last one of its main system.
-
-    Raises:
-      FileNotFoundError: if there is no such file, or the run's stage is not finished.
-      ValueError: if it cannot be read.
-    """
+    """Open a run folder or a file of any format that `load_splats` reads. `name` is a model of a run, as `a2tg info`
+    prints it; None: the last one of its main system. Raises FileNotFoundError if there is no such file, or the run's
+    stage is not finished, and ValueError if it cannot be read."""
     if path.is_dir():
         run = _run_at(path)
         record, planned = finished_stage(run, name)
@@ -152,14 +145,9 @@ def _run_at(folder: Path) -> RunFolder:
 def check_init(file: Path, out: Path, system: System) -> Model:
     """Return the splats of a file that can replace the first stage of a run, with a warning about what is left out.
 
-    Args:
-      file: of any format that `load_splats` reads; plain splats in the original world of the photographs, or a model.
-      out: the run folder.
-      system: the system that continues with them.
-
-    Raises:
-      ValueError: if there is no such file, the folder holds a run, or the splats exceed the system's memory budget.
-    """
+    The file is of any format that `load_splats` reads: plain splats in the original world of the photographs, or a
+    model. Raises ValueError if there is no such file, the folder holds a run, or the splats exceed the system's memory
+    budget."""
     if not is_regular(file):
         raise ValueError(f"init: there is no file {file}")
     format_of(file)

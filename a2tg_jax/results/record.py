@@ -161,12 +161,9 @@ def scene_place(scene: str, folder: Path = Path()) -> str:
 
 
 def read_run_file(path: Path) -> RunRecord:
-    """Read a configuration file, in which the scene may be missing. Relative paths in it start from its folder.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: naming file and key, if it is no TOML, or a key is unknown or of another type.
-    """
+    """Read a configuration file, in which the scene may be missing. Relative paths in it start from its folder. Raises
+    FileNotFoundError if there is no such file, and ValueError, naming file and key, if it is no TOML, or a key is
+    unknown or of another type."""
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such configuration file")
     data, where = read_regular(path, MOST_TOML_BYTES), f"{path}:"
@@ -230,11 +227,8 @@ def _without_none(table: dict[str, object], start: dict[str, Any]) -> dict[str, 
 
 
 def read_record(run: RunFolder) -> RunRecord:
-    """Read run.toml. The module of a custom system is imported.
-
-    Raises:
-      ValueError: if it is damaged or of another version, its system is not found, or an option is invalid.
-    """
+    """Read run.toml. The module of a custom system is imported. Raises ValueError if it is damaged or of another
+    version, its system is not found, or an option is invalid."""
     try:
         record = read_run_file(run.record)
         if not record.scene.path:

@@ -51,11 +51,9 @@ class ModelResult:
     num_texels: int
     """Number of texels; 0 without textures."""
     num_bytes: int
-    """Bytes of the trained floats without padding: `Model.num_bytes`."""
     num_published_bytes: int
-    """Bytes as the method's authors count them: `Model.num_published_bytes`."""
     num_padding_bytes: int
-    """Bytes of padding in the buffers."""
+    """Bytes as in `Model`."""
     seconds: float
     """Training time of this stage."""
     sha256: str = ""

@@ -53,14 +53,8 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     """Measure the finished models of a run, and write the run folder's metrics, pictures and report. A replaced run is
     deleted once all stages are trained.
 
-    Args:
-      run: an opened run folder with at least one finished stage.
-      scene: its scene, if it is loaded already.
-      lpips_weights: weights file for LPIPS; None keeps earlier values of the same models.
-
-    Raises:
-      FileNotFoundError: as `finished_stages` does, or if the scene or the weights are missing.
-      ValueError: if a model was trained on views that the scene holds out.
+    Without `lpips_weights`, a weights file, earlier values of the same models are kept. Raises FileNotFoundError as
+    `finished_stages`, or if the scene or the weights are missing, and ValueError as `check_held_out`.
     """
     record = read_record(run)
     plan = record.plan

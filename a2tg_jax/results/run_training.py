@@ -189,9 +189,8 @@ def how_to_go_on(run: RunFolder, devices: Devices | None = None) -> str:
 def train_run(
     run: RunFolder, scene: Scene, options: RunOptions, *, is_stopped: IsStopped = never, watch: Watch = unwatched
 ) -> None:
-    """Train every stage of the run's record that is not finished yet, from its newest checkpoint.
-
-    When a stage ends, its history and its model are written, and its checkpoints deleted.
+    """Train every stage of the run's record that is not finished yet, from its newest checkpoint. When a stage ends,
+    its history and its model are written, and its checkpoints deleted.
 
     Raises:
       ValueError: as `fit` does, or if a checkpoint or model is damaged, of another version, or made with other options
@@ -366,12 +365,8 @@ def _send_stage(name: str | None, files: Sequence[Path | None] = (), num_restore
 
 
 def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> None:
-    """Train what the first process sends until its end.
-
-    Raises:
-      ValueError: as `fit_stage` does.
-      Stopped: if a signal ends one of the processes.
-    """
+    """Train what the first process sends until its end. Raises ValueError as `fit_stage`, and Stopped if a signal ends
+    one of the processes."""
     check_alike(record, scene, session)
     plan = record.plan
 

@@ -50,14 +50,10 @@ MOST_VIEWS = 8
 
 
 class ServedPhotographs:
-    """Photographs of a model's cameras, served as JPEG and read on demand."""
+    """Photographs of a model's cameras, served as JPEG and read on demand; RGB `background` is behind transparent
+    ones."""
 
     def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None], background: Color = BLACK):
-        """Args:
-        origin: the cameras; None without cameras.
-        load_scene: loader of the photographs; None if there are none.
-        background: RGB behind transparent photographs.
-        """
         self._names, self._background = () if origin is None else origin.names, background
         self._load_scene, self._lock = load_scene, threading.Lock()
 
@@ -102,14 +98,9 @@ def routes_of(source: Source) -> dict[str, Route]:
 
 
 class LiveView:
-    """View of a training, called between its steps (`training.loop.Watch`)."""
+    """View of a training, called between its steps (`training.loop.Watch`); `now` is a clock in seconds."""
 
     def __init__(self, scene: Scene, title: str, now: Callable[[], float] = time.perf_counter):
-        """Args:
-        scene: the training's scene.
-        title: title of the page.
-        now: clock in seconds.
-        """
         self._scene, self._title, self._now = scene, title, now
         self._due = self._noted = -np.inf
         self._paused, self._lock = threading.Event(), threading.Lock()
@@ -209,15 +200,11 @@ def check_page(out: Path, *, single_file: bool, photographs: bool, overwrite: bo
 def export_web(
     source: Source, out: Path, *, single_file: bool = False, photographs: bool = False, overwrite: bool = False
 ) -> str:
-    """Write a page that shows a model: a folder for any web server, or one file that opens from the disk. Return a
-    summary of the files, their size and the loss of the scene file.
+    """Write a page that shows a model, and return a summary of its files, their size and the loss of the scene file.
 
-    Args:
-      source: the model.
-      out: the folder, which is made if needed; or one file, if its name ends in .html and no such folder exists.
-      single_file: write one file, whatever its name.
-      photographs: add the cameras' photographs to the folder.
-      overwrite: whether to replace existing files. Photographs of an earlier page that this one lacks are deleted.
+    The page is a folder for any web server, or one file that opens from the disk: with `single_file`, or if its name
+    ends in .html and no such folder exists. `photographs` adds the cameras' photographs to the folder; with
+    `overwrite`, photographs of an earlier page that this one lacks are deleted.
 
     Raises:
       FileExistsError: if a file exists, or is in the place of a folder or the reverse.
