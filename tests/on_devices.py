@@ -256,11 +256,9 @@ def fit(own, count, **options):
 def batches(folder):
     """Views that are drawn at once, each by its share of the devices, have the gradients of one device."""
     own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True, loss={"points_weight": 0.1})
-    for index, size, num_at_once, is_streamed in ((1, 4, 4, False), (0, 6, 2, True)):
-        with same_attempts(scene(), dataclasses.replace(own, batch_size=size), index, is_streamed) as (run, arguments):
-            assert arguments[0].render.exchange.views_at_once == num_at_once
-            if is_streamed:
-                check_parts(arguments[4].images, [run.views[place].image for place in run.order.indices(1)])
+    with same_attempts(scene(), dataclasses.replace(own, batch_size=6), 1, True) as (run, arguments):
+        assert arguments[0].render.exchange.views_at_once == 2
+        check_parts(arguments[4].images, [run.views[place].image for place in run.order.indices(1)])
 
 
 @contextlib.contextmanager
@@ -287,13 +285,11 @@ def lenses(folder):
         return jnp.mean(output.color**2) + consistency + jnp.mean(output.distortion)
 
     same_gradients(loss, textured(), camera, exchange, "native")
-    same_gradients(loss, plain(), camera, exchange, "xla")
-    base = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True)
-    for size, is_streamed in ((2, True), (4, False)):
-        with same_attempts(found, dataclasses.replace(base, batch_size=size), 0, is_streamed) as (_, arguments):
-            rays = arguments[4].rays
-            assert len(rays.sharding.device_set) == 4 and rays.is_fully_replicated
-            assert arguments[0].render.exchange.views_at_once == size
+    own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True, batch_size=4)
+    with same_attempts(found, own, 0, False) as (_, arguments):
+        rays = arguments[4].rays
+        assert len(rays.sharding.device_set) == 4 and rays.is_fully_replicated
+        assert arguments[0].render.exchange.views_at_once == 4
 
 
 def attempted(arguments):
@@ -346,8 +342,8 @@ def pruned_and_detailed():
     """A system whose stages prune, raise degrees and let textures grow."""
     return system(
         a2tg.Bytewise, densify={"cap": 120}, stage1_iterations=20, stage2_iterations=20,
-        prune={"share": 0.3, "at": (0.2,)}, floaters={"min_views": 3, "at": (0.4,)},
-        view_dependence_share=0.2, view_dependence={"at": (0.2,)}, texture_share=0.2, details={"at": (0.4,)},
+        prune={"share": 0.3, "at": (0.2,)}, floaters={"min_views": 3, "at": (0.2,)},
+        view_dependence_share=0.2, view_dependence={"at": (0.2,)}, texture_share=0.2, details={"at": (0.2,)},
     )  # fmt: skip
 
 
@@ -365,7 +361,7 @@ def events_change_the_same(session):
         alone, together = (
             StageRun(scene(), own, index, initial_model(scene(), own), session=each) for each in (None, session)
         )
-        done = 0
+        before, done = together.model, 0
         for due in sorted(set(together._due_on_host())):
             while done < due:
                 done += len(together.steps(done + 1, due))
@@ -376,15 +372,14 @@ def events_change_the_same(session):
             same_bits(alone.state, readable(together.state))
             same_bits(alone.model, together.model)
             assert_spread(together.state)
-            events = [e for e in together.stage.events if isinstance(e, HostEvent) and due in e.iterations(20)]
-            happened += [(type(each).__name__, together.model.num, together.model.num_bytes) for each in events]
+            on_host_now = (e for e in together.stage.events if isinstance(e, HostEvent) and due in e.iterations(20))
+            happened += [type(event).__name__ for event in on_host_now]
+        assert together.model.num < before.num, "rows were pruned"
         alone.photographs.close()
         together.photographs.close()
-    assert [name for name, *_ in happened] == HAPPENED, happened
-    assert len({(num, num_bytes) for _, num, num_bytes in happened}) > 3, happened
-
-
-HAPPENED = ["Prune", "PruneFloaters", "Prune", "AdaptDegrees", "Upscale"]
+    assert happened == ["Prune", "PruneFloaters", "Prune", "AdaptDegrees", "Upscale"]
+    found = readable(together.model.appearance)
+    assert found.textures.sizes.max() > 1 and found.coefficients.sizes.max() > 0, "textures and degrees have grown"
 
 
 @contextlib.contextmanager
