@@ -96,8 +96,9 @@ def textures_from_arrays(arrays: Sequence[ArrayLike]) -> Textures:
             raise ValueError(f"texture {index} must be [Tv, Tu, 4]; got {array.shape}")
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(f"texture {index} must be floats; got {array.dtype}")
-    checked_sizes(np.array([array.shape[:2] for array in given], np.int64).reshape(-1, 2))
-    return Textures.of_blocks(given)
+    sizes = checked_sizes(np.array([array.shape[:2] for array in given], np.int64).reshape(-1, 2))
+    empty = np.zeros((0, 4), given[0].dtype if given else np.float32)
+    return Textures.of_flat(sizes, np.concatenate([empty, *(array.reshape(-1, 4) for array in given)]))
 
 
 def texture_arrays(textures: Textures) -> list[np.ndarray]:

@@ -55,7 +55,6 @@ Factor = Array | None
 # stores textures, `core.bilinear` interpolates them. The renderer gets all of them one after the other as texels
 # [T, 4], each row by row.
 
-
 EXTENT = 3.0
 """Half the side of a texture, in standard deviations."""
 
@@ -223,7 +222,6 @@ def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
 #
 # which is 1 at the centre and 1/e at ρ = 2 for every β, as a Gaussian's is. δ keeps the slope at the centre finite.
 
-
 OFFSET = 0.02
 """δ, in squared standard deviations."""
 LARGEST_LOG_EXPONENT = 1.0
@@ -297,7 +295,6 @@ def reach_of(curve: Curve, bound: Array) -> Array:
 # Spherical harmonics with a degree per Gaussian, beyond the degree that all Gaussians have. Band l holds the 2l + 1
 # coefficients of degree l. All Gaussians have the bands of `Gaussians.sh`. One of a higher degree has a block of all
 # bands between in a `core.table.Table`; one without takes no bytes there.
-
 
 MAX_DEGREE = 3
 
@@ -418,7 +415,6 @@ def bands_of_dense(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> 
 # The Gaussian nearest to a kernel, for files that have Gaussians only. Of all Gaussians a·exp(−ρ/2k) it has the least
 # squared difference from the kernel over the plane: for a given k, the best a is ⟨f, g⟩/⟨g, g⟩ with g = exp(−ρ/2k) and
 # ⟨g, g⟩ = k, and the best k maximises ⟨f, g⟩²/k. Both are tabulated over the logarithm of the exponent.
-
 
 LEAST_OPACITY = 1e-6
 NUM_SHAPES, NUM_SCALES, NUM_PLACES = 41, 121, 2001

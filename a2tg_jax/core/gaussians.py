@@ -255,7 +255,6 @@ def no_rows(num: int, num_coefficients: int, dtype: DTypeLike = jnp.float32) -> 
 
 # Coincident copies that together look like one Gaussian (3DGS-MCMC, Kheradmand et al., 2024, relocation)
 
-
 DEAD_OPACITY = 0.005
 MAX_SHARES = 51
 LARGEST_OPACITY = 1 - 2**-23

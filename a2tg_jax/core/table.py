@@ -118,13 +118,6 @@ class Table:
         ids = [np.flatnonzero(bucket == index) for index in range(len(self.buckets))]
         return [(own, on_host(blocks)[row[own]]) for own, blocks in zip(ids, self.buckets, strict=True)]
 
-    @classmethod
-    def of_blocks(cls, blocks: Sequence[np.ndarray]) -> Self:
-        """Return the table of N arrays [T₁, …, C] of one dtype; the inverse of `blocks` (host)."""
-        sizes = np.array([block.shape[:-1] for block in blocks], np.int64).reshape(-1, cls.num_sides)
-        empty = np.zeros((0, len(cls.padding)), blocks[0].dtype if blocks else np.float32)
-        return cls.of_flat(sizes, np.concatenate([empty, *(block.reshape(-1, block.shape[-1]) for block in blocks)]))
-
     def blocks(self) -> list[np.ndarray]:
         """Return the N blocks as NumPy arrays [T₁, …, C], in the order of the Gaussians (host)."""
         found = {
@@ -245,7 +238,6 @@ def is_table(leaf: object) -> bool:
 
 # Places
 
-
 _Ends = tuple[np.ndarray, np.ndarray]
 """Buckets and rows of blocks that move."""
 
@@ -281,6 +273,7 @@ def plan_places(
     # Codes of sizes ascend as the sizes do.
     weights = 64 ** np.arange(sizes.shape[1])[::-1]
     codes, bucket, counts = np.unique(sizes @ weights, return_inverse=True, return_counts=True)
+    # Stable: rows of a bucket are in the order of the Gaussians, so that equal sizes lead to equal places.
     order = np.argsort(bucket, kind="stable")
     starts = np.repeat(np.cumsum(counts) - counts, counts)
     row = np.empty(len(sizes), np.int32)

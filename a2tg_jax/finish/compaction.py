@@ -213,6 +213,7 @@ def _descent(by_group: Mapping[str, Sequence[Trial]], max_loss: float) -> list[d
     """Return the precisions after each step down, given the groups' trials from small to large."""
     at = {group: own[-1] for group, own in by_group.items()}
     path: list[dict[str, Precision]] = []
+    # Greedy, as for a knapsack: bytes saved per loss. A step may skip precisions that save little.
     while True:
         predicted = sum(max(trial.losses[0], 0.0) for trial in at.values())
         steps = [

@@ -112,12 +112,8 @@ def _cheapest(model: Model, step: Step, is_allowed: Callable[[Model], bool]) -> 
 
 
 def halve_textures(model: Model, weights: Textures) -> Step:
-    """Return all textures halved along the cheaper even side, and single texels merged (host).
-
-    Args:
-      model: with textures.
-      weights: h of every texel, in the layout of the model.
-    """
+    """Return all textures halved along the cheaper even side, and single texels merged, given h of every texel in the
+    layout of the model (host)."""
     assert model.textures is not None
     textures, gaussians = model.textures, model.gaussians
     halved: list[Group] = []
@@ -186,13 +182,8 @@ def texel_weights(model: Model, cameras: Sequence[Camera], background: ArrayLike
 def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Group]:
     """Return textures that have `most` texels at most in all, at least one each, a table for each size (host).
 
-    Each texture has a row of halvings down to one texel. Of all rows together, those are taken that change least per
-    texel saved.
-
-    Args:
-      textures: of N Gaussians; empty ones become a neutral texel.
-      weights: the visibility of each texel, as `texel_weights` gives it.
-      most: at least N.
+    Each texture has a row of halvings down to one texel; the halvings of all rows that change least per texel saved are
+    taken. Empty textures become a neutral texel. Weights are as `texel_weights` returns them.
     """
     start: list[Group] = []
     for (ids, texels), (_, squares) in zip(textures.groups(), weights.groups(), strict=True):
@@ -216,7 +207,7 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Grou
                 steps.append((chosen, np.full(len(chosen), number), least[chosen], np.full(len(chosen), saved)))
         tables, number = _merged(smaller), number + 1
     ids, numbers, costs, saved_texels = (np.concatenate(parts) for parts in zip(*steps, strict=True))
-    order = np.lexsort((numbers, costs))
+    order = np.lexsort((numbers, costs))  # By cost, and steps of one texture in their order.
     excess = sum(texels[..., 0].size for _, texels in start) - most
     count = int(np.searchsorted(np.cumsum(saved_texels[order]), excess)) + 1 if excess > 0 else 0
     rounds, tables = np.bincount(ids[order[:count]], minlength=textures.num), start

@@ -322,12 +322,8 @@ def smallest_tuned(
     Each tuning starts from the one before, so that what was too much once may be tried again. The search ends early if
     a tuning diverges or even the finest choices lose more, and keeps what was found before.
 
-    Args:
-      model: the model.
-      losses: measures of loss.
-      max_loss: in dB, by the first measure, of the tuned model's file against `model`.
-      trials: results of `measure_choices`, such as with `TUNED_LADDER`.
-      tune: tunes a model for choices.
+    Losses are in dB, by the first measure, of the tuned model's file against `model`. Trials are results of
+    `measure_choices`, such as with `TUNED_LADDER`.
     """
     found, latest = TunedFiles([]), model
     tolerance, factor = max(FIRST_TOLERANCE, 2 * max_loss), 2.0

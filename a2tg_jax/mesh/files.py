@@ -115,12 +115,10 @@ def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
 
 
 def _save_glb(path: Path, mesh: Mesh, transform: Similarity | None) -> None:
-    """Write a GLB file of a mesh, unlit.
-
-    With a transform, the node leads to the upright world that `save_gltf` places splats in, and its extras have the
-    transform if the original world is far from there. Without, positions far from the origin are relative to the
-    translation of the node.
-    """
+    """Write a GLB file of a mesh, unlit."""
+    # With a transform, the node leads to the upright world that `save_gltf` places splats in, and its extras have the
+    # transform if the original world is far from there. Without, positions far from the origin are relative to the
+    # translation of the node.
     builder = Builder()
     node: dict[str, Any] = {"name": "mesh", "mesh": 0}
     middle = _middle(mesh.vertices) if transform is None else np.zeros(3)

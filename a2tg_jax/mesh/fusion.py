@@ -134,6 +134,7 @@ class BlockGrid:
         if num + len(new) > self.capacity:
             raise GridFullError(f"there is room for no more than {self.capacity:,} blocks of voxels")
         self._rows |= zip(new, range(num, num + len(new)), strict=True)
+        # A key holds three coordinates of 21 bits, shifted to be positive (`_keys_of`).
         made = [(np.asarray(new, np.int64) >> shift & (2 * LIMIT - 1)) - LIMIT for shift in (42, 21, 0)]
         self.coordinates = np.concatenate([self.coordinates, np.stack(made, axis=-1).astype(np.int32)])
         return np.asarray([self._rows[key] for key in keys.tolist()], np.int64)

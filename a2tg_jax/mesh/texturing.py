@@ -188,6 +188,7 @@ def _candidates(points: np.ndarray, width: int, height: int) -> Iterator[tuple[n
     low, span = low[order].astype(np.int64), (high[order] - low[order] + 1).astype(np.int64)
     areas = span.prod(axis=1)
     ends = np.cumsum(areas)
+    # Chunks of whole faces, so that arrays stay bounded however large the faces are drawn.
     start = done = 0
     while start < len(order):
         end = max(start + 1, int(np.searchsorted(ends, done + CHUNK, side="right")))

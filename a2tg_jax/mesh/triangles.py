@@ -78,13 +78,8 @@ class Mesh:
 
 
 def largest_clusters(mesh: Mesh, most: int, least_faces: int) -> tuple[Mesh, int]:
-    """Return the mesh of its largest connected parts, and the number of parts that are left out.
-
-    Args:
-      mesh: a mesh.
-      most: largest number of parts to keep.
-      least_faces: smallest number of faces of a part.
-    """
+    """Return the mesh of its largest connected parts, at most `most` of at least `least_faces` faces each, and the
+    number of parts that are left out."""
     if not mesh.num_faces:
         return mesh, 0
     a, b, c = mesh.faces.T

@@ -141,6 +141,7 @@ class ImageBands(NamedTuple):
         """Yield what devices send, to others and to themselves, so that each has its rows of an even cut."""
         height = self.even_height
         yield Hop(0, 0, height)  # To itself.
+        # A border that moves by more than the height of a share uncovers rows of bands further away.
         for number in range(1, self.num):
             below, above = (min(height, room - (number - 1) * height) for room in (self.room.below, self.room.above))
             if below > 0:
@@ -340,7 +341,6 @@ def _shifted(M: Array, top: Array) -> Array:
 # (`of_own_view`). Derivatives are taken around the `jax.vmap`, since views that share their devices are drawn, and
 # differentiated, together.
 
-
 VIEWS_AXIS = "views_at_once"
 """Axis of `jax.vmap` along which the views are that are drawn at once."""
 
@@ -405,7 +405,6 @@ def _all(size: int, is_batched: object, views: object, index: Array) -> tuple[An
 
 
 # Photographs of the training views on the devices that draw them (host)
-
 
 GROUP_AXIS = "views"
 """Axis of a mesh of the same devices along which their groups are."""
