@@ -203,7 +203,7 @@ def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh
     vertices = np.concatenate([vertices for vertices, _, _ in parts])
     faces = np.concatenate([faces + start for (_, faces, _), start in zip(parts, starts, strict=True)])
     colors = np.concatenate([colors for _, _, colors in parts])
-    # Marching cubes run brick by brick. Vertices on the border of bricks become one, and faces between such vertices vanish.
+    # Vertices that two bricks share become one, and faces between such vertices vanish.
     side = BRICK * SIDE
     on_border = np.flatnonzero((np.abs(vertices - side * np.rint(vertices / side)) < SAME).any(axis=1))
     pairs = on_border[cKDTree(vertices[on_border]).query_pairs(SAME, output_type="ndarray")] if len(on_border) else []
