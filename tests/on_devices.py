@@ -316,7 +316,7 @@ def training(folder):
     whole = fit(own, 4, on_checkpoint=keeping(path), checkpoint_every=12)
     assert path.is_file() and len(whole.model.gaussians.means.devices()) == 1, "results are on one device"
     alone = fit(own, 1, on_checkpoint=keeping(path_alone), checkpoint_every=12)
-    for count, start in ((4, path), (3, path), (1, path), (2, path_alone)):
+    for count, start in ((4, path), (3, path), (2, path_alone)):
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             again = fit(own, count, resume=a2tg.load_checkpoint(start))

@@ -147,27 +147,28 @@ def test_processes_that_live_are_left_alone(three):
 
 
 @pytest.mark.parametrize(
-    ("living", "messages", "told"),
+    ("living", "messages", "told", "quiet"),
     [
-        ((0, 1), [], dict.fromkeys((0, 1), f"process 2 of 3 was not heard from for {SECONDS} s")),
+        ((0, 1), [], dict.fromkeys((0, 1), f"process 2 of 3 was not heard from for {SECONDS} s"), ()),
         (
             (0, 1, 2),
             [(1, processes.INTERRUPTED, ""), (0, processes.INTERRUPTED, "")],
             {2: "process 0 of 3 was interrupted"},
+            (0, 1),
         ),
-        ((0, 1, 2), [(2, processes.FAILED, "no scene")], dict.fromkeys((0, 1), "process 2 of 3 failed: no scene")),
-        ((0, 1, 2), [(0, processes.QUIT, "")], {1: "", 2: ""}),
+        ((0, 1, 2), [(2, processes.FAILED, "no scene")], dict.fromkeys((0, 1), "process 2 of 3 failed: no scene"), ()),
+        ((0, 1, 2), [(0, processes.QUIT, "")], {1: "", 2: ""}, ()),
     ],
     ids=["silent", "interrupted", "failed", "quit"],
 )
-def test_the_end_of_a_process_is_reported_to_those_who_wait(three, monkeypatch, living, messages, told):
+def test_the_end_of_a_process_is_reported_to_those_who_wait(three, monkeypatch, living, messages, told, quiet):
     monkeypatch.setattr(processes, "INTERRUPTED_GRACE", SECONDS)
     everyone, ends = watched(three, living), three[1]
     for number, kind, reason in messages:
         everyone[number].end(kind, reason)
     until(lambda: all(ends[number] for number in told))
-    assert {number: found[0] for number, found in enumerate(ends) if found and number in told} == told
-    assert not [number for number, found in enumerate(ends) if found and number not in told]
+    assert {number: ends[number] for number in told} == {number: [reason] for number, reason in told.items()}
+    assert not any(ends[number] for number in quiet)
 
 
 def test_the_command_to_go_on_names_devices_and_processes(tmp_path):
