@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from a2tg_jax import Gaussians2dMcmc, align_poses, color_fit, evaluate, fit, synthetic_scene
+from a2tg_jax import Gaussians2dMcmc, RenderSettings, align_poses, color_fit, evaluate, fit, synthetic_scene
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.cameras import moved_viewmat
 from a2tg_jax.mcmc import Mcmc
+from a2tg_jax.measure import alignment
 from a2tg_jax.training.corrections import Exposure
 from a2tg_jax.training.options import Corrections
 
@@ -84,6 +85,14 @@ def test_a_disturbed_test_camera_comes_back(scene, model):
 
     assert min(shifts(disturbed)) > 1.5 and max(shifts(aligned)) < 0.25
     assert evaluate(disturbed, model).psnr < 30 < 40 < evaluate(aligned, model).psnr
+
+
+@pytest.mark.long
+def test_alignment_finds_room_for_what_it_sees(scene, model, monkeypatch):
+    (view,) = align_poses(scene.test[:1], model, num_steps=3)
+    monkeypatch.setattr(alignment, "plan_render", lambda *_, **options: RenderSettings(capacity=64))
+    (again,) = align_poses(scene.test[:1], model, num_steps=3)
+    np.testing.assert_array_equal(again.camera.viewmat, view.camera.viewmat)
 
 
 @pytest.mark.long
