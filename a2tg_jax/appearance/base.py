@@ -43,7 +43,7 @@ from a2tg_jax.core.numerics import Integer, at_least
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
 from a2tg_jax.core.table import Table, check_places, check_table, is_table
-from a2tg_jax.texture import NEUTRAL_TEXEL, Textures
+from a2tg_jax.texture import Textures
 
 T = TypeVar("T")
 
@@ -327,11 +327,6 @@ def cutoff_of(appearance: Appearance, opacities: Array) -> Array:
 def num_colors_of(appearance: Appearance) -> int:
     """Return the number of colours of a splat, or of features."""
     return appearance.num_colors if appearance.features is None else int(appearance.features.shape[1])
-
-
-def empty_values(appearance: Appearance) -> tuple[float, ...]:
-    """Return the values of a splat without a texture; () if all splats have one."""
-    return appearance.empty if appearance.texture is None else NEUTRAL_TEXEL
 
 
 # Templates and arrays

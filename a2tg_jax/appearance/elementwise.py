@@ -14,13 +14,14 @@ import jax.extend.core
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.appearance.base import Appearance, check_arrays_given, empty_values, without_arrays
+from a2tg_jax.appearance.base import Appearance, check_arrays_given, without_arrays
 from a2tg_jax.appearance.parts import Curve, Factor, Residual, falloff_of
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.checks import check_kind, described
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.pytree import check_pytree
 from a2tg_jax.core.table import check_table, is_table
+from a2tg_jax.texture import NEUTRAL_TEXEL
 
 ODD_SHAPE = (5, 7)
 """Shape of arrays that fits no matrix in an appearance by chance."""
@@ -81,7 +82,8 @@ class StaticShading:
         def falloff(numbers: tuple[Array, ...], rho: Array) -> Array:
             return falloff_of(Curve(*numbers[-CURVE:]), rho) if has_curve else own.falloff(numbers, rho)
 
-        return Elementwise(own.texel_position, shade, falloff, own.alpha_limit, own.has_low_pass, empty_values(own))
+        empty = own.empty if own.texture is None else NEUTRAL_TEXEL
+        return Elementwise(own.texel_position, shade, falloff, own.alpha_limit, own.has_low_pass, empty)
 
 
 class _LeftOut:

@@ -196,17 +196,13 @@ def described(value: object) -> str:
 
 
 def short_repr(value: Any) -> str:
-    """Return the `repr` of a dataclass that holds arrays, without optional fields that are None."""
-    found = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    left_out = {field.name for field in dataclasses.fields(value) if field.default is None}
-    fields = (f"{name}={described(own)}" for name, own in found.items() if own is not None or name not in left_out)
-    return f"{type(value).__name__}({', '.join(fields)})"
-
-
-def short_tuple_repr(value: Any) -> str:
-    """Return the `repr` of a named tuple, with arrays by dtype and shape."""
-    fields = ", ".join(f"{name}={described(field)}" for name, field in zip(value._fields, value, strict=True))
-    return f"{type(value).__name__}({fields})"
+    """Return the `repr` of a dataclass or a named tuple that holds arrays, without optional fields of a dataclass that
+    are None."""
+    fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
+    left_out = {field.name for field in fields if field.default is None}
+    found = {name: getattr(value, name) for name in getattr(value, "_fields", [field.name for field in fields])}
+    shown = (f"{name}={described(own)}" for name, own in found.items() if own is not None or name not in left_out)
+    return f"{type(value).__name__}({', '.join(shown)})"
 
 
 def _written(shape: tuple[int | str, ...]) -> str:

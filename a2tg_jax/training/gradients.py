@@ -10,7 +10,7 @@ from jax import Array
 
 from a2tg_jax.appearance import Appearance, check_is_appearance
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_kind, check_literal, short_tuple_repr
+from a2tg_jax.core.checks import check_kind, check_literal, short_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.core.pytree import combine, partition
@@ -42,7 +42,7 @@ class ViewGradients(NamedTuple):
     """Number of pairs, the least capacity (`plan_render`)."""
 
     def __repr__(self) -> str:
-        return short_tuple_repr(self)
+        return short_repr(self)
 
 
 def view_gradients(
