@@ -46,10 +46,10 @@ class NoSurfaceError(ValueError):
         """Keep the radius in units of the model's world, and how many parts had fewer than the least faces."""
         self.radius, self.num_dropped, self.least_faces = radius, num_dropped, least_faces
         advice = "raise the resolution, or lower least_faces" if num_dropped else "give a larger radius, or unbounded"
-        super().__init__(f"{self.told()}: {advice}")
+        super().__init__(f"{self.reason()}: {advice}")
 
-    def told(self, scale: float = 1.0) -> str:
-        """Return what happened, with lengths divided by `scale`."""
+    def reason(self, scale: float = 1.0) -> str:
+        """Return why there is no mesh, with lengths divided by `scale`."""
         if self.num_dropped:
             parts = counted(self.num_dropped, "part")
             return f"there are only small parts of a surface; {parts} had fewer than {self.least_faces} faces"

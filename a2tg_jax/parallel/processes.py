@@ -152,7 +152,7 @@ AUTO = "auto"
 LOST = 75
 """Exit code after another process was lost: training can resume from its last checkpoint."""
 LONGEST_HOST = 255
-MOST_TOLD = 300
+LONGEST_REASON = 300
 """Largest number of characters of another process's error."""
 
 
@@ -221,7 +221,7 @@ class Team:
             liveness.end(QUIT)
         else:
             is_interrupted = isinstance(error, KeyboardInterrupt)
-            liveness.end(FAILED, "it was interrupted" if is_interrupted else shortened(str(error), MOST_TOLD))
+            liveness.end(FAILED, "it was interrupted" if is_interrupted else shortened(str(error), LONGEST_REASON))
             time.sleep(self._seconds)
 
     def _end(self, reason: str) -> NoReturn:

@@ -122,7 +122,7 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
     except GridFullError as error:
         raise ValueError(f"{str(error).partition(': ')[0]}: {GRID_FULL}") from None
     except NoSurfaceError as error:
-        raise ValueError(f"{error.told(scale)}: {SMALL_PARTS if error.num_dropped else NO_SURFACE}") from None
+        raise ValueError(f"{error.reason(scale)}: {SMALL_PARTS if error.num_dropped else NO_SURFACE}") from None
     mesh = result.mesh if options.most_faces is None else simplify_mesh(result.mesh, options.most_faces)
     if options.texture != "none":
         print(f"unwrapping {counted(mesh.num_faces, 'face')}", flush=True)
