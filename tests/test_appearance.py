@@ -100,7 +100,8 @@ def test_floats_of_a_splat():
 
 
 @pytest.mark.parametrize(
-    ("template", "size", "opacity"), [(MovableKernels(), 1.0, 0.6), (Billboards(side=15), 0.5, 0.5)]
+    ("template", "size", "opacity"),
+    [(MovableKernels(), 1.0, 0.6), pytest.param(Billboards(side=15), 0.5, 0.5, marks=pytest.mark.long)],
 )
 def test_appearances_start_colourless_and_as_opaque_as_their_gaussians_or_half(template, size, opacity):
     scene = hand_scene([[0.1, 0.1, 4]], [FACING], [[size, size]], [0.6], [[0.2, 0.5, 0.7]])
@@ -161,6 +162,7 @@ def test_copies_of_a_billboard_show_what_one_did():
     np.testing.assert_allclose(stacked, before, atol=1e-6)
 
 
+@pytest.mark.long
 def test_copies_of_movable_kernels_are_those_of_a_gaussian_as_opaque():
     gaussians, appearance = allocated(MovableKernels())
     appearance = moved(appearance)

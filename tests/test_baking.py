@@ -179,6 +179,7 @@ def test_other_appearances_give_their_gaussians():
         bake(model, [CAMERA], growth=0.5)
 
 
+@pytest.mark.long
 def test_convert_bakes(tmp_path, capsys):
     model = textured()
     official = Appearance(texture=Texture(model.textures, options=TextureOptions.official()))

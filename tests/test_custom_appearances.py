@@ -182,7 +182,7 @@ def expected_gradients(name: str):
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("compositor", ["native", "xla"])
+@pytest.mark.parametrize("compositor", ["native", pytest.param("xla", marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", some_long)
 def test_every_leaf_against_differences(name, compositor):
     case = CASES[name]
@@ -284,6 +284,7 @@ def test_wrong_numbers_are_refused(make, words):
         rendered(draw_scene(4, num=3, width=8, height=8), make(), dtype="float32")
 
 
+@pytest.mark.long
 def test_without_a_low_pass_filter_edge_on_splats_show_nothing():
     scene = hand_scene([[0, 0, 4]], [EDGE_ON], [[0.0, 0.0]], [0.9], [[1, 1, 1]])
     arrays = random_arrays("glossy", 1, "float32")

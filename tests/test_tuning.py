@@ -93,6 +93,7 @@ def test_groups_kept_as_floats_are_not_rounded(precision):
     assert all(map(np.array_equal, jax.tree.leaves(rounded), jax.tree.leaves(start)))
 
 
+@pytest.mark.long
 def test_numbers_are_rounded_one_after_the_other_and_stay():
     start = half_turned(MODELS["banded, shaped and textured"]())
     rounding = GridRounding.to(grids_of(start, COARSE), COARSE)
