@@ -28,9 +28,9 @@ from a2tg_jax import configure_cpu
 from a2tg_jax.host.text import did_you_mean
 
 MODULES = (
-    "choose_plain", "summary", "equal_bytes", "larger_pictures", "ablation", "texture_resolution", "memory_charts",
-    "resolution_shares", "decomposition", "comparison_pictures", "upscale_gains", "polish", "shrink", "on_disk",
-    "efficiency", "equal_bytes_speed",
+    "choose_plain", "findings", "summary", "equal_bytes", "larger_pictures", "ablation", "texture_resolution",
+    "memory_charts", "resolution_shares", "decomposition", "comparison_pictures", "upscale_gains", "polish", "shrink",
+    "on_disk", "efficiency", "equal_bytes_speed",
 )  # fmt: skip
 """Modules of this folder that hold an EXPERIMENT; those that measure time come last."""
 EVERYTHING, APPENDIX = "all", "appendix"

@@ -1,0 +1,114 @@
+"""Statistics of PROTOCOL.md: differences of two methods by scene, with intervals, p-values and Holm's correction.
+
+A pair is one seed and one fold of a scene in which both methods were run. The value of a scene is the mean over its
+pairs of the mean over views.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import scipy.stats
+
+from lab.tables import Result, grouped
+
+FIGURES = ("psnr", "ssim", "lpips")
+"""Figures of a view in a record's `per_view`, in their order."""
+CONFIDENCE = 0.95
+NUM_DRAWS = 10_000
+Differences = Mapping[str, Sequence[np.ndarray]]
+"""Differences of the views of every pair [V], by scene."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Mean difference of two methods over scenes; what too few scenes leave open is NaN."""
+
+    by_scene: Mapping[str, float]
+    mean: float
+    half_width: float
+    """Half-width of the t interval over scenes."""
+    bootstrap: tuple[float, float]
+    """Interval of the hierarchical bootstrap."""
+    p_value: float
+    """p-value of the exact sign-flip test over scenes."""
+
+    @property
+    def is_decided(self) -> bool:
+        """Whether the t interval excludes 0."""
+        return abs(self.mean) > self.half_width
+
+    def num_won(self, is_lower_better: bool = False) -> int:
+        """Return the number of scenes in which the first method is better."""
+        return sum((value < 0) if is_lower_better else (value > 0) for value in self.by_scene.values())
+
+
+def differences(results: Sequence[Result], label: str, other: str, figure: str) -> dict[str, list[np.ndarray]]:
+    """Return a figure of one method − that of another for every view of every pair, by scene.
+
+    Raises:
+      ValueError: if the methods of a pair were scored on different views.
+    """
+    place = FIGURES.index(figure)
+    found: dict[str, list[np.ndarray]] = {}
+    for cell, block in grouped(results, lambda result: result.run.cell):
+        views = {result.label: result.record["per_view"] for result in block if result.label in (label, other)}
+        if len(views) < 2:
+            continue
+        own, base = views[label], views[other]
+        if own.keys() != base.keys():
+            raise ValueError(f"{label} and {other} were scored on different views of {cell.scene.label}")
+        pair = [np.array([figures[name][place] for name in own], float) for figures in (own, base)]  # None is NaN.
+        found.setdefault(cell.scene.label, []).append(pair[0] - pair[1])
+    return found
+
+
+def compare(found: Differences, seed: int = 0) -> Comparison:
+    """Return the mean over scenes of some differences."""
+    by_scene = {scene: float(np.mean([pair.mean() for pair in pairs])) for scene, pairs in found.items()}
+    values = np.array(list(by_scene.values()))
+    mean, half, p_value = float("nan"), float("nan"), float("nan")
+    if len(values):
+        mean = float(values.mean())
+    if len(values) > 1:
+        half = float(scipy.stats.sem(values) * scipy.stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1))
+        p_value = sign_flip(values)
+    return Comparison(by_scene, mean, half, bootstrap(found, seed), p_value)
+
+
+def sign_flip(values: np.ndarray) -> float:
+    """Return the two-sided p-value of a mean of 0 if each value's sign were a coin's, over all 2^n signs."""
+    signs = np.array(list(itertools.product((1.0, -1.0), repeat=len(values))))
+    return float(np.mean(np.abs(signs @ values) >= abs(values.sum()) * (1 - 1e-12)))
+
+
+def bootstrap(found: Differences, seed: int = 0) -> tuple[float, float]:
+    """Return the percentile interval of the mean over scenes if scenes, pairs of each scene and views of each pair are
+    drawn with replacement; NaN of less than two scenes."""
+    if len(found) < 2:
+        return float("nan"), float("nan")
+    rng = np.random.default_rng(seed)
+    # Each scene's mean is drawn as often as all scenes together need it: draws of one scene are independent.
+    draws = np.array([_scene_means(pairs, NUM_DRAWS * len(found), rng) for pairs in found.values()])
+    draws = draws.reshape(len(found), NUM_DRAWS, len(found))
+    chosen = rng.integers(len(found), size=(NUM_DRAWS, len(found)))
+    means = draws[chosen, np.arange(NUM_DRAWS)[:, None], np.arange(len(found))].mean(axis=1)
+    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+def _scene_means(pairs: Sequence[np.ndarray], num: int, rng: np.random.Generator) -> np.ndarray:
+    """Return means [num] of a scene whose pairs, and the views of each, are drawn with replacement."""
+    drawn = np.array([pair[rng.integers(len(pair), size=(len(pairs), num, len(pair)))].mean(axis=2) for pair in pairs])
+    chosen = rng.integers(len(pairs), size=(len(pairs), num))
+    return drawn[chosen, np.arange(len(pairs))[:, None], np.arange(num)].mean(axis=0)
+
+
+def holm(p_values: Mapping[str, float]) -> dict[str, float]:
+    """Return p-values corrected for their number by Holm's step-down procedure."""
+    corrected, highest = {}, 0.0
+    for index, (name, p_value) in enumerate(sorted(p_values.items(), key=lambda item: item[1])):
+        highest = max(highest, min(1.0, (len(p_values) - index) * p_value))
+        corrected[name] = highest
+    return {name: corrected[name] for name in p_values}
