@@ -84,29 +84,26 @@ class Worker:
 def run(worker: Worker, cases: range, keep: Path | None = None, seed: int = SEED) -> Iterator[dict]:
     """What became of each case: its number, reader, file, kind, place, seconds and megabytes.
 
-    Changed files of cases that are not well go to the folder `keep`. The worker is stopped in the end.
+    Changed files of cases that are not well go to the folder `keep`.
     """
-    try:
-        for index in cases:
-            worker.start()  # It reads the sound files first.
-            number, rng = index % len(READERS), np.random.default_rng([seed, index])
-            reader = READERS[number]
-            name = reader.files[int(rng.integers(len(reader.files)))]
-            change = reader.changes[int(rng.integers(len(reader.changes)))]
-            file = worker.work / "seeds" / reader.folder / name
-            sound = file.read_bytes()
-            changed = change(sound, rng)
-            try:
-                file.write_bytes(changed)
-                answer = worker.ask(number, name)
-            finally:
-                file.write_bytes(sound)
-            if keep is not None and answer["kind"] not in WELL:
-                keep.mkdir(parents=True, exist_ok=True)
-                (keep / f"{index}-{reader.name}-{Path(name).name}").write_bytes(changed)
-            yield {"case": index, "reader": reader.name, "file": name, **answer}
-    finally:
-        worker.stop()
+    for index in cases:
+        worker.start()  # It reads the sound files first.
+        number, rng = index % len(READERS), np.random.default_rng([seed, index])
+        reader = READERS[number]
+        name = reader.files[int(rng.integers(len(reader.files)))]
+        change = reader.changes[int(rng.integers(len(reader.changes)))]
+        file = worker.work / "seeds" / reader.folder / name
+        sound = file.read_bytes()
+        changed = change(sound, rng)
+        try:
+            file.write_bytes(changed)
+            answer = worker.ask(number, name)
+        finally:
+            file.write_bytes(sound)
+        if keep is not None and answer["kind"] not in WELL:
+            keep.mkdir(parents=True, exist_ok=True)
+            (keep / f"{index}-{reader.name}-{Path(name).name}").write_bytes(changed)
+        yield {"case": index, "reader": reader.name, "file": name, **answer}
 
 
 def main() -> None:
@@ -117,12 +114,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=SEED, help="another one makes other cases")
     options = parser.parse_args()
     counts: Counter = Counter()
+    cases = range(options.first, options.first + options.cases)
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, contextlib.suppress(KeyboardInterrupt):
-        cases = range(options.first, options.first + options.cases)
-        for found in run(Worker(Path(folder)), cases, options.keep, options.seed):
-            counts[found["reader"], found["kind"]] += 1
-            if found["kind"] not in WELL:
-                print(*found.values(), flush=True)
+        worker = Worker(Path(folder))
+        try:
+            for found in run(worker, cases, options.keep, options.seed):
+                counts[found["reader"], found["kind"]] += 1
+                if found["kind"] not in WELL:
+                    print(*found.values(), flush=True)
+        finally:
+            worker.stop()
     for (reader, kind), count in sorted(counts.items()):
         print(f"{reader:>12} {kind:>16} {count:>6}")
 

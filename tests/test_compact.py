@@ -185,7 +185,8 @@ def test_floats_come_back_as_they_were_in_another_order(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param("plain 16", marks=pytest.mark.long), "textured or not", "banded, shaped and textured"]
+    "name",
+    [*(pytest.param(name, marks=pytest.mark.long) for name in ("plain 16", "textured or not")), FAST[-1]],
 )
 def test_what_comes_back_looks_the_same(name):
     """Mirrored textures and half-turned splats included; from files on disk and of several chunks for browsers."""
@@ -306,7 +307,8 @@ def test_only_rows_that_exist_are_kept():
     assert found.num == 7 and found.num_bytes == model.num_bytes
 
 
-@pytest.mark.parametrize("encode_it", [encode_model, pytest.param(encode_web_scene, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("encode_it", [encode_model, encode_web_scene])
 def test_splats_that_are_all_alike_take_more_room_than_they_need_and_come_back(encode_it):
     """The file of so few bytes would be refused as a bomb: it is written without a coder."""
     one = plain(1).gaussians[:1]
@@ -424,7 +426,9 @@ def test_every_changed_byte_is_noticed(tmp_path):
         refused(tmp_path, bytes(spoiled))
 
 
-@pytest.mark.parametrize("coder", CODERS)
+@pytest.mark.parametrize(
+    "coder", [coder if coder == "deflate" else pytest.param(coder, marks=pytest.mark.long) for coder in CODERS]
+)
 def test_changed_bytes_under_a_right_checksum_do_no_harm(coder):
     """A model of other numbers, or a ValueError; nothing else."""
     data = encode_model(banded(0, textured(True)), CompactChoices(coder=coder))
@@ -643,6 +647,7 @@ def test_the_viewer_opens_at_a_central_training_camera():
     assert "first" not in header["page"] and "origin" not in header
 
 
+@pytest.mark.long
 def test_textures_are_kept_as_they_are_seen():
     """The authors' conventions clip residuals and divide alpha: the file holds what is left, and says where to look."""
     options, base = TextureOptions.official(), textured()
@@ -678,7 +683,7 @@ def test_what_is_nearer_to_the_cameras_shows_more():
     assert near > 50 * far
 
 
-@pytest.mark.parametrize("name", ["plain 4", "banded, shaped and textured"])
+@pytest.mark.parametrize("name", [pytest.param("plain 4", marks=pytest.mark.long), FAST[-1]])
 def test_the_reference_reader_finds_the_numbers(reference, tmp_path, name):
     """In several chunks; it shares no code."""
     model = MODELS[name]()

@@ -55,11 +55,10 @@ CASES = {
     "Ctrl-C with a handler": (CTRL_C, "ZeroDivisionError", NOTICED, "noticed\n[7. 7. 7.]"),
     "an interrupt that is raised": ("if index == 0: raise KeyboardInterrupt", "KeyboardInterrupt", "0", "met"),
 }
-SHORT = ("an error", "Ctrl-C on a thread of XLA's")
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in SHORT else pytest.param(name, marks=pytest.mark.long) for name in CASES]
+    "name", [name if name == "an error" else pytest.param(name, marks=pytest.mark.long) for name in CASES]
 )
 def test_the_caller_meets_what_happens_in_a_function_whatever_the_hook_does(name):
     part, error, more, printed = CASES[name]

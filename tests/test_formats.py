@@ -318,6 +318,7 @@ def test_gaussians_of_a_model_are_counted_by_their_means(tmp_path):
         number_in_file(tmp_path / "a.npz")
 
 
+@pytest.mark.long
 def test_what_a_first_stage_cannot_take_of_a_file_is_refused_or_told(tmp_path):
     save_model(tmp_path / "a.npz", textured())
     with pytest.warns(UserWarning, match="leaves out what its splats show besides Gaussians"):

@@ -42,6 +42,14 @@ def write_parts(path, described, binary):
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
+def rewritten(path, model, change):
+    """A file of a model whose JSON went through a function."""
+    save_gltf(path, model)
+    described, binary = parts_of(path)
+    change(described)
+    write_parts(path, described, binary)
+
+
 def attribute(described, binary, name):
     """An attribute of floats, as a reader of its own takes it from the file."""
     accessor = described["accessors"][described["meshes"][0]["primitives"][0]["attributes"][name]]
@@ -270,12 +278,13 @@ def test_integers_that_stand_for_fractions(tmp_path):
 
 def test_several_meshes_make_one_model(tmp_path):
     path, model = tmp_path / "m.glb", textured()
-    save_gltf(path, model)
-    described, binary = parts_of(path)
-    node = described["nodes"][0]
-    described["nodes"] = [node, {"mesh": 0, "matrix": node["matrix"]}, {"camera": 0}]
-    described["scenes"][0]["nodes"] = [0, 1, 2]
-    write_parts(path, described, binary)
+
+    def repeat(described):
+        node = described["nodes"][0]
+        described["nodes"] = [node, {"mesh": 0, "matrix": node["matrix"]}, {"camera": 0}]
+        described["scenes"][0]["nodes"] = [0, 1, 2]
+
+    rewritten(path, model, repeat)
     found = load_gltf(path)
     assert found.num == 2 * model.num and found.origin == model.origin
     np.testing.assert_array_equal(found.gaussians.means[model.num :], model.gaussians.means)
@@ -304,31 +313,27 @@ def test_shapes_out_of_range_or_of_another_length_are_refused(tmp_path, monkeypa
 
 def test_shapes_are_what_the_extension_says(tmp_path, saved):
     """Extras of another structure do not count."""
-    save_gltf(tmp_path / "m.glb", shaped(textured()))
-    described, binary = parts_of(tmp_path / "m.glb")
-    del first_primitive(described)["extensions"][SPLATS]["extensions"][EXTENSION]["shapes"]
-    write_parts(tmp_path / "m.glb", described, binary)
+    rewritten(tmp_path / "m.glb", shaped(textured()), lambda described: extension_of(described).pop("shapes"))
     found = load_gltf(tmp_path / "m.glb")
     assert found.appearance.exponents is None and found.textures is not None
 
 
 def test_other_kernels_and_colours_are_told(tmp_path):
-    path = tmp_path / "m.glb"
-    save_gltf(path, plain())
-    described, binary = parts_of(path)
-    described["meshes"][0]["primitives"][0]["extensions"][SPLATS]["colorSpace"] = "lin_rec709_display"
-    write_parts(path, described, binary)
+    path, linear = tmp_path / "m.glb", {"colorSpace": "lin_rec709_display"}
+    rewritten(path, plain(), lambda described: first_primitive(described)["extensions"][SPLATS].update(linear))
     with pytest.warns(UserWarning, match="colorSpace lin_rec709_display; they are read as srgb_rec709_display"):
         load_gltf(path)
 
 
 def test_degree_4_is_read_to_degree_3(tmp_path):
     path, model = tmp_path / "m.glb", plain(16)
-    save_gltf(path, model)
-    described, binary = parts_of(path)
-    attributes = described["meshes"][0]["primitives"][0]["attributes"]
-    attributes |= {f"{SPLATS}:SH_DEGREE_4_COEF_{n}": attributes[f"{SPLATS}:SH_DEGREE_3_COEF_0"] for n in range(9)}
-    write_parts(path, described, binary)
+
+    def add_degree(described):
+        attributes = first_primitive(described)["attributes"]
+        first = attributes[f"{SPLATS}:SH_DEGREE_3_COEF_0"]
+        attributes |= {f"{SPLATS}:SH_DEGREE_4_COEF_{n}": first for n in range(9)}
+
+    rewritten(path, model, add_degree)
     with pytest.warns(UserWarning, match=r"m\.glb: has SH of degree 4; degree 3 is read"):
         assert_shows_the_same(load_gltf(path), model)
 

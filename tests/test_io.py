@@ -41,12 +41,6 @@ def write_ply(path, names, rows, encoding="binary_little_endian", types=None) ->
 # PLY
 
 
-def test_ply_round_trip(tmp_path):
-    gaussians = some_gaussians()
-    save_ply(tmp_path / "g.ply", gaussians)
-    assert_same(load_ply(tmp_path / "g.ply"), gaussians)
-
-
 def test_ply_attributes_in_the_order_of_2dgs(tmp_path):
     gaussians = some_gaussians()
     save_ply(tmp_path / "g.ply", gaussians, third_scale=False)
@@ -163,12 +157,7 @@ def test_infinite_logits_of_opacities_become_finite(tmp_path):
     np.testing.assert_allclose(load_ply(tmp_path / "g.ply").opacities, [0, 1], atol=2e-6)
 
 
-def test_ply_of_3d_gaussians_warns(tmp_path):
-    write_ply(tmp_path / "g.ply", (*ATTRIBUTES, "scale_2"), np.ones((2, 62)))
-    with pytest.warns(UserWarning, match="3D Gaussians"):
-        assert load_ply(tmp_path / "g.ply").num == 2
-
-
+@pytest.mark.long
 def test_flat_ellipsoids_show_the_same_whichever_axis_is_thin(tmp_path):
     """The same splats with their axes cycled, so that the first or the second is thin, are the same splats."""
     gaussians, camera = (
@@ -269,7 +258,8 @@ def test_sh_rotations_compose():
     np.testing.assert_allclose(sh_rotation(a.T), sh_rotation(a).T, atol=1e-13)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(2))
 def test_world_and_camera_moved_together_show_the_same(x64, seed):
     rng = np.random.default_rng(seed)
     as_double = lambda x: jnp.asarray(x, jnp.float64)  # noqa: E731

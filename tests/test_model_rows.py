@@ -79,7 +79,7 @@ def assert_rows(found: Model, wanted: list[np.ndarray]) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-SLOW = set(APPEARANCES) - {"plain", "all parts"}
+SLOW = set(APPEARANCES) - {"all parts"}
 every_appearance = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.long] * (name in SLOW)) for name in APPEARANCES]
 )
@@ -131,6 +131,7 @@ def test_mistakes_are_named():
         concatenate([model, some_model("movable kernels")])
 
 
+@pytest.mark.long
 def test_a_loss_of_a_whole_model_is_differentiated():
     model = some_model("texture")
     floats, rest = partition(model)

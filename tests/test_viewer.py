@@ -353,6 +353,7 @@ def test_photographs_are_those_of_the_cameras():
     assert np.abs(found - by_name[origin.names[0]].image).mean() < 12
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("error", "told"),
     [(FileNotFoundError("no folder"), "photographs of"), (ValueError("a.png: is truncated"), r"a\.png: is truncated")],

@@ -85,12 +85,14 @@ def node():
         pytest.skip("needs Node, Chromium and `npm ci` in web/")
 
 
+@pytest.mark.long
 def test_the_page_is_what_the_sources_build(node, tmp_path):
     run_node("build", "--", "--outDir", str(tmp_path), "--emptyOutDir")
     built = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert built == viewer_html(), "the sources give another page: .ci/web --write"
 
 
+@pytest.mark.long
 def test_the_page_shows_what_the_renderer_shows(node, tmp_path):
     scene = a2tg.synthetic_scene(num_views=6, width=96, height=72, num_points=400)
     source = trained(scene)
@@ -107,6 +109,7 @@ def test_the_page_shows_what_the_renderer_shows(node, tmp_path):
     run_node("test:browser", "--", "compare", A2TG_CASES=str(tmp_path))
 
 
+@pytest.mark.long
 def test_the_page_shows_a_real_scene(node, shared, tmp_path):
     scene = a2tg.load_scene(shared / "scenes" / "fox", downscale=8)
     source = trained(scene)
@@ -114,5 +117,6 @@ def test_the_page_shows_a_real_scene(node, shared, tmp_path):
     run_node("test:browser", "--", "compare", A2TG_CASES=str(tmp_path))
 
 
+@pytest.mark.long
 def test_the_page_itself(node):
     run_node("test:browser", "--", "page", "adjust")
