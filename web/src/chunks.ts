@@ -65,16 +65,23 @@ export async function readChunk(parts: PartReader, header: Header, start: number
  */
 function positions(planes: Uint8Array, num: number, { means, meanBits }: Header): Float32Array<ArrayBuffer> {
   const found = new Float32Array(3 * num);
-  const steps = means.map(([, , low, high]) => (high - low) / (2 ** meanBits - 1));
+  const powers = Array.from({ length: Math.ceil((3 * meanBits) / 8) }, (_, k) => 256 ** k);
+  const axes = means.map(([centre, spread, low, high]) => ({
+    centre,
+    spread,
+    low,
+    step: (high - low) / (2 ** meanBits - 1),
+  }));
   let place = 0;
   for (let i = 0; i < num; i++) {
-    for (let k = 0; k * num < planes.length; k++) place += planes[k * num + i]! * 256 ** k;
+    for (let k = 0; k < powers.length; k++) place += planes[k * num + i]! * powers[k]!;
     if (place >= 2 ** (3 * meanBits)) throw damaged("a position is out of range");
     const [lower, upper] = [place % 2 ** 24, Math.floor(place / 2 ** 24)];
-    means.forEach(([centre, spread, low], axis) => {
+    for (let axis = 0; axis < 3; axis++) {
+      const { centre, spread, low, step } = axes[axis]!;
       const code = everyThird(lower >> axis) | (everyThird(upper >> axis) << 8);
-      found[3 * i + axis] = centre + spread * Math.sinh(low + code * steps[axis]!);
-    });
+      found[3 * i + axis] = centre + spread * Math.sinh(low + code * step);
+    }
   }
   return found;
 }
