@@ -15,9 +15,9 @@ import sys
 import tempfile
 
 from a2tg_jax.cli import main as cli
-from a2tg_jax.host.machine import memory_peak
 from a2tg_jax.results.forecast import forecast_run
 from benchmarks.large_scene import write_scene
+from benchmarks.timing import memory_peak
 from experiments.lab import markdown
 
 SHORT = ("--stage1-iterations", "20", "--stage2-iterations", "20")

@@ -21,7 +21,7 @@ from PIL import Image
 
 import a2tg_jax
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
-from a2tg_jax.host.machine import memory_peak
+from benchmarks.timing import memory_peak
 
 NUM_PICTURES = 8
 """Number of different photographs; the others are links to them, decoded like any."""

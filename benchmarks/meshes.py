@@ -20,10 +20,10 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.core.similarity import transform_gaussians
 from a2tg_jax.data.synthetic import exact_points, still_life
-from a2tg_jax.host.machine import memory_peak
 from a2tg_jax.mesh.extract import GRID_BYTES, common_sphere, surface_of
 from a2tg_jax.mesh.fusion import BlockGrid, Space, fuse, rendered_depth
 from a2tg_jax.renderer import Renderer
+from benchmarks.timing import memory_peak
 
 SMALL = (160, 106)
 """Width and height of the views that place the splats."""

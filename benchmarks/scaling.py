@@ -34,11 +34,11 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.geometry import NEAR_PLANE, screen_bounds
+from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.parallel.exchange import BorderRoom, ImageBands
 from a2tg_jax.rasterize.splats import drawn_splats, num_numbers
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.training.registry import with_changes
 from benchmarks.workload import random_scene
 from experiments.lab.markdown import table as markdown
 
@@ -154,7 +154,7 @@ def training(num: int, steps: int) -> dict[str, float]:
     """Return the time and the memory of a training of `num` Gaussians on all devices, at 128×96 pixels."""
     scene = a2tg.synthetic_scene(num_views=9, width=128, height=96, num_points=num)
     changes = {"initial_gaussians": num, "densify": {"cap": num}, "stage1_iterations": steps}
-    own = with_changes(Gaussians2dMcmc.preset("smoke"), changes, "here")
+    own = changed_config(Gaussians2dMcmc.preset("smoke"), changes, "here")
     result = a2tg.fit(scene, own, session=a2tg.Session(devices=jax.devices()))
     paces = np.diff(result.history.seconds) / np.diff(result.history.iteration)
     return {

@@ -1,7 +1,9 @@
-"""Time of a call. Needs nothing but numpy, so that other programs are timed by the same rule."""
+"""Time of a call and peak memory. Needs nothing but numpy, so that other programs are timed by the same rule."""
 
+import contextlib
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,3 +30,13 @@ def timed(
     while len(times) < least_runs or (sum(times) < 1.0 and len(times) < 40):
         times.append(seconds())
     return {"first_s": first, "ms": float(np.median(times)) * 1e3, "least_ms": min(times) * 1e3}
+
+
+def memory_peak() -> int:
+    """Return the peak memory of this process in bytes; 0 if the system does not report it (host)."""
+    # Not getrusage, which also counts the program that started this one.
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
+    return 0

@@ -25,8 +25,8 @@ from lab.kept import KeptFigures, parser_of
 
 import a2tg_jax as a2tg
 from a2tg_jax.host.machine import tidy_memory
+from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.training import find_system
-from a2tg_jax.training.registry import with_changes
 
 SCENES = ("fox", "snowmiku", "lego", "herz_jesus_p25")
 WHITE_BEHIND = ("lego",)
@@ -94,7 +94,7 @@ def measured(
     """Return the figures of one training by a system with some options."""
     known, options = method
     own = {"memory_budget": budget, "seed": seed, **({"background": "white"} if name in WHITE_BEHIND else {})}
-    system = with_changes(find_system(known).preset("quick"), {**options, **own}, name)
+    system = changed_config(find_system(known).preset("quick"), {**options, **own}, name)
     start = time.perf_counter()
     model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
     psnr, train_psnr = (a2tg.evaluate(views, model).psnr for views in (scene.test, scene.train))

@@ -31,7 +31,7 @@ from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.ray_tracing import Surface, light, trace_rays
 from a2tg_jax.data.synthetic import SAMPLE_OFFSETS, camera_path, still_life, viewmat_to_target
 from a2tg_jax.host.machine import tidy_memory
-from a2tg_jax.training.registry import with_changes
+from a2tg_jax.io.config_json import changed_config
 
 SIZE = 208, 156
 """Width and height of the photographs in pixels."""
@@ -103,7 +103,7 @@ def measured(folder: Path, name: str, use: str) -> dict[str, float]:
         write_scene(folder, name)
     scene, kept = read_scene(folder, use), read_scene(folder, "keep")
     options = {**GAUSSIAN_KERNELS, "memory_budget": BUDGET}
-    system = with_changes(a2tg.find_system("bytewise").preset("quick"), options, "lenses")
+    system = changed_config(a2tg.find_system("bytewise").preset("quick"), options, "lenses")
     model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
     is_cropped = seen_when_undistorted(name)
     masked = [dataclasses.replace(view, mask=is_cropped & counted(view)) for view in kept.test]

@@ -28,7 +28,7 @@ from lab.outdoors import outdoors
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_depths
 from a2tg_jax.host.machine import tidy_memory
-from a2tg_jax.training.registry import with_changes
+from a2tg_jax.io.config_json import changed_config
 
 SIZE = 128, 96
 OPTIONS = {"stage1_iterations": 800, "stage2_iterations": 0, "densify": {"cap": 2_500}}
@@ -209,7 +209,7 @@ def seen_at(width: int, model_of: Callable[[int], a2tg.Model]) -> dict[str, floa
 
 def trained(scene: a2tg.Scene, options: Mapping[str, Any], session: a2tg.Session) -> a2tg.Model:
     """Return the model of one training."""
-    system = with_changes(a2tg.find_system("gaussians-2d-mcmc").preset("quick"), {**OPTIONS, **options}, "wild")
+    system = changed_config(a2tg.find_system("gaussians-2d-mcmc").preset("quick"), {**OPTIONS, **options}, "wild")
     return a2tg.fit(scene, system, progress=False, session=session).model
 
 

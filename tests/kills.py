@@ -33,7 +33,7 @@ def start(out: Path, options: tuple[str, ...], cache: Path) -> subprocess.Popen:
     """The process that begins or continues a run."""
     words = ["--resume"] if (out / "run.toml").is_file() else ["synthetic", *options]
     return subprocess.Popen(
-        [sys.executable, "-m", "a2tg_jax.cli", "train", *words, "--out", str(out)],
+        [sys.executable, "-m", "a2tg_jax", "train", *words, "--out", str(out)],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env={**os.environ, "XDG_CACHE_HOME": str(cache)},
     )  # fmt: skip
 

@@ -21,6 +21,7 @@ from scenes_random import fisheye
 import a2tg_jax as a2tg
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Change, Due, HostEvent, StepEvent
+from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.parallel import exchange as exchanges, sharded_rows as rows
 from a2tg_jax.parallel.exchange import AXIS, ROOM_OF_A_BAND, BorderRoom, ImageBands, exchange_among
 from a2tg_jax.parallel.sharded_rows import on_host, placed_like, readable, rows_moved, sharding_of_rows, spread
@@ -33,7 +34,6 @@ from a2tg_jax.training.cost import stage_bytes
 from a2tg_jax.training.divergence import jitted_attempt
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.losses import normal_consistency
-from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
 
@@ -240,7 +240,7 @@ def borders_find_room():
 
 
 def system(kind, **options):
-    return with_changes(kind.preset("smoke"), {"initial_gaussians": ROWS, "seed": 3, **options}, "here")
+    return changed_config(kind.preset("smoke"), {"initial_gaussians": ROWS, "seed": 3, **options}, "here")
 
 
 def psnr_of(result):

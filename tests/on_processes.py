@@ -74,7 +74,7 @@ def pair(arguments, count=2):
 
 def trainings(out, flags, *own):
     """Processes of the command line that train together, each with some flags of its own."""
-    words = ["-m", "a2tg_jax.cli", "train", "synthetic", "--out", str(out), *flags]
+    words = ["-m", "a2tg_jax", "train", "synthetic", "--out", str(out), *flags]
     place = ["--coordinator", f"{ipv6_loopback()}:{free_port()}", "--num-processes", str(len(own)), "--process-id"]
     return [started([*words, *place, str(number), *each]) for number, each in enumerate(own)]
 

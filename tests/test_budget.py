@@ -21,11 +21,11 @@ from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.densify.clone_split import FillingDensity
 from a2tg_jax.events import Due, GradientStatistics, Now, Times
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict
 from a2tg_jax.mcmc import FillingMcmc
 from a2tg_jax.model import Model
 from a2tg_jax.training.fitting import warn_of_budget
-from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict, with_changes
+from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict
 from a2tg_jax.training.start import check_start
 
 SHORT = {"stage1_iterations": 60, "initial_gaussians": None}
@@ -49,7 +49,7 @@ def scene():
 def smoke(name: str, **changes):
     preset = type(a2tg.find_system(name)).preset("smoke")
     textured = {"stage2_iterations": 6} if preset.stage2_iterations else {}
-    return with_changes(preset, {**SHORT, **textured, **changes}, "test")
+    return changed_config(preset, {**SHORT, **textured, **changes}, "test")
 
 
 def filling(system: a2tg.System) -> FillingMcmc | FillingDensity:
@@ -94,7 +94,7 @@ def test_a_budget_is_one_value_however_it_comes(name, tmp_path):
     assert cli.parsed("train", ["synthetic", *run, "--memory-budget", "1.5"]).record.options == wanted
     for number in ('"1.5MB"', "1.5", '"1500 kB"'):
         table = tomllib.loads(f"memory_budget = {number}")
-        assert with_changes(kind(), table, "file") == wanted
+        assert changed_config(kind(), table, "file") == wanted
     assert config_from_dict(kind, json.loads(json.dumps(config_to_dict(wanted)))) == wanted
     assert system_from_dict(system_to_dict(wanted), "file") == wanted
     old = system_to_dict(kind())
@@ -302,7 +302,7 @@ def test_budgets_that_the_points_of_a_scene_cannot_fill_are_refused(scene, name,
 
 def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene):
     changes = {"texture": {"select": "budget", "budget_mb": 0.03}, "initial_gaussians": None}
-    system = with_changes(a2tg.A2tg.preset("smoke"), changes, "test")
+    system = changed_config(a2tg.A2tg.preset("smoke"), changes, "test")
     with pytest.raises(ValueError, match=r"0\.03, but \d+ Gaussians .*: raise it, or lower densify\.cap$"):
         check_start(scene, system)
     most = 30_000 // bytes_per_gaussian(system.sh_degree, 4)
@@ -343,7 +343,7 @@ def test_a_budget_of_textures_is_checked_before_the_first_stage(scene, cap):
             start(scene, system)
     with pytest.raises(ValueError, match=r"but 120 Gaussians .*: raise it$"):
         check_start(scene, system, num_given=120)
-    check_start(scene, with_changes(system, {"texture": {"budget_mb": 0.0298}}, "test"))
+    check_start(scene, changed_config(system, {"texture": {"budget_mb": 0.0298}}, "test"))
 
 
 @pytest.mark.parametrize(

@@ -19,10 +19,10 @@ from a2tg_jax.core.budget import bytes_of, event_budget
 from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import HostEvent
+from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.results.record import compared_system
 from a2tg_jax.systems.bytewise import Bytewise, LimitExponents
 from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint
-from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.step import jitted_step
 
 
@@ -33,7 +33,7 @@ def scene():
 
 def smoke(**changes) -> Bytewise:
     short = {"stage1_iterations": 60, "stage2_iterations": 20, "memory_budget": "40kB", "initial_gaussians": None}
-    return with_changes(Bytewise.preset("smoke"), {**short, **changes}, "test")
+    return changed_config(Bytewise.preset("smoke"), {**short, **changes}, "test")
 
 
 SHARES = {"view_dependence_share": 0.1, "texture_share": 0.05}
@@ -132,7 +132,7 @@ def test_shapes_of_kernels_are_trained_in_both_stages_and_counted(scene, tmp_pat
     first = a2tg.fit_stage(scene, system, 0, progress=False).model
     before = np.asarray(first.appearance.shapes)
     assert before.std() > 0.02 and before.max() > 0 > before.min()
-    resting = a2tg.fit_stage(scene, with_changes(system, {"kernel_rate": 1e-9}, "test"), 1, first, progress=False)
+    resting = a2tg.fit_stage(scene, changed_config(system, {"kernel_rate": 1e-9}, "test"), 1, first, progress=False)
     after = resting.model.appearance.shapes
     np.testing.assert_allclose(after, before, atol=1e-6, err_msg="the second stage goes on from the first one's shapes")
     result = a2tg.fit_stage(scene, system, 1, first, progress=False)

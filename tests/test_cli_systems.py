@@ -1,4 +1,4 @@
-"""The command line on a system of one's own, which lies as one file in the folder where the commands are given."""
+"""The command line on a custom system, a file in the current folder."""
 
 import json
 import shutil
@@ -14,6 +14,7 @@ from a2tg_jax.cli import main as cli
 from a2tg_jax.results import run_training
 from a2tg_jax.results.folder import RunFolder
 
+pytestmark = pytest.mark.long
 TOY = Path(__file__).with_name("toy_system.py")
 MINE = ["--system", "my_toy:Toy"]
 
@@ -63,34 +64,23 @@ def test_interrupted_and_resumed(folder, inside):
     assert inside.report.is_file()
 
 
-def test_eval_measures_the_same_again(inside, capsys):
+def test_other_commands(inside, tmp_path, capsys):
     before = json.loads(inside.metrics.read_text())["models"]["Toy-rings"]["test"]
-    assert cli.main(["eval", "run"]) == 0
-    assert "Toy-rings" in capsys.readouterr().out
+    assert cli.main(["eval", "run"]) == cli.main(["info", "run"]) == 0
+    text = capsys.readouterr().out
+    assert "my_toy:Toy" in text and "Toy-rings" in text and "60 Gaussians" in text
     assert json.loads(inside.metrics.read_text())["models"]["Toy-rings"]["test"] == before
-
-
-def test_render_draws_frames(inside, tmp_path):
     assert cli.main(["render", "run", "--frames", "2", "--out", str(tmp_path)]) == 0
     frames = sorted(tmp_path.glob("*.png"))
     assert [path.name for path in frames] == ["frame_0000.png", "frame_0001.png"]
     assert all(np.asarray(Image.open(path)).std() > 1 for path in frames)
-
-
-def test_info_tells_system_and_model(inside, capsys):
-    assert cli.main(["info", "run"]) == 0
-    text = capsys.readouterr().out
-    assert "my_toy:Toy" in text and "Toy-rings" in text and "60 Gaussians" in text
-
-
-def test_help_lists_its_options(inside, capsys):
     assert cli.main(["train", *MINE, "--help-all"]) == 0
     text = capsys.readouterr().out
     assert "--contrast-weight" in text and "--rings-rate" in text and "--texture.cap" not in text
 
 
 def test_numbers_edited_between_two_attempts_are_refused(inside, tmp_path, capsys):
-    """A model, or a checkpoint, made with other numbers is not passed off as one of the record's."""
+    """Models and checkpoints made with other numbers than the record's are refused."""
     copy = RunFolder(shutil.copytree(inside.path, tmp_path / "copy"))
     copy.record.write_text(copy.record.read_text().replace("contrast_weight = 0.2", "contrast_weight = 0.3"))
     assert cli.main(["train", "--out", str(copy.path), "--resume"]) == 2

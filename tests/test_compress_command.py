@@ -1,21 +1,31 @@
 """The command `a2tg compress`, with and without tuning, on a tiny run."""
 
+import dataclasses
 import re
 import shutil
 
+import numpy as np
 import pytest
-from test_cli import TINY, fails
+from run_folders import create_run
+from test_cli import fails
 
+from a2tg_jax.appearance import Appearance, Texture
 from a2tg_jax.cli import main as cli
+from a2tg_jax.data.load import SceneSource
+from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import tuning
 from a2tg_jax.finish.compaction import Trial
 from a2tg_jax.io.compact import CompactChoices, grids_of, half_turned, load_compact
-from a2tg_jax.io.model_file import load_model
+from a2tg_jax.io.model_file import load_model, save_model
+from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.results import compression
 from a2tg_jax.results.folder import RunFolder
-from a2tg_jax.results.record import SceneSource, read_record
+from a2tg_jax.results.record import RunRecord, read_record, write_record
+from a2tg_jax.systems.a2tg import A2tg
+from a2tg_jax.texture import allocate_textures
 from a2tg_jax.training import DivergedError, reports
+from a2tg_jax.training.start import initial_model
 
 TUNE = ["compress", "--tune-iterations", "30"]
 COARSE = CompactChoices(means=5, log_scales=3, quats=3, opacities=2, sh_0=3, sh_rest=2, texels=2)
@@ -26,14 +36,20 @@ pytestmark = pytest.mark.usefixtures("untouched_jax")
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    out = tmp_path_factory.mktemp("compress") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "configure_cpu", lambda: None)
-        options = [option for option in TINY if option != "--baseline"]
-        assert cli.main(["train", "synthetic", "--out", str(out), *options]) == 0
-    return RunFolder(out)
+    """A finished run whose last model has texels, made without training."""
+    run = create_run(tmp_path_factory.mktemp("compress") / "run")
+    system = A2tg(stage1_iterations=1, stage2_iterations=1, initial_gaussians=60, densify=Mcmc(cap=60))
+    write_record(run, RunRecord(SceneSource("synthetic", downscale=5), "a2tg", system))
+    scene = read_record(run).scene.load()
+    model = dataclasses.replace(initial_model(scene, system), origin=origin_of_scene(scene))
+    textures = allocate_textures(np.full((60, 2), 2), rgb=0.1)
+    save_model(run.own(run.model("a2tg-gaussians")), model)
+    textured = dataclasses.replace(model, appearance=Appearance(texture=Texture(textures)))
+    save_model(run.own(run.model("a2tg-textures")), textured)
+    return run
 
 
+@pytest.mark.long
 def test_compress(run, tmp_path, monkeypatch, capsys):
     """Choices are measured on the run's photographs or, without them, on renders of the model."""
     ladder = {"means": (8, 14), "sh_rest": (3, 8)}
@@ -57,8 +73,9 @@ def test_compress(run, tmp_path, monkeypatch, capsys):
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
-    """Tuned files are measured as any others, and are kept only if they are smaller and lose no more."""
+    """Tuned files are measured like the others, and kept only if they are smaller and lose no more."""
     ladder = {"means": (3, 5, 8, 14), "log_scales": (1, 2, 4, 10), "sh_0": (1, 2, 4, 10), "opacities": (1, 2, 4, 10)}
     monkeypatch.setattr(compression, "TUNED_LADDER", ladder)
     monkeypatch.setattr(tuning, "MOST_TUNINGS", 1)
@@ -79,13 +96,14 @@ def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
 
 
 def tuned_so(path, choices, *, adds=0, losses=2):
-    """A search of tuned files that has found the model of a file in some bits, told to be larger than it is."""
+    """A search of tuned files that has found the model of a file in some bits, said to be larger than it is."""
     model = half_turned(load_model(path))
     tuned = tuning.Tuned(model, choices, grids_of(model, choices))
     trial = Trial(choices, len(tuned.data) + adds, (0.0,) * losses)
     return tuning.TunedFiles([trial], trial, tuned)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("adds", "is_kept"), [(0, True), (10**9, False)])
 def test_compress_writes_the_smaller_file(adds, is_kept, run, tmp_path, monkeypatch, capsys):
     found = tuned_so(run.model("a2tg-textures"), COARSE, adds=adds)
@@ -97,6 +115,7 @@ def test_compress_writes_the_smaller_file(adds, is_kept, run, tmp_path, monkeypa
     assert ("chosen: means 5" in capsys.readouterr().out) is is_kept
 
 
+@pytest.mark.long
 def test_a_tuned_file_may_be_the_only_one_within_the_loss(run, tmp_path, monkeypatch, capsys):
     found = tuned_so(run.model("a2tg-textures"), COARSE, losses=1)
     monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (3, 4)})
@@ -114,19 +133,28 @@ def test_a_tuned_file_may_be_the_only_one_within_the_loss(run, tmp_path, monkeyp
     assert cli.main(command) == 0 and out.read_bytes() == found.tuned.data
 
 
-def test_a_diverged_tuning_keeps_what_was_found(run, tmp_path, monkeypatch, capsys):
-    def diverge(*arguments, title, **options):
-        raise DivergedError(f"{title}: the loss has exploded", None)
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(KeyboardInterrupt(), 130), (ValueError("a bug"), 2), (DivergedError("the loss has exploded", None), 0)],
+)
+def test_a_tuning_that_ends_early(error, code, run, tmp_path, monkeypatch, capsys):
+    """One that diverges keeps what was found before; any other writes no file."""
+
+    def stop(*arguments, **options):
+        raise error
 
     monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (8, 14)})
-    monkeypatch.setattr(compression, "tune_compact", diverge)
-    out = tmp_path / "a.a2tgz"
-    assert cli.main([*TUNE, str(run.path), "--out", str(out), "--max-loss", "0.5"]) == 0
-    told = "tuning ended early, what was found before is kept: tuning 1 of up to 4: the loss has exploded\n"
-    assert told in capsys.readouterr().out and load_compact(out).num == 60
+    monkeypatch.setattr(compression, "tune_compact", stop)
+    assert cli.main([*TUNE, str(run.path), "--out", str(tmp_path / "a.a2tgz"), "--max-loss", "0.5"]) == code
+    assert [path.name for path in tmp_path.iterdir()] == ([] if code else ["a.a2tgz"])
+    if code == 0:
+        told = "tuning ended early, what was found before is kept: the loss has exploded\n"
+        assert told in capsys.readouterr().out and load_compact(tmp_path / "a.a2tgz").num == 60
 
 
-def test_only_a_file_that_the_run_wrote_is_replaced_unasked(run, tmp_path, monkeypatch, capsys):
+@pytest.mark.long
+def test_only_a_file_that_the_run_wrote_is_replaced(run, tmp_path, monkeypatch, capsys):
     """Nothing is computed before the refusal."""
 
     class Reached(Exception):
@@ -158,21 +186,9 @@ def test_only_a_file_that_the_run_wrote_is_replaced_unasked(run, tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
-    [("plain.a2tgz", ", which is compressed already"), *((f"c.{kind}", "") for kind in ("ply", "spz", "SOG", "pt"))],
+    ("name", "told"), [("plain.a2tgz", ", which is compressed already"), ("c.ply", ""), ("c.SOG", "")]
 )
-def test_compress_tells_what_it_reads(name, told, tmp_path, monkeypatch, capsys):
+def test_compress_names_what_it_reads(name, told, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).touch()
     assert f"a2tg compress reads a run folder or *.npz; got {name}{told}\n" in fails(capsys, "compress", name)
-
-
-@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (ValueError("the loss has exploded"), 2)])
-def test_a_stopped_tuning_writes_no_file(error, code, run, tmp_path, monkeypatch, capsys):
-    def stop(*arguments, **options):
-        raise error
-
-    monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (8, 14)})
-    monkeypatch.setattr(compression, "tune_compact", stop)
-    assert cli.main([*TUNE, str(run.path), "--out", str(tmp_path / "a.a2tgz"), "--max-loss", "0.5"]) == code
-    assert not list(tmp_path.iterdir())

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax.training.registry import SYSTEMS, with_changes
+from a2tg_jax.io.config_json import changed_config
+from a2tg_jax.training.registry import SYSTEMS
 
 MODES = {
     "disable_jit": jax.disable_jit,
@@ -37,7 +38,7 @@ def test_a_system_trains(mode, name, scene):
     changes = {"stage1_iterations": 12, "initial_gaussians": 20, "densify": {"cap": 200 if name in GROWS else 21}}
     if hasattr(a2tg.find_system(name), "stage2_iterations"):
         changes["stage2_iterations"] = 3
-    system = with_changes(a2tg.find_system(name), changes, "test")
+    system = changed_config(a2tg.find_system(name), changes, "test")
     with MODES[mode]():
         model = a2tg.fit(scene, system, progress=False).model
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model.gaussians))

@@ -302,7 +302,7 @@ def test_checkpoints_out_of_range(checkpoint, change, message):
 
 @pytest.mark.parametrize("data", [3, None, [], "a2tg", {}, {"name": "a2tg"}, {"name": ["a2tg"], "options": {}}])
 def test_systems_that_are_none(data):
-    with pytest.raises(ValueError, match=r"m\.npz: does not say of which system it is"):
+    with pytest.raises(ValueError, match=r"m\.npz: does not name its system"):
         system_from_dict(data, "m.npz")
 
 

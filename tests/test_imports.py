@@ -27,6 +27,7 @@ LAYERS = (
     {"finish", "mesh"},
     {"results"},
     {"cli"},
+    {"__main__"},
 )
 """Lowest first. A module may import from lower layers, and, within one subpackage, from itself."""
 DRAWING = {"parallel.exchange", "parallel.exchange_room"}

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ import pytest
 from run_folders import create_run
 
 from a2tg_jax import Change, StepEvent
-from a2tg_jax.cli import __main__ as entry, main as cli
+from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host import signals
 from a2tg_jax.host.atomic import replacing
@@ -182,7 +182,7 @@ def test_the_error_of_a_full_disk_names_the_file(tmp_path, monkeypatch, capsys, 
         with writing, open("/dev/full", "wb", buffering=0) as file:
             file.write(b"x")
 
-    monkeypatch.setattr(cli.Info, "run", write)
+    monkeypatch.setattr(runs.Info, "run", write)
     assert cli.main(["info", "run"]) == 2
     where = rf"{tmp_path / 'x.npz'}: the disk is full( or has no inodes left)?, \d+\.\d MB are free"
     told = where if is_ours else "the disk is full"
@@ -460,7 +460,7 @@ def test_restoring_has_an_end(scene, tmp_path):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_outside_training_ends_with_one_line(monkeypatch, capsys, number, code):
-    monkeypatch.setattr(cli.Info, "run", lambda self: os.kill(os.getpid(), number))
+    monkeypatch.setattr(runs.Info, "run", lambda self: os.kill(os.getpid(), number))
     before = signal.getsignal(number)
     assert cli.main(["info", "run"]) == code
     assert capsys.readouterr().err == "a2tg: interrupted\n" and signal.getsignal(number) == before
@@ -490,20 +490,6 @@ def test_a_signal_in_training_keeps_its_state(scene, stopped, tmp_path, monkeypa
     assert_same(run, stopped[1])
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (None, 7)])
-def test_a_signal_during_the_imports_ends_the_program_in_one_line(monkeypatch, capsys, number, code):
-    def main_of(name):
-        if number is not None and name == "main":
-            signal.raise_signal(number)
-        return lambda: 7
-
-    module = ModuleType("a2tg_jax.cli.main")
-    module.__getattr__ = main_of
-    monkeypatch.setitem(sys.modules, "a2tg_jax.cli.main", module)
-    assert entry.main() == code
-    assert capsys.readouterr().err == ("" if number is None else "a2tg: interrupted\n")
-
-
 def test_a_second_signal_ends_the_program_at_once():
     with pytest.raises(signals.Stopped) as raised, signals.noted() as is_asked:
         assert not is_asked()
@@ -518,7 +504,7 @@ def test_a_second_signal_ends_the_program_at_once():
 def test_a_closed_pipe_is_quiet(tmp_path):
     run = filled(tmp_path / "run")
     run.model(NAME).unlink()
-    command = f"{sys.executable} -m a2tg_jax.cli info {run.path}; echo $? >&2"
+    command = f"{sys.executable} -m a2tg_jax info {run.path}; echo $? >&2"
     done = subprocess.run(
         ["bash", "-c", f"({command}) | true"], capture_output=True, text=True, check=False,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
@@ -557,12 +543,12 @@ def test_a_lack_of_memory_in_training_comes_with_advice(tmp_path, monkeypatch, c
 @pytest.mark.parametrize(("name", "advice"), [("render", "lower --size or --supersample"), ("info", "close other")])
 def test_a_lack_of_memory_outside_training_is_one_line(name, advice, monkeypatch, capsys):
     for told, error in LACKS.items():
-        monkeypatch.setattr(cli.COMMANDS[name], "run", raising(error))
+        monkeypatch.setattr(cli.command_class(name), "run", raising(error))
         assert cli.main([name, "run"]) == 2
         assert f"a2tg: error: {told}{advice}" in capsys.readouterr().err
 
 
 def test_an_internal_error_is_not_reported_as_a_mistake_of_the_user(monkeypatch):
-    monkeypatch.setattr(cli.Info, "run", raising(jax.errors.JaxRuntimeError("INTERNAL: a bug")))
+    monkeypatch.setattr(runs.Info, "run", raising(jax.errors.JaxRuntimeError("INTERNAL: a bug")))
     with pytest.raises(jax.errors.JaxRuntimeError, match="a bug"):
         cli.main(["info", "run"])

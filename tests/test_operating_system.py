@@ -1,6 +1,7 @@
-"""Each system's way of a call, with the modules and functions of the others taken away."""
+"""The machine: calls of each operating system without the modules of the others, signals, and numbers of threads."""
 
 import gc
+import math
 import os
 import signal
 import sys
@@ -8,10 +9,13 @@ import time
 from types import SimpleNamespace
 
 import pytest
+from scenes_random import as_camera, as_gaussians, draw_scene
 
+import a2tg_jax
+from a2tg_jax import render_image
 from a2tg_jax.host import machine, operating_system, signals
+from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 
-SYSTEMS = ("linux", "darwin", "win32")
 NOT_LOCKED, TAKEN, NO_LOCKS = None, "taken", OSError(95, "Operation not supported")
 
 
@@ -60,14 +64,11 @@ def test_folders_are_flushed_except_on_windows(monkeypatch, tmp_path):
     assert len(flushed) < 2
 
 
-def test_cores_and_features_without_linux(monkeypatch, tmp_path):
+def test_cores_and_features(monkeypatch, tmp_path):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 7)
     assert operating_system.num_cores() == 7
     assert machine.processor_features(tmp_path / "cpuinfo") == frozenset()
-
-
-def test_features_are_those_of_the_first_processor(tmp_path):
     (tmp_path / "cpuinfo").write_text("processor\t: 0\nflags\t\t: fpu avx2\n\nprocessor\t: 1\nflags\t\t: fpu\n")
     assert machine.processor_features(tmp_path / "cpuinfo") == {"fpu", "avx2"}
 
@@ -82,15 +83,15 @@ def test_a_heap_is_trimmed_only_by_a_library_that_can(monkeypatch, library):
     assert trimmed == [0]
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
 @pytest.mark.parametrize("variable", [None, "DISPLAY", "WAYLAND_DISPLAY"])
-def test_linux_needs_a_display_for_a_browser(monkeypatch, system, variable):
-    monkeypatch.setattr(sys, "platform", system)
+def test_linux_needs_a_display_for_a_browser(monkeypatch, variable):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     if variable:
         monkeypatch.setenv(variable, ":0")
-    assert operating_system.has_display() == (system != "linux" or variable is not None)
+    for system in ("linux", "darwin", "win32"):
+        monkeypatch.setattr(sys, "platform", system)
+        assert operating_system.has_display() == (system != "linux" or variable is not None)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -113,3 +114,90 @@ def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_lost(number)
         assert time.monotonic() - start < 10, "waiting of the main thread is interrupted"
     finally:
         gc.callbacks.remove(callback)
+
+
+@pytest.mark.parametrize("num", [1, 2])
+def test_a_noted_signal_ends_the_block_and_a_second_one_does_at_once(num):
+    with pytest.raises(KeyboardInterrupt), signals.noted((signals.CTRL_C,)) as is_interrupted:
+        assert not is_interrupted()
+        for _ in range(num):
+            signal.raise_signal(signal.SIGINT)
+            assert is_interrupted()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+CGROUPS = {
+    "version 2, in a container": ("0::/", {"cpu.max": "150000 100000"}, 1.5),
+    "version 2, without a limit": ("0::/", {"cpu.max": "max 100000"}, math.inf),
+    "version 2, the group around it": (
+        "0::/user/job",
+        {"user/cpu.max": "200000 100000", "user/job/cpu.max": "300000 100000"},
+        2.0,
+    ),
+    "version 1": (
+        "4:memory:/job\n3:cpu,cpuacct:/job",
+        {"cpu,cpuacct/job/cpu.cfs_quota_us": "50000", "cpu,cpuacct/job/cpu.cfs_period_us": "100000"},
+        0.5,
+    ),
+    "version 1, path of the host": (
+        "3:cpu:/docker/0123\n0::/",
+        {"cpu/cpu.cfs_quota_us": "400000", "cpu/cpu.cfs_period_us": "100000"},
+        4.0,
+    ),
+    "version 1, without a limit": (
+        "3:cpu:/",
+        {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"},
+        math.inf,
+    ),
+    "unreadable": ("0::/", {"cpu.max": "plenty"}, math.inf),
+    "no groups": ("", {}, math.inf),
+}
+
+
+@pytest.mark.parametrize("name", CGROUPS)
+def test_quotas_of_control_groups(tmp_path, name):
+    groups, files, expected = CGROUPS[name]
+    for path, text in {"proc/self/cgroup": groups, **{f"sys/fs/cgroup/{k}": v for k, v in files.items()}}.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text + "\n")
+    assert machine.cpu_quota(tmp_path) == expected
+    assert machine.cpu_quota(tmp_path / "nowhere") == math.inf
+
+
+@pytest.fixture
+def threads(monkeypatch):
+    """Neither `set_num_threads` nor the environment has set a number of threads."""
+    monkeypatch.setattr(machine, "_chosen", None)
+    monkeypatch.delenv(machine.VARIABLE, raising=False)
+
+
+@pytest.mark.parametrize(("quota", "expected"), [(0.2, 1), (1.5, 2), (3.0, 3), (99.0, 8), (math.inf, 8)])
+def test_the_default_is_what_the_process_may_use(monkeypatch, threads, quota, expected):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
+    monkeypatch.setattr(machine, "cpu_quota", lambda: quota)
+    assert machine.num_threads() == expected
+
+
+def test_a_set_number_precedes_the_environment(monkeypatch, threads):
+    monkeypatch.setenv(machine.VARIABLE, "3")
+    for given, expected in ((5, 5), (None, 3)):
+        a2tg_jax.set_num_threads(given)
+        assert machine.num_threads() == expected
+    for wrong in (0, -1, 1.5, True, "2"):
+        with pytest.raises(ValueError, match=r"num_threads must be a positive integer or None; got"):
+            a2tg_jax.set_num_threads(wrong)
+    for wrong in ("0", "-1", "two"):
+        monkeypatch.setenv(machine.VARIABLE, wrong)
+        with pytest.raises(ValueError, match=rf"A2TG_NUM_THREADS must be a positive integer; got '{wrong}'"):
+            a2tg_jax.configure_cpu(use_cache=False)
+
+
+def test_rendering_uses_that_number_of_threads(monkeypatch, threads):
+    parts, run_spans, scene = [], ffi.run_spans, draw_scene(3, num=60)
+    monkeypatch.setattr(native, "PAIRS_PER_THREAD", 1)
+    monkeypatch.setattr(ffi, "run_spans", lambda work, spans: (parts.append(len(spans)), run_spans(work, spans)))
+    for num in (1, 3):
+        parts.clear()
+        a2tg_jax.set_num_threads(num)
+        render_image(as_gaussians(scene, "float32"), as_camera(scene, "float32")).color.block_until_ready()
+        assert max(parts) == num

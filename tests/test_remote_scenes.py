@@ -4,7 +4,6 @@ import collections
 import os
 import re
 import sys
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -22,7 +21,7 @@ from a2tg_jax import load_scene
 from a2tg_jax.cli import main as cli
 from a2tg_jax.data import photo_store
 from a2tg_jax.host import remote_files
-from a2tg_jax.host.regular_files import open_regular
+from a2tg_jax.host.regular_files import is_folder, is_regular, open_regular
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.record import SceneSource, read_record, scene_place
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
@@ -188,7 +187,7 @@ def test_large_files_are_fetched_in_pieces(store, monkeypatch, size, num):
     path = remote_files.located(f"{URL}/file")
     remote_files.check_reachable(path.parent)
     store.num.clear()
-    with remote_files.fetched(path, remote_files.remote_size(path), 1000) as file:
+    with remote_files.fetched(path, 1000) as file:
         assert file.read() == data
     assert store.num_of("cat_file") == num == sum(store.num.values())
 
@@ -214,27 +213,36 @@ def test_the_bound_of_a_file_holds_whatever_its_store_lists(store, monkeypatch, 
         assert len(file.read()) == 500
 
 
-def test_a_slow_listing_holds_up_no_other(store, monkeypatch):
-    """Threads that need the same folder wait for one request."""
-    for name in ("slow", "quick"):
-        store.fs.pipe_file(f"{ROOT}/{name}/file", b"")
-    path, is_asked, may_go, ls = remote_files.located(URL), threading.Event(), threading.Event(), type(store.fs).ls
+def test_threads_that_need_the_same_folder_make_one_request(store):
+    store.fs.pipe_file(f"{ROOT}/images/a.png", b"a")
+    path = remote_files.located(URL)
     remote_files.check_reachable(path)
+    store.seconds = 0.05
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(is_folder, [path / "images"] * 4))
+    assert store.num["ls", f"{ROOT}/images"] == 1
 
-    def listed(fs, place, **options):
-        if place.endswith("slow"):
-            is_asked.set()
-            assert may_go.wait(5)
-        return ls(fs, place, **options)
 
-    monkeypatch.setattr(type(store.fs), "ls", listed)
-    with ThreadPoolExecutor(2) as pool:
-        waiting = [pool.submit(remote_files.is_remote_folder, path / "slow") for _ in range(2)]
-        assert is_asked.wait(5) and remote_files.is_remote_folder(path / "quick")
-        assert not any(each.done() for each in waiting)
-        may_go.set()
-        assert all(each.result() for each in waiting)
-    assert store.num["ls", f"{ROOT}/slow"] == 1
+def test_links_are_followed(store, monkeypatch):
+    for name in ("linked", "dangling"):
+        store.fs.pipe_file(f"{ROOT}/{name}", bytes(5))
+    listed_as(monkeypatch, type="link", size=1)
+    path = remote_files.located(URL)
+    remote_files.check_reachable(path)
+    store.fs.rm(f"{ROOT}/dangling")
+    assert is_regular(path / "linked") and remote_files.remote_entry(path / "linked").size == 5
+    assert not is_regular(path / "dangling")
+
+
+def test_folders_in_no_listing_are_not_requested(store):
+    """A store may refuse to list a missing folder."""
+    store.fs.pipe_file(f"{ROOT}/images/a.png", b"a")
+    path = remote_files.located(URL)
+    remote_files.check_reachable(path)
+    store.num.clear()
+    assert not is_folder(path / "sparse" / "0") and not store.num
+    assert is_regular(path / "images" / "a.png") and store.num_of("ls") == 1
+    assert not is_regular(path / "masks" / "a.png") and store.num_of("ls") == 1
 
 
 def test_a_photograph_that_changes_or_goes_is_named(fox, store):

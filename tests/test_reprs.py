@@ -84,6 +84,10 @@ LINES = {
     "StageResult('texture', 5 Gaussians, 1.16 kB, 12 s)": lambda: fit_result().stages[0],
     "History(2 rows to iteration 1,200 of stage 2, 21.25 dB)": some_history,
     "History(0 rows)": History.empty,
+    "Checkpoint(A2tg, stage 2, iteration 1,200, 5 Gaussians)": lambda: Checkpoint(
+        A2tg(), 1, types.SimpleNamespace(iteration=1200, model=small_model()), some_history()
+    ),
+    "Renderer(5 Gaussians, no size yet)": lambda: a2tg.Renderer(small_model()),
 }
 
 
@@ -92,10 +96,13 @@ def test_a_value_is_a_line(line):
     assert repr(LINES[line]()) == line
 
 
-def test_checkpoint_is_a_line():
-    state = types.SimpleNamespace(iteration=1200, model=small_model())
-    checkpoint = Checkpoint(A2tg(), 1, state, some_history())
-    assert repr(checkpoint) == "Checkpoint(A2tg, stage 2, iteration 1,200, 5 Gaussians)"
+def test_a_renderer_and_a_camera_print_their_size():
+    renderer = a2tg.Renderer(small_model())
+    renderer(CAMERA)
+    assert repr(renderer) == "Renderer(5 Gaussians, 21×13)"
+    camera = dataclasses.replace(CAMERA, width=np.int64(80))
+    assert "width=80" in repr(camera) and type(camera.width) is int
+    assert "OpenCV" in a2tg.Camera.__doc__ and "+0.5" in a2tg.Camera.__doc__
 
 
 def test_model_without_values_has_a_repr():
@@ -137,21 +144,15 @@ def test_render_is_a_picture():
     picture = decoded(output._repr_png_())
     np.testing.assert_array_equal(picture[::12, ::12], expected)
     assert picture.shape == (12 * 13, 12 * 21, 3), "small pictures are enlarged to 240 pixels"
-
-
-def test_several_views_and_traced_views_have_no_picture():
     seen = []
-    jax.jit(lambda output: seen.append(output._repr_png_()))(some_output())
-    assert seen == [None] and some_output(2)._repr_png_() is None
+    jax.jit(lambda output: seen.append(output._repr_png_()))(output)
+    assert seen == [None] and some_output(2)._repr_png_() is None, "traced and several views have none"
 
 
-def test_view_is_a_picture():
+def test_a_view_and_a_scene_are_pictures():
     view = some_view(channels=4)
     factor = -(-240 // view.picture.size[1])
     np.testing.assert_array_equal(decoded(view._repr_png_())[::factor, ::factor], view.picture.read())
-
-
-def test_scene_shows_a_few_thumbnails():
     text = some_scene()._repr_html_()
     assert text.count("<img ") == 8 and "12 training views" in text
     assert 'title="&lt;0&gt;.png"' in text and 'title="&lt;10&gt;.png"' in text
@@ -181,11 +182,12 @@ def test_help_has_the_docstrings_of_fields(kind, field, text):
     assert inspect.getdoc(kind) == kind.__doc__ and f"\n  {field}: {text}" in kind.__doc__
 
 
-def test_every_public_class_can_be_told():
-    """And a class without documented fields keeps its docstring."""
+def test_every_public_class_has_a_docstring():
+    """A class without documented fields keeps its own. No helpers are public."""
     classes = [found for name in a2tg.__all__ if isinstance(found := getattr(a2tg, name), type)]
     assert all(isinstance(found.__doc__, str) for found in classes)
     assert "Attributes:" not in a2tg.CapacityWarning.__doc__
+    assert not {"Any", "TYPE_CHECKING", "importlib"} & set(dir(a2tg)) and "__version__" in dir(a2tg)
 
 
 def test_the_command_line_prints_fields_as_options_only(capsys):

@@ -14,10 +14,11 @@ from toy_system import Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.pytree import num_compiled
+from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.training import fit_stage, loop
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.registry import SYSTEMS, differences, system_from_dict, system_to_dict, with_changes
+from a2tg_jax.training.registry import SYSTEMS, differences, system_from_dict, system_to_dict
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import jitted_step
 
@@ -50,7 +51,7 @@ def tiny(name: str, **changes):
         changes["densify"] = {"cap": 600, **changes.get("densify", {})}
     if hasattr(system, "stage2_iterations"):
         changes = {"stage2_iterations": 12, **changes}
-    return with_changes(system, {**TINY, **changes}, "test")
+    return changed_config(system, {**TINY, **changes}, "test")
 
 
 def assert_same(a, b):
@@ -315,7 +316,7 @@ def test_a_training_without_gaussians_left_tells_what_to_change(scene, name, rea
 def test_options_as_values_of_files_and_back(name):
     system = type(a2tg.find_system(name)).preset("smoke")
     assert system_from_dict(system_to_dict(system), "file") == system
-    assert with_changes(a2tg.find_system(name), differences(system), "file") == system
+    assert changed_config(a2tg.find_system(name), differences(system), "file") == system
 
 
 def test_a_file_imports_nothing():

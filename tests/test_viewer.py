@@ -185,7 +185,7 @@ def test_view_tells_the_address_for_a_phone(monkeypatch, tmp_path, capsys):
     save_ply(tmp_path / "a.ply", some_gaussians())
     asked = []
     monkeypatch.setattr(
-        "a2tg_jax.cli.scenes.serve", lambda routes, *, on_start, **rest: (asked.append(rest), on_start("http://x/t/"))
+        "a2tg_jax.cli.runs.serve", lambda routes, *, on_start, **rest: (asked.append(rest), on_start("http://x/t/"))
     )
     assert main(["view", str(tmp_path / "a.ply"), "--no-open", "--host", "0.0.0.0"]) == 0
     assert asked == [{"host": "0.0.0.0", "port": 0}]
@@ -195,7 +195,7 @@ def test_view_tells_the_address_for_a_phone(monkeypatch, tmp_path, capsys):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_ctrl_c_is_the_usual_end_of_a_server(monkeypatch, tmp_path, number, code):
     save_ply(tmp_path / "a.ply", some_gaussians())
-    monkeypatch.setattr("a2tg_jax.cli.scenes.ViewCommand._started", lambda *_: signal.raise_signal(number))
+    monkeypatch.setattr("a2tg_jax.cli.runs.ViewCommand._started", lambda *_: signal.raise_signal(number))
     assert main(["view", str(tmp_path / "a.ply")]) == code
 
 

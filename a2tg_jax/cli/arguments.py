@@ -2,10 +2,9 @@
 
 import dataclasses
 import inspect
-import itertools
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -17,7 +16,6 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from a2tg_jax.host.remote_files import is_url, without_secrets
 
 Parsed = TypeVar("Parsed")
-NONE = "None"
 
 
 def defaulting_to(text: str, metavar: str | None = None) -> Any:
@@ -58,13 +56,13 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: P
       ValueError: if a URL is given where only paths on this machine work.
     """
     if {"-h", "--help"} & set(arguments):  # It takes a second.
-        for one in _nested(default or kind):
-            _fill_help(one)
+        _fill_help(default or kind)
     rules = ConstructorRegistry()
     rules.primitive_rule(_optional_rule)
     about = inspect.getdoc(kind) or ""
-    given: dict[str, Any] = {} if default is None else {"default": default}
-    about = about if default is None else about.split("\n")[0]  # The other lines are the short help.
+    given: dict[str, Any] = {}
+    if default is not None:
+        about, given = about.split("\n")[0], {"default": default}  # The other lines are the short help.
     command: Parsed = tyro.cli(kind, prog=program, args=arguments, description=about, registry=rules, **given)
     scene = getattr(getattr(getattr(command, "record", None), "scene", None), "path", None)
     for word in arguments:
@@ -81,26 +79,25 @@ def check_path(text: str) -> None:
         raise ValueError(f"{url}: only SCENE of a2tg train may be a URL; copy it here, or mount the bucket")
 
 
-def _nested(value: Any) -> Iterator[type]:
-    """Yield the class of a dataclass, and the classes of dataclasses in its fields."""
-    yield value if isinstance(value, type) else type(value)
-    for field in dataclasses.fields(value):
-        inner = getattr(value, field.name, None)
-        if dataclasses.is_dataclass(inner) and not isinstance(inner, type):
-            yield from _nested(inner)
-
-
-def _fill_help(kind: type) -> None:
-    """Have the help of a dataclass fill its lines; tyro breaks them where the docstrings in the source do."""
-    params = itertools.chain.from_iterable(parse_from_object(one).params for one in kind.__mro__[-2::-1])
+def _fill_help(value: Any) -> None:
+    """Make each option's help one paragraph, in a dataclass and those in its fields; tyro would keep the source's line
+    breaks."""
+    kind = value if isinstance(value, type) else type(value)
+    params = [param for base in kind.__mro__[-2::-1] for param in parse_from_object(base).params]
     texts = {param.arg_name: " ".join(param.description.split()) for param in params if param.description}
     for field in dataclasses.fields(kind):
         if field.name in texts:
             field.metadata = types.MappingProxyType({**field.metadata, "help": texts[field.name]})
+        inner = getattr(value, field.name, None)
+        if dataclasses.is_dataclass(inner) and not isinstance(inner, type):
+            _fill_help(inner)
 
 
 def _optional_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """Return the rule for a value that may be None, named in the help as without None."""
+    """Return the rule for a value that may be None: the rule for the value, which also takes the word None.
+
+    tyro's own rule prints {None}|FLOAT in the help.
+    """
     kinds = typing.get_args(info.type)
     if typing.get_origin(info.type) not in (typing.Union, types.UnionType) or types.NoneType not in kinds:
         return None
@@ -111,8 +108,8 @@ def _optional_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | N
     return dataclasses.replace(
         plain,
         metavar="SIZE" if {float, str} <= set(kinds) else plain.metavar,
-        instance_from_str=lambda words: None if words == [NONE] else plain.instance_from_str(words),
+        instance_from_str=lambda words: None if words == ["None"] else plain.instance_from_str(words),
         is_instance=lambda value: value is None or plain.is_instance(value),
-        str_from_instance=lambda value: [NONE] if value is None else plain.str_from_instance(value),
-        choices=None if plain.choices is None else (*plain.choices, NONE),
+        str_from_instance=lambda value: ["None"] if value is None else plain.str_from_instance(value),
+        choices=None if plain.choices is None else (*plain.choices, "None"),
     )

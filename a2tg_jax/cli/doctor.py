@@ -4,7 +4,7 @@ import dataclasses
 import os
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 
 import jax
@@ -23,7 +23,7 @@ from a2tg_jax.render import render_image
 
 PACKAGES = ("jax", "jaxlib", "jax-cuda13-plugin", "jaxopt", "numpy", "llvmlite", "nvidia-cuda-nvrtc", "pycolmap")
 MOST_DIFFERENCE = 1e-3
-"""Largest difference of colours in [0, 1] between compositors that is rounding."""
+"""Largest rounding difference between compositors, of colours in [0, 1]."""
 WIDTH, HEIGHT, NUM = 96, 64, 400
 
 
@@ -31,7 +31,7 @@ WIDTH, HEIGHT, NUM = 96, 64, 400
 class Doctor:
     """Print what this machine computes with, and render an image by each compositor to compare them.
 
-    Put its output into a report of a problem.
+    Include the output when you report a problem.
     """
 
     def run(self) -> None:
@@ -53,22 +53,27 @@ class Doctor:
         }
         for name, text in lines.items():
             _print(name, text)
-        available = [name for name in platforms.PLATFORMS if platforms.is_available(name, of_jax)]
-        for name, remedy in platforms.REMEDIES.items():
-            if name not in available:
-                _print("", f"{name} is not available: it needs {remedy}")
-        largest = _compare(available)
+        missing = {name: text for name, text in platforms.REMEDIES.items() if not platforms.is_available(name, of_jax)}
+        for name, remedy in missing.items():
+            _print("", f"{name} is not available: it needs {remedy}")
+        largest = _compare([name for name in platforms.PLATFORMS if platforms.is_available(name, of_jax)])
         if not largest <= MOST_DIFFERENCE:
             raise ValueError(f"the compositors differ by {largest:.2g}; please report this with the lines above")
-        _print("verdict", _verdict(of_jax, available, has_driver=cuda is not None))
+        _print("verdict", _verdict(of_jax, missing, has_driver=cuda is not None))
 
 
-def _verdict(platform: str, available: Sequence[Compositor], *, has_driver: bool) -> str:
-    """Return whether everything works on a machine whose compositors agree."""
+def _verdict(platform: str, missing: Mapping[Compositor, str], *, has_driver: bool) -> str:
+    """Return how well everything works on a machine whose compositors agree.
+
+    Args:
+      platform: JAX's name of the device's platform.
+      missing: what each missing compositor needs.
+      has_driver: whether the machine has an NVIDIA driver.
+    """
     if platform == "cpu" and has_driver:
         return "everything works, but on the CPU: JAX does not find the NVIDIA GPU; pip install 'a2tg-jax[cuda13]'"
-    for name, remedy in platforms.REMEDIES.items():
-        if platforms.PLATFORMS[name] == platform and name not in available:
+    for name, remedy in missing.items():
+        if platforms.PLATFORMS[name] == platform:
             return f"everything works, but slowly: {name} is not available, which needs {remedy}"
     return "everything works on this machine"
 
@@ -88,13 +93,12 @@ def _compare(available: Sequence[Compositor]) -> float:
     """Render an image by each compositor; return the largest difference from XLA's, infinite if it is not finite."""
     rng = np.random.default_rng(0)
     gaussians = init_from_points(rng.uniform(-1, 1, (NUM, 3)), rng.uniform(0, 1, (NUM, 3)), opacity=0.5)
-    viewmat = jnp.eye(4, dtype=jnp.float32).at[2, 3].set(4)
-    K = jnp.asarray([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]], jnp.float32)
+    K = [[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]]
+    camera = Camera(jnp.eye(4, dtype=jnp.float32).at[2, 3].set(4), jnp.asarray(K, jnp.float32), WIDTH, HEIGHT)
     colors, largest = {}, 0.0
     for name in ("xla", *available):
         start = time.perf_counter()
-        output = render_image(gaussians, Camera(viewmat, K, WIDTH, HEIGHT), settings=RenderSettings(compositor=name))
-        colors[name] = np.asarray(output.color)
+        colors[name] = np.asarray(render_image(gaussians, camera, settings=RenderSettings(compositor=name)).color)
         text = f"{name}: {time.perf_counter() - start:.2f} s with compiling"
         if name != "xla":
             difference = float(np.nan_to_num(abs(colors[name] - colors["xla"]), nan=np.inf).max())

@@ -26,8 +26,8 @@ from a2tg_jax.results.forecast import quick_flags
 class Sfm:
     """Find camera poses and sparse points for photographs, videos and panoramas.
 
-    COLMAP extracts features, matches them and maps the scene. Of a video (pip install 'a2tg-jax[video]') it takes the
-    sharpest frames along the camera path. Panoramas of 360° are cut into views. Photographs are turned as EXIF says.
+    COLMAP extracts features, matches them and maps the scene. From a video (pip install 'a2tg-jax[video]') it takes the
+    sharpest frames along the camera path. Panoramas of 360° are cut into views. Photographs are rotated as EXIF says.
     The scene folder gets images, sparse points and cameras.png, which shows where the cameras are.
 
     Examples:
@@ -97,8 +97,8 @@ class Sfm:
 class Download:
     """Download benchmark data sets and unpack them.
 
-    An interrupted download continues when the command is given again. What is there is left alone. The experiments find
-    the scenes where they are unpacked.
+    Repeat the command to continue an interrupted download. Sets that exist are skipped. Scenes are unpacked where the
+    experiments find them.
 
     Examples:
       a2tg download --list

@@ -1,6 +1,6 @@
-"""The command line `a2tg`: demo, train, eval, finish, render, mesh, view, export, convert, compress, info, sfm,
-download, doctor."""
+"""The command line `a2tg`. Commands are imported when they run, so that help and a mistyped name need no JAX."""
 
+import importlib
 import inspect
 import os
 import re
@@ -10,29 +10,15 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-from a2tg_jax.cli.arguments import parse
-from a2tg_jax.cli.doctor import Doctor
-from a2tg_jax.cli.inputs import Download, Sfm
-from a2tg_jax.cli.runs import Compress, Eval, Finish, Info, MeshCommand, Render
-from a2tg_jax.cli.scenes import Convert, Export, ViewCommand
-from a2tg_jax.cli.train import Demo, Train, train_defaults
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.results.run_training import LESS_MEMORY
-from a2tg_jax.training import SYSTEMS
 
 BROKEN_PIPE = 128 + 13
 LONGEST_ERROR = 1000
 """Longest error line in characters."""
-SMALLER = {
-    "train": LESS_MEMORY,
-    "render": "lower --size or --supersample",
-    "mesh": "lower --resolution, --radius, --max-memory or --texture-size",
-}
-"""Advice by command for a lack of memory; other commands say "close other programs"."""
-OVERVIEW = f"""usage: a2tg COMMAND [OPTIONS]
+OVERVIEW = """usage: a2tg COMMAND [OPTIONS]
 
 Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textured scene.
 
@@ -54,22 +40,29 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg doctor                          print what this machine computes with, and test it
 
 Run a2tg COMMAND --help for a command, a2tg train --system NAME --help-all for the options of a system,
-and a2tg --version for the version. The systems: {", ".join(SYSTEMS)}.
+and a2tg --version for the version. The systems: a2tg, gaussians-2d, gaussians-2d-mcmc,
+textured-gaussians, supergaussians, bbsplat, bytewise.
 Set A2TG_DEBUG=1 to see the traceback of an error."""
-
-
-COMMANDS: dict[str, type] = {
-    "demo": Demo, "train": Train, "eval": Eval, "finish": Finish, "render": Render, "mesh": MeshCommand,
-    "view": ViewCommand, "export": Export, "convert": Convert, "compress": Compress, "info": Info, "sfm": Sfm,
-    "download": Download, "doctor": Doctor,
+COMMANDS = {
+    "demo": "train:Demo", "train": "train:Train", "eval": "runs:Eval", "finish": "runs:Finish", "render": "runs:Render",
+    "mesh": "runs:MeshCommand", "view": "runs:ViewCommand", "export": "runs:Export", "convert": "runs:Convert",
+    "compress": "runs:Compress", "info": "runs:Info", "sfm": "inputs:Sfm", "download": "inputs:Download",
+    "doctor": "doctor:Doctor",
 }  # fmt: skip
+"""Module of `a2tg_jax.cli` and dataclass of each command."""
+SMALLER = {
+    "train": "close other programs, or give a larger --downscale, or a smaller --memory-budget or --batch-size",
+    "render": "lower --size or --supersample",
+    "mesh": "lower --resolution, --radius, --max-memory or --texture-size",
+}
+"""What to do if a command runs out of memory; for other commands: close other programs."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Args:
-      argv: arguments without the program's name; None takes those of the process.
+      argv: arguments without the program's name; None: arguments of the process.
 
     Returns:
       The exit code: 0, 2 after a user's error (on stderr), 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP, 141
@@ -82,14 +75,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         near = did_you_mean(name, COMMANDS)
         return _fail(f"there is no command {name!r}{near or ';'} the commands are {', '.join(COMMANDS)}")
-    if name == "train" and {"-h", "--help"} & set(arguments):
-        print(f"usage: a2tg train SCENE --out RUN [OPTIONS]\n\n{inspect.getdoc(Train)}")
-        return 0
     try:
         with warnings.catch_warnings(), signals.raised():
             warnings.showwarning = _show_warning
             configure_cpu()
-            _add_current_folder()
+            try:
+                here = os.getcwd()
+            except FileNotFoundError:
+                raise ValueError("the current folder was deleted: change to one that exists") from None
+            if here not in sys.path:  # Custom systems are modules there.
+                sys.path.append(here)
+            if name == "train" and {"-h", "--help"} & set(arguments):
+                print(f"usage: a2tg train SCENE --out RUN [OPTIONS]\n\n{inspect.getdoc(command_class(name))}")
+                return 0
             try:
                 command = parsed(name, arguments)
             except SystemExit as end:  # tyro has printed help, or an error.
@@ -115,27 +113,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
+def command_class(name: str) -> Any:
+    """Import and return the dataclass of a command."""
+    module, _, kind = COMMANDS[name].partition(":")
+    return getattr(importlib.import_module(f"a2tg_jax.cli.{module}"), kind)
+
+
 def parsed(name: str, arguments: Sequence[str]) -> Any:
-    """Return the command for some arguments. Of a training, system, preset and file are read first: they set the
-    defaults.
+    """Return a command with its arguments. For a2tg train, the defaults come from the given system, preset or file.
 
     Raises:
       SystemExit: after help or an error of an argument, which are printed.
       ValueError, FileNotFoundError: if there is no such system, preset or file, or it is invalid.
     """
-    kind, default = COMMANDS[name], train_defaults(arguments) if name == "train" else None
+    from a2tg_jax.cli.arguments import parse
+
+    kind, default = command_class(name), None
+    if name == "train":
+        from a2tg_jax.cli.train import train_defaults
+
+        default = train_defaults(arguments)
     arguments = ["--help" if word == "--help-all" else word for word in arguments]
     return parse(kind, f"a2tg {name}", arguments, default)
-
-
-def _add_current_folder() -> None:
-    """Have Python look for modules in the current folder, too: custom systems are modules there."""
-    try:
-        here = os.getcwd()
-    except FileNotFoundError:
-        raise ValueError("the current folder was deleted: change to one that exists") from None
-    if here not in sys.path:
-        sys.path.append(here)
 
 
 def _fail(message: str) -> int:

@@ -1,4 +1,5 @@
-"""The commands for a finished run: `a2tg eval`, `finish`, `render`, `mesh`, `compress` and `info`."""
+"""The commands for finished runs and models: `a2tg eval`, `finish`, `render`, `mesh`, `view`, `export`, `convert`,
+`compress` and `info`."""
 
 import dataclasses
 from pathlib import Path
@@ -6,16 +7,18 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import LastModel, LpipsWeights, RunFolderPath, defaulting_to
-from a2tg_jax.cli.train import tell_result
+from a2tg_jax.cli.arguments import LastModel, LpipsWeights, RunFolderPath, RunOrFile, defaulting_to
+from a2tg_jax.cli.train import open_browser, print_result
 from a2tg_jax.host.text import counted
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.compression import compress
+from a2tg_jax.results.conversion import BakeOptions, check_ply, convert, export_ply
 from a2tg_jax.results.finishing import finish_run
 from a2tg_jax.results.folder import (
     RunFolder,
     check_apart,
     check_export,
+    check_new,
     check_not_source,
     check_output,
     json_text,
@@ -38,6 +41,8 @@ from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import FinishOptions
 from a2tg_jax.results.report import metrics_json
 from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
+from a2tg_jax.results.viewing import check_page, export_web, routes_of
+from a2tg_jax.web.server import LOOPBACK, serve
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,15 +69,15 @@ class Eval:
             if self.json:
                 print(json_text(metrics_json(result)))
             else:
-                tell_result(result, self.folder)
+                print_result(result, self.folder)
 
 
 @dataclasses.dataclass(frozen=True)
 class Finish:
     """Shrink and polish the model of a finished run, in a new run folder.
 
-    Textures become smaller where that loses next to nothing on the training views. Then colours and texels move to the
-    least squared error on them. The new run is evaluated; the old one stays as it is.
+    Textures become smaller where that loses next to nothing on the training views. Then colours and texels are solved
+    for the least squared error on these views. The new run is evaluated; the old one does not change.
 
     Example:
       a2tg finish runs/fox --out runs/fox-finished
@@ -124,15 +129,14 @@ class Render:
     """Output folder."""
     model: LastModel = None
     overwrite: bool = False
-    """Replace files that exist. What earlier renders wrote is always replaced, and frames of a longer flight are
-    deleted."""
+    """Replace files that exist. Files of earlier renders are always replaced, and frames of a longer flight deleted."""
 
     def run(self) -> None:
         run = open_run(self.folder)
         out = self.out or run.path / "frames"
         check_rate(self.fps)
         if self.path == "test" and (self.frames, self.fps) != (Render.frames, Render.fps):
-            raise ValueError("--frames and --fps are of a flight and have no effect on --path test: leave them out")
+            raise ValueError("--frames and --fps have no effect on --path test: leave them out")
         size = None if self.size is None else parse_size(self.size)
         if self.supersample < 1:
             raise ValueError(f"--supersample must be at least 1; got {self.supersample}")
@@ -152,19 +156,17 @@ class Render:
         print(f"wrote {counted(len(paths), 'frame')} to {out}/")
         if self.path != "test":
             video = write_video(paths, frames_per_second=self.fps)
-            if video.suffix == ".mp4":
-                print(f"video: {video}")
-                return
-            print("no video: ffmpeg is not installed; install it for MP4 (apt install ffmpeg, brew install ffmpeg)")
-            print(f"animation: {video}")
+            if video.suffix != ".mp4":
+                print("no video: ffmpeg is not installed; install it for MP4 (apt install ffmpeg, brew install ffmpeg)")
+            print(f"{'video' if video.suffix == '.mp4' else 'animation'}: {video}")
 
 
 @dataclasses.dataclass(frozen=True)
 class MeshCommand:
     """Write the surface of a trained scene as triangles, by fusion of rendered depths.
 
-    GLB files are upright, with the lengths of the original world; PLY and OBJ are in the original world. Only textures
-    need the photographs. Surfaces are best if the scene was trained with --system gaussians-2d --preset surfaces.
+    GLB files are upright and in the units of the original world; PLY and OBJ are in the original world. Photographs are
+    needed for textures only. For the best surfaces, train with --system gaussians-2d --preset surfaces.
 
     Examples:
       a2tg mesh runs/fox
@@ -180,7 +182,7 @@ class MeshCommand:
     options: Annotated[MeshOptions, arg(name="")] = MeshOptions()
     model: LastModel = None
     overwrite: bool = False
-    """Replace files that exist. The default of a run is always replaced once a2tg mesh has written it."""
+    """Replace files that exist. A run's mesh.glb, once a2tg mesh has written it, is always replaced."""
 
     def run(self) -> None:
         is_run = self.source.is_dir()
@@ -196,6 +198,133 @@ class MeshCommand:
         print(write_mesh(source, out, self.options))
         if is_run and out.resolve() == default.resolve():
             RunFolder(self.source).own(default)
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewCommand:
+    """Show a scene in a browser on this machine.
+
+    Other machines cannot connect without --host. A run is shown with its photographs. Gaussians of 3DGS (PLY) are
+    flattened along their thinnest axis.
+
+    Examples:
+      a2tg view runs/fox
+      a2tg view scene.ply --port 8080 --no-open
+      a2tg view runs/fox --host 0.0.0.0
+    """
+
+    source: RunOrFile
+    model: LastModel = None
+    host: str = LOOPBACK
+    """Address to listen on. 0.0.0.0 opens the page to the network, for a phone on the same Wi-Fi. Anyone who has the
+    printed address, which contains a random token, can see the scene; the connection is not encrypted."""
+    port: int = 0
+    """Port at that address; 0: any free one."""
+    open: bool = True
+    """Open a browser if the machine has a display."""
+
+    def run(self) -> None:
+        serve(routes_of(open_source(self.source, self.model)), host=self.host, port=self.port, on_start=self._started)
+
+    def _started(self, address: str) -> None:
+        print(f"{address} shows {self.source}; press Ctrl-C to stop", flush=True)
+        if self.open:
+            open_browser(address)
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write a page that shows a scene in any browser, or a PLY file for other programs.
+
+    The page is a folder for a web server, or one HTML file that opens without one. The PLY file holds the Gaussians in
+    the original world, flat and without textures, as 3DGS programs read them.
+
+    Examples:
+      a2tg export runs/fox --web site/fox
+      a2tg export runs/fox --web fox.html
+      a2tg export runs/fox --ply fox.ply
+    """
+
+    source: RunOrFile
+    web: Path | None = None
+    """Output folder of the page, or one HTML file, if the name ends in .html."""
+    ply: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Output file of the Gaussians."""
+    float64: bool = False
+    """Write the positions of --ply as float64, so that map coordinates keep their precision."""
+    single_file: bool = False
+    """Write one HTML file, whatever its name."""
+    photographs: bool = False
+    """Add the photographs of the run's cameras to the page."""
+    model: LastModel = None
+    overwrite: bool = False
+    """Replace the outputs of --web and --ply if they exist."""
+
+    def run(self) -> None:
+        if self.web is None and (self.ply is None or self.single_file or self.photographs):
+            raise ValueError("give --web PATH for a page, or --ply FILE for other programs")
+        if self.float64 and self.ply is None:
+            raise ValueError("--float64 has no effect without --ply: add it")
+        if self.ply is not None:
+            check_output(self.ply)
+            check_ply(self.ply)
+            check_not_source([self.ply], self.source, "--ply")
+            check_new(self.ply, "--ply", overwrite=self.overwrite)
+        page = {"single_file": self.single_file, "photographs": self.photographs, "overwrite": self.overwrite}
+        if self.web is not None:
+            check_output(self.web)
+            files = check_page(self.web, **page)
+            if self.ply is not None:
+                check_apart(files[0], self.ply)  # A PLY file may be in the folder of a page.
+            check_not_source(files, self.source, "--web")
+        source = open_source(self.source, self.model)
+        if self.web is not None:
+            print(export_web(source, self.web, **page))
+        if self.ply is not None:
+            print(export_ply(source, self.ply, float64=self.float64))
+
+
+@dataclasses.dataclass(frozen=True)
+class Convert:
+    """Convert splats between formats, chosen by the suffixes of the files.
+
+    Reads and writes *.npz, *.a2tgz, *.ply, *.compressed.ply, *.spz, *.sog, *.splat, *.ksplat, *.glb, *.gltf, *.usda,
+    *.usdc and *.usdz. Also reads checkpoints of gsplat, Nerfstudio, 3DGS and 2DGS (*.pt, *.pth, *.ckpt). Gaussians of
+    3DGS are flattened along their thinnest axis. Files of other programs hold the original world.
+
+    Other programs support no textures, and no kernels but Gaussians. --bake turns a textured splat into plain ones, as
+    many as its texels or fewer, and trains them on pictures of the model from its training cameras. The photographs
+    are not needed.
+
+    Examples:
+      a2tg convert runs/fox fox.sog --bake
+      a2tg convert scene.spz scene.npz
+    """
+
+    source: RunOrFile
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Output file."""
+    model: LastModel = None
+
+    bake: bool = False
+    """Turn splats with textures, or with kernels of other shapes, into plain ones."""
+    bake_growth: float = BakeOptions.growth
+    """Largest ratio of the numbers' bytes after --bake to the bytes before."""
+    bake_iterations: int = BakeOptions.iterations
+    """Iterations of training in --bake; each draws one view. 0 leaves training out."""
+
+    float64: bool = False
+    """Write the positions of a PLY as float64, so that map coordinates keep their precision."""
+
+    overwrite: bool = False
+    """Replace the output file."""
+
+    def run(self) -> None:
+        options = BakeOptions(self.bake_growth, self.bake_iterations)
+        if not self.bake and options != BakeOptions():
+            raise ValueError("--bake-growth and --bake-iterations have no effect without --bake: add it")
+        baking = options if self.bake else None
+        print(convert(self.source, self.out, self.model, baking=baking, float64=self.float64, overwrite=self.overwrite))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,18 +348,15 @@ class Compress:
     max_loss: float = 0.05
     """Largest loss of PSNR in dB."""
     tune_iterations: int = 0
-    """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. It happens up to 4
-    times, for other bits each time: first those that lose 0.5 dB, or twice --max-loss if that is more. 0: numbers are
-    only rounded."""
+    """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. The model is
+    tuned up to 4 times, each time for other bits: first for bits that lose 0.5 dB, or twice --max-loss if that is more.
+    0: numbers are only rounded."""
     overwrite: bool = False
-    """Replace the output file. The default of a run is always replaced once a2tg compress has written it."""
+    """Replace the output file. A file that a2tg compress wrote into a run folder is always replaced."""
 
     def run(self) -> None:
-        iterations = self.tune_iterations
-        table = compress(
-            self.source, self.out, max_loss=self.max_loss, tune_iterations=iterations, overwrite=self.overwrite
-        )
-        print(table)
+        turns = self.tune_iterations
+        print(compress(self.source, self.out, max_loss=self.max_loss, tune_iterations=turns, overwrite=self.overwrite))
 
 
 @dataclasses.dataclass(frozen=True)

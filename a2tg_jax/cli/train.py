@@ -4,7 +4,9 @@ import contextlib
 import dataclasses
 import math
 import re
-from collections.abc import Sequence
+import webbrowser
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
 
@@ -14,9 +16,10 @@ from tyro.conf import arg
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli.arguments import LpipsWeights, check_path, defaulting_to
-from a2tg_jax.cli.scenes import in_browser
+from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC, SceneSource
 from a2tg_jax.host.machine import tidy_memory
+from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.host.text import counted
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.parallel.processes import AUTO, ProcessPlace, joined
@@ -33,8 +36,10 @@ from a2tg_jax.results.record import (
 )
 from a2tg_jax.results.report import RunResult, summary_text
 from a2tg_jax.results.run_training import RunOptions, begin_run, follow_first_process, resume_run, unseen
+from a2tg_jax.results.viewing import shown_live
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import Session
+from a2tg_jax.training.loop import Watch
 
 BASELINE = "gaussians-2d-mcmc"
 HEARTBEAT_TIMEOUT = 60.0
@@ -48,7 +53,7 @@ DEMO_SYSTEM = A2tg(
     texture=Upscale(fraction=0.5, at=(0.1, 0.2)),
     texel_rate=1e-2,
 )
-"""System of the demo. It has few iterations, so textures grow early and learn fast."""
+"""With few iterations, textures must grow early and learn fast."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,17 +70,17 @@ class Demo:
     overwrite: bool = False
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
     quiet: bool = False
-    """Show no progress of training; forecasts, warnings and results stay."""
+    """Hide the progress of training, but not forecasts, warnings and results."""
 
     def run(self) -> None:
-        options = RunOptions(overwrite=self.overwrite, session=tidy_session(), progress=not self.quiet)
+        options = RunOptions(
+            overwrite=self.overwrite, session=Session(after_compiling=tidy_memory), progress=not self.quiet
+        )
         if self.resume:
-            _check_resumed_only(self.overwrite)
-            with opened(self.out) as run:
-                tell_result(resume_run(run, options), self.out)
+            resume(self.out, options)
             return
         record = RunRecord(SceneSource(SYNTHETIC), DEFAULT_SYSTEM, DEMO_SYSTEM, (BASELINE,))
-        tell_result(begin_run(record, self.out, options), self.out)
+        print_result(begin_run(record, self.out, options), self.out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +100,7 @@ class Train:
       --config FILE          take options from a file, such as run.toml of another run
       --resume               continue from the newest checkpoint in the run folder
       --overwrite            replace an earlier run in that folder
-      --quiet                show no progress of training
+      --quiet                hide the progress of training
 
     a2tg train --help-all lists every option by group, with its default; add --system NAME for the options of another
     system, --preset NAME for the defaults of a preset. Flags take precedence over --config.
@@ -124,30 +129,31 @@ class Train:
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
     lpips_weights: LpipsWeights = None
     quiet: bool = False
-    """Show no progress of training; forecasts, warnings and results stay."""
+    """Hide the progress of training, but not forecasts, warnings and results."""
     tensorboard: bool = False
-    """Write the histories as files of TensorBoard too, into RUN/tensorboard, at each checkpoint."""
+    """Also write the histories as TensorBoard files, into RUN/tensorboard, at each checkpoint."""
     view: bool = False
     """Show the training in a browser, where you can pause it."""
     max_memory: Annotated[str | None, defaulting_to("all available", "SIZE")] = None
     """Memory limit of the process and of the GPU, such as 8GB or 800MB. Training does not start if it needs more.
-    Photographs beyond a quarter of it stay on disk. --memory-budget bounds the model."""
+    Photographs beyond a quarter of it stay on disk. For a limit on the model, use --memory-budget."""
     devices: Annotated[str, arg(metavar="N")] = "1"
-    """Number of GPUs of each process that train the scene together, each with a share of its Gaussians; or all."""
+    """Number of GPUs per process that train the scene together, each with a share of its Gaussians; or all."""
     coordinator: Annotated[str | None, defaulting_to("one process", "HOST:PORT")] = None
     """Address of the first of several processes that train the scene together, or auto under Slurm, Open MPI or
-    Kubernetes. Start the same command in each of them."""
+    Kubernetes. Start the same command for each process."""
     num_processes: Annotated[int | None, defaulting_to("as the cluster says", "N")] = None
     """Number of processes, with --coordinator HOST:PORT."""
     process_id: Annotated[int | None, defaulting_to("as the cluster says", "I")] = None
-    """Number of this process, from 0, with --coordinator HOST:PORT. The first one, 0, writes the run folder."""
+    """Number of this process, from 0, with --coordinator HOST:PORT. Process 0 writes the run folder."""
     heartbeat_timeout_seconds: Annotated[float | None, defaulting_to(f"{HEARTBEAT_TIMEOUT:g}", "SECONDS")] = None
-    """Time after which a process that is silent counts as lost and the others stop, with --coordinator."""
+    """Time without a sign of life after which a process counts as lost and the others stop, with --coordinator."""
 
     def run(self) -> None:
         with joined(self.place) as team:
-            session, most = tidy_session(devices_named(self.devices)), bytes_allowed(self.max_memory)
-            if team is not None and not team.is_first:  # It trains what the first process says, and is quiet.
+            session = Session(after_compiling=tidy_memory, devices=devices_named(self.devices))
+            most = bytes_allowed(self.max_memory)
+            if team is not None and not team.is_first:  # It trains with the first process and prints nothing.
                 run = RunFolder(self.out)
                 team.advice = lambda: f"continue with: {resuming_command(run, session.devices)}"
                 record = self.resumed(open_run(self.out), is_first=False) if self.resume else self.whole_record
@@ -164,27 +170,24 @@ class Train:
                 watched=in_browser if self.view else unseen,
                 session=session,
             )
-            if not self.resume:
-                tell_result(begin_run(self.whole_record, self.out, options), self.out)
-                return
-            _check_resumed_only(self.overwrite)
-            with opened(self.out) as run:
-                self.resumed(run)
-                tell_result(resume_run(run, options), self.out)
+            if self.resume:
+                resume(self.out, options, self.resumed)
+            else:
+                print_result(begin_run(self.whole_record, self.out, options), self.out)
 
     @property
     def place(self) -> ProcessPlace | None:
-        """Place of this process among those that train together; None if it is the only one.
+        """Place of this process among several that train together; None if it is the only one.
 
         Raises:
           ValueError: if flags of several processes are missing or wrong, or exclude each other.
         """
         number, index, seconds = self.num_processes, self.process_id, self.heartbeat_timeout_seconds
         values = {"--num-processes": number, "--process-id": index}
-        given = {**values, "--heartbeat-timeout-seconds": seconds}
         if self.coordinator is None:
-            for flag in (flag for flag, value in given.items() if value is not None):
-                raise ValueError(f"{flag} needs --coordinator HOST:PORT, the address of the first process")
+            for flag, value in {**values, "--heartbeat-timeout-seconds": seconds}.items():
+                if value is not None:
+                    raise ValueError(f"{flag} needs --coordinator HOST:PORT, the address of the first process")
             return None
         if self.view:
             raise ValueError("--view shows the training of one process: leave out --view or --coordinator")
@@ -197,10 +200,9 @@ class Train:
                 raise ValueError(f"--coordinator HOST:PORT also needs {' and '.join(missing)}")
             if not ADDRESS.fullmatch(self.coordinator):
                 raise ValueError(f"--coordinator must be HOST:PORT, [IPv6]:PORT or auto; got {self.coordinator!r}")
-        if number is not None and number < 1:
-            raise ValueError(f"--num-processes must be at least 1; got {number}")
-        if index is not None and index < 0:
-            raise ValueError(f"--process-id must be at least 0; got {index}")
+        for flag, value, least in (("--num-processes", number, 1), ("--process-id", index, 0)):
+            if value is not None and value < least:
+                raise ValueError(f"{flag} must be at least {least}; got {value}")
         if number is not None and index is not None and index >= number:
             raise ValueError(f"--process-id must be from 0 to {number - 1}, one less than --num-processes; got {index}")
         return ProcessPlace(self.coordinator, number, index, seconds)
@@ -214,7 +216,7 @@ class Train:
     def resumed(self, run: RunFolder, *, is_first: bool = True) -> RunRecord:
         """Return the record of a run to resume, with further comparisons, which the first of several processes writes.
 
-        On the machines of the others the scene may have another path.
+        The scene may have another path on the machines of the other processes.
 
         Raises:
           ValueError: if a flag contradicts the record.
@@ -236,7 +238,7 @@ class Train:
 
 @dataclasses.dataclass(frozen=True)
 class DecidingOptions:
-    """Options that decide the defaults of all others."""
+    """Options that determine the defaults of the others."""
 
     config: str = ""
     system: str = ""
@@ -271,15 +273,17 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     return Train(dataclasses.replace(record, scene=scene), tyro.MISSING)
 
 
-def _check_resumed_only(overwrite: bool) -> None:
-    """Raise ValueError if a run that is resumed is to be replaced as well."""
-    if overwrite:
+def resume(folder: Path, options: RunOptions, check: Callable[[RunFolder], object] = lambda run: None) -> None:
+    """Continue a run, once `check` has accepted it, and print its results.
+
+    Raises:
+      ValueError: if the run is to be replaced as well.
+    """
+    if options.overwrite:
         raise ValueError("--resume continues a run and --overwrite replaces it: give one of them")
-
-
-def tidy_session(devices: Sequence[jax.Device] | None = None) -> Session:
-    """Return a session that tidies this process's memory after each compilation."""
-    return Session(after_compiling=tidy_memory, devices=devices)
+    with opened(folder) as run:
+        check(run)
+        print_result(resume_run(run, options), folder)
 
 
 def devices_named(text: str) -> list[jax.Device] | None:
@@ -299,7 +303,23 @@ def devices_named(text: str) -> list[jax.Device] | None:
     return chosen if len(chosen) > 1 else None
 
 
-def tell_result(result: RunResult, folder: Path) -> None:
+def print_result(result: RunResult, folder: Path) -> None:
     """Print the metrics and the path of the report."""
     print(summary_text(result))
     print(f"report: {RunFolder(folder).report}")
+
+
+def in_browser(scene: Scene) -> AbstractContextManager[Watch]:
+    """Show the training of a scene in a browser."""
+
+    def started(address: str) -> None:
+        print(f"{address} shows the training", flush=True)
+        open_browser(address)
+
+    return shown_live(scene, scene.name, started)
+
+
+def open_browser(address: str) -> None:
+    """Open a page if the machine has a display."""
+    if has_display():
+        webbrowser.open(address)

@@ -1,4 +1,4 @@
-"""Texts of errors that a user can do something about."""
+"""Messages of errors that a user can do something about."""
 
 import contextlib
 import errno
@@ -6,23 +6,22 @@ import os
 import shutil
 from pathlib import Path
 
-import jax
-
 from a2tg_jax.host.atomic import NO_ROOM
 from a2tg_jax.host.text import shortened
 
 PLENTY = 1 << 30
-"""Free bytes above which a disk that takes no file may lack inodes."""
+"""Free bytes above which a disk that accepts no file is likely to lack inodes."""
 
 
 def error_text(error: Exception, less_memory: str) -> str | None:
-    """Return the text of a user's error, or of a lack of memory or disk; None for an error of the program itself.
+    """Return the message of a user's error, or of full memory or disk; None for an error of the program itself.
 
     Args:
       error: any error.
-      less_memory: advice that follows if the machine or a device has run out of memory.
+      less_memory: advice if the machine or a device has run out of memory.
     """
-    is_of_device = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
+    # JAX's errors are RuntimeErrors; jax.errors itself takes a second to import.
+    is_of_device = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
     if is_of_device or isinstance(error, MemoryError):
         details = shortened(str(error), 120)
         return f"the memory does not suffice{f' ({details})' if details else ''}: {less_memory}"

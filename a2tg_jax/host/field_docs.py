@@ -1,4 +1,4 @@
-"""Docstrings under the fields of classes, added to the docstring of the class, where `help` and notebooks show them."""
+"""Docstrings under the fields of a class, added to the docstring of the class for `help` and notebooks."""
 
 import inspect
 import sys
@@ -8,11 +8,11 @@ _known: set[str] = set()
 
 
 def list_fields() -> None:
-    """Have each class of this package that was imported so far list its fields in its docstring."""
+    """Add the docstrings of fields to each class of this package that was imported so far."""
     for name in {name for name in sys.modules if name.startswith("a2tg_jax.")} - _known:
         _known.add(name)
         if name.startswith("a2tg_jax.cli."):
-            continue  # There fields are options, which the help lists.
+            continue  # These fields are options, which the help lists.
         for found in list(vars(sys.modules[name]).values()):
             own = vars(found).get("__doc__") if isinstance(found, type) and found.__module__ == name else None
             if isinstance(own, str):
@@ -20,7 +20,7 @@ def list_fields() -> None:
 
 
 class _WithFields:
-    """Docstring of a class that is completed when it is read, as reading the sources takes time."""
+    """Docstring of a class that is completed when it is read, because reading the sources takes time."""
 
     def __init__(self, text: str):
         self._text = text
@@ -30,12 +30,10 @@ class _WithFields:
         if self._whole is None:
             from docstring_parser import parse_from_object  # takes longer to import than this whole library
 
-            self._whole = self._text  # What is parsed reads this docstring, too.
+            self._whole = self._text  # The parser reads this docstring, too.
             bases = [base for base in reversed(owner.__mro__) if base.__module__.startswith("a2tg_jax.")]
-            params = [
-                param for base in bases for param in parse_from_object(base).params if param.args[0] == "attribute"
-            ]
-            texts = {param.arg_name: inspect.cleandoc(param.description or "") for param in params}
-            lines = [textwrap.indent(f"{name}: {text}", "    ")[2:] for name, text in texts.items()]
+            params = [param for base in bases for param in parse_from_object(base).params]
+            fields = {p.arg_name: inspect.cleandoc(p.description or "") for p in params if p.args[0] == "attribute"}
+            lines = [textwrap.indent(f"{name}: {text}", "    ")[2:] for name, text in fields.items()]
             self._whole = "\n".join([inspect.cleandoc(self._text), *(["", "Attributes:", *lines] if lines else [])])
         return self._whole

@@ -1,9 +1,11 @@
-"""Untrusted JSON and TOML: sizes are checked before parsing, depth after it, and numbers must be finite."""
+"""Untrusted JSON and TOML: size is checked before parsing, depth after it, and numbers must be finite."""
 
+import contextlib
 import json
 import math
 import re
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,9 @@ MOST_TOML_BYTES = 1 << 18
 MOST_DIGITS = 25
 """Largest number of digits of an integer; 2^64 has 20."""
 DEEPEST = 64
-"""Largest number of lists and objects within each other, and of names in one key."""
+"""Largest depth of nested lists and objects, and number of names in one key."""
 MOST_BRACKETS = 500_000
-"""Largest number of lists and objects: one takes up to 232 bytes of memory for 6 of text. A scene of 10,000
+"""Largest number of lists and objects: each takes up to 232 bytes of memory for 6 of text. A scene of 10,000
 photographs has about 60,000."""
 
 
@@ -28,33 +30,30 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
 
     Args:
       text: the text, or UTF-8.
-      allow_nan: accept NaN and infinities, which Python's own library writes although they are not JSON, and floats
-        that overflow.
+      allow_nan: whether to accept floats that overflow, NaN and infinities, which are not JSON but which Python's own
+        library writes.
 
     Raises:
-      ValueError: saying in a few words what is wrong.
+      ValueError: with a short reason.
     """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     _check_size(data, MOST_BYTES)
     if (found := data.count(b"[") + data.count(b"{")) > MOST_BRACKETS:
         raise ValueError(f"it has {found:,} brackets; {MOST_BRACKETS:,} are the most that is read")
 
-    def constant(name: str) -> float:
-        if not allow_nan:
-            raise ValueError(f"{name} is not JSON")
-        return float(name)
-
     def number(digits: str) -> float:
         value = float(digits)
-        return value if math.isfinite(value) else constant(digits)
+        if not (allow_nan or math.isfinite(value)):
+            raise ValueError(f"{digits} is not JSON")
+        return value
+
+    def integer(digits: str) -> int:
+        if len(digits) > MOST_DIGITS:
+            raise ValueError(f"a number of {len(digits)} digits is too large")
+        return int(digits)
 
     text = data.decode("utf-8-sig", "surrogatepass")
-    try:
-        value = json.loads(text, parse_constant=constant, parse_int=_integer, parse_float=number)
-    except RecursionError:
-        value = _too_deep()
-    _check_depth(value)
-    return value
+    return _parsed(lambda: json.loads(text, parse_constant=number, parse_int=integer, parse_float=number))
 
 
 def read_object(file: Path) -> dict[str, Any]:
@@ -62,7 +61,7 @@ def read_object(file: Path) -> dict[str, Any]:
 
     Raises:
       OSError: if the file cannot be read.
-      ValueError: naming the file, if it is no such JSON.
+      ValueError: naming the file, if it is not JSON, or no object.
     """
     try:
         values = parse_json(read_regular(file, MOST_BYTES))
@@ -80,24 +79,13 @@ def parse_toml(data: bytes) -> dict[str, Any]:
       data: UTF-8.
 
     Raises:
-      ValueError: saying in a few words what is wrong.
+      ValueError: with a short reason.
     """
     _check_size(data, MOST_TOML_BYTES)
     # The parser takes quadratic time for a key of many names.
     if max(word.count(b".") for word in re.split(rb"[\[\]{}=,\n]", data)) >= DEEPEST:
         raise ValueError(f"a key is nested more than {DEEPEST} deep")
-    try:
-        table = tomllib.loads(data.decode("utf-8"))
-    except RecursionError:
-        table = _too_deep()
-    _check_depth(table)
-    return table
-
-
-def _integer(digits: str) -> int:
-    if len(digits) > MOST_DIGITS:
-        raise ValueError(f"a number of {len(digits)} digits is too large")
-    return int(digits)
+    return _parsed(lambda: tomllib.loads(data.decode("utf-8")))
 
 
 def _check_size(data: bytes, most: int) -> None:
@@ -105,16 +93,14 @@ def _check_size(data: bytes, most: int) -> None:
         raise ValueError(f"it has {len(data):,} bytes; {most:,} are the most that is read")
 
 
-def _check_depth(value: object) -> None:
-    """Raise ValueError if lists and mappings are nested more than `DEEPEST` deep."""
-    level = [value]
-    for _ in range(DEEPEST):
-        lists = [list(held.values()) if isinstance(held, dict) else held for held in level]
-        level = [inner for held in lists if isinstance(held, list) for inner in held if isinstance(inner, dict | list)]
-        if not level:
-            return
-    _too_deep()
-
-
-def _too_deep() -> Any:
-    raise ValueError(f"its brackets are nested more than {DEEPEST} deep") from None
+def _parsed(parse: Callable[[], Any]) -> Any:
+    """Return a parsed value. Raises ValueError if its lists and mappings are nested more than `DEEPEST` deep."""
+    with contextlib.suppress(RecursionError):
+        value = parse()
+        level = [value]
+        for _ in range(DEEPEST):
+            lists = [list(held.values()) if isinstance(held, dict) else held for held in level]
+            level = [one for held in lists if isinstance(held, list) for one in held if isinstance(one, dict | list)]
+            if not level:
+                return value
+    raise ValueError(f"its brackets are nested more than {DEEPEST} deep")

@@ -1,4 +1,7 @@
-"""The machine of this process: threads, memory and processor, and what of it decides the last bits of a result."""
+"""The machine of this process: its threads, memory and processor.
+
+JAX is imported in functions, so that the command line can answer a mistyped command at once.
+"""
 
 import contextlib
 import dataclasses
@@ -10,8 +13,6 @@ import os
 import platform
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import psutil
 from jaxlib.version import __version__ as jaxlib_version
 
@@ -19,7 +20,7 @@ from a2tg_jax.host.operating_system import num_cores, trim_heap
 
 VARIABLE = "A2TG_NUM_THREADS"
 LARGEST_SHARE = 0.6
-"""Share of the memory mappings allowed to a process beyond which compiled programs are dropped."""
+"""Share of a process's allowed memory mappings beyond which compiled programs are dropped."""
 MEMORY_FILES = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
 """File names of a control group's limit and use, in version 2 and in version 1."""
 
@@ -32,7 +33,8 @@ def set_num_threads(num_threads: int | None) -> None:
     Only the last bits of gradients depend on it.
 
     Args:
-      num_threads: at least 1; None: A2TG_NUM_THREADS of the environment, or else all cores that the process may use.
+      num_threads: number of threads, at least 1; None: the environment variable A2TG_NUM_THREADS, or else all cores
+        that the process may use.
 
     Raises:
       ValueError: if the number is not a positive integer.
@@ -62,8 +64,8 @@ def num_threads() -> int:
 def control_groups(root: Path, controller: str) -> list[Path]:
     """Return the folders of Linux's control groups (containers, jobs, services) of this process, innermost first.
 
-    A group's limit holds for all groups in it. In a container, the group may have its path on the machine outside,
-    whose folders do not exist. Then the limit is at the top.
+    A group's limit holds for all groups in it. A container may see its group's path on the host, whose folders do not
+    exist; then the limit is at the top.
 
     Args:
       root: root of the file system, with proc/self/cgroup and sys/fs/cgroup.
@@ -87,7 +89,7 @@ def cpu_quota(root: Path = Path("/")) -> float:
     """Return the number of processors that control groups grant this process; inf without a limit."""
     quotas = [math.inf]
     for folder in control_groups(root, "cpu"):
-        with contextlib.suppress(OSError, ValueError, ZeroDivisionError):  # "max", or no limit that can be read
+        with contextlib.suppress(OSError, ValueError, ZeroDivisionError):  # "max", or unreadable
             if (folder / "cpu.max").is_file():
                 quota, period = (folder / "cpu.max").read_text().split()
             else:  # version 1
@@ -97,31 +99,21 @@ def cpu_quota(root: Path = Path("/")) -> float:
 
 
 def memory_limit(root: Path = Path("/")) -> int:
-    """Return the bytes of memory that this process may use in all: its own, and what is free now (host).
+    """Return the total bytes of memory that this process may use: its own, and what is free now (host).
 
-    Limits of control groups count. A group's cache of files counts as free.
+    Limits of control groups count. A group's file cache counts as free.
     """
     left: list[int] = [psutil.virtual_memory().available]
     for folder, (limit, usage) in itertools.product(control_groups(root, "memory"), MEMORY_FILES):
-        with contextlib.suppress(OSError, ValueError):  # of the other version, or "max"
+        with contextlib.suppress(OSError, ValueError):  # a file of the other version, or "max"
             room = int((folder / limit).read_text()) - int((folder / usage).read_text())
             stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
             left.append(room + int(stat.get("total_inactive_file", stat.get("inactive_file", 0))))
     return int(psutil.Process().memory_info().rss) + max(0, min(left))
 
 
-def memory_peak() -> int:
-    """Return the peak memory of this process in bytes; 0 if the system does not report it (host)."""
-    # Not getrusage, which also counts the program that started this one.
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return 1024 * int(line.split()[1])
-    return 0
-
-
 def tidy_memory() -> None:
-    """Return free memory, 100 to 200 MB with glibc, and keep room for programs, after one was compiled."""
+    """Return free memory to the system after compiling, 100 to 200 MB with glibc, and keep room for programs."""
     trim_heap()
     keep_room_for_programs()
 
@@ -129,11 +121,11 @@ def tidy_memory() -> None:
 def keep_room_for_programs(processes: Path = Path("/proc")) -> bool:
     """Drop all compiled programs of JAX if the process is about to run out of memory mappings.
 
-    Linux allows vm.max_map_count of them, 65,530 by default, and XLA takes hundreds for every program. Without one it
-    waits for ever. Programs in use are compiled again.
+    Linux allows vm.max_map_count of them, 65,530 by default, and XLA takes hundreds per program. When there are none
+    left, XLA waits forever. Programs in use are compiled again.
 
     Args:
-      processes: /proc; on systems without one nothing happens.
+      processes: /proc; without such a folder nothing happens.
 
     Returns:
       Whether programs were dropped.
@@ -145,28 +137,27 @@ def keep_room_for_programs(processes: Path = Path("/proc")) -> bool:
     except (OSError, ValueError):
         return False
     if is_full:
+        import jax
+
         jax.clear_caches()
     return is_full
 
 
 def processor_features(file: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
     """Return the processor's features as Linux lists them; macOS and Windows list none."""
-    try:
-        lines = file.read_text().splitlines()
-    except OSError:
-        return frozenset()
+    lines = file.read_text().splitlines() if file.exists() else []
     return frozenset(next((line.split(":", 1)[1].split() for line in lines if line.startswith("flags")), []))
 
 
 def processor_key() -> str:
-    """Return a short text shared by processors that run the same compiled code."""
+    """Return a hash that is equal for processors that can run each other's compiled code."""
     processor = f"{platform.machine()} {platform.processor()} {' '.join(sorted(processor_features()))}"
     return hashlib.sha256(processor.encode()).hexdigest()[:12]
 
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """Machine and software that computed a result. Besides the options they decide its last bits."""
+    """Machine and software that computed a result. Like the options, they affect its last bits."""
 
     jax: str
     """Version."""
@@ -175,20 +166,20 @@ class Machine:
     device: str
     """JAX's platform and the kind of device."""
     processor: str
-    """Text shared by processors that run the same compiled code."""
+    """Hash that is equal for processors that can run each other's compiled code."""
     threads: int
     """Number of threads of native loops, which divide sums among them."""
 
     def differences(self, now: "Machine") -> list[str]:
-        """Return the differences to another machine that change the last bits, with a remedy if there is one."""
+        """Return the differences to another machine that affect the last bits, with a remedy if there is one."""
         found = [
             f"{name} is {getattr(now, name)} and was {getattr(self, name)}"
             for name in ("jax", "jaxlib", "device", "processor")
             if getattr(self, name) != getattr(now, name)
         ]
         if self.threads != now.threads and now.device.startswith("cpu"):
-            kept = f"{VARIABLE}={self.threads} keeps them"
-            found.append(f"there are {now.threads} threads and were {self.threads} ({kept})")
+            remedy = f"{VARIABLE}={self.threads} keeps them"
+            found.append(f"there are {now.threads} threads and were {self.threads} ({remedy})")
         return found
 
 
@@ -202,17 +193,20 @@ class Devices:
 
 
 ALONE = Devices()
-"""One device of one process."""
 
 
 def default_platform() -> str:
     """Return JAX's platform of the device on which new arrays are placed ("cpu" or "gpu")."""
-    (device,) = jnp.zeros(()).devices()
+    import jax
+
+    (device,) = jax.numpy.zeros(()).devices()
     return device.platform
 
 
 def this_machine() -> Machine:
     """Return the machine of this process. This starts JAX's devices."""
+    import jax
+
     device = jax.devices()[0]
     kind = f"{device.platform} {device.device_kind}"
     return Machine(jax.__version__, jaxlib_version, kind, processor_key(), num_threads())

@@ -1,4 +1,4 @@
-"""Reading .npz files of numbers. No allocation exceeds what the file can hold, and nothing is unpickled."""
+"""Untrusted .npz and .npy files of numbers: no allocation exceeds the file's possible content, nothing is unpickled."""
 
 import ast
 import math
@@ -14,9 +14,9 @@ from a2tg_jax.host.text import shortened
 
 LARGEST_RATIO = 64
 FREE_ROOM = 1 << 20
-"""Bytes a file may unpack to beyond `LARGEST_RATIO` times its own size."""
+"""A file may unpack to `LARGEST_RATIO` times its own size and these bytes."""
 LONGEST_HEADER = 10_000
-"""Largest size in bytes of an array's header."""
+"""Largest array header in bytes."""
 CHUNK = 1 << 24
 LONGEST_REASON = 200
 
@@ -28,15 +28,27 @@ def read_npz(
 
     Raises:
       OSError: if the file cannot be opened.
-      ValueError: saying what is wrong, if it is damaged, or an array is not numeric or larger than its data.
+      ValueError: with the reason, if it is damaged, or an array is not numeric or larger than its data.
     """
+    arrays: dict[str, np.ndarray] = {}
     with open_regular(path) as file:
         try:
             with zipfile.ZipFile(file) as archive:
                 room = FREE_ROOM + LARGEST_RATIO * os.fstat(file.fileno()).st_size
-                return _read_arrays(archive, room, is_wanted)
-        except Exception as error:  # what a damaged zip raises goes from zlib.error to NotImplementedError
+                for entry in archive.infolist():
+                    name = entry.filename.removesuffix(".npy")
+                    if not is_wanted(name):
+                        continue
+                    room -= entry.file_size
+                    if name in arrays:
+                        raise ValueError(f"{name} occurs twice")
+                    if room < 0:
+                        raise ValueError(f"{name} would take more than the file may hold")
+                    with archive.open(entry) as inner:
+                        arrays[name] = _read_array(inner, name, entry.file_size)
+        except Exception as error:  # Damaged zips raise errors from zlib.error to NotImplementedError.
             raise ValueError(shortened(str(error) or type(error).__name__, LONGEST_REASON)) from error
+    return arrays
 
 
 def read_npy(path: str | os.PathLike[str]) -> np.ndarray:
@@ -44,24 +56,10 @@ def read_npy(path: str | os.PathLike[str]) -> np.ndarray:
 
     Raises:
       OSError: if the file cannot be opened.
-      ValueError: saying what is wrong, if it is damaged or not numeric.
+      ValueError: with the reason, if it is damaged or not numeric.
     """
     with open_regular(path) as file:
         return _read_array(file, "it", os.fstat(file.fileno()).st_size)
-
-
-def _read_arrays(archive: zipfile.ZipFile, room: int, is_wanted: Callable[[str], bool]) -> dict[str, np.ndarray]:
-    arrays: dict[str, np.ndarray] = {}
-    for entry in archive.infolist():
-        name = entry.filename.removesuffix(".npy")
-        if not is_wanted(name):
-            continue
-        room -= entry.file_size
-        if name in arrays or room < 0:
-            raise ValueError(f"{name} {'occurs twice' if name in arrays else 'would take more than the file may hold'}")
-        with archive.open(entry) as file:
-            arrays[name] = _read_array(file, name, entry.file_size)
-    return arrays
 
 
 def _read_array(file: IO[bytes], name: str, size: int) -> np.ndarray:
@@ -72,11 +70,11 @@ def _read_array(file: IO[bytes], name: str, size: int) -> np.ndarray:
         raise ValueError(f"{name} claims the shape {shape} of {dtype}, but has {left} bytes")
     flat = np.empty(math.prod(shape), dtype)
     target = flat.view(np.uint8)
-    for start in range(0, left, CHUNK):  # A zip keeps what it has unpacked of one call in memory.
+    for start in range(0, left, CHUNK):  # zipfile holds the unpacked bytes of one call in memory.
         piece = target[start : start + CHUNK]
         if file.readinto(memoryview(piece)) != len(piece):  # type: ignore[attr-defined, arg-type]
             raise ValueError(f"{name} is cut off")
-    if file.read(1):  # Also makes the zip compare its checksum.
+    if file.read(1):  # Reading to the end also makes zipfile compare the checksum.
         raise ValueError(f"{name} continues past its end")
     return flat.reshape(shape, order="F" if is_fortran else "C").astype(dtype.newbyteorder("="), copy=False)
 

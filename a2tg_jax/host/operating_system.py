@@ -1,4 +1,4 @@
-"""Calls that differ between Linux, macOS and Windows. No other module checks which system it runs on."""
+"""Calls that differ between Linux, macOS and Windows. No other module checks the operating system."""
 
 import contextlib
 import ctypes
@@ -11,22 +11,19 @@ from pathlib import Path
 from typing import Any, TextIO
 
 LOCKED_BYTE = 1 << 30
-"""Position of the byte that Windows locks: past the end, as Windows keeps others from reading what is locked."""
+"""Position of the byte that Windows locks: past the file's end, because others cannot read a locked byte."""
 HANDLER_SIZE = 1024
-"""Bytes with room for C's struct sigaction, whose size depends on the system; glibc's has 152."""
+"""Bytes for C's struct sigaction, whose size depends on the system; glibc's has 152."""
 
 
 def try_lock(number: int) -> bool:
     """Lock an open file for this process, without waiting, until the file is closed or the process ends.
 
-    Linux and macOS lock the file, Windows one byte past its end. Some file systems have no locks; there nothing keeps
-    two processes apart.
-
     Args:
-      number: the file's descriptor.
+      number: file descriptor.
 
     Returns:
-      False if another process has the lock.
+      False if another process has the lock. True if this one has it, or if the file system has no locks.
     """
     refusal = PermissionError if sys.platform == "win32" else BlockingIOError
     try:
@@ -50,8 +47,7 @@ def flush_folder(folder: Path) -> None:
         return
     number = os.open(folder, os.O_RDONLY)
     try:
-        # Some network file systems refuse it; they keep names in another way.
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # Some network file systems refuse it.
             os.fsync(number)
     finally:
         os.close(number)
@@ -59,9 +55,9 @@ def flush_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def signal_handlers_kept() -> Iterator[None]:
-    """Restore the C handlers of all signals after the block, in which a library may replace them.
+    """Restore the C handlers of all signals after the block, in which a library may replace them; not on Windows.
 
-    Python's `signal.getsignal` does not report those. Windows has no sigaction; there nothing is restored.
+    `signal.getsignal` does not report such handlers.
     """
     sigaction: Any = getattr(_c_library(), "sigaction", None)
     before = {}
@@ -77,31 +73,31 @@ def signal_handlers_kept() -> Iterator[None]:
 
 
 def num_cores() -> int:
-    """Return the number of cores that this process may run on. macOS and Windows report all cores of the machine."""
+    """Return the number of cores that this process may use; on macOS and Windows all cores of the machine."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def trim_heap() -> None:
-    """Have the C library return the free memory that it caches. Only glibc has a function for that."""
+    """Return the C library's cached free memory to the system. Only glibc has a function for that."""
     trim = getattr(_c_library(), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
 def wait_in_abort() -> None:
-    """Have abort() wait some seconds before it ends the process, so that another thread can say why and end it.
+    """Make abort() wait some seconds before it ends the process, so that another thread can print the reason first.
 
-    XLA aborts the process when another one ends. Windows keeps its abort().
+    XLA aborts a process when another one of the same training ends. Windows is not affected.
     """
     library = _c_library()
     if library is not None:
         library.signal.argtypes, library.signal.restype = [ctypes.c_int, ctypes.c_void_p], ctypes.c_void_p
-        # C's sleep takes the number of the signal, 6, for seconds.
+        # The handler is C's sleep, which takes the signal's number, 6, as seconds.
         library.signal(signal.SIGABRT, ctypes.cast(library.sleep, ctypes.c_void_p))
 
 
 def own_output_only() -> None:
-    """Drop what C++ libraries write to stdout and stderr; `sys.stdout` and `sys.stderr` keep their places."""
+    """Drop the output of C++ libraries, but not of `sys.stdout` and `sys.stderr`."""
 
     def moved(stream: TextIO, number: int) -> TextIO:
         stream.flush()
@@ -123,9 +119,9 @@ def _c_library() -> Any:
 
 
 def has_display() -> bool:
-    """Return whether a browser can open: macOS and Windows always have a display, Linux with X or Wayland."""
-    is_always = sys.platform in ("win32", "darwin")
-    return is_always or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    """Return whether a browser can open: always on macOS and Windows, on Linux with X or Wayland."""
+    variables = ("DISPLAY", "WAYLAND_DISPLAY")
+    return sys.platform in ("win32", "darwin") or any(os.environ.get(name) for name in variables)
 
 
 def cuda_of_driver() -> tuple[int, int] | None:

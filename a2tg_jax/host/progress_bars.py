@@ -1,4 +1,4 @@
-"""Progress over items: a bar on a terminal, plain lines elsewhere, each a tenth and some seconds after the last."""
+"""Progress over items: a bar on a terminal; elsewhere plain lines, at most one per tenth and per three seconds."""
 
 import sys
 import time
@@ -20,7 +20,7 @@ def has_terminal() -> bool:
 
 
 def progress_over(items: Sequence[Item], title: str, unit: str, *, is_shown: bool = True) -> Iterator[Item]:
-    """Yield items, and show how many are done as `counting` does."""
+    """Yield items and show the number of finished ones, with `counting`."""
     with counting(title, len(items), unit, is_shown=is_shown) as counter:
         for item in items:
             yield item
@@ -29,13 +29,13 @@ def progress_over(items: Sequence[Item], title: str, unit: str, *, is_shown: boo
 
 @contextmanager
 def counting(title: str, total: int | None, unit: str, *, is_shown: bool = True) -> Iterator["tqdm | PlainCounter"]:
-    """Show how many items are done; the result's `update(number)` counts them.
+    """Show the number of finished items, which the caller counts by `update(number)` of the result.
 
     Args:
       title: word before the numbers.
       total: number of items; None if it is not known.
       unit: word for one item.
-      is_shown: whether anything is shown.
+      is_shown: whether to show anything.
     """
     if is_shown and not has_terminal():
         yield PlainCounter(title, total)

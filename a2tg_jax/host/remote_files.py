@@ -1,7 +1,7 @@
-"""Files in object storage and wherever else fsspec reaches, at paths of universal_pathlib.
+"""Files in object storage and in whatever else fsspec supports, as paths of universal_pathlib.
 
 Such a path has pathlib's methods and is annotated as `Path`. Each request to a store takes a while, so every folder is
-listed once, and files are fetched whole. A request that fails is tried again. URLs hold no secrets, because the run
+listed once, and files are fetched whole. Failed requests are repeated. URLs must not contain secrets, because the run
 folder keeps them.
 """
 
@@ -15,7 +15,6 @@ import time
 import urllib.request
 import warnings
 from collections.abc import Callable
-from concurrent.futures import Future
 from io import BufferedReader
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Protocol, TypeVar, cast
@@ -23,25 +22,25 @@ from typing import IO, Any, NamedTuple, Protocol, TypeVar, cast
 from a2tg_jax.host.text import shortened
 
 PAUSES = (1.0, 4.0, 15.0)
-"""Seconds between the attempts to read something."""
+"""Seconds between attempts to read."""
 PIECE = 1 << 26
-"""Largest number of bytes of one request."""
+"""Largest number of bytes per request."""
 LIBRARIES = ("s3fs", "gcsfs", "adlfs", "paramiko", "aiohttp")
-"""Libraries of stores whose packages have their modules' names."""
+"""Store libraries whose packages have the name of their module."""
 FINAL = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError, NotImplementedError)
-"""Errors for which another attempt makes no sense."""
+"""Errors that another attempt would not fix."""
 URL = re.compile(r"[A-Za-z][\w+.:-]+://")
 USER = re.compile(r"([\w+.-]+)://([^/]*)@")
-"""Scheme, and what precedes the host; in chained URLs too."""
+"""Scheme and user information, also inside chained URLs."""
 QUERY = re.compile(r"(https?://[^?]*)\?.+", re.IGNORECASE | re.DOTALL)
 REVISIONS = ("git", "github")
-"""Schemes that write an owner, a repository and a revision where others have a user and a password."""
+"""Schemes with an owner, a repository and a revision where others have a user and a password."""
 
 Result = TypeVar("Result")
 
 
 class Unreachable(OSError):
-    """Error of a store that does not answer, or does not give what is requested."""
+    """Error of a store that does not answer or refuses a request."""
 
 
 class RemotePath(Protocol):
@@ -57,21 +56,19 @@ class RemotePath(Protocol):
 
 
 class Entry(NamedTuple):
-    """File, folder or link in a listing."""
+    """Entry of a listing: fsspec's kind ("file", "directory", "link", ...), and the size in bytes, if it is known."""
 
     kind: str
-    """ "file", "directory", "link", or another word of fsspec's."""
     size: int | None
-    """Number of bytes; None if the store does not say it."""
 
 
 Listing = dict[str, Entry]
-_listings: dict[tuple[Any, str], "Future[Listing]"] = {}
-"""Listings of folders, by file system and path."""
-_lock = threading.Lock()
+_listings: dict[tuple[Any, str], Listing] = {}
+"""Entries of folders by name, by file system and path."""
+_lock = threading.RLock()
 
 
-def is_remote(path: str | os.PathLike[str] | RemotePath) -> bool:
+def is_remote(path: object) -> bool:
     """Return whether a path is one of universal_pathlib that the operating system does not know."""
     return not isinstance(path, str | os.PathLike)
 
@@ -82,7 +79,7 @@ def is_url(text: str) -> bool:
 
 
 def path_here(text: str) -> Path | None:
-    """Return the path on this machine that a text means, file:// included; None for the URL of a store.
+    """Return the path on this machine for a path or a file:// URL; None for the URL of a store.
 
     Raises:
       ValueError: if file:// has a host, or no path.
@@ -102,12 +99,12 @@ def checked_url(url: str) -> str:
     """Return the URL of a store, without slashes at its end.
 
     Raises:
-      ValueError: if it holds a secret, which is left out of the message, or names no folder.
+      ValueError: if it contains a secret, which the message leaves out, or names no folder.
     """
-    told = without_secrets(url)
-    if told != url:
+    public = without_secrets(url)
+    if public != url:
         raise ValueError(
-            f"{told}: has a password, token or signature, which the run folder would keep; leave it out, and give it "
+            f"{public}: has a password, token or signature, which the run folder would keep; leave it out, and give it "
             "in fsspec's configuration (~/.config/fsspec)"
         )
     kept = url.rstrip("/")
@@ -118,98 +115,99 @@ def checked_url(url: str) -> str:
 
 def without_secrets(url: str) -> str:
     """Return a URL with "…" for passwords, and for users and queries of web addresses."""
-    return QUERY.sub(r"\1?…", USER.sub(_without_password, url))
 
+    def without_password(match: re.Match[str]) -> str:
+        scheme, (user, colon, _) = match[1], match[2].partition(":")
+        if scheme.lower().endswith(("http", "https")):
+            return f"{scheme}://…@"
+        return f"{scheme}://{user}:…@" if colon and scheme.lower() not in REVISIONS else match[0]
 
-def _without_password(match: re.Match[str]) -> str:
-    scheme, (user, colon, _) = match[1], match[2].partition(":")
-    if scheme.lower().endswith(("http", "https")):
-        return f"{scheme}://…@"
-    return f"{scheme}://{user}:…@" if colon and scheme.lower() not in REVISIONS else match[0]
+    return QUERY.sub(r"\1?…", USER.sub(without_password, url))
 
 
 def located(path: str | os.PathLike[str] | RemotePath) -> Path:
-    """Return the path that a text means: of universal_pathlib for a URL, but of this machine for file://.
+    """Return a path of universal_pathlib for the URL of a store, and a path on this machine for any other text.
 
     Raises:
       ValueError: if it is no path, a library is missing, fsspec has no such protocol, or the URL has a secret.
     """
-    if isinstance(path, str | os.PathLike):
-        text = os.fspath(path)
-        here = path_here(text)
-        return _of_store(checked_url(text)) if here is None else here
-    if not (hasattr(type(path), "fs") and hasattr(type(path), "path")):
+    if not isinstance(path, str | os.PathLike):
+        if hasattr(type(path), "fs") and hasattr(type(path), "path"):
+            return cast(Path, path)
         raise ValueError(f"path must be a path, a URL, or a UPath of universal_pathlib; got {path!r}")
-    return cast(Path, path)
-
-
-def _of_store(url: str) -> Path:
-    """Return the path of universal_pathlib of a URL, whose file system can be used."""
+    if (here := path_here(os.fspath(path))) is not None:
+        return here
+    url = checked_url(os.fspath(path))
     try:
         from upath import UPath
     except ImportError:
         raise ValueError(f"{url}: a URL needs universal_pathlib: pip install 'a2tg-jax[remote]'") from None
     try:
-        path = UPath(url)
-        _ = path.fs, path.path
+        found = UPath(url)
+        _ = found.fs, found.path  # The file system is made now, with its errors.
     except ImportError as error:
         package = getattr(error.__cause__ or error, "name", None)
         advice = f": pip install {package}" if package in LIBRARIES else ""
         raise ValueError(f"{url}: {error}{advice}") from None
-    except Exception as error:  # what file systems raise when they are made
+    except Exception as error:
         raise ValueError(f"{url}: cannot be opened ({_reason(error)})") from None
-    return cast(Path, path)
+    return cast(Path, found)
 
 
 def check_reachable(folder: Path) -> None:
     """List a folder again, in one attempt, so that a mistake in a URL or in credentials is reported at once."""
-    with _lock:
-        _listings.clear()
+    _listings.clear()
     cast(Any, folder).fs.invalidate_cache()
-    if not _listed(folder, ()):
+    if not listed(folder, pauses=()):
         raise FileNotFoundError(f"{folder}: no such scene folder, or it is empty")
 
 
-def is_remote_file(path: Path) -> bool:
-    """Return whether a file is listed in its folder. Links are followed."""
-    entry = _entry(path)
-    return entry is not None and entry.kind == "file"
+def listed(folder: Any, pauses: tuple[float, ...] | None = None) -> Listing:
+    """Return the files and folders in a folder, by name, from its first listing; nothing if there is no such folder."""
+    with _lock:  # Several threads that read photographs need the same listing.
+        if _key(folder) not in _listings:
+            _listings[_key(folder)] = _retried(folder, lambda: _list(folder), pauses) if _may_exist(folder) else {}
+        return _listings[_key(folder)]
 
 
-def is_remote_folder(path: Path) -> bool:
-    """Return whether anything is listed in a folder. Object storage has no empty ones."""
-    return bool(_listed(path))
+def remote_entry(path: Any) -> Entry | None:
+    """Return the entry of a path, or of its target if it is a link; None if nothing is there."""
+    listing = listed(path.parent)
+    entry = listing.get(path.name)
+    if entry is not None and entry.kind == "link":
+        try:
+            found = _retried(path, lambda: path.fs.info(path.path))
+            entry = Entry(found["type"], found.get("size"))
+        except FileNotFoundError:
+            entry = Entry("nothing", None)
+        listing[path.name] = entry
+    return entry
 
 
-def remote_names(folder: Path) -> list[str]:
-    """Return the sorted names in a folder; none if there is no such folder."""
-    return sorted(_listed(folder))
-
-
-def remote_size(path: Path) -> int | None:
-    """Return the number of bytes of a file that is listed in its folder; None if its store does not say it."""
-    entry = _entry(path)
-    if entry is None or entry.kind != "file":
-        raise _missing(path)
-    return entry.size
-
-
-def fetched(path: Path, size: int | None, most_bytes: int) -> BufferedReader:
-    """Return an open temporary file with the bytes of a remote one. It has no name, and goes when it is closed.
+def fetched(path: Any, most_bytes: int) -> BufferedReader:
+    """Return an open temporary file with the bytes of a remote file. It has no name and is deleted when it is closed.
 
     Args:
       path: the remote file.
-      size: its number of bytes as listed, which need not be true; None: unknown.
-      most_bytes: size above which it is refused.
+      most_bytes: largest size.
 
     Raises:
-      OSError: naming the file, if it has gone, may not be read, or cannot be after all attempts (`Unreachable`).
+      OSError: naming the file, if it is missing, may not be read, or cannot be after all attempts (`Unreachable`).
       ValueError: naming the file, if it is larger.
     """
+    entry = remote_entry(path)
+    if entry is None or entry.kind != "file":
+        raise _missing(path)
+    size = entry.size or 0  # Listed sizes need not be true.
+    if size > most_bytes:
+        raise ValueError(too_large(path, size, most_bytes))
     file = tempfile.TemporaryFile()  # noqa: SIM115 - the caller closes it
     try:
-        if not size or not _is_filled(file, path, size):
-            _tried(path, functools.partial(_stream, path, file, most_bytes))
+        for start in range(0, size, PIECE):
+            end = start + PIECE if start + PIECE < size else size + 1  # One byte more shows whether the file is longer.
+            file.write(_retried(path, functools.partial(path.fs.cat_file, path.path, start=start, end=end)))
+        if not size or file.tell() > size:
+            _retried(path, lambda: _stream(path, file, most_bytes))
         if file.tell() > most_bytes:
             raise ValueError(f"{path}: has more than {most_bytes:,} bytes, the most that such a file may have")
     except BaseException:
@@ -219,17 +217,13 @@ def fetched(path: Path, size: int | None, most_bytes: int) -> BufferedReader:
     return cast(BufferedReader, file)
 
 
-def _is_filled(file: IO[bytes], path: Path, size: int) -> bool:
-    """Write a file of a listed size in pieces, and return whether it has no more bytes. The last piece asks for one."""
-    store: Any = path
-    for start in range(0, size, PIECE):
-        end = start + PIECE if start + PIECE < size else size + 1
-        file.write(_tried(path, functools.partial(store.fs.cat_file, store.path, start=start, end=end)))
-    return file.tell() <= size
+def too_large(path: object, size: int, most_bytes: int) -> str:
+    """Return the message about a file of too many bytes."""
+    return f"{path}: has {size:,} bytes, and {most_bytes:,} are the most that such a file may have"
 
 
 def _stream(path: Any, file: IO[bytes], most_bytes: int) -> None:
-    """Write a file of unknown size in pieces, up to the first one beyond the bound."""
+    """Write a file of unknown size in pieces, up to one byte beyond the bound."""
     file.seek(0)
     file.truncate()
     with path.fs.open(path.path, "rb") as source:
@@ -237,51 +231,16 @@ def _stream(path: Any, file: IO[bytes], most_bytes: int) -> None:
             file.write(data)
 
 
-def _entry(path: Any) -> Entry | None:
-    """Return what is listed of a path, or what a link leads to; None if there is nothing."""
-    listing = _listed(path.parent)
-    entry = listing.get(path.name)
-    if entry is not None and entry.kind == "link":
-        try:
-            found = _tried(path, functools.partial(path.fs.info, path.path))
-            entry = Entry(found["type"], found.get("size"))
-        except FileNotFoundError:
-            entry = Entry("nothing", None)
-        listing[path.name] = entry
-    return entry
-
-
-def _listed(folder: Any, pauses: tuple[float, ...] | None = None) -> Listing:
-    """Return the files and folders in a folder, by name, from its first listing; nothing if there is no such folder.
-
-    Other threads that want the same folder wait for this listing.
-    """
-    with _lock:
-        listing = _listings.get(_key(folder))
-        if is_first := listing is None:
-            listing = _listings[_key(folder)] = Future()
-    assert listing is not None
-    if is_first:
-        try:
-            listing.set_result(_tried(folder, functools.partial(_list, folder), pauses) if _may_exist(folder) else {})
-        except BaseException as error:
-            with _lock:
-                _listings.pop(_key(folder), None)
-            listing.set_exception(error)
-    return listing.result()
-
-
 def _key(folder: Any) -> tuple[Any, str]:
     return folder.fs, folder.path.rstrip("/")
 
 
 def _may_exist(folder: Any) -> bool:
-    """Return False if a folder is below a listed one, and is in no listing itself. Some stores refuse to list it."""
+    """Return False if a folder is below a listed one and in no listing; some stores refuse to list such a folder."""
     if ".." in folder.parts:
         return True
-    with _lock:
-        is_below = any(_key(parent) in _listings for parent in folder.parents if _key(parent) != _key(folder))
-    return not is_below or folder.name in _listed(folder.parent)
+    is_below = any(_key(parent) in _listings for parent in folder.parents if _key(parent) != _key(folder))
+    return not is_below or folder.name in listed(folder.parent)
 
 
 def _list(folder: Any) -> Listing:
@@ -297,14 +256,14 @@ def _list(folder: Any) -> Listing:
     }
 
 
-def _tried(path: Path, read: Callable[[], Result], pauses: tuple[float, ...] | None = None) -> Result:
-    """Return what a function reads, in several attempts with pauses; None: `PAUSES`."""
+def _retried(path: Path, read: Callable[[], Result], pauses: tuple[float, ...] | None = None) -> Result:
+    """Return the result of a function, in several attempts with pauses; None: `PAUSES`."""
     for pause in (*(PAUSES if pauses is None else pauses), None):
         try:
             return read()
         except FileNotFoundError:
             raise _missing(path) from None
-        except Exception as error:  # libraries of stores raise errors of their own
+        except Exception as error:  # Stores' libraries have their own classes of errors.
             if pause is None or isinstance(error, FINAL):
                 raise Unreachable(f"{path}: cannot be read from its store ({_reason(error)})") from error
             warnings.warn(f"{path}: {_reason(error)}; it is read again in {pause:g} s", stacklevel=2)

@@ -1,7 +1,7 @@
 """Ctrl-C, SIGTERM and SIGHUP: orderly ends of a program.
 
-Python ignores exceptions in callbacks of the garbage collector, of which JAX has one. A signal that comes while one
-runs is therefore sent once more.
+Python ignores exceptions in callbacks of the garbage collector, and JAX has such a callback. A signal that comes while
+one runs is therefore sent again.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ CTRL_C = signal.SIGINT
 ENDING = (CTRL_C, *(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)))
 """Signals that end a process; Windows has no SIGHUP."""
 SOON = 0.02
-"""Seconds after which a signal is sent once more."""
+"""Seconds after which a signal is sent again."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -33,7 +33,7 @@ class Stopped(KeyboardInterrupt):
 
     @staticmethod
     def of(interrupt: KeyboardInterrupt) -> "Stopped":
-        """Return an interrupt of another kind as the end by the signal that it names, or else by Ctrl-C."""
+        """Return a `Stopped` for any interrupt: by the signal that it names, or else by Ctrl-C."""
         return interrupt if isinstance(interrupt, Stopped) else Stopped(getattr(interrupt, "number", CTRL_C))
 
     @property
@@ -44,7 +44,7 @@ class Stopped(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def raised() -> Iterator[None]:
-    """Have SIGTERM and SIGHUP raise `Stopped` within the block, as Ctrl-C raises KeyboardInterrupt."""
+    """Within the block, SIGTERM and SIGHUP raise `Stopped`, as Ctrl-C raises KeyboardInterrupt."""
 
     def stop(number: int, frame: object) -> None:
         raise KeyboardInterrupt if number == CTRL_C else Stopped(number)
@@ -55,10 +55,10 @@ def raised() -> Iterator[None]:
 
 @contextlib.contextmanager
 def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
-    """Note the first signal within the block, and raise `Stopped` at the second.
+    """Note the first signal within the block, and raise `Stopped` at the second, or else at the end of the block.
 
-    Yield a function that returns whether there was one. At the end of the block a noted signal raises `Stopped`.
-    Programs that handle a signal themselves keep their handler.
+    Yield a function that returns whether there was a signal. Programs that handle a signal themselves keep their
+    handler.
     """
     found: list[int] = []
 
@@ -73,7 +73,7 @@ def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
         try:
             yield lambda: bool(found)
         except KeyboardInterrupt as stop:
-            if found:  # What ends the block keeps its class, and says which signal ended it.
+            if found:  # The interrupt keeps its class and gets the number of the signal.
                 stop.number = found[-1]  # type: ignore[attr-defined]
             raise
     if found:
@@ -82,7 +82,7 @@ def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
 
 @dataclasses.dataclass(frozen=True)
 class _Heard:
-    """Handler of a signal whose exceptions are not lost."""
+    """Signal handler that sends the signal again if it would raise within a callback of the garbage collector."""
 
     handler: Callable[..., Any]
 
@@ -100,7 +100,7 @@ class _Heard:
 
 
 def _send(number: int) -> None:
-    """Send a signal to the main thread, whose waiting it ends; Windows has no such call."""
+    """Send a signal to the main thread, which stops waiting; Windows has no such call."""
     if hasattr(signal, "pthread_kill") and (main := threading.main_thread().ident) is not None:
         signal.pthread_kill(main, number)
     else:
@@ -109,8 +109,8 @@ def _send(number: int) -> None:
 
 @contextlib.contextmanager
 def _handled_by(handler: Callable[..., object], numbers: tuple[int, ...]) -> Iterator[None]:
-    """Install a handler within the block. Ignored signals, such as SIGHUP under nohup, stay ignored; other threads
-    install none."""
+    """Install a handler within the block. Ignored signals, such as SIGHUP under nohup, stay ignored, and only the main
+    thread installs handlers."""
     before: dict[int, object] = {}
     if threading.current_thread() is threading.main_thread():
         before = {number: signal.getsignal(number) for number in numbers}

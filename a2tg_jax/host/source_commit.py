@@ -11,7 +11,7 @@ GIT_SECONDS = 10
 
 
 def source_commit() -> str | None:
-    """Return the commit of the checkout, with "-dirty" behind it if files were changed, or the commit that pip noted
+    """Return the commit of the checkout, with "-dirty" appended if files were changed, or the commit that pip recorded
     when it installed from a repository (direct_url.json, PEP 610); None if neither is known."""
     try:
         if (CHECKOUT / ".git").exists():

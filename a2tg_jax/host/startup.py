@@ -3,14 +3,13 @@
 import os
 from pathlib import Path
 
-import jax
 from jaxlib.version import __version__ as jaxlib_version
 
 from a2tg_jax.host import machine
 from a2tg_jax.host.machine import processor_features, processor_key
 
 CHECKED_JAX_VERSIONS = ((0, 10), (0, 11), (0, 12))
-"""Versions known to have the flags below; an unknown flag would end the process."""
+"""Versions that have the flags below; an unknown flag would end the process."""
 QUIET_CACHE_VERSION = (0, 12)
 """First version that reads programs from a cache without alarming log lines."""
 WHOLE_LOOPS_FLAG = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
@@ -22,17 +21,19 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
 
     Keeps XLA's compiled programs on disk, and adds two flags to XLA_FLAGS unless you have set them: while-loops are
     compiled whole, which speeds up compositing by XLA, and vectors are 512 bits wide on processors with AVX-512. Native
-    compositing needs neither. GPUs are not affected. The command line calls this; programs and notebooks may.
+    compositing needs neither. GPUs are not affected. The command line calls this function.
 
     Args:
-      use_cache: keep compiled programs in `compilation_cache_folder()`, so that the next process starts in seconds,
-        unless JAX has a cache already. If XLA would print pages for every cached program, its log is reduced to fatal
-        errors (`silence_xla`).
-      num_threads: number of threads of native loops (`set_num_threads`); None leaves what is set.
+      use_cache: whether to keep compiled programs in `compilation_cache_folder()`, so that the next process starts in
+        seconds, unless JAX has a cache already. If XLA would print pages for every cached program, its log is reduced
+        to fatal errors (`silence_xla`).
+      num_threads: number of threads of native loops (`set_num_threads`); None: unchanged.
 
     Raises:
       ValueError: if the number of threads, here or in the environment, is not a positive integer.
     """
+    import jax  # Only here, as in `host.machine`.
+
     if num_threads is not None:
         machine.set_num_threads(num_threads)
     machine.num_threads()
@@ -56,18 +57,20 @@ def silence_xla() -> None:
     """Let XLA's C++ code log fatal errors only. Exceptions and JAX's own log are not affected.
 
     With AVX-512, XLA warns at length of crashes whenever it reads a program from a cache, because two of its own tuning
-    hints are missing from the processor's features. It does not crash (openxla/xla#44565). If you ask for XLA's log by
-    jax_logging_level or TF_CPP_MIN_LOG_LEVEL=0, you get all of it.
+    hints are missing from the processor's features. It does not crash (openxla/xla#44565). With jax_logging_level or
+    TF_CPP_MIN_LOG_LEVEL=0 you get the whole log.
     """
+    import jax
+
     chosen = jax.config.values["jax_logging_level"]
     if chosen in (None, "NOTSET") and os.environ.get("TF_CPP_MIN_LOG_LEVEL") != "0":
-        # The first sets the level of XLA and of JAX, the second takes back only that of JAX.
+        # The first call sets the levels of XLA and of JAX, the second restores only JAX's.
         jax.config.update("jax_logging_level", "CRITICAL")
         jax.config.update("jax_logging_level", chosen)
 
 
 def add_xla_flags(flags: tuple[str, ...]) -> None:
-    """Append flags to XLA_FLAGS of the environment, except those that are set already."""
+    """Append flags to the environment's XLA_FLAGS, except flags that are set already."""
     own = os.environ.get("XLA_FLAGS", "").split()
     taken = {flag.split("=", 1)[0] for flag in own}
     os.environ["XLA_FLAGS"] = " ".join(own + [flag for flag in flags if flag.split("=", 1)[0] not in taken])
@@ -79,8 +82,6 @@ def cache_folder() -> Path:
 
 
 def compilation_cache_folder() -> Path:
-    """Return the folder of compiled programs, one per processor and jaxlib: code for one may not run on another.
-
-    It is in `cache_folder()` and may be deleted at any time.
-    """
+    """Return the folder of compiled programs, in `cache_folder()`, one per processor and jaxlib: code for one may not
+    run on another. You may delete it at any time."""
     return cache_folder() / f"jaxlib-{jaxlib_version}-{processor_key()}"

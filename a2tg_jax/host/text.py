@@ -5,33 +5,30 @@ import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-SLACK = 10
-"""Number of letters to read for each printed letter, because runs of spaces print as one."""
-
 
 def shortened(value: object, most: int = 80) -> str:
     """Return a value as errors print it: one line of bounded length, without quotes around texts or terminal control
     characters."""
-    text = (value if isinstance(value, str) else repr(value))[: SLACK * most]  # Words of it all would take memory.
-    text = " ".join(text.split())
+    # Runs of spaces print as one, so ten letters are read for each printed one; splitting a huge text takes memory.
+    text = " ".join((value if isinstance(value, str) else repr(value))[: 10 * most].split())
     text = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 def as_argument(path: Path) -> str:
-    """Return a path as a shell takes it, relative to the current folder if it is inside."""
+    """Return a path quoted for a shell, relative to the current folder if it is inside."""
     here = Path.cwd()
     return shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path))
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return "; did you mean KNOWN?" for the known name nearest to a misspelt one; empty if none is near."""
+    """Return "; did you mean KNOWN?" for the known name closest to a misspelt one; empty if none is close."""
     close = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {close[0]}?" if close else ""
 
 
 def counted(num: int, noun: str) -> str:
-    """Return a number with its noun, as in "1 view" and "8,412 points"."""
+    """Return a number and its noun, such as "1 view" and "8,412 points"."""
     return f"{num:,} {noun}{'' if num == 1 else 's'}"
 
 
@@ -41,7 +38,7 @@ def first_names(names: Sequence[str], most: int = 5) -> str:
 
 
 def in_bytes(num: float) -> str:
-    """Return a number of bytes with three digits in a unit that suits it: bytes, kB, MB or GB (10^9 bytes)."""
+    """Return a number of bytes with three digits in bytes, kB, MB or GB (10^9 bytes)."""
     size, text = float(num), counted(round(num), "byte")
     for unit in ("kB", "MB", "GB"):
         if size < 999.5:

@@ -35,12 +35,12 @@ from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.remote_files import checked_url, path_here
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict, flatten_config, merged
+from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.results.folder import RunFolder, read_json
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import Stage, System, find_system, like
 from a2tg_jax.training.options import own_options
-from a2tg_jax.training.registry import differences, with_changes
+from a2tg_jax.training.registry import differences
 
 DEFAULT_SYSTEM = "a2tg"
 LONGEST_REASON = 500
@@ -86,7 +86,7 @@ class RunRecord:
             if label_of(name) in found:
                 raise ValueError(f"compare: two systems of the run would be called {shortened(label_of(name))!r}")
             other, given = compared_system(name, self.options, self.preset), self.compare_options.get(name, {})
-            found[label_of(name)] = with_changes(other, given, f"compare_options.{name}")
+            found[label_of(name)] = changed_config(other, given, f"compare_options.{name}")
         return found
 
     @property
@@ -139,7 +139,7 @@ def chosen_system(name: str, preset: str | None = None) -> System:
     """Return a system by name, with the options of a preset. Options that an instance sets itself take precedence.
     Raises ValueError if there is no such system or preset."""
     found = find_system(name)
-    return found if preset is None else with_changes(type(found).preset(preset), differences(found), name)
+    return found if preset is None else changed_config(type(found).preset(preset), differences(found), name)
 
 
 def compared_system(name: str, other: System, preset: str | None = None) -> System:
@@ -149,7 +149,7 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
     found = find_system(name)
     kind = type(found)
     start = kind() if preset is None else kind.presets().get(preset, kind())
-    return with_changes(like(start, other), differences(found), name)
+    return changed_config(like(start, other), differences(found), name)
 
 
 def scene_place(scene: str, folder: Path = Path()) -> str:
@@ -186,7 +186,7 @@ def read_run_file(path: Path) -> RunRecord:
     for key, value in tables.items():
         if not isinstance(value, Mapping):
             raise ValueError(f"{where} {shortened(key)} must be a table of options; got {shortened(value)}")
-    system = with_changes(chosen_system(record.system, record.preset), options, f"{path}: options")
+    system = changed_config(chosen_system(record.system, record.preset), options, f"{path}: options")
     return dataclasses.replace(record, options=system).placed(path.parent)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import typing
-from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
@@ -50,7 +49,7 @@ class LossConfig:
     """Least residual of a patch that robust_share leaves out, as a multiple of the photograph's median."""
 
     depth_weight: float = 0.0
-    """Rendered inverse depth against the scene's depth maps, after scale and shift of least squares per view."""
+    """Rendered inverse depth against the scene's depth maps, after a least-squares scale and shift per view."""
     depth_kind: DepthKind = "inverse"
     """Meaning of depth maps: inverse depth up to scale and shift (monocular networks), or depth up to scale."""
     points_weight: float = 0.0
@@ -68,8 +67,12 @@ class LossConfig:
         """Return the loss terms whose weight is not 0.
 
         Args:
-          is_first: whether they are of the first stage, in whose beginning robust_share leaves out nothing.
+          is_first: whether they are for the first stage, at whose beginning robust_share leaves out nothing.
         """
+        first: LossTerm = Photometric(self.ssim_weight) if self.ssim_weight else Term(l1)
+        if self.robust_share:
+            start, has_ssim = RobustPhotometric.start if is_first else 0.0, self.ssim_weight != 0
+            first = RobustPhotometric(self.ssim_weight, self.robust_share, self.robust_factor, start, has_ssim)
         optional: tuple[Term | DepthPrior | PointDepths, ...] = (
             Term(normals, self.normal_weight, has_geometry=True),
             Term(distortion, self.distortion_weight, has_geometry=True),
@@ -78,23 +81,16 @@ class LossConfig:
             DepthPrior(self.depth_weight, self.depth_kind),
             PointDepths(self.points_weight),
         )
-        return (self._photometric(is_first), *(term for term in optional if term.weight))
-
-    def _photometric(self, is_first: bool) -> LossTerm:
-        if self.robust_share:
-            start = RobustPhotometric.start if is_first else 0.0
-            has_ssim = self.ssim_weight != 0
-            return RobustPhotometric(self.ssim_weight, self.robust_share, self.robust_factor, start, has_ssim)
-        return Photometric(self.ssim_weight) if self.ssim_weight else Term(l1)
+        return (first, *(term for term in optional if term.weight))
 
 
 @dataclasses.dataclass(frozen=True)
 class Corrections:
-    """Options of what `exposure` and `refine_poses` learn."""
+    """Options of `exposure` and `refine_poses`."""
 
     exposure_kind: Literal["affine", "grid"] = "affine"
-    """Exposure of a photograph: an affine map of its colours, or in addition a bilateral grid of such maps, which
-    follows vignettes and local tone mapping."""
+    """Exposure of a photograph: an affine map of its colours, or also a bilateral grid of such maps, which follows
+    vignettes and local tone mapping."""
     affine: Exposure = Exposure()
     grid: BilateralGrid = BilateralGrid()
     pose: PoseRefinement = PoseRefinement(final_factor=0.1)
@@ -105,25 +101,6 @@ class Corrections:
             with fields_of(name):
                 getattr(self, name).check_options()
 
-    def of_stage(self, stage: int, *, exposure: bool, poses: bool) -> tuple[Correction, ...]:
-        """Return the corrections of a stage; later stages keep the rates of the first one's end.
-
-        Args:
-          stage: index of the stage, from 0.
-          exposure: whether exposures are learned.
-          poses: whether poses are learned.
-        """
-        found: list[Exposure | BilateralGrid | PoseRefinement] = []
-        if poses:
-            found.append(self.pose)
-        if exposure:
-            found.append(self.affine)
-        if exposure and self.exposure_kind == "grid":
-            found.append(self.grid)
-        if stage:
-            found = [dataclasses.replace(one, rate=one.rate * one.final_factor, final_factor=1.0) for one in found]
-        return tuple(found)
-
 
 FEW_GAUSSIANS = 100
 """Number of Gaussians below which a memory budget is likely to be a mistake."""
@@ -131,7 +108,7 @@ FEW_GAUSSIANS = 100
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class System:
-    """A method of training as a value: its fields are its options, `stages` says what happens.
+    """A training method as a value: its fields are its options, `stages` composes the training.
 
     Derive a custom system from this class, add fields and compose its stages; the command line takes it as
     package.module:NAME. Fields are numbers, texts, tuples of them, and dataclasses of such fields, such as events. The
@@ -145,10 +122,10 @@ class System:
     sky_gaussians: int = 0
     """Number of the initial Gaussians that start as the sky of an outdoor capture, on a sphere around the cameras,
     where training views see no points; 0: none. Its radius is 10 times the distance of the farthest points, 1 % of them
-    left out. Systems that prune splats of that size refuse it."""
+    left out. Not for systems that prune splats of that size."""
     initial_opacity: float = 0.1
-    """Opacity of the Gaussians that training starts from; pictures with an alpha of their own start half opaque in the
-    middle, whatever it is."""
+    """Opacity of the Gaussians that training starts from; billboards with alpha textures always start half opaque in
+    the middle."""
     memory_budget: float | str | None = None
     """Memory budget of the model: 1.5MB, 800kB, 2GB, or a number of MB (10^6 bytes). The model stays within it at every
     iteration and ends within 0.5 % of it. It sets the number of Gaussians and texels, instead of densify.cap."""
@@ -225,12 +202,21 @@ class System:
         return cap
 
     def corrections_of(self, stage: int = 0) -> tuple[Correction, ...]:
-        """Return the corrections of a stage that `exposure` and `refine_poses` ask for.
+        """Return the corrections of a stage that `exposure` and `refine_poses` turn on.
 
         Args:
           stage: index of the stage, from 0; later stages keep the rates of the first one's end.
         """
-        return self.corrections.of_stage(stage, exposure=self.exposure, poses=self.refine_poses)
+        found: list[Exposure | BilateralGrid | PoseRefinement] = []
+        if self.refine_poses:
+            found.append(self.corrections.pose)
+        if self.exposure:
+            found.append(self.corrections.affine)
+        if self.exposure and self.corrections.exposure_kind == "grid":
+            found.append(self.corrections.grid)
+        if stage:
+            found = [dataclasses.replace(one, rate=one.rate * one.final_factor, final_factor=1.0) for one in found]
+        return tuple(found)
 
     def stages(self) -> tuple[Stage, ...]:
         """Return the stages, in the order of training.
@@ -267,7 +253,7 @@ class System:
         return {"paper": cls()}
 
     def check(self) -> None:
-        """Refuse invalid options before training.
+        """Check all options before training.
 
         Raises:
           ValueError: beginning with the path of the option, then what was wanted and what came.
@@ -276,8 +262,8 @@ class System:
         self._check_stages()
 
     def check_options(self) -> None:
-        """Refuse options of another type or out of range; each group that has a method `check_options`, such as an
-        event, checks its own. Extend it for further options.
+        """Check types and ranges of options; each group with a method `check_options`, such as an event, checks its
+        own. Extend this method for further options.
 
         Raises:
           ValueError: beginning with the path of the option.
@@ -313,11 +299,7 @@ class System:
             raise ValueError(f"the stages of {type(self).__name__} must have different names; got {', '.join(names)}")
         for stage in stages:
             stage.check()
-        self._check_sky(stages)
-        self._check_learned(stages)
-
-    def _check_sky(self, stages: Sequence[Stage]) -> None:
-        """Refuse a sky that would be pruned for its size, or that leaves no room for the Gaussians at points."""
+        # A sky would be pruned for its size, or leave no room for the Gaussians at points.
         pruning = next((event for stage in stages for event in stage.events if event.prunes_large), None)
         if self.sky_gaussians and pruning is not None:
             raise ValueError(
@@ -327,14 +309,12 @@ class System:
         caps = [most for event in stages[0].events if (most := event.most_gaussians) is not None]
         room = min([*caps, self.initial_gaussians or math.inf])
         if self.sky_gaussians and self.sky_gaussians > room - 2:
-            names = " and ".join(self.limits()) if room in caps else "initial_gaussians"
+            limits = " and ".join(self.limits()) if room in caps else "initial_gaussians"
             raise ValueError(
                 f"sky_gaussians must leave room for 2 others among the {room:,} that training starts from at most; got "
-                f"{self.sky_gaussians:,}: lower sky_gaussians, or raise {names}"
+                f"{self.sky_gaussians:,}: lower sky_gaussians, or raise {limits}"
             )
-
-    def _check_learned(self, stages: Sequence[Stage]) -> None:
-        """Refuse corrections that would do nothing."""
+        # Corrections that would do nothing.
         if self.corrections.exposure_kind != "affine" and not self.exposure:
             raise ValueError(
                 f"corrections.exposure_kind is {self.corrections.exposure_kind!r}, but nothing is learned of it: "
@@ -355,7 +335,7 @@ class System:
         return next(iter(found), type(event).__name__)
 
     def more_growth(self) -> str:
-        """Return the names of the options that make more Gaussians, for advice."""
+        """Return the names of the options to raise for more Gaussians, for advice."""
         names = [field.name for field in dataclasses.fields(self)]
         return " or ".join(name for name in ("stage1_iterations", "initial_gaussians") if name in names)
 
@@ -370,21 +350,21 @@ class System:
         return ("memory_budget",) if self.memory_budget is not None else self.caps() or ("initial_gaussians",)
 
     def check_number(self, num: int) -> None:
-        """Refuse options that cannot be trained from this number of Gaussians at the start.
+        """Check the options for a number of Gaussians at the start.
 
         Raises:
           ValueError: naming the option, what was wanted and what came.
         """
 
     def check_given_number(self, num: int) -> None:
-        """Do what `check_number` does, for Gaussians of a file instead of the first stage, and refuse more than the
-        memory budget has room for. It calls `check_number` unless overridden."""
+        """Check the options for Gaussians from a file instead of the first stage; the memory budget must have room for
+        them."""
         self.check_number(num)
         self.check_given_bytes(num)
 
     def check_given_bytes(self, num: int) -> None:
-        """Refuse more Gaussians of a file than the memory budget has room for, with what a stage shows of them when it
-        begins.
+        """Check that the memory budget has room for the Gaussians of a file, with their appearance at the beginning of
+        each stage.
 
         Raises:
           ValueError: naming the budget.
@@ -402,14 +382,23 @@ class System:
                 )
 
 
-def like(kind: type[System] | System, other: System) -> System:
-    """Return a system of a kind with the options of another that have the same name and type.
+def like(kind: Any, other: object) -> Any:
+    """Return a system, or a group of options, with the options of another that have the same name and type.
 
     Args:
-      kind: class or instance that gives all other options.
+      kind: system or its class, which gives all other options.
       other: the other system.
     """
-    return _like(kind() if isinstance(kind, type) else kind, other)
+    value = kind() if isinstance(kind, type) else kind
+    hints, other_hints = (typing.get_type_hints(type(config)) for config in (value, other))
+    changes = {}
+    for field in dataclasses.fields(value):
+        own, others = getattr(value, field.name), getattr(other, field.name, None)
+        if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
+            changes[field.name] = like(own, others)
+        elif hints[field.name] == other_hints.get(field.name):
+            changes[field.name] = others
+    return dataclasses.replace(value, **changes)
 
 
 def own_options(system: object, other: object) -> dict[str, Any]:
@@ -425,15 +414,3 @@ def own_options(system: object, other: object) -> dict[str, Any]:
         elif hints[name] != other_hints.get(name):
             found[name] = option
     return found
-
-
-def _like(value: Any, other: object) -> Any:
-    hints, other_hints = (typing.get_type_hints(type(config)) for config in (value, other))
-    changes = {}
-    for field in dataclasses.fields(value):
-        own, others = getattr(value, field.name), getattr(other, field.name, None)
-        if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
-            changes[field.name] = _like(own, others)
-        elif hints[field.name] == other_hints.get(field.name):
-            changes[field.name] = others
-    return dataclasses.replace(value, **changes)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from a2tg_jax.host.text import did_you_mean, shortened
-from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.training.options import System
 
 SYSTEMS = {
@@ -19,8 +19,6 @@ SYSTEMS = {
     "bytewise": "a2tg_jax.systems.bytewise:Bytewise",
 }
 """Module and class of each system of this library, imported on demand."""
-
-
 LONGEST_REASON = 300
 
 
@@ -31,67 +29,56 @@ def find_system(reference: str) -> System:
       ValueError: if there is no such system.
     """
     path, _, attribute = SYSTEMS.get(reference, reference).partition(":")
+    name = repr(shortened(reference))
     if not attribute:
         raise ValueError(
-            f"there is no system {shortened(reference)!r}; the systems are {', '.join(SYSTEMS)}, "
+            f"there is no system {name}; the systems are {', '.join(SYSTEMS)}, "
             f"and your own as package.module:NAME{did_you_mean(reference, SYSTEMS)}"
         )
     try:
         found = getattr(importlib.import_module(path), attribute)
     except Exception as error:  # A custom module may fail in any way.
-        names = vars(sys.modules[path]) if path in sys.modules else {}
-        raise ValueError(
-            f"the system {shortened(reference)!r} cannot be imported: {shortened(_told(error), LONGEST_REASON)}"
-            f"{did_you_mean(attribute, names)}"
-        ) from error
+        kind = "" if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: "
+        near = did_you_mean(attribute, vars(sys.modules[path]) if path in sys.modules else {})
+        reason = shortened(f"{kind}{error}", LONGEST_REASON)
+        raise ValueError(f"the system {name} cannot be imported: {reason}{near}") from error
     if isinstance(found, type) and issubclass(found, System):
-        return _with_defaults(found, reference)
+        try:
+            return found()
+        except TypeError as error:
+            raise ValueError(f"every option of the system {name} must have a default: {error}") from error
     if not isinstance(found, System):
-        raise ValueError(
-            f"{shortened(reference)!r} is no system: it must be a subclass or an instance of a2tg_jax.System"
-        )
+        raise ValueError(f"{name} is no system: it must be a subclass or an instance of a2tg_jax.System")
     return found
 
 
-def _told(error: Exception) -> str:
-    """Return an error in a few words."""
-    return str(error) if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: {error}"
-
-
-def _with_defaults(kind: type[System], reference: str) -> System:
-    try:
-        return kind()
-    except TypeError as error:
-        raise ValueError(f"every option of the system {shortened(reference)!r} must have a default: {error}") from error
-
-
 def reference_of(system: System) -> str:
-    """Return the name of a system's class, by which `find_system` finds it."""
+    """Return the name with which `find_system` finds a system's class."""
     reference = f"{type(system).__module__}:{type(system).__qualname__}"
     return next((name for name, own in SYSTEMS.items() if own == reference), reference)
 
 
 def system_to_dict(system: System) -> dict[str, object]:
-    """Return a system and all its options as JSON-able values."""
+    """Return a system and all its options as values for JSON."""
     return {"name": reference_of(system), "options": config_to_dict(system)}
 
 
 def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | None = None) -> System:
     """Return the system from its options, the inverse of `system_to_dict`.
 
-    A file never makes this program import foreign modules: the class of another system must be given, or its module
+    A file never makes this program import foreign modules: the class of a custom system must be given, or its module
     already imported.
 
     Args:
       data: name and options.
       where: name of the file in errors.
-      kind: the class.
+      kind: class of the system; None: the class of that name.
 
     Raises:
       ValueError: if the class is not known, or an option is missing, unknown or of another type.
     """
     if not isinstance(data, Mapping) or not isinstance(data.get("name"), str) or "options" not in data:
-        raise ValueError(f"{where}: does not say of which system it is; it is damaged or of another version")
+        raise ValueError(f"{where}: does not name its system; it is damaged or of another version")
     name, options = data["name"], data["options"]
     if kind is None and name in SYSTEMS:
         kind = type(find_system(name))
@@ -105,26 +92,17 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
     return config_from_dict(kind, options, f"{where}: options")
 
 
-def with_changes(system: System, changes: Mapping[str, object], where: str) -> System:
-    """Return the system with some options changed, given as nested dictionaries as in a configuration file.
-
-    Raises:
-      ValueError: naming the option, if it is unknown or of another type.
-    """
-    return changed_config(system, changes, where)
-
-
 def differences(system: System) -> dict[str, object]:
     """Return the options in which a system differs from its class's defaults, nested."""
-    return _differences(config_to_dict(system), config_to_dict(type(system)()))
 
+    def changed(values: Mapping[str, object], defaults: Mapping[str, Any]) -> dict[str, object]:
+        found: dict[str, object] = {}
+        for name, value in values.items():
+            if isinstance(value, Mapping):
+                inner = changed(value, defaults[name])
+                found |= {name: inner} if inner else {}
+            elif value != defaults[name]:
+                found[name] = value
+        return found
 
-def _differences(values: Mapping[str, object], defaults: Mapping[str, Any]) -> dict[str, object]:
-    changed: dict[str, object] = {}
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            inner = _differences(value, defaults[name])
-            changed |= {name: inner} if inner else {}
-        elif value != defaults[name]:
-            changed[name] = value
-    return changed
+    return changed(config_to_dict(system), config_to_dict(type(system)()))

@@ -15,9 +15,8 @@ from typing import Any
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, MEGABYTE
 from a2tg_jax.host.text import did_you_mean
-from a2tg_jax.io.config_json import merged
+from a2tg_jax.io.config_json import changed_config, merged
 from a2tg_jax.results.folder import read_json
-from a2tg_jax.training.registry import with_changes
 from lab.grid_file import (
     GRIDS,
     SIZES,
@@ -167,7 +166,7 @@ def _system(place: str, preset: str, method: Method, cell: Cell) -> a2tg.System:
     basis = {"seed": cell.seed, **size, "stage1_iterations": first, "stage2_iterations": second}
     told = {"": basis, f" options on {cell.scene.label!r}": cell.scene.options, " options": method.options}
     for part, changes in told.items():
-        system = with_changes(system, changes, f"{place}{part}")
+        system = changed_config(system, changes, f"{place}{part}")
     return system
 
 
