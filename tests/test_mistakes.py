@@ -584,7 +584,7 @@ for module in (appearance, corrections, dataclasses, losses, mcmc, options, a2tg
 NAMES |= {**globals(), "Path": Path}
 
 
-@pytest.mark.parametrize("mistake", cases(CALLS, lambda code: "trained(" in code and "each_pixel" not in code))
+@pytest.mark.parametrize("mistake", cases(CALLS, lambda code: "trained(" in code and "target.depth" not in code))
 def test_a_mistake_in_python(mistake, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises((ValueError, FileNotFoundError)) as told:

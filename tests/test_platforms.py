@@ -63,7 +63,8 @@ def test_one_function_takes_the_kernels_of_the_platform_that_it_is_lowered_for()
         lowered("cuda", compositor="native")
 
 
-@pytest.mark.parametrize("compositor", ["xla", pytest.param("autodiff", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("compositor", ["xla", "autodiff"])
 def test_xla_takes_more_tiles_at_once_elsewhere(compositor):
     """15 tiles one by one on CPUs, else all together."""
 
