@@ -67,6 +67,7 @@ def rows_of_bytewise(results: Sequence[Result]) -> list[Row]:
             own = [result for result in results if stratum_of(result) == stratum and result.run.cell.budget == budget]
             place = f"{budget:g} MB" if stratum == DENSE else f"{budget:g} MB, {FEW}"
             others = {BEST: "best plain method", f"{MCMC}, degree 0": "MCMC, degree 0", MCMC: "MCMC, degree 3"}
+            others |= {f"3DGS-MCMC, degree {degree}": f"3DGS-MCMC, degree {degree}" for degree in (0, 3)}
             rows += [Row(f"bytewise − {told}, {place}", own, BYTEWISE, label) for label, told in others.items()]
             rows.append(Row(f"bytewise − best plain method, {place}, equal time", own, BYTEWISE, BEST + EQUAL_TIME))
     return rows

@@ -39,6 +39,7 @@ from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import FLOATS, described
 from a2tg_jax.core.gaussians import Gaussians, logit, share
+from a2tg_jax.core.geometry import homographies
 from a2tg_jax.core.numerics import Integer, at_least
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
@@ -96,6 +97,13 @@ class Appearance:
         The renderer calls it once per view, and JAX differentiates it. Gradients of invisible rows are zero.
         """
         return jnp.zeros((gaussians.num, 0), gaussians.means.dtype)
+
+    def homographies(self, gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
+        """Return the homographies M [N, 3, 3] from (u, v, 1) to pixels, and normals [N, 3] in the world.
+
+        M[:, 2, 2] is the depth by which splats are sorted.
+        """
+        return homographies(gaussians, camera)
 
     def peak_opacities(self, gaussians: Gaussians) -> Array:
         """Return the peak opacities [N], before falloff and alpha factor."""

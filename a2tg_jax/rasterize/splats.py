@@ -18,7 +18,6 @@ from a2tg_jax.appearance.base import colors_in_view, cutoff_of, num_colors_of, n
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.geometry import homographies
 from a2tg_jax.core.numerics import Integer
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
@@ -161,7 +160,7 @@ def project_gaussians(
     Raises:
       ValueError: if the appearance gives opacities, numbers or colours of another shape.
     """
-    M, normals = homographies(gaussians, camera)
+    M, normals = appearance.homographies(gaussians, camera)
     opacities, numbers = appearance.peak_opacities(gaussians), numbers_in_view(appearance, gaussians, camera)
     colors = colors_in_view(appearance, gaussians, camera, sh_degree)
     _check_given(appearance, opacities, numbers, colors, gaussians.num)
@@ -186,7 +185,7 @@ def drawn_splats(
 ) -> tuple[Array, Array]:
     """Return homographies [N, 3, 3] and squared distances [N] of visibility, not positive for rows that do not
     exist."""
-    M, _ = homographies(gaussians, camera)
+    M, _ = appearance.homographies(gaussians, camera)
     cutoff = cutoff_of(appearance, appearance.peak_opacities(gaussians))
     if num_live is not None:
         cutoff = jnp.where(jnp.arange(gaussians.num, dtype=jnp.int32) < num_live, cutoff, -1.0)

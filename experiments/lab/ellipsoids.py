@@ -1,0 +1,100 @@
+"""3D Gaussian splatting (Kerbl et al., 2023) as an appearance: ellipsoids, projected by EWA splatting.
+
+The 2D covariance of a splat is Σ' = J·W·Σ·Wᵀ·Jᵀ + 0.3·I in pixels², with the camera's rotation W and the Jacobian J of
+the perspective projection at the mean. With a Cholesky factor A of Σ' and the projected mean c, pixels are
+A·(u, v) + c: a homography without perspective, for which u² + v² is the squared distance of Mahalanobis.
+"""
+
+import dataclasses
+from typing import Any, ClassVar, Self
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+import a2tg_jax as a2tg
+from a2tg_jax.core.gaussians import rotation_matrices
+from a2tg_jax.events import Now
+from a2tg_jax.mcmc import NOISE_SCALE, NOISE_STEEPNESS, NOISE_TRANSPARENCY, Noise, densify_times
+from a2tg_jax.systems.baselines import Gaussians2dMcmc
+from a2tg_jax.systems.two_stages import grown_by_mcmc, pruned
+from a2tg_jax.training.stage import Stage
+
+LOW_PASS = 0.3
+"""Variance in pixels² that is added to both axes on the screen."""
+MOST_TANGENT = 1.3
+"""Limit of the tangents in the Jacobian, as a multiple of those at the image's border."""
+
+
+@a2tg.pytree(kw_only=True)
+class Ellipsoids(a2tg.Appearance):
+    """Gaussians with a third axis."""
+
+    log_thickness: Array | None = None
+    """[N] logarithms of the standard deviations along the third axis."""
+
+    has_low_pass = False  # That of 2DGS; the covariance has its own.
+
+    def homographies(self, gaussians: a2tg.Gaussians, camera: a2tg.Camera) -> tuple[Array, Array]:
+        if camera.rays is not None:
+            raise ValueError("ellipsoids are drawn by cameras without distortion only; undistort the photographs")
+        _, normals = super().homographies(gaussians, camera)
+        axes = rotation_matrices(gaussians.quats) * self.scales(gaussians)[:, None, :]
+        to_camera, K = camera.viewmat[:3, :3], camera.K
+        in_camera = jnp.sum(to_camera[None, :, :, None] * axes[:, None, :, :], axis=2)  # [N, 3, 3]: columns are axes
+        x, y, z = (jnp.sum(gaussians.means * to_camera[i][None], axis=1) + camera.viewmat[i, 3] for i in range(3))
+        z = jnp.where(z > 1e-6, z, jnp.asarray(1e-6, z.dtype))
+        # The Jacobian's limits are centred on the image, as in the authors' program of 2023.
+        at_border = MOST_TANGENT * jnp.array([0.5 * camera.width, 0.5 * camera.height], z.dtype) / jnp.diagonal(K)[:2]
+        tangents = [jnp.clip(w / z, -most, most) for w, most in ((x, at_border[0]), (y, at_border[1]))]
+        rows = [(in_camera[:, i] - tangents[i][:, None] * in_camera[:, 2]) * (K[i, i] / z)[:, None] for i in range(2)]
+        xx, yy = (jnp.sum(row * row, axis=1) + LOW_PASS for row in rows)
+        xy = jnp.sum(rows[0] * rows[1], axis=1)
+        along = jnp.sqrt(xx)
+        across = jnp.sqrt(yy - (xy / along) ** 2)
+        none = jnp.zeros_like(z)
+        M = [z * along, none, K[0, 0] * x + K[0, 2] * z, z * (xy / along), z * across, K[1, 1] * y + K[1, 2] * z]
+        return jnp.stack([*M, none, none, z], axis=1).reshape(-1, 3, 3), normals
+
+    def scales(self, gaussians: a2tg.Gaussians) -> Array:
+        """Return the standard deviations [N, 3]."""
+        return jnp.concatenate([gaussians.scales, jnp.exp(self.log_thickness)[:, None]], axis=1)
+
+    def allocate(self, key: Array, gaussians: a2tg.Gaussians) -> Self:
+        """Return the appearance of spheres."""
+        return dataclasses.replace(self, log_thickness=jnp.mean(gaussians.log_scales, axis=1))
+
+    def share(self, gaussians: a2tg.Gaussians, num_shares: Array) -> tuple[a2tg.Gaussians, Self]:
+        shared, _ = super().share(gaussians, num_shares)
+        ratio = shared.log_scales[:, 0] - gaussians.log_scales[:, 0]
+        return shared, dataclasses.replace(self, log_thickness=self.log_thickness + ratio)
+
+
+@a2tg.pytree
+class EllipsoidNoise(Noise):
+    """Exploration noise with the covariance of the ellipsoids (`mcmc.perturb`)."""
+
+    def apply(self, now: Now, model: a2tg.Model, moments: Any, state: tuple[()]) -> a2tg.Change:
+        gaussians, dtype = model.gaussians, model.gaussians.means.dtype
+        axes = rotation_matrices(gaussians.quats)
+        noise = jax.random.normal(now.keys[0], gaussians.means.shape, dtype)
+        along = jnp.sum(axes * noise[:, :, None], axis=1) * model.appearance.scales(gaussians) ** 2
+        transparency = jax.nn.sigmoid(-gaussians.logit_opacities)
+        gate = jax.nn.sigmoid(NOISE_STEEPNESS * (transparency - NOISE_TRANSPARENCY))
+        gate = jnp.where(jnp.arange(gaussians.num) < model.live_count, gate, 0.0)
+        strength = gate * (jnp.asarray(now.rate_of_means, dtype) * NOISE_SCALE)
+        means = gaussians.means + jnp.sum(axes * along[:, None, :], axis=2) * strength[:, None]
+        model = dataclasses.replace(model, gaussians=dataclasses.replace(gaussians, means=means))
+        return a2tg.Change(model, moments, state)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Gaussians3dMcmc(Gaussians2dMcmc):
+    """3DGS-MCMC with the options of plain 2D Gaussians by MCMC."""
+
+    name: ClassVar[str] = "gaussians-3d-mcmc"
+
+    def stages(self) -> tuple[Stage, ...]:
+        _, growth = grown_by_mcmc(self.densify, self.budget_cap(1))
+        events = EllipsoidNoise(), growth, *pruned(self.prune, self.stage1_iterations, densify_times)
+        return self.continued(self.growing_stage(events, Ellipsoids(), {"log_thickness": self.rates.log_scales}))
