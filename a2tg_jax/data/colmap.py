@@ -148,6 +148,7 @@ def viewmat_of(image: ImageRecord) -> np.ndarray:
     if length == 0:
         raise ValueError(f"{image.name}: its pose has a quaternion of zeros; remove it from the model")
     w, x, y, z = quaternion / length if np.isfinite(length) else np.full(4, np.nan)
+    # Rotation of the unit quaternion w + xi + yj + zk, in Hamilton's convention.
     viewmat[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

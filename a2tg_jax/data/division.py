@@ -86,6 +86,7 @@ def divided(
 
     own = map_in_threads(attempt, range(division.index, len(names), division.count), place=place)
     parts = division.exchange("photographs read", own)
+    # Process p did items p, p + count, p + 2·count, …
     return _without_errors([parts[n % division.count][n // division.count] for n in range(len(names))])
 
 

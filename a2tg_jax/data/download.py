@@ -110,7 +110,7 @@ def _download(archive: Archive, file: Path, progress: bool) -> None:
     partial = file.with_name(f"{file.name}.partial")
     # The server's name (ETag) of the version of which a part has come.
     version = partial.with_name(f"{partial.name}.etag")
-    if archive.num_bytes is not None:
+    if archive.num_bytes is not None:  # The archive and what is unpacked from it are on the disk at once.
         _check_room(file.parent, 2 * archive.num_bytes - _size(partial), archive.url)
     total = None
     for attempt in range(ATTEMPTS):

@@ -47,6 +47,7 @@ def observed_points(xy: np.ndarray, depths: np.ndarray, size: tuple[int, int]) -
         raise ValueError(f"xy must be [S, 2] and depths [S]; got {list(xy.shape)} and {list(depths.shape)}")
     is_within = ((xy >= 0) & (xy < size[::-1])).all(axis=1) & _are_usable(depths)  # False for NaN.
     column, row = xy[is_within].astype(np.int32).T
+    # int32 holds any index: pictures have at most 128 megapixels.
     pixels, near = row * np.int32(size[1]) + column, depths[is_within].astype(np.float32)
     order = np.lexsort((near, pixels))  # By pixel, the nearest first; `unique` returns the index of the first.
     found, first = np.unique(pixels[order], return_index=True)

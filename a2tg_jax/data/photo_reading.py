@@ -119,7 +119,7 @@ def read_photos(
     """
     found = _find_files(photos, options.downscale, place, root, how_to_remove)
     names: dict[Path, str] = {}
-    for own in found:
+    for own in found:  # Where capitals or suffixes were lost, one file may fit two names.
         if names.setdefault(own.file, own.photo.name) != own.photo.name:
             raise ValueError(
                 f"{own.file}: is the only file for {names[own.file]} and {own.photo.name}; put both there, or remove "

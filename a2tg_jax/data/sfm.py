@@ -195,7 +195,7 @@ def _map(database: Path, staged: Staged, work: Path, seed: int, progress: bool) 
         random_seed=seed, num_threads=1, min_model_size=MIN_REGISTERED, ba_use_gpu=False
     )
     options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.mapper.num_threads = 1
+    options.mapper.num_threads = 1  # The sums of several threads depend on their order.
     if staged.rigs:  # The calibration of a panorama's views is exact.
         options.ba_refine_sensor_from_rig = False
         firsts = [group.names[0] for rig in staged.rigs for group in rig.groups]
