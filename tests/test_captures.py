@@ -244,6 +244,15 @@ def test_rigs_of_metashape(tmp_path, master):
     check_dots(scene, 0.05)
 
 
+def test_rigs_of_metashape_without_offsets(tmp_path):
+    save_dots(tmp_path / "images", [f"{index}_0.png" for index in range(COUNT)])
+    (tmp_path / "cameras.xml").write_text(rig_xml(np.eye(4), sensors=(" ",)))
+    with pytest.warns(
+        UserWarning, match=r"4 of 8 cameras have no pose or are switched off, such as 0_1\.png: not used"
+    ):
+        assert len(load_scene(tmp_path, test_every=0).train) == COUNT
+
+
 def fisheye_place(pose, projection, k=(0.0, 0.0, 0.0, 0.0), p1=0.0, p2=0.0):
     """The place of the target by Metashape's manual: the fisheye's radius of the angle, then Brown's distortion."""
     x, y, z = to_camera(pose, TARGET)
