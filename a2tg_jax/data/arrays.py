@@ -103,7 +103,6 @@ def scene_from_arrays(
 def _mistakes(
     images: Sequence[object], colors: ArrayLike | None, shots: Sequence[Shot], points: np.ndarray | None
 ) -> Iterator[str]:
-    """Yield warnings of what looks like a mistake."""
     # Colours are only 0 and 1 of 255. One image is enough, as a rule.
     arrays = {"images": [image for image in images if not isinstance(image, Picture)]}
     for name, own in (arrays | ({} if colors is None else {"colors": [colors]})).items():
@@ -178,7 +177,6 @@ def _share_that_meet(viewmats: np.ndarray, precision: float) -> float:
 
 
 def _matrices(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Return matrices as float64 after checking their shape."""
     check_shape(name, values, shape)
     check_unmasked(name, values)
     return np.asarray(values, np.float64)
@@ -197,7 +195,6 @@ def _converted(name: str, kind: Callable[[Any], Any], values: object, size: tupl
 
 
 def _cloud(points: ArrayLike, colors: ArrayLike | None) -> PointCloud:
-    """Return points and their colours, grey without."""
     check_unmasked("points", points)
     check_unmasked("colors", colors)
     points = np.asarray(points, np.float64)
@@ -210,7 +207,6 @@ def _cloud(points: ArrayLike, colors: ArrayLike | None) -> PointCloud:
 
 
 def _chosen(points: np.ndarray, indices: ArrayLike, what: str) -> np.ndarray:
-    """Return the points of the given indices."""
     check_unmasked(what, indices)
     indices = np.asarray(indices)
     is_index = indices.ndim == 1 and (np.issubdtype(indices.dtype, np.integer) or not indices.size)

@@ -34,7 +34,6 @@ SHALLOWEST, DEEPEST = 0.5, 10.0
 FIRST_LOOK = 10_000
 """Number of points, evenly chosen, that a view is tried with before all of them."""
 RANDOM_COLOR = 128
-"""Mid-grey of random points."""
 FARTHEST = 1e5
 """Largest distance of a camera from the median centre, in units of the median distance."""
 MIN_UP_LENGTH = 1e-3
@@ -243,7 +242,6 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
 
 
 def _are_somewhere(points: np.ndarray) -> np.ndarray:
-    """Return [P] whether all coordinates of a point are within bounds."""
     return (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
 
 

@@ -284,7 +284,6 @@ def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
 
 
 def _has_record(line: bytes) -> bool:
-    """Return whether a line is neither empty nor a comment."""
     return bool(line.strip()) and not line.lstrip().startswith(b"#")
 
 

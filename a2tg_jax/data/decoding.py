@@ -23,7 +23,6 @@ FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
 HEIC_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx"}
 """Brands in the first box of HEIC files, one of which they name; AVIF files name others."""
 LONGEST_BOX = 64
-"""Bytes of the first box that are looked at."""
 BITS_PER_SAMPLE = 258
 """TIFF tag of the bits per sample."""
 TIFF_SIZE = 256, 257
@@ -176,7 +175,6 @@ def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool =
 
 
 def _formats_of(path: str | os.PathLike[str], file: BufferedReader) -> tuple[str, ...]:
-    """Return the formats to try on an open file."""
     # HEIC and AVIF files begin with a box "ftyp": its length, its name, and the brands, each of 4 bytes.
     head = file.peek(LONGEST_BOX)[:LONGEST_BOX]
     brands = {head[at : at + 4] for at in range(8, min(len(head), int.from_bytes(head[:4], "big")), 4)}

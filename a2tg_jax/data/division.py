@@ -123,7 +123,6 @@ def _plain(error: Exception) -> Exception:
 
 
 def _without_errors(results: list[Any]) -> list[Any]:
-    """Return results, or raise SharedError with the first error among them."""
     if (error := next((result for result in results if isinstance(result, Exception)), None)) is not None:
         raise SharedError(error)
     return results

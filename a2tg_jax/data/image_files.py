@@ -17,7 +17,6 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".h
 LONGEST_NAME = 1000
 """Largest number of letters in an image's path below its folder."""
 MOST_READERS = 8
-"""Largest number of threads that read photographs."""
 
 Result = TypeVar("Result")
 

@@ -21,13 +21,11 @@ LARGEST_DISTORTION = 1e6
 GRID, MARGIN = 9, 0.1
 """Number of test points along an axis of an undistorted image, and their largest distance outside the photograph."""
 ROWS_AT_ONCE = 128
-"""Number of rows undistorted at a time, which bounds the memory."""
 WIDEST_ANGLE = np.deg2rad(80.0)
 """Largest angle between a ray of a kept lens and the direction of view; pixels beyond it do not count."""
 FARTHEST_FROM_RAY = 0.1
 """Largest distance in pixels between a pixel and the projection of its ray; a ray farther off is none."""
 LEAST_SEEN = 0.05
-"""Smallest share of pixels with a ray."""
 CUT = ": find cameras again with a2tg sfm, which cuts panoramas into views"
 """What to do about cameras that look all around."""
 LensUse = Literal["undistort", "keep"]
@@ -211,7 +209,6 @@ def checked_lens(camera: Any, what: str, use: LensUse = "undistort") -> Lens:
 
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:
-    """Return [P, 2] → [P, 3] with a last coordinate of 1."""
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 

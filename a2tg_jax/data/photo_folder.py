@@ -144,7 +144,6 @@ def told_of_capture(path: Path) -> str | None:
 
 
 def _written(folder: Path, names: Sequence[str]) -> set[str]:
-    """Return the pictures that `a2tg` wrote."""
     cameras = (name for name in names if PurePosixPath(name).name == CAMERA_PICTURE)
     found = {name for name in cameras if (folder / name).with_name("sparse").is_dir()}
     for file in folder.rglob(".a2tg-*"):

@@ -291,7 +291,6 @@ class Shelf:
 
 
 def _read_file(source: Path, view: Processing | None) -> np.ndarray:
-    """Return the pixels in an image file, or what `view` makes of them."""
     stored = read_pixels(source)
     return np.ascontiguousarray(stored if view is None else view(stored))
 

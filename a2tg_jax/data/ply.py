@@ -150,7 +150,6 @@ def read_ply_points(path: Path) -> PointCloud:
 
 
 def _colors(vertices: np.ndarray, fields: Mapping[str, str]) -> np.ndarray:
-    """Return uint8 colours [P, 3] of the vertices."""
     names = next((names for names in (*COLORS, SH_DEGREE0) if set(names).issubset(fields)), None)
     if names is None or not len(vertices):
         return np.full((len(vertices), 3), 128, np.uint8)

@@ -25,7 +25,6 @@ MANY_LENSES = 8
 LONGEST_PREVIEW = 800
 """Longest side in pixels of the picture of a view in a notebook."""
 NUM_THUMBNAILS = 8
-"""Number of training views in the picture of a scene."""
 GENERIC_NAMES = {
     "0", "capture", "colmap", "data", "dataset", "dense", "images", "input", "output", "photos", "scene", "sfm",
     "sparse", "undistorted",

@@ -36,7 +36,6 @@ MIN_REGISTERED = 3
 PHOTOS_PER_CORE = 2
 """Photographs of which features are extracted together, so that the progress bar moves."""
 TICK = 0.5
-"""Seconds between two readings of the clock of a phase without countable progress."""
 ADVICE = "take more, sharp and closer together: they should overlap by two thirds and show texture, unlike blank walls"
 
 
@@ -166,7 +165,6 @@ def list_photos(database: Path, staged: Staged, camera_model: str) -> None:
 
 
 def _extract_features(database: Path, folder: Path, names: list[str], progress: bool) -> None:
-    """Extract features of the photographs into the database, a few photographs at a time."""
     colmap = pycolmap()
     together = PHOTOS_PER_CORE * num_threads()
     with counting("features", len(names), "photo", is_shown=progress) as bar:
@@ -177,7 +175,6 @@ def _extract_features(database: Path, folder: Path, names: list[str], progress: 
 
 
 def _match_features(database: Path, num_photos: int, seed: int, matching: Matching, progress: bool) -> None:
-    """Match features of pairs of photographs into the database."""
     colmap = pycolmap()
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed

@@ -33,7 +33,6 @@ COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 """Suffixes of the images that COLMAP can write; it reads by content."""
 LOSSLESS_FORMATS = ("PNG", "TIFF", "BMP")
 QUALITY = 95
-"""JPEG quality of photographs that are written again."""
 FIELD_OF_VIEW = np.deg2rad(100.0)
 """Field of view of each square view of a panorama; with the headings below no direction is left out."""
 AROUND = 6

@@ -23,7 +23,6 @@ LEAST_MOTION = 0.005
 ONLY_VIDEOS = {"format_whitelist": "mov,matroska,webm,avi", "protocol_whitelist": "file"}
 """Options that keep FFmpeg from playlists, which name further files and addresses."""
 QUALITY = 95
-"""JPEG quality of the written frames."""
 
 
 def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = True) -> tuple[int, int]:
@@ -88,7 +87,6 @@ def motion(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def _frames(video: Path, phase: str, progress: bool) -> Iterator[Any]:
-    """Yield the decoded frames of the first video stream."""
     try:
         av = importlib.import_module("av")
     except ImportError:
