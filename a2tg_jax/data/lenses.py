@@ -209,6 +209,7 @@ def checked_lens(camera: Any, what: str, use: LensUse = "undistort") -> Lens:
 
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:
+    """Return [P, 2] → [P, 3] with a last coordinate of 1."""
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 

@@ -190,6 +190,7 @@ def _exact_hits(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def _center(viewmat: np.ndarray) -> np.ndarray:
+    """Return [3, 1] float32 position of a camera."""
     return (-viewmat[:3, :3].T @ viewmat[:3, 3:]).astype(np.float32)
 
 
