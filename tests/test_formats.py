@@ -74,7 +74,10 @@ def matched(found: Model, model: Model) -> Model:
     return found[np.linalg.norm(apart, axis=-1).argmin(axis=0)]
 
 
-@pytest.mark.parametrize("suffix", OTHERS)
+FAST = (".ply", ".spz")
+
+
+@pytest.mark.parametrize("suffix", [pytest.param(x, marks=[pytest.mark.long] * (x not in FAST)) for x in OTHERS])
 def test_splats_come_back_from_files_of_other_programs(tmp_path, suffix):
     needs_gaussforge()
     model = small_scene()

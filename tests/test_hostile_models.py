@@ -240,6 +240,7 @@ def test_a_whole_checkpoint_loads(checkpoint):
     assert found.iteration == 0 and found.model.num == NUM - 2
 
 
+@pytest.mark.long
 def test_every_array_of_another_shape_is_refused(checkpoint):
     """Whichever it is: of Gaussians, what they show, moments, events, counters, history."""
     _, arrays = read_archive(checkpoint)
@@ -257,6 +258,7 @@ def test_every_array_of_another_shape_is_refused(checkpoint):
             load_checkpoint(checkpoint)
 
 
+@pytest.mark.long
 def test_every_array_of_nan_is_refused(checkpoint):
     _, arrays = read_archive(checkpoint)
     whole = checkpoint.read_bytes()

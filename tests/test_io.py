@@ -409,7 +409,8 @@ def test_an_option_that_is_missing_has_its_default():
         config_from_dict(Strict, {})
 
 
-@pytest.mark.parametrize("template", [MovableKernels(), pytest.param(Billboards(side=4), marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("template", [MovableKernels(), Billboards(side=4)])
 def test_ply_of_splats_with_opacities_of_their_own(tmp_path, template):
     gaussians = init_from_points(np.eye(3), np.eye(3), opacity=0.2)
     appearance = allocate_appearance(template, jax.random.key(0), gaussians)

@@ -211,7 +211,7 @@ def test_arrays_and_options_that_do_not_fit_are_refused(tmp_path, change, messag
     refused(load_model, path, message)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_flipped_bits_are_found_or_do_no_harm(tmp_path, seed):
     path, rng = tmp_path / "bits.npz", np.random.default_rng(seed)
     save_model(path, textured_model())
@@ -237,6 +237,7 @@ def test_a_model_of_wrong_shapes_is_not_written(tmp_path):
 # The value
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("x64")
 def test_a_moved_model_shows_the_same_to_its_cameras():
     scene = draw_scene(9)

@@ -157,6 +157,7 @@ def test_a_loss_may_return_more():
     np.testing.assert_allclose(gradient.gaussians.means, 2 * model.gaussians.means)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows", [[0, 5, 3], [1, 1, *range(NUM + 2)]])
 def test_an_event_may_leave_fewer_rows_or_more(rows, name="exponents"):
     model = some_model(name)

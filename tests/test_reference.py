@@ -36,7 +36,8 @@ def test_the_reference_reader_finds_what_this_library_finds(reference, name):
         np.testing.assert_allclose(found[key], values, atol=2e-6, rtol=2e-6, err_msg=key)
 
 
-@pytest.mark.parametrize("has_shapes", [pytest.param(False, marks=pytest.mark.long), True])
+@pytest.mark.long
+@pytest.mark.parametrize("has_shapes", [False, True])
 def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path, has_shapes):
     """It follows the rules of the page alone."""
     read_model, draw = reference
