@@ -77,7 +77,7 @@ export class CropControls {
     viewer.draw();
   }
 
-  /** Show the values of the sliders beside their names. */
+  /** Show the values of the sliders next to their names. */
   private tell(): void {
     for (const [k, output] of this.ranges.entries()) {
       output.value = `${percentOf(this.from[k])} to ${percentOf(this.to[k])} %`;

@@ -38,7 +38,7 @@ export interface Crop {
 
 export const WHOLE: Crop = { from: [0, 0, 0], to: [1, 1, 1] };
 
-/** Return the extent that the positions' quantization tells: their median, and the spread that holds three quarters. */
+/** Return the extent that follows from the positions' quantization: their median, and the spread that holds three quarters. */
 export function extentOf([x, y, z]: Header["means"]): Extent {
   const half = (spread: number): number => Math.max(PERCENTILES_PER_SPREAD * spread, 1e-6);
   return { centre: [x[0], y[0], z[0]], half: [half(x[1]), half(y[1]), half(z[1])] };

@@ -73,7 +73,7 @@ export interface FileHeader {
   /** Texture sizes Tv, Tu that occur; null without textures. */
   readonly sizes: readonly Vec2[] | null;
   readonly numTexels: number;
-  /** Whether kernels have shapes of their own. */
+  /** Whether kernels differ in shape. */
   readonly hasShapes: boolean;
   readonly nearPlane: number;
   readonly maxAlpha: number;

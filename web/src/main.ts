@@ -88,7 +88,7 @@ function tell(splats: Splats): void {
   setFigures(figures);
 }
 
-/** Whether the scene stands in the page. */
+/** Whether the scene is embedded in the page. */
 const isHeld = (): boolean => document.getElementById("scene-data") !== null;
 /** Whether the server of the page shows a training. */
 const isTraining = (): boolean => document.documentElement.dataset.training === "yes";

@@ -92,7 +92,7 @@ export class Panel {
     if (!this.followLink()) this.restart();
   }
 
-  /** Set which cameras have a photograph beside the page. */
+  /** Set which cameras have a photograph next to the page. */
   setPhotographs(indices: readonly number[]): void {
     this.photographs = new Set(indices);
     this.showPhotograph();

@@ -1,4 +1,4 @@
-/** Loading of a scene, embedded in the page or in a file beside it, as a stream of bytes. */
+/** Loading of a scene, embedded in the page or in a file next to it, as a stream of bytes. */
 
 import { at } from "./arrays";
 import type { Intrinsics, Viewmat } from "./camera";
@@ -19,7 +19,7 @@ export interface Source {
   readonly length: number | null;
 }
 
-/** Open the scene embedded in the page, else the file beside it. Throws a SceneError if there is neither. */
+/** Open the scene embedded in the page, else the file next to it. Throws a SceneError if there is neither. */
 export async function openScene(): Promise<Source> {
   const held = document.getElementById("scene-data");
   if (held !== null) return fromBytes(fromBase64(held.textContent.trim()));

@@ -93,7 +93,7 @@ export class Viewer implements Steered {
     splats.sort(this.depthRow);
   }
 
-  /** Go to the most central camera, or to where most of the scene is seen, with the vertical that the cameras tell. */
+  /** Go to the most central camera, or to where most of the scene is seen, with the vertical of the cameras. */
   settle({ header }: Splats): void {
     const first = header.cameras.at(header.first);
     const extent = extentOf(header.means);
@@ -211,7 +211,7 @@ export class Viewer implements Steered {
   }
 }
 
-/** Return the vertical that the cameras of a scene tell; without cameras −y, as in most point clouds. */
+/** Return the vertical of the cameras of a scene; without cameras −y, as in most point clouds. */
 function verticalOfScene({ cameras }: Header): Vec3 {
   return cameras.length === 0 ? [0, -1, 0] : verticalOf(cameras.map(({ viewmat }) => poseOf(viewmat, 1).rotation));
 }
