@@ -108,13 +108,14 @@ def test_statistics_do_not_depend_on_the_image_plane(x64, statistic):
     camera, gaussians = as_camera(scene, "float64"), as_gaussians(scene, "float64")
     wide = dataclasses.replace(camera, K=camera.K * jnp.asarray([[0.25], [0.25], [1.0]]))
     in_plane = pinhole_rays(wide, np.asarray(camera.K))
-    model = Model(gaussians)
-    of_camera, of_rays = (
-        a2tg.view_gradients(
-            lambda model, output: jnp.sum(output.color**2), model, seen, statistic=statistic
-        ).norms
-        for seen in (camera, in_plane)
-    )  # fmt: skip
+    settings = a2tg.RenderSettings(capacity=CAPACITY)
+
+    @jax.jit
+    def norms(model, seen):
+        square = lambda model, output: jnp.sum(output.color**2)  # noqa: E731
+        return a2tg.view_gradients(square, model, seen, settings=settings, statistic=statistic).norms
+
+    of_camera, of_rays = (norms(Model(gaussians), seen) for seen in (camera, in_plane))
     assert float(of_camera.max()) > 0
     np.testing.assert_allclose(of_rays, of_camera, rtol=1e-5, atol=1e-6 * float(of_camera.max()))
 
