@@ -12,7 +12,7 @@ from a2tg_jax.host import machine
 from a2tg_jax.host.machine import keep_room_for_programs, memory_limit, tidy_memory
 from a2tg_jax.host.operating_system import trim_heap
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.training.session import Session
+from a2tg_jax.training import Session
 
 
 def proc(folder, count: int, limit: str):

@@ -31,10 +31,9 @@ from a2tg_jax.core.pytree import num_compiled, pytree
 from a2tg_jax.core.table import Shape
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.training import LearningRates, LossConfig, Stage, fit_stage, like, loop
+from a2tg_jax.training import LearningRates, LossConfig, Session, Stage, fit_stage, like, loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.session import Session
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
 

@@ -14,8 +14,8 @@ from a2tg_jax.training.fitting import (
     fit as fit,
     fit_stage as fit_stage,
 )
+from a2tg_jax.training.loop import Session as Session
 from a2tg_jax.training.options import LossConfig as LossConfig, System as System, like as like
 from a2tg_jax.training.registry import SYSTEMS as SYSTEMS, find_system as find_system
-from a2tg_jax.training.session import Session as Session
 from a2tg_jax.training.stage import LearningRates as LearningRates, Stage as Stage
 from a2tg_jax.training.terms import Target as Target, Term as Term

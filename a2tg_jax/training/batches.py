@@ -1,10 +1,9 @@
 """Batches of views: the order of a training, and photographs on their way to the device."""
 
-import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -28,6 +27,10 @@ MOST_AHEAD = 10
 BYTES_PER_DEPTH = 4
 ALIGNMENT = 64
 """Alignment in bytes of memory that XLA adopts."""
+
+
+Kind = tuple[int, int, int]
+"""Image size and lens of a view (`data.scene.kinds_of`)."""
 
 
 class Extras(NamedTuple):
@@ -62,12 +65,19 @@ class Photographs(NamedTuple):
     points: ObservedPoints | None = None
     """Observed points [V, S]; None unless a loss term reads them."""
 
-    def of(self, views: Array | None) -> "Photographs":
-        """Return the views of some indices; None: all."""
-        if views is None:
-            return self
-        chosen: Photographs = jax.tree.map(lambda x: x[views], self._replace(rays=None))
-        return chosen._replace(rays=self.rays)
+    def of(self, views: Array | np.ndarray | None, dtype: np.dtype | None = None) -> "Photographs":
+        """Return the views of some indices, or all; with a dtype, cameras and depths are of it."""
+        batch = self
+        if views is not None:
+            batch = jax.tree.map(lambda x: x[views], self._replace(rays=None))._replace(rays=self.rays)
+        if dtype is None:
+            return batch
+        batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
+        if batch.depths is not None:
+            batch = batch._replace(depths=batch.depths.astype(dtype))
+        if batch.points is not None:
+            batch = batch._replace(points=batch.points._replace(depths=batch.points.depths.astype(dtype)))
+        return batch
 
 
 class BatchOrder:
@@ -75,12 +85,7 @@ class BatchOrder:
     alone, so a resumed run sees the same one."""
 
     def __init__(self, views: tuple[View, ...], batch_size: int, seed: int, number: int = 0):
-        """Args:
-        views: of one scene.
-        batch_size: views of an iteration.
-        seed: of the order.
-        number: which order of this seed, from 0.
-        """
+        """`number` selects one of the orders of a seed, from 0."""
         self.kinds, self._batch_size = kinds_of(views), batch_size
         """Image size and lens of each view."""
         self._seeds = (seed, number) if number else (seed,)
@@ -96,7 +101,7 @@ class BatchOrder:
     def _draw(self, epoch: int) -> list[tuple[int, ...]]:
         """Return one epoch: every view once. The last batch of a kind is filled from the start of its order."""
         rng = np.random.default_rng([*self._seeds, epoch])
-        by_kind: dict[tuple[int, int, int], list[int]] = {}
+        by_kind: dict[Kind, list[int]] = {}
         for index in rng.permutation(len(self.kinds)):
             by_kind.setdefault(self.kinds[index], []).append(int(index))
         batches = []
@@ -122,7 +127,7 @@ class BatchPlan(NamedTuple):
 def plan_batches(
     views: tuple[View, ...], batch_size: int, room: float | None = None, extras: Extras = NO_EXTRAS
 ) -> BatchPlan:
-    """Return whether photographs stay on the device, or how many batches are prepared. Arguments as `PhotoStore`."""
+    """Return where photographs are during training. Arguments as of `PhotoStore`."""
     sizes, of_rays = [view_bytes(view, extras) for view in views], ray_bytes(views)
     room = device_room() if room is None else room
     batch_bytes = batch_size * max(sizes)
@@ -152,12 +157,12 @@ class PhotoStore:
         room: float | None = None,
     ):
         """Args:
-        views: of one scene.
+        views: all training views.
         order: views of each iteration.
         last: the stage's last iteration.
         exchange: devices that draw the views of an iteration, and over which photographs that stay there are spread
           by rows of pixels; None: one.
-        extras: what is loaded with them.
+        extras: data to load with the photographs.
         room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
         self._views, self._order, self._last, self._exchange = views, order, last, exchange
@@ -165,9 +170,9 @@ class PhotoStore:
         plan = plan_batches(views, len(order.indices(1)), room, extras)
         self._mesh = None if exchange is None else exchange.mesh
         self._keeps_rays, self.num_ahead = plan.keeps_rays, plan.num_ahead
-        self._rays: dict[tuple[int, int, int], Array] = {}
-        self._stacks: dict[tuple[int, int, int], Photographs] = {}
-        self._of_kind: dict[tuple[int, int, int], list[int]] = {}
+        self._rays: dict[Kind, Array] = {}
+        self._stacks: dict[Kind, Photographs] = {}
+        self._of_kind: dict[Kind, list[int]] = {}
         """Views of each kind, in the order of its stack."""
         for index, kind in enumerate(order.kinds):
             self._of_kind.setdefault(kind, []).append(index)
@@ -177,8 +182,8 @@ class PhotoStore:
         self.is_resident = not asked_by_any(self._mesh, not plan.is_resident)
 
     def batch(self, iteration: int) -> tuple[Photographs, np.ndarray | None]:
-        """Return photographs of one kind that include the iteration's, and int32 indices of these; None if there are no
-        others.
+        """Return photographs of one kind that include the iteration's, and the int32 indices of these; None if all
+        are.
 
         Raises:
           ValueError, OSError: if a photograph that was not copied has gone, has changed or cannot be read.
@@ -189,10 +194,11 @@ class PhotoStore:
             following = range(iteration, min(iteration + self.num_ahead, self._last) + 1)
             return self._placed(kind, self._ahead.first({key: self._order.indices(key) for key in following})), None
         if kind not in self._stacks:
-            self._stacks[kind] = self._placed(kind, self._stacked(self._of_kind[kind]))
+            views = [self._views[index] for index in self._of_kind[kind]]
+            self._stacks[kind] = self._placed(kind, stack_views(views, self._views, extras=self._extras))
         return self._stacks[kind], np.asarray([self._places[index] for index in indices], np.int32)
 
-    def _placed(self, kind: tuple[int, int, int], batch: Photographs) -> Photographs:
+    def _placed(self, kind: Kind, batch: Photographs) -> Photographs:
         """Return photographs of a kind on the devices, with the rays of their lens, which stay there if the rays of
         all lenses fit."""
         rays = self._rays.get(kind, batch.rays)
@@ -208,14 +214,11 @@ class PhotoStore:
     def _read(self, indices: Sequence[int]) -> Photographs:
         """Return the photographs of an iteration, without those that other processes' devices draw."""
         height = self._views[indices[0]].picture.size[0]
-        return self._stacked(indices, are_drawn_here(self._exchange, len(indices), height))
-
-    def _stacked(self, indices: Sequence[int], are_read: Sequence[bool] | None = None) -> Photographs:
-        views = [self._views[index] for index in indices]
+        views, are_read = [self._views[i] for i in indices], are_drawn_here(self._exchange, len(indices), height)
         return stack_views(views, self._views, extras=self._extras, are_read=are_read)
 
     def close(self) -> None:
-        """Ends the threads."""
+        """End the threads."""
         self._ahead.close()
 
 
@@ -223,11 +226,8 @@ class Ahead:
     """Threads that prepare the next batches in order."""
 
     def __init__(self, load: Callable[[tuple[int, ...]], Photographs], num_ahead: int, *, is_waiting: bool = False):
-        """Args:
-        load: makes the batch of some views; its errors reach who waits for that batch.
-        num_ahead: how many batches may be ready before they are wanted.
-        is_waiting: whether it waits for object storage more than it computes; then each batch has a thread.
-        """
+        """`load` makes the batch of some views; its errors are raised where that batch is taken. Up to `num_ahead` are
+        ready before they are needed. If loading waits for object storage (`is_waiting`), each batch has a thread."""
         self._load = load
         num = num_ahead if is_waiting else min(num_ahead, num_threads())
         self._pool = ThreadPoolExecutor(num, thread_name_prefix="photographs")
@@ -257,20 +257,31 @@ def stack_views(
     views: list[View], among: tuple[View, ...] | None = None, *, extras: Extras = NO_EXTRAS,
     are_read: Sequence[bool] | None = None,
 ) -> Photographs:  # fmt: skip
-    """Return views of one image size and lens, stacked on the host.
+    """Return views of one image size and lens, stacked in numpy arrays.
 
     Args:
-      views: those to stack.
+      views: the views to stack.
       among: views that decide the structure: if one of that size has opacities or a mask, every stack of that size has
         them, and each has room for as many points as the view with the most. None: `views`.
-      extras: what is loaded with them. Depths are NaN where a view has no map.
+      extras: data to load with the photographs. Depths are NaN where a view has no map.
       are_read: whether the pictures of each view are read; other pictures are zeros. None: all.
     """
     size = views[0].picture.size
     alike = [view for view in among or views if view.picture.size == size]
     read = {place: view for place, view in enumerate(views) if are_read is None or are_read[place]}
     pixels = {place: view.picture.read() for place, view in read.items()}
-    stacked = functools.partial(_stacked, len(views), size)
+
+    def stacked(arrays: Mapping[int, Any], dtype: DTypeLike = np.uint8, channels: tuple[int, ...] = ()) -> Any:
+        # Arrays at their places among zeros [V, H, W, ...], aligned so that `jax.device_put` adopts them on CPUs.
+        shape = (len(views), *size, *channels)
+        num_bytes = math.prod(shape) * np.dtype(dtype).itemsize
+        room = np.zeros(num_bytes + ALIGNMENT, np.uint8)
+        start = -room.ctypes.data % ALIGNMENT
+        stack = room[start : start + num_bytes].view(dtype).reshape(shape)
+        for place, own in arrays.items():
+            stack[place] = own
+        return stack
+
     alphas = masks = depths = points = None
     if any(view.has_alpha for view in alike):
         opaque = np.full(size, 255, np.uint8)
@@ -283,37 +294,10 @@ def stack_views(
         length = max(0 if view.points is None else len(view.points.pixels) for view in alike)
         points = stacked_points([view.points for view in views], size, length)
     if extras.depths:
-        depths = stacked({place: _depth(view) for place, view in read.items()}, np.float32)
-    return Photographs(
-        viewmats=np.stack([np.asarray(view.camera.viewmat) for view in views]),  # type: ignore[arg-type]
-        Ks=np.stack([np.asarray(view.camera.K) for view in views]),  # type: ignore[arg-type]
-        images=stacked({place: own[..., :3] for place, own in pixels.items()}, channels=(3,)),  # type: ignore[arg-type]
-        alphas=alphas,  # type: ignore[arg-type]
-        masks=masks,  # type: ignore[arg-type]
-        rays=views[0].camera.rays,
-        depths=depths,  # type: ignore[arg-type]
-        points=points,
-    )
-
-
-def _depth(view: View) -> np.ndarray:
-    """Return the depth map of a view [H, W] float32, NaN without one."""
-    return np.full(view.picture.size, np.nan, np.float32) if view.depth is None else view.depth.read()
-
-
-def _stacked(
-    num: int, size: tuple[int, int], arrays: Mapping[int, np.ndarray], dtype: DTypeLike = np.uint8,
-    channels: tuple[int, ...] = (),
-) -> np.ndarray:  # fmt: skip
-    """Stack arrays at the given indices into zeros of shape [num, H, W, ...].
-
-    Its memory is aligned, so that `jax.device_put` adopts it on CPUs without a copy.
-    """
-    shape = (num, *size, *channels)
-    num_bytes = math.prod(shape) * np.dtype(dtype).itemsize
-    room = np.zeros(num_bytes + ALIGNMENT, np.uint8)
-    start = -room.ctypes.data % ALIGNMENT
-    stack = room[start : start + num_bytes].view(dtype).reshape(shape)
-    for place, own in arrays.items():
-        stack[place] = own
-    return stack
+        unknown = np.full(size, np.nan, np.float32)
+        found = {place: unknown if view.depth is None else view.depth.read() for place, view in read.items()}
+        depths = stacked(found, np.float32)
+    viewmats, Ks = (np.stack([np.asarray(getattr(view.camera, name)) for view in views]) for name in ("viewmat", "K"))
+    images = stacked({place: own[..., :3] for place, own in pixels.items()}, channels=(3,))
+    rays: Any = views[0].camera.rays
+    return Photographs(viewmats, Ks, images, alphas, masks, depths, rays, points)  # type: ignore[arg-type]

@@ -3,7 +3,6 @@
 import dataclasses
 import os
 import warnings
-from typing import Any
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind, kind_of
@@ -15,11 +14,10 @@ from a2tg_jax.host.text import counted, in_bytes, shortened
 from a2tg_jax.model import Model
 from a2tg_jax.training.checkpoint import Checkpoint, History, check_resume
 from a2tg_jax.training.corrections import corrected_origin
-from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, StageRun, Watch, never, unwatched
+from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, Watch, never, unwatched
 from a2tg_jax.training.options import System
-from a2tg_jax.training.session import Session
 from a2tg_jax.training.stage import Background
-from a2tg_jax.training.start import check_loss_data, check_start, check_views, initial_model
+from a2tg_jax.training.start import check_loss_data, check_start, check_views
 
 BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
 """Background of a finished model for each background of training."""
@@ -122,17 +120,17 @@ def fit(
         check_start(scene, system)
     else:
         check_resume(resume, system, first)
-    session = Session() if session is None else session
+    session = session or Session()
     results: list[StageResult] = []
     with signals.noted((signals.CTRL_C,)) as is_interrupted:
         for index in range(first, len(stages)):
             start = results[-1].model if results else None
-            result = _train_stage(
-                scene, system, index, start, resume if index == first else None, None, session, on_log,
-                is_last=index == len(stages) - 1, on_checkpoint=on_checkpoint, checkpoint_every=checkpoint_every,
-                progress=progress, is_stopped=lambda: is_interrupted() or is_stopped(),
+            run = StageRun(scene, system, index, start, None if results else resume, session=session)
+            run.train(
+                on_checkpoint, checkpoint_every, progress, is_stopped=lambda: is_interrupted() or is_stopped(),
+                on_log=on_log,
             )  # fmt: skip
-            results.append(result)
+            results.append(_result_of(run, scene, is_last=index == len(stages) - 1))
     return FitResult(system, tuple(results))
 
 
@@ -195,36 +193,17 @@ def fit_stage(
     check_loss_data(scene.train, stages[index : index + 1])
     if resume is not None:
         check_resume(resume, system, index)
-    return _train_stage(
-        scene, system, index, start, resume, num_restored, session, on_log,
-        is_last=index == len(stages) - 1, on_checkpoint=on_checkpoint, checkpoint_every=checkpoint_every,
-        progress=progress, title=title, is_stopped=is_stopped, watch=watch,
-    )  # fmt: skip
-
-
-def _train_stage(
-    scene: Scene,
-    system: System,
-    index: int,
-    start: Model | None,
-    resume: Checkpoint | None,
-    num_restored: int | None,
-    session: Session | None,
-    on_log: OnLog | None,
-    *,
-    is_last: bool,
-    **how: Any,
-) -> StageResult:
-    """Train a stage, given checked arguments as in `fit_stage`; `how` as in `StageRun.train`."""
-    if start is None and resume is None:
-        start = initial_model(scene, system)
     run = StageRun(scene, system, index, start, resume, num_restored, session)
-    run.on_log = on_log
-    run.train(**how)
+    run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch, on_log)
+    return _result_of(run, scene, is_last=index == len(stages) - 1)
+
+
+def _result_of(run: StageRun, scene: Scene, *, is_last: bool) -> StageResult:
+    """Return the result of a trained stage."""
     origin = corrected_origin(origin_of_scene(scene), run.stage.corrections, run.state.corrections)
-    model = dataclasses.replace(run.model, background=BACKGROUNDS[system.background], origin=origin)
+    model = dataclasses.replace(run.model, background=BACKGROUNDS[run.system.background], origin=origin)
     if is_last:
-        warn_of_budget(system, model)
+        warn_of_budget(run.system, model)
     return StageResult(run.stage.name, model, run.history, run.seconds, run.num_regrown)
 
 

@@ -1,14 +1,14 @@
-"""The training loop of one stage, on the host, top to bottom: steps, host events, checkpoints, history.
+"""The training loop of one stage, top to bottom: steps, events between them, checkpoints, history.
 
-The host launches up to `LAUNCHED` steps before it waits for the device. If a step cannot be taken, the launched ones
-after it stay idle (`step.TrainState.status`); the loop mends the cause and launches them again.
+Up to `LAUNCHED` steps are launched before Python waits for the device. If a step cannot be taken, the launched ones
+after it stay idle (`step.TrainState.status`); the loop removes the cause and launches them again.
 """
 
 import contextlib
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -16,10 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.pytree import num_compiled
+from a2tg_jax.core.table import Shape
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Change, Due, HostEvent, StepEvent
+from a2tg_jax.host.machine import Devices
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.exchange import Exchange
+from a2tg_jax.parallel.exchange import Exchange, exchange_among
 from a2tg_jax.parallel.exchange_room import exchange_with_room, room_of_view, with_wider_borders
 from a2tg_jax.parallel.sharded_rows import (
     asked_by_any,
@@ -38,9 +40,8 @@ from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.options import System
 from a2tg_jax.training.reports import LearningCheck, ProgressBar, StageEffects
-from a2tg_jax.training.returned import checked_change
-from a2tg_jax.training.session import Session
-from a2tg_jax.training.start import padded
+from a2tg_jax.training.returned import calling, checked_change
+from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import (
     EXPLODED,
     FINE,
@@ -71,21 +72,24 @@ Size = tuple[int, int]
 OnCheckpoint = Callable[[Checkpoint], None]
 OnLog = Callable[[Mapping[str, float]], object]
 IsStopped = Callable[[], bool]
-
-
-def never() -> bool:
-    """Training that nobody stops."""
-    return False
-
-
 Watch = Callable[["StageRun", IsStopped], float]
 """Function called between steps with the running stage. It may read the state but not keep it, because the next step
 reuses its buffers. Of several processes, all must read the same parts of it, or the training hangs. It returns the
 seconds it took, which are not counted as training."""
 
 
+def never() -> bool:
+    """Default `is_stopped`: never stop."""
+    return False
+
+
+def unwatched(run: "StageRun", is_stopped: IsStopped) -> float:
+    """Default `watch`: do nothing."""
+    return 0.0
+
+
 def are_events_decided_by_host(state: TrainState) -> bool:
-    """Return whether the host says which events are due, in which case a step is compiled for each pattern of them.
+    """Return whether Python decides which events are due, in which case a step is compiled for each pattern of them.
 
     A GPU waits for the host at each decision inside a step, and cannot launch the step as one graph. On CPUs one
     program for all steps takes less time to compile.
@@ -94,39 +98,78 @@ def are_events_decided_by_host(state: TrainState) -> bool:
     return all(device.platform != "cpu" for device in devices)
 
 
-def unwatched(run: "StageRun", is_stopped: IsStopped) -> float:
-    """Training that nobody looks at."""
-    return 0.0
+class Session:
+    """Shapes that steps are compiled for, which trainings of one session prefer, and the devices that they use.
 
+    `fit` makes a new session unless you pass one. Pass the same session to all trainings of a sweep. No result depends
+    on the shapes; on several devices sums have another order, so that last digits differ.
+    """
 
-def read(infos: list[StepInfo]) -> list[StepInfo]:
-    """Return the scalars of some steps as host numbers. Only here the loop waits for the device."""
-    return jax.device_get(infos)
+    def __init__(
+        self, after_compiling: Callable[[], object] = lambda: None, devices: Sequence[jax.Device] | None = None
+    ):
+        """Args:
+        after_compiling: called after a step was compiled, such as `host.machine.tidy_memory`.
+        devices: two or more devices that train one scene together, each with a share of the Gaussians and of the
+          pixels, such as `jax.devices()`; None: JAX's default device. If they are of several processes, each of these
+          makes the same calls.
+
+        Raises:
+          ValueError: if there is one device or none.
+        """
+        if devices is not None and len(devices) < 2:
+            raise ValueError(f"devices must be two or more; got {len(devices)}: for one say jax.default_device(device)")
+        self.after_compiling = after_compiling
+        self.exchange = None if devices is None else exchange_among(devices)
+        """Devices that render together; None: one."""
+        self.num_devices = 1 if self.exchange is None else self.exchange.num
+        self.mesh = None if self.exchange is None else self.exchange.mesh
+        """Mesh over which rows are spread; None: one device."""
+        processes = num_processes(self.mesh)
+        self.devices = Devices(self.num_devices // processes, processes)
+        """Their numbers."""
+        self.shapes: set[Shape] = set()
+        """Shapes of textures."""
+        self.capacities: dict[Hashable, set[int]] = {}
+        """Capacities of tile lists, by stage and image size."""
+
+    def capacity(self, place: Hashable, needed: int) -> int:
+        """Return the largest known capacity up to twice the pairs that are needed, or else a new one.
+
+        Capacities are kept by place, a stage and an image size.
+        """
+        known = self.capacities.setdefault(place, set())
+        power = 2 ** (needed.bit_length() - 1)
+        rounded = next(room for room in (power, power + power // 2, 2 * power) if room >= needed)
+        # The largest: lists that overflowed in an earlier run will do so again.
+        capacity = max((room for room in known if needed <= room <= 2 * needed), default=rounded)
+        known.add(capacity)
+        return capacity
 
 
 class StageRun:
-    """One stage while it is trained: its state, and what the host keeps besides."""
+    """One stage during training: its state, and what Python keeps besides."""
 
     def __init__(
         self,
         scene: Scene,
         system: System,
         index: int,
-        start: Model | None,
+        start: Model | None = None,
         resume: Checkpoint | None = None,
         num_restored: int | None = None,
         session: Session | None = None,
     ):
         """Args:
-        scene: its training views are trained on.
+        scene: training views and points.
         system: the options.
-        index: which of its stages, from 0.
-        start: the model to start from; None where `resume` is given.
+        index: number of the stage in `system.stages()`, from 0.
+        start: the model to start from; None: `resume`, or Gaussians at the scene's points.
         resume: a checkpoint of this stage (`checkpoint.check_resume`).
         num_restored: which order of the views, from 0; None: the checkpoint's order, or the first.
         session: what trainings of this process share; None: a new one.
         """
-        self.session = Session() if session is None else session
+        self.session = session or Session()
         self.mesh, exchange = self.session.mesh, self.session.exchange
         self._exchange = None if exchange is None else exchange.for_batches(system.batch_size)
         self.views, self.system, self.index = scene.train, system, index
@@ -136,11 +179,10 @@ class StageRun:
         self._rows: list[dict[str, float]] = []
         """Rows of the history since then."""
 
-        # Steps take over the buffers that they are given: copies on the device, or on the host to be shared out.
+        # Steps take over the buffers that they are given: copies on the device, or in numpy to be spread.
         copied = jnp.array if self.mesh is None else np.array
         if resume is None:
-            if start is None:
-                raise ValueError("a stage needs a model to start from, or a checkpoint to resume")
+            start = initial_model(scene, system) if start is None else start
             model = padded(jax.tree.map(copied, start.live), self.stage, system, self.session.num_devices)
             names = [view.name for view in self.views]
             state = initial_state(self.stage, spread(self.mesh, model), names, start.origin)
@@ -148,8 +190,7 @@ class StageRun:
             check_corrections(resume.state.corrections, len(self.views))
             warn_of_uneven_rows(resume.state.model.gaussians.num, self.session.num_devices)
             state = jax.tree.map(copied, resume.state)
-        self.state: TrainState = spread(self.mesh, state)
-        self._pad_for_events()
+        self.state = self._with_room(spread(self.mesh, state))
 
         self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
@@ -158,35 +199,30 @@ class StageRun:
         self.photographs = PhotoStore(self.views, self.order, self.stage.iterations, self._exchange, self.stage.extras)
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.learning = LearningCheck(
-            self.views,
-            self.order,
-            self.stage.iterations,
-            system.background,
-            is_first=index == 0,
+            self.views, self.order, self.stage.iterations, system.background, is_first=index == 0,
             small_budget=system.small_budget,
-        )
+        )  # fmt: skip
         self.effects = StageEffects(self.stage, system, len({view.picture.size for view in self.views}))
         self.capacities: dict[Size, int] = {}
         """Capacities of the tile lists that steps are compiled for."""
         self.exchanges: dict[Size, Exchange] = {}
         """Room of devices that draw together; empty for one device."""
-        self.on_log: OnLog | None = None
-        """Called with each row of the history."""
         self.started = time.perf_counter()
         self.num_regrown = self.num_compiled = 0
         self.num_refused = resume.num_refused if resume else 0
 
-    def _pad_for_events(self) -> None:
-        """Pad the state for what events on the host will add, so that steps need not be compiled again."""
-        model, moments = self.state.model, self.state.moments
+    def _with_room(self, state: TrainState) -> TrainState:
+        """Return the state, padded for what events will add between steps, so that no step is compiled again."""
+        model, moments = state.model, state.moments
         num, num_bytes = model.num, float(model.num_bytes)
-        for event, state in zip(self.stage.events, self.state.events, strict=True):
-            if isinstance(event, HostEvent) and state is not None:
-                found = Change(*event.with_room(model, moments, num_bytes, self.stage.iterations), state)
-                found = checked_change(f"stage {self.stage.name!r}: {type(event).__name__}.with_room", found)
+        for event, own in zip(self.stage.events, state.events, strict=True):
+            if isinstance(event, HostEvent) and own is not None:
+                with calling(event, "with_room", self.stage.name):
+                    found = Change(*event.with_room(model, moments, num_bytes, self.stage.iterations), own)
+                    found = checked_change(found)
                 model, moments = found.model, found.moments
             num_bytes = event.most_bytes(num_bytes, num, self.stage.iterations)
-        self.state = dataclasses.replace(self.state, model=model, moments=moments)
+        return dataclasses.replace(state, model=model, moments=moments)
 
     @property
     def history(self) -> History:
@@ -215,12 +251,13 @@ class StageRun:
 
     def train(
         self,
-        on_checkpoint: OnCheckpoint | None,
-        checkpoint_every: int | None,
-        progress: bool,
+        on_checkpoint: OnCheckpoint | None = None,
+        checkpoint_every: int | None = None,
+        progress: bool = True,
         title: str | None = None,
         is_stopped: IsStopped = never,
         watch: Watch = unwatched,
+        on_log: OnLog | None = None,
     ) -> None:
         """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
         `Interrupted`.
@@ -233,7 +270,7 @@ class StageRun:
         bar = ProgressBar(title or self.stage.name, iteration, end, is_shown=progress, may_grow=may_grow)
         with contextlib.closing(self.photographs), bar:
             while iteration < end:
-                # The Python side acts next after `launched` steps, an event, or a checkpoint.
+                # Python acts next after `launched` steps, an event, or a checkpoint.
                 stops = [iteration + self.launched - iteration % self.launched, end]
                 stops += [due for due in self._due_on_host() if due > iteration]
                 if checkpoint_every is not None:
@@ -241,7 +278,8 @@ class StageRun:
                 stop = min(stops)
                 for info in self.steps(iteration + 1, stop, stops_launching):
                     iteration += 1
-                    self._log(iteration, info)
+                    if iteration % LOG_EVERY == 0 or iteration == end:
+                        self._log(iteration, info, on_log)
                     self.learning.observe(iteration, float(info.psnr))
                     bar.update(info, self._rows[-1] if self._rows else None)
                 ahead = self.effects.programs_ahead(iteration)
@@ -249,17 +287,16 @@ class StageRun:
                 if iteration == stop:
                     self._host_events(iteration)
                 self.started += watch(self, is_stopped)
-                is_asked = asked_by_any(self.mesh, is_stopped())
+                must_stop = asked_by_any(self.mesh, is_stopped())
                 is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == stop
-                if on_checkpoint is not None and (is_due or is_asked or iteration == end):
+                if on_checkpoint is not None and (is_due or must_stop or iteration == end):
                     on_checkpoint(self.checkpoint)
-                if is_asked:
+                if must_stop:
                     raise Interrupted(self.checkpoint)
         self.effects.warn_of_unused()
         if self.num_refused:
-            caps = [
-                f"{self.system.path_of(event)}.{event.limited_by}" for event in self.stage.events if event.limited_by
-            ]
+            events = [event for event in self.stage.events if event.limited_by]
+            caps = [f"{self.system.path_of(event)}.{event.limited_by}" for event in events]
             advice = f": raise {' or '.join(caps)}" if caps else ""
             warnings.warn(
                 f"stage {self.stage.name}: {self.num_refused:,} times there was no room for a Gaussian that should "
@@ -267,28 +304,26 @@ class StageRun:
                 stacklevel=2,
             )
 
-    def _log(self, iteration: int, info: StepInfo) -> None:
-        """Add a row to the history, if one is due."""
-        if iteration % LOG_EVERY and iteration < self.stage.iterations:
-            return
+    def _log(self, iteration: int, info: StepInfo, on_log: OnLog | None) -> None:
+        """Add a row to the history."""
         num_live = int(info.num_live)
         megabytes = self.state.model.bytes_of(num_live) / 1e6
         values = self.index + 1, iteration, float(info.loss), float(info.psnr), num_live, megabytes, self.seconds
         terms = {f"{TERM}{name}": float(value) for name, value in info.terms.items()}
         self._rows.append(dict(zip(COLUMNS, values, strict=True)) | terms)
-        if self.on_log is not None:
-            self.on_log(self._rows[-1])
+        if on_log is not None:
+            on_log(self._rows[-1])
         if len(self._rows) == 1:
             self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
 
     # Steps
 
     def steps(self, first: int, last: int, is_stopped: IsStopped = never) -> list[StepInfo]:
-        """Run iterations `first` to `last`. Stop at one that cannot be taken and mend its cause."""
+        """Run iterations `first` to `last`. Stop at one that cannot be taken and remove its cause."""
         launched: list[StepInfo] = []
         while first + len(launched) <= last and not is_stopped():
             launched.append(self._launch(first + len(launched)))
-        infos = read(launched)
+        infos = jax.device_get(launched)  # Only here the loop waits for the device.
         taken = [info for info in infos if info.status == FINE]
         self.num_refused += sum(int(info.num_refused) for info in taken)
         if len(taken) < len(infos):
@@ -323,8 +358,8 @@ class StageRun:
         return self.views[self.order.indices(iteration)[0]].picture.size
 
     def render_settings(self, size: Size) -> RenderSettings:
-        """Return settings with room for the views of a size. It is planned before the first of them, for a sample of
-        the views and for all rows of the model to exist."""
+        """Return settings with room for the views of a size, planned before the first of them for a sample of the views
+        and for all rows of the model to exist."""
         settings, model = RenderSettings(tile_size=self.system.tile_size), self.state.model
         if size not in self.capacities:
             dtype, appearance = model.gaussians.means.dtype, model.appearance
@@ -357,7 +392,13 @@ class StageRun:
         self.state = dataclasses.replace(self.state, status=jnp.zeros_like(self.state.status))
         if info.status == OVERFLOW:
             self.num_regrown += 1
-            return self._widen(self._size(iteration), float(info.num_pairs))
+            size, num_pairs = self._size(iteration), float(info.num_pairs)
+            exchange = self.exchanges.get(size)
+            if exchange is None or exchange.border_room is None or num_pairs > SURELY_FITTING * self.capacities[size]:
+                self.capacities[size] = self._capacity(size, num_pairs * GROWTH_ROOM)
+            else:  # The lists had room; the borders between the bands of the devices had too little.
+                self.exchanges[size] = with_wider_borders(exchange, size[0], self.system.tile_size)
+            return
         where = f"at iteration {iteration} of stage {self.stage.name}"
         if info.status in (NOT_FINITE, EXPLODED):
             names = [self.views[index].name for index in self.order.indices(iteration)]
@@ -374,14 +415,6 @@ class StageRun:
             f"training cannot continue {where}: {reasons}; check the cameras and points of the scene, or lower "
             "rates.logit_opacities"
         )
-
-    def _widen(self, size: Size, num_pairs: float) -> None:
-        """Make room for `num_pairs` in views of a size or, if there was enough, for the borders between bands."""
-        exchange = self.exchanges.get(size)
-        if exchange is None or exchange.border_room is None or num_pairs > SURELY_FITTING * self.capacities[size]:
-            self.capacities[size] = self._capacity(size, num_pairs * GROWTH_ROOM)
-        else:
-            self.exchanges[size] = with_wider_borders(exchange, size[0], self.system.tile_size)
 
     # Events between steps
 
@@ -408,26 +441,21 @@ class StageRun:
             if not isinstance(event, HostEvent):
                 if times is not None and event.observes and iteration == times.last:
                     self._keep(place, None)
-            elif iteration in event.iterations(self.stage.iterations):
-                self._apply(place, event, iteration)
-
-    def _apply(self, place: int, event: HostEvent, iteration: int) -> None:
-        """Apply a host event."""
-        due = event.iterations(self.stage.iterations)
-        now = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes)
-        name = f"stage {self.stage.name!r}: {type(event).__name__}.apply"
-        try:
-            change = event.apply(now, self.state.model, self.state.moments, self.state.events[place])
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from error
-        change = checked_change(name, change)
-        self.effects.apply(place, self.state, change)
-        self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
-        if change.rows is not None:
-            self._move_rows(change.rows)
-        is_dropped = iteration == due[-1] and event.observes and self._is_worth_dropping(iteration)
-        self._keep(place, None if is_dropped else change.state)
-        self.state = spread(self.mesh, self.state)
+                continue
+            due = event.iterations(self.stage.iterations)
+            if iteration not in due:
+                continue
+            now = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes)
+            with calling(event, "apply", self.stage.name):
+                change = event.apply(now, self.state.model, self.state.moments, self.state.events[place])
+                change = checked_change(change)
+            self.effects.apply(place, self.state, change)
+            self.state = dataclasses.replace(self.state, model=change.model, moments=change.moments)
+            if change.rows is not None:
+                self._move_rows(change.rows)
+            is_dropped = iteration == due[-1] and event.observes and self._is_worth_dropping(iteration)
+            self._keep(place, None if is_dropped else change.state)
+            self.state = spread(self.mesh, self.state)
 
     def _move_rows(self, rows: np.ndarray) -> None:
         """Move the events' statistics along with the Gaussians."""

@@ -1,6 +1,8 @@
 """Checks of what loss functions and events return, traced or not: kinds, shapes and dtypes only."""
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -12,10 +14,19 @@ from a2tg_jax.core.checks import check_kind, described, dtype_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import partition
-from a2tg_jax.events import Change
+from a2tg_jax.events import Change, Event
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.validate import check_like
 from a2tg_jax.model import Model
+
+
+@contextlib.contextmanager
+def calling(event: Event, method: str, stage_name: str) -> Iterator[None]:
+    """Name the stage, the event and its method in errors of the block, which calls the method."""
+    try:
+        yield
+    except (ValueError, ArithmeticError) as error:
+        raise ValueError(f"stage {stage_name!r}: {type(event).__name__}.{method}: {error}") from error
 
 
 def check_scalar(name: str, value: object) -> None:
@@ -26,20 +37,20 @@ def check_scalar(name: str, value: object) -> None:
         raise ValueError(f"{name} must return a scalar, such as jnp.mean(…); got {described(value)}")
 
 
-def checked_change(name: str, change: Any) -> Change:
+def checked_change(change: Any) -> Change:
     """Return what an event returned, with the number of Gaussians that exist as an array.
 
     Raises:
       ValueError: unless it is a change whose moments fit its model.
     """
-    check_kind(f"{name}: the result", change, Change, "say Change(model, moments, state)")
-    check_kind(f"{name}: model", change.model, Model)
-    check_kind(f"{name}: moments", change.moments, AdamState)
-    check_gaussians(change.model.gaussians, f"{name}: model.gaussians")
+    check_kind("the result", change, Change, "say Change(model, moments, state)")
+    check_kind("model", change.model, Model)
+    check_kind("moments", change.moments, AdamState)
+    check_gaussians(change.model.gaussians, "model.gaussians")
     floats, _ = partition(change.model)
     for field in ("mu", "nu"):
         try:
-            check_kept(f"{name}: moments.{field}", getattr(change.moments, field), floats)
+            check_kept(f"moments.{field}", getattr(change.moments, field), floats)
         except ValueError as error:
             hint = "keep_rows(model, moments, state, is_kept) removes Gaussians from both"
             raise ValueError(f"{error}, as in the model: {hint}") from None
@@ -51,9 +62,9 @@ def check_kept(name: str, found: object, wanted: object) -> None:
     before, after = (str(jax.tree.structure(tree)) for tree in (wanted, found))
     if after != before:
         raise ValueError(f"{name} must keep its structure, {shortened(before)}; got {shortened(after)}")
-    check_like(name, jax.tree.map(_shape_of, found), wanted)
 
+    def shape_of(leaf: ArrayLike) -> jax.ShapeDtypeStruct:
+        # JAX's dtype of a number or an array, which is not copied.
+        return jax.ShapeDtypeStruct(np.shape(leaf), jax.dtypes.canonicalize_dtype(dtype_of(leaf)))
 
-def _shape_of(leaf: ArrayLike) -> jax.ShapeDtypeStruct:
-    """Return the shape and dtype that JAX gives a number or an array, which stays where it is."""
-    return jax.ShapeDtypeStruct(np.shape(leaf), jax.dtypes.canonicalize_dtype(dtype_of(leaf)))
+    check_like(name, jax.tree.map(shape_of, found), wanted)

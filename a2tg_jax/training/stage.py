@@ -25,6 +25,7 @@ from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.batches import Extras
 from a2tg_jax.training.corrections import Correction
+from a2tg_jax.training.returned import calling
 from a2tg_jax.training.terms import Target
 
 
@@ -152,8 +153,9 @@ class Stage:
             raise ValueError(
                 f"a stage's name must be letters, digits, - and _, for files are called so; got {self.name!r}"
             )
+        where = f"stage {self.name!r}:"
         if not isinstance(self.iterations, int | np.integer):
-            raise ValueError(f"stage {self.name!r}: iterations must be an integer; got {self.iterations!r}")
+            raise ValueError(f"{where} iterations must be an integer; got {self.iterations!r}")
         if not 1 <= self.iterations < 2**31:
             raise ValueError(
                 f"a stage must have at least 1 iteration, and fewer than 2^31; {self.name!r} has {self.iterations}"
@@ -161,15 +163,27 @@ class Stage:
         kinds = sorted({event.statistic for event in self.events if event.statistic is not None})
         if len(kinds) > 1:
             raise ValueError(f"the events of one stage must use one statistic; the events of {self.name!r} use {kinds}")
-        with fields_of(f"stage {self.name!r}: rates"):
+        with fields_of(f"{where} rates"):
             self.rates.check_options()
+        parts: tuple[Event | Correction, ...] = (*self.events, *self.corrections)
+        for part in parts:
+            with fields_of(f"{where} {type(part).__name__}"):
+                part.check_options()
         for event in self.events:
-            with fields_of(f"stage {self.name!r}: {type(event).__name__}"):
-                event.check_options()
-            _check_times(f"stage {self.name!r}: {type(event).__name__}", event, self.iterations)
-        for correction in self.corrections:
-            with fields_of(f"stage {self.name!r}: {type(correction).__name__}"):
-                correction.check_options()
+            name = f"{where} {type(event).__name__}"
+            if isinstance(event, StepEvent):
+                with calling(event, "times", self.name):
+                    times = event.times(self.iterations)
+                check_kind(f"{name}.times: the result", times, Times)
+                check_number(f"{name}.times: every", times.every, least=1)
+            elif isinstance(event, HostEvent):
+                with calling(event, "iterations", self.name):
+                    found = event.iterations(self.iterations)
+                is_integers = isinstance(found, Sequence) and all(isinstance(num, int | np.integer) for num in found)
+                if not is_integers or list(found) != sorted(set(found)):
+                    raise ValueError(
+                        f"{name}.iterations must return ascending integers in a tuple; got {shortened(found)}"
+                    )
         names = [correction.name for correction in self.corrections]
         if len(set(names)) < len(names):
             raise ValueError(f"the corrections of {self.name!r} must have different names; got {', '.join(names)}")
@@ -180,11 +194,27 @@ class Stage:
         where = f"stage {self.name!r}:"
         check_kind(f"{where} appearance", self.appearance, Appearance)
         check_kind(f"{where} rates", self.rates, LearningRates)
-        for name in ("events", "losses", "corrections"):
-            several = getattr(self, name)
-            check_kind(f"{where} {name}", several, (tuple, list), "one of them stands in (…,)")
-            for index, one in enumerate(several):
-                _check_part(f"{where} {name}[{index}]", one, PARTS.get(name, ()))
+        kinds: dict[str, tuple[type, ...]] = {
+            "events": (StepEvent, HostEvent), "losses": (), "corrections": (Correction,),
+        }  # fmt: skip
+        for name, kind in kinds.items():
+            parts: Any = getattr(self, name)
+            check_kind(f"{where} {name}", parts, (tuple, list), "one of them stands in (…,)")
+            for index, part in enumerate(parts):
+                label = f"{where} {name}[{index}]"
+                is_function = inspect.isroutine(part)
+                if kind:
+                    check_kind(label, part, kind)
+                elif isinstance(part, type) or is_function or not callable(part):
+                    hint = f": say Term({part.__name__})" if is_function else ""
+                    raise ValueError(f"{label} must be a loss term, such as Term(function); got {kind_of(part)}{hint}")
+                check_pytree(label, part)
+                for leaf in jax.tree.leaves(part):
+                    if not isinstance(leaf, numbers.Number | np.ndarray | np.generic | jax.Array):
+                        raise ValueError(
+                            f"{label} must hold numbers; got {leaf!r}: make fields of {type(part).__name__} that hold "
+                            "other static()"
+                        )
         check_pytree(f"{where} appearance", self.appearance)
         few = allocate_appearance(self.appearance, jax.random.key(0), no_rows(2, 1))
         if self.appearance_rate is None and jax.tree.leaves(few):
@@ -204,12 +234,13 @@ class Stage:
 
     def clock(self) -> "Clock":
         """Return the schedule for the step (host)."""
+        times = (event.times(self.iterations) if isinstance(event, StepEvent) else None for event in self.events)
         return Clock(
             num_iterations=self.iterations,
             per_iteration=1.0 / self.iterations,
             log_decay=math.log(self.rates.means_final_factor),
             sh_interval=max(1, round(self.iterations / 30)),
-            times=tuple(_times(event, self.iterations) for event in self.events),
+            times=tuple(None if times == EVERY_ITERATION else times for times in times),
         )
 
 
@@ -231,45 +262,3 @@ class Clock(NamedTuple):
     def progress(self, iteration: Array) -> Array:
         """Return the share of the stage that a number of finished iterations is; traced."""
         return jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) * self.per_iteration, 0.0, 1.0)
-
-
-PARTS: dict[str, tuple[type, ...]] = {"events": (StepEvent, HostEvent), "corrections": (Correction,)}
-"""Classes of what stands in the tuples of a stage."""
-
-
-def _check_part(name: str, part: Any, kinds: tuple[type, ...]) -> None:
-    """Raise ValueError unless an event, a correction or, without kinds, a loss term is a pytree of numbers."""
-    is_function = inspect.isroutine(part)
-    if kinds:
-        check_kind(name, part, kinds)
-    elif isinstance(part, type) or is_function or not callable(part):
-        hint = f": say Term({part.__name__})" if is_function else ""
-        raise ValueError(f"{name} must be a loss term, such as Term(function); got {kind_of(part)}{hint}")
-    check_pytree(name, part)
-    for leaf in jax.tree.leaves(part):
-        if not isinstance(leaf, numbers.Number | np.ndarray | np.generic | jax.Array):
-            kind = type(part).__name__
-            raise ValueError(f"{name} must hold numbers; got {leaf!r}: make fields of {kind} that hold other static()")
-
-
-def _check_times(name: str, event: Event, num_iterations: int) -> None:
-    """Raise ValueError unless the times of an event are valid."""
-    if isinstance(event, StepEvent):
-        times = event.times(num_iterations)
-        check_kind(f"{name}.times: the result", times, Times)
-        check_number(f"{name}.times: every", times.every, least=1)
-    elif isinstance(event, HostEvent):
-        try:
-            found = event.iterations(num_iterations)
-        except (ValueError, ArithmeticError) as error:
-            raise ValueError(f"{name}.iterations: {error}") from error
-        is_integers = isinstance(found, Sequence) and all(isinstance(number, int | np.integer) for number in found)
-        if not is_integers or list(found) != sorted(set(found)):
-            raise ValueError(f"{name}.iterations must return ascending integers in a tuple; got {shortened(found)}")
-
-
-def _times(event: Event, num_iterations: int) -> Times | None:
-    if not isinstance(event, StepEvent):
-        return None
-    times = event.times(num_iterations)
-    return None if times == EVERY_ITERATION else times

@@ -1,7 +1,7 @@
 """One training step, jitted once per image size and stage: render, loss, gradients, Adam, events.
 
 A step is not taken if the tile lists overflow, a number is not finite or the loss explodes. Then the state keeps its
-values, and its status makes all further steps idle, so that the host may look at it some steps later and lose nothing.
+values, and its status makes all further steps idle, so that Python may read it some steps later and lose nothing.
 """
 
 import dataclasses
@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import DTypeLike
 
 from a2tg_jax.appearance import Appearance, projected
 from a2tg_jax.core.cameras import Camera
@@ -20,7 +19,7 @@ from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import combine, partition, pytree
-from a2tg_jax.events import EventInfo, Now, Seen, StepEvent, read_probe
+from a2tg_jax.events import Change, EventInfo, Now, Seen, StepEvent, read_probe
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.exchange import map_views
 from a2tg_jax.parallel.sharded_rows import spread
@@ -32,12 +31,11 @@ from a2tg_jax.training.corrections import (
     corrected_color,
     initial_corrections,
     penalties,
-    rows_of,
     updated,
 )
 from a2tg_jax.training.gradients import TracedView, differentiate
-from a2tg_jax.training.returned import check_kept, check_scalar, checked_change
-from a2tg_jax.training.stage import Background, Clock, LossTerm, Stage
+from a2tg_jax.training.returned import calling, check_kept, check_scalar, checked_change
+from a2tg_jax.training.stage import Background, Clock, Stage
 from a2tg_jax.training.terms import Target
 
 FINE, OVERFLOW, NOT_FINITE, IMPOSSIBLE, EXPLODED = range(5)
@@ -85,20 +83,14 @@ class StepInfo(NamedTuple):
     """Status after the step."""
     num_live: Array
     num_refused: Array
-    """Number of Gaussians that events could not add for lack of room."""
+    """Number of Gaussians that events could not add because all rows were taken."""
     terms: dict[str, Array]
     """Summands of the loss by name."""
 
 
 def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin: Origin | None = None) -> TrainState:
-    """Return the state before the first iteration of a stage.
-
-    Args:
-      stage: which.
-      model: with the rows and the appearance of the stage; the state is spread over devices as its rows are.
-      names: of the training views.
-      origin: of the model that the stage starts from; its corrections continue.
-    """
+    """Return the state before the first iteration of a stage, given a model with its rows and appearance, the names of
+    the training views, and the origin of the model that it starts from, whose corrections continue."""
     return TrainState(
         model=model,
         moments=adam_init(partition(model)[0]),
@@ -162,12 +154,16 @@ def train_step(
       rows: [V] int32, their numbers among all training views; needed for corrections.
     """
     tried = attempt(settings, stage, clock, state, photographs, views, scene_scale, key, rows)
-    status = jnp.where(state.status == FINE, _status(clock, tried), state.status)
+    found = tried.views
+    status = jnp.where(tried.info.is_possible, FINE, IMPOSSIBLE)
+    status = jnp.where(jnp.mean(found.loss) > clock.largest_loss, EXPLODED, status)
+    status = jnp.where(tried.is_finite, status, NOT_FINITE)
+    status = jnp.where(jnp.any(found.is_overflow), OVERFLOW, status).astype(jnp.int32)
+    status = jnp.where(state.status == FINE, status, state.status)
     new, old = (dataclasses.replace(known, status=status) for known in (tried.state, state))
     chosen = jax.tree.map(lambda a, b: jnp.where(status == FINE, a, b), new, old)
     if settings.render.exchange is not None:
         chosen = spread(settings.render.exchange.mesh, chosen)
-    found = tried.views
     return chosen, StepInfo(
         loss=jnp.mean(found.loss), psnr=jnp.mean(found.psnr), num_pairs=jnp.max(found.num_pairs), status=status,
         num_live=chosen.model.num_live, num_refused=jnp.asarray(tried.info.num_refused),
@@ -180,19 +176,17 @@ def attempt(
     views: Array | None, scene_scale: Array, key: Array, rows: Array | None = None,
 ) -> Attempt:  # fmt: skip
     """Return the outcome of one iteration. Arguments as of `train_step`, none of them donated."""
-    iteration = state.iteration + 1
+    iteration, model = state.iteration + 1, state.model
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
     keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
-    dtype = state.model.gaussians.means.dtype
-    batch = photographs.of(views)
-    batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
-    batch = batch if batch.depths is None else batch._replace(depths=batch.depths.astype(dtype))
-    if batch.points is not None:
-        batch = batch._replace(points=batch.points._replace(depths=batch.points.depths.astype(dtype)))
-    backgrounds = drawn_backgrounds(keys[0], settings.background, batch.viewmats.shape[0], dtype)
-    own = rows_of(state.corrections, rows)
+    dtype = model.gaussians.means.dtype
+    batch = photographs.of(views, dtype)
+    if settings.background == "random":
+        backgrounds = jax.random.uniform(keys[0], (len(batch.viewmats), 3), dtype)
+    else:
+        backgrounds = jnp.full((len(batch.viewmats), 3), 1.0 if settings.background == "white" else 0.0, dtype)
+    own = tuple(known.rows[rows] for known in state.corrections)
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
-    model = state.model
     found = batch_gradients(settings.render, stage, clock, model, batch, backgrounds, iteration, own, is_gathering)
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads[:2])
 
@@ -203,20 +197,35 @@ def attempt(
     moments: AdamState = step.state
     model = combine(step.params, partition(model)[1])
     model = dataclasses.replace(model, appearance=projected(model.appearance))
+
+    height, width = batch.images.shape[1:3]
+    cameras = Camera(batch.viewmats, batch.Ks, width, height)
+    if own:
+        cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(own, cameras)
+    colors = found.grads[0].sh[:, :, 0] / SH_C0
+    statistic = jnp.zeros_like(colors), jnp.zeros(colors.shape[:2], bool)
+    if found.statistic is not None and stage.statistic is not None:
+        statistic = read_probe(found.statistic, stage.statistic, width, height)
     now = Now(keys[1:], iteration, stage.cooled(rate, progress), jnp.asarray(clock.num_iterations), scene_scale)
-    seen = _seen(stage, batch, own, found)
-    model, moments, events, info = _events(settings.due, stage, clock, now, seen, model, moments, state.events)
+    change, events = _events(
+        settings.due, stage, clock, now, Seen(cameras, *statistic, colors), model, moments, state.events
+    )
     corrections = tuple(
         updated(correction, known, rows, grad, progress)  # type: ignore[arg-type]
         for correction, known, grad in zip(stage.corrections, state.corrections, found.grads[2], strict=True)
     )
-    after = TrainState(model, moments, events, iteration, state.status, corrections)
-    made: Any = partition(model)[0]
+    after = TrainState(change.model, change.moments, events, iteration, state.status, corrections)
+    made: Any = partition(change.model)[0]
     if settings.due is not None:
         # Adam's steps are finite if gradients are. A check of what nothing else changed makes a GPU write it twice.
-        made = _others(step.params, made)
-    is_finite = _all_finite((found.loss, grads, found.grads[2], made, [known.rows for known in corrections]))
-    return Attempt(found, (*grads, found.grads[2]), after, info, is_finite)
+        known_ids = {id(leaf) for leaf in jax.tree.leaves(step.params)}
+        made = [leaf for leaf in jax.tree.leaves(made) if id(leaf) not in known_ids]
+    checked = jax.tree.leaves((found.loss, grads, found.grads[2], made, [known.rows for known in corrections]))
+    # Row by row first, then one reduction of all rows. Without the barrier XLA would reduce each leaf to one flag
+    # apart, which costs a GPU two launches a leaf.
+    are_finite = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in checked]
+    is_finite = jnp.all(jax.lax.optimization_barrier(jnp.concatenate(are_finite)))
+    return Attempt(found, (*grads, found.grads[2]), after, change.info, is_finite)
 
 
 def batch_gradients(
@@ -230,18 +239,10 @@ def batch_gradients(
     own: tuple[Array, ...],
     is_gathering: bool,
 ) -> BatchGradients:
-    """Return loss and gradients of every view: one after the other, or as many at once as the devices share.
+    """Return loss and gradients of V views: one after the other, or as many at once as the devices share.
 
-    Args:
-      settings: with room for each view.
-      stage: its loss terms and corrections.
-      clock: `stage.clock()`.
-      model: N rows.
-      batch: V photographs.
-      backgrounds: [V, 3].
-      iteration: from 1.
-      own: for each correction, its rows [V, ...] of these views.
-      is_gathering: whether an event still gathers the stage's statistic.
+    Backgrounds are [V, 3], and `own` has the rows [V, ...] of each correction. If an event still gathers the stage's
+    statistic, `is_gathering` is True.
     """
     height, width = batch.images.shape[1:3]
     highest = settings.sh_degree
@@ -255,14 +256,22 @@ def batch_gradients(
         shown: Model, seen: TracedView, output: RenderOutput
     ) -> tuple[Array, tuple[Array, Array, dict[str, Array]]]:
         image, alpha, mask, depth, points = seen.target
-        photograph = _black_outside(mask, _over(image, alpha, seen.background))
-        target = Target(seen.camera, photograph, seen.background, mask, clock.progress(iteration - 1), depth, points)
+        photograph = image.astype(seen.background.dtype) / 255
+        if alpha is not None:
+            weight = alpha.astype(photograph.dtype)[..., None] / 255
+            photograph = weight * photograph + (1 - weight) * seen.background[None, None, :]
         color = corrected_color(seen.corrections, seen.rows, output.color)
-        output = dataclasses.replace(output, color=_black_outside(mask, color))
+        if mask is not None:  # Excluded pixels of both are black, so that no loss term sees them.
+            photograph, color = (jnp.where(mask[..., None], x, jnp.zeros_like(x)) for x in (photograph, color))
+        target = Target(seen.camera, photograph, seen.background, mask, clock.progress(iteration - 1), depth, points)
+        output = dataclasses.replace(output, color=color)
         parts_by_name: dict[str, Array] = {}
         values: list[Array] = []
         for index, term in enumerate(stage.losses):
-            parts = term_parts(term, shown, target, output)
+            if hasattr(term, "parts"):
+                parts: dict[str, Array] = term.parts(shown, target, output)
+            else:
+                parts = {getattr(term, "name", type(term).__name__): term(shown, target, output)}
             for name, part in parts.items():
                 check_scalar(f"stage {stage.name!r}: losses[{index}]", part)
                 parts_by_name[name if name not in parts_by_name else f"{name}_{index + 1}"] = part
@@ -270,11 +279,13 @@ def batch_gradients(
         if added := penalties(seen.corrections, seen.rows):
             parts_by_name["corrections"] = functools.reduce(jnp.add, added)
         value = functools.reduce(jnp.add, [*values, *added])
-        error = _mean_over(mask, (jnp.clip(output.color, 0, 1) - target.image) ** 2)
+        error = jnp.mean((jnp.clip(output.color, 0, 1) - target.image) ** 2)
+        if mask is not None:  # The mean over the pixels that count; the error of the others is 0.
+            error = error / jnp.mean(mask.astype(error.dtype))
         return value, (error, output.overflow, parts_by_name)
 
     def gradients_of(arrays: tuple[Any, ...]) -> tuple[BatchGradients, Any]:
-        """Return the gradients of a view, apart from those in the appearance; or of several views that share these."""
+        # Of a view, apart from those in the appearance; or of several views that share these.
         viewmat, K, background, rows, pictures = arrays
         view = TracedView(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows, pictures)
         found = differentiate(loss, model, view, settings, **options)
@@ -293,66 +304,9 @@ def batch_gradients(
     return views._replace(grads=(views.grads[0], appearance, views.grads[2]))
 
 
-def term_parts(term: LossTerm, model: Model, target: Target, output: RenderOutput) -> dict[str, Array]:
-    """Return the summands of a loss term by name; most terms are one."""
-    parts: dict[str, Array]
-    if hasattr(term, "parts"):
-        parts = term.parts(model, target, output)
-    else:
-        parts = {getattr(term, "name", type(term).__name__): term(model, target, output)}
-    return parts
-
-
-def _over(image: Array, alpha: Array | None, background: Array) -> Array:
-    """Return a photograph as floats, composed over the background."""
-    color = image.astype(background.dtype) / 255
-    if alpha is None:
-        return color
-    weight = alpha.astype(background.dtype)[..., None] / 255
-    return weight * color + (1 - weight) * background[None, None, :]
-
-
-def _black_outside(mask: Array | None, color: Array) -> Array:
-    """Return an image [H, W, 3] with excluded pixels black, so that no loss term sees them."""
-    return color if mask is None else jnp.where(mask[..., None], color, jnp.zeros_like(color))
-
-
-def _mean_over(mask: Array | None, values: Array) -> Array:
-    """Return the mean of values [H, W, 3] over the pixels that count; the values of the others are 0."""
-    mean = jnp.mean(values)
-    return mean if mask is None else mean / jnp.mean(mask.astype(values.dtype))
-
-
-def drawn_backgrounds(key: Array, kind: Background, num: int, dtype: DTypeLike) -> Array:
-    """Return the colours [V, 3] behind the views of a step."""
-    if kind == "random":
-        return jax.random.uniform(key, (num, 3), dtype)
-    return jnp.full((num, 3), 1.0 if kind == "white" else 0.0, dtype)
-
-
-def _seen(stage: Stage, batch: Photographs, own: tuple[Array, ...], found: BatchGradients) -> Seen:
-    """Return the views as events observe them."""
-    height, width = batch.images.shape[1:3]
-    cameras = Camera(batch.viewmats, batch.Ks, width, height)
-    if own:
-        cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(own, cameras)
-    colors = found.grads[0].sh[:, :, 0] / SH_C0
-    if found.statistic is None or stage.statistic is None:
-        nothing = jnp.zeros_like(colors)
-        return Seen(cameras, nothing, jnp.zeros(colors.shape[:2], bool), colors)
-    return Seen(cameras, *read_probe(found.statistic, stage.statistic, width, height), colors)
-
-
 def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array, progress: Array) -> OptStep:
-    """Return the model's floats and their moments after Adam.
-
-    Args:
-      stage: its rates.
-      state: before the step.
-      grads: of the Gaussians, and of the floats of the appearance.
-      rate_of_means: present rate of the means.
-      progress: share of the stage that is done.
-    """
+    """Return the model's floats and their moments after Adam, given the gradients of the Gaussians and of the floats of
+    their appearance, the present rate of the means, and the share of the stage that is done."""
     floats, _ = partition(state.model)
     of_gaussians = stage.rates.of_gaussians(rate_of_means, floats.gaussians.sh_degree)
     of_appearance = floats.appearance.rates(0.0 if stage.appearance_rate is None else stage.appearance_rate)
@@ -365,60 +319,36 @@ def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array,
 def _events(
     due: tuple[bool, ...] | None, stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, moments: AdamState,
     states: Sequence[Any],
-) -> tuple[Model, AdamState, tuple[Any, ...], EventInfo]:  # fmt: skip
-    """Gather statistics for the events, and apply those inside the step."""
+) -> tuple[Change, tuple[Any, ...]]:  # fmt: skip
+    """Gather statistics for the events, and apply those inside the step, which must keep all shapes."""
     nothing = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
     infos, left, at = nothing, [], 0
     known = due or (None,) * len(stage.events)
     for event, times, state, is_due in zip(stage.events, clock.times, states, known, strict=True):
+        name = f"stage {stage.name!r}: {type(event).__name__}"
         if state is not None and event.observes:
             before, state = state, event.observe(state, model, seen)
-            check_kept(f"stage {stage.name!r}: {type(event).__name__}.observe", state, before)
+            check_kept(f"{name}.observe", state, before)
         if isinstance(event, StepEvent):
             own = now._replace(keys=now.keys[at : at + event.num_keys], times=times)
             at += event.num_keys
-            apply, carry, info = functools.partial(_applied, stage.name, event, own), (model, moments, state), nothing
+
+            def apply(carry: tuple[Any, ...], event: StepEvent = event, now: Now = own) -> tuple[Any, ...]:
+                model, moments, state = carry
+                with calling(event, "apply", stage.name):
+                    change = checked_change(event.apply(now, model, moments, state))
+                    check_kept("model", change.model, model)
+                    check_kept("state", change.state, state)
+                is_possible, num_refused = change.info
+                info = EventInfo(jnp.asarray(is_possible), jnp.asarray(num_refused, jnp.int32))
+                return change.model, change.moments, change.state, info
+
+            carry, info = (model, moments, state), nothing
             if times is None or (is_due and state is not None):  # The state of an event that is past is None.
                 model, moments, state, info = apply(carry)
             elif is_due is None and state is not None:  # The step itself decides.
                 wait = lambda carry: (*carry, nothing)  # noqa: E731
                 model, moments, state, info = jax.lax.cond(times.is_due(now.iteration), apply, wait, carry)
-            possible = infos.is_possible & info.is_possible
-            infos = EventInfo(possible, infos.num_refused + info.num_refused)
+            infos = EventInfo(infos.is_possible & info.is_possible, infos.num_refused + info.num_refused)
         left.append(state)
-    return model, moments, tuple(left), infos
-
-
-def _applied(
-    stage_name: str, event: StepEvent, now: Now, carry: tuple[Model, AdamState, object]
-) -> tuple[Model, AdamState, Any, EventInfo]:
-    """Return the model, moments and state after an event, which must keep all shapes."""
-    model, moments, state = carry
-    name = f"stage {stage_name!r}: {type(event).__name__}.apply"
-    change = checked_change(name, event.apply(now, model, moments, state))
-    check_kept(f"{name}: model", change.model, model)
-    check_kept(f"{name}: state", change.state, state)
-    info = EventInfo(jnp.asarray(change.info.is_possible), jnp.asarray(change.info.num_refused, jnp.int32))
-    return change.model, change.moments, change.state, info
-
-
-def _status(clock: Clock, tried: Attempt) -> Array:
-    """Return the first reason why a step may not be taken."""
-    found = tried.views
-    status = jnp.where(tried.info.is_possible, FINE, IMPOSSIBLE)
-    status = jnp.where(jnp.mean(found.loss) > clock.largest_loss, EXPLODED, status)
-    status = jnp.where(tried.is_finite, status, NOT_FINITE)
-    return jnp.where(jnp.any(found.is_overflow), OVERFLOW, status).astype(jnp.int32)
-
-
-def _others(known: object, tree: object) -> list[Array]:
-    """Return the leaves of a tree that are no leaves of a known one."""
-    ids = {id(leaf) for leaf in jax.tree.leaves(known)}
-    return [leaf for leaf in jax.tree.leaves(tree) if id(leaf) not in ids]
-
-
-def _all_finite(tree: object) -> Array:
-    """Return whether all numbers are finite: row by row first, then by one reduction of all rows."""
-    rows = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in jax.tree.leaves(tree)]
-    # Without the barrier XLA would reduce each leaf to one flag apart, which costs a GPU two launches a leaf.
-    return jnp.all(jax.lax.optimization_barrier(jnp.concatenate(rows)))
+    return Change(model, moments, None, infos), tuple(left)
