@@ -14,7 +14,7 @@ from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition
-from a2tg_jax.core.table import Table, is_table
+from a2tg_jax.core.table import is_table
 from a2tg_jax.host.machine import ALONE, Devices, Machine, this_machine
 from a2tg_jax.host.text import counted, shortened
 from a2tg_jax.io.archive import read_archive, write_archive
@@ -69,13 +69,13 @@ class History:
         return float(self.seconds[-1]) if len(self.seconds) else 0.0
 
     def with_point(self, /, *point: float, **terms: float) -> "History":
-        """One more row: values in the order of the fields, and loss terms by name."""
+        """Add a row: values in the order of the fields, and loss terms by name."""
         own = dict(zip(COLUMNS, point, strict=True))
         return self.followed_by(History.of_rows([own | {f"{TERM}{name}": value for name, value in terms.items()}]))
 
     @staticmethod
     def of_rows(rows: Sequence[Mapping[str, float]]) -> "History":
-        """Return the history of rows, each a value for each column; NaN for a loss term that a row lacks."""
+        """Return the history of rows, which map column names to values; NaN for a loss term that a row lacks."""
         names = dict.fromkeys([*COLUMNS, *(name for row in rows for name in row)])
         kinds = {name: column.dtype for name, column in History.empty().to_dict().items()}
         return History.of_columns(
@@ -84,13 +84,13 @@ class History:
 
     @staticmethod
     def of_columns(columns: Mapping[str, np.ndarray]) -> "History":
-        """Return the history whose `to_dict` the columns are."""
+        """Return the history of columns, the inverse of `to_dict`."""
         terms = {name.removeprefix(TERM): column for name, column in columns.items() if name not in COLUMNS}
         known: dict[str, Any] = {name: columns[name] for name in COLUMNS}
         return History(**known, terms=terms)
 
     def followed_by(self, other: "History") -> "History":
-        """This history and then another."""
+        """Return this history, continued by another."""
         both = [(history.to_dict(), np.full(len(history.iteration), np.nan)) for history in (self, other)]
         names = {**both[0][0], **both[1][0]}
         return History.of_columns(
@@ -115,7 +115,7 @@ class Checkpoint:
     history: History
     """History of this stage."""
     num_restored: int = 0
-    """Number of times the stage went back because it diverged; it decides the order of the views."""
+    """Number of times the stage went back because it diverged; the order of the views depends on it."""
     machine: Machine | None = None
     """Machine on which it was saved; None if unknown or not saved yet."""
     devices: Devices = ALONE
@@ -183,7 +183,7 @@ def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = 
 
     Args:
       path: the file.
-      system: class of its system. Only needed for a system of your own whose module is not imported.
+      system: class of its system. Only needed for a custom system whose module is not imported.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -234,7 +234,7 @@ def _checkpoint_of(
 
 
 MOST_COUNTED = 2**31 - 1
-MOST_TOLD = 300
+LONGEST_DIFFERENCE = 300
 """Largest number of characters of the options that differ from a checkpoint's."""
 SHOWN = "shown/"
 """Prefix of the names of appearance arrays."""
@@ -250,12 +250,11 @@ def _packed(model: Model, moments: AdamState) -> AdamState:
     _, rest = partition(model.appearance)
     rows = np.arange(model.gaussians.num)
 
-    def smaller(leaf: object) -> object:
-        return leaf.take(rows, padding=(0.0,) * len(leaf.padding)) if isinstance(leaf, Table) else leaf
-
     def packed(moment: Model) -> Model:
-        whole = combine(moment.appearance, rest)
-        whole = jax.tree.map(smaller, whole, is_leaf=is_table)
+        whole = jax.tree.map(
+            lambda leaf: leaf.take(rows, padding=(0.0,) * len(leaf.padding)) if is_table(leaf) else leaf,
+            combine(moment.appearance, rest), is_leaf=is_table,
+        )  # fmt: skip
         return dataclasses.replace(moment, appearance=partition(whole)[0])
 
     return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))
@@ -274,13 +273,8 @@ def _filled(template: object, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
-    """Raise ValueError, naming the leaf, unless a state fits a stage.
-
-    Args:
-      state: state from the file; the arrays of its model fit each other.
-      wanted: shapes and dtypes of a state of that model.
-      stage: stage of both states.
-    """
+    """Raise ValueError, naming the leaf, unless a file's state, whose model's arrays fit each other, has the shapes and
+    dtypes of a state of that stage and model."""
     check_like("state.model.num_live", state.model.num_live, wanted.model.num_live)
     for name in ("moments", "events", "iteration", "status"):
         check_like(f"state.{name}", getattr(state, name), getattr(wanted, name))
@@ -314,7 +308,7 @@ def check_history(history: History) -> None:
     for name, column in columns.items():
         if column.ndim != 1 or column.shape != num or column.dtype.kind not in "iuf":
             raise ValueError(f"history.{name} must be numbers {list(num)}; got {column.dtype} {list(column.shape)}")
-        is_term = name.startswith("loss_")
+        is_term = name.startswith(TERM)
         if (np.isnan(column).any() and not is_term) or (name != "psnr" and np.isinf(column).any()):
             raise ValueError(f"history.{name} must be finite; some are not")
         if name not in ("loss", "psnr") and not is_term and (column < 0).any():
@@ -331,14 +325,13 @@ def check_resume(resume: Checkpoint, system: System, index: int) -> None:
     values, others = flatten_config(resume.system), flatten_config(system)
     if before is now:
         pairs = {name: (values[name], others[name]) for name in values if values[name] != others[name]}
-        told = [f"{name} {value!r}, not {other!r}" for name, (value, other) in pairs.items()]
-        differing = ", ".join(told)
+        differing = ", ".join(f"{name} {value!r}, not {other!r}" for name, (value, other) in pairs.items())
     elif (before.__module__, before.__qualname__) == (now.__module__, now.__qualname__):  # A notebook's cell ran twice.
         differing = f"the class {now.__name__} as it was before it was defined again"
         advice = f", or with load_checkpoint(path, {now.__name__}) of what save_checkpoint wrote, for the new class"
     else:
         differing = f"{before.__name__}, not {now.__name__}"
     raise ValueError(
-        f"the checkpoint was made with another configuration ({shortened(differing, MOST_TOLD)}): resume with "
+        f"the checkpoint was made with another configuration ({shortened(differing, LONGEST_DIFFERENCE)}): resume with "
         f"checkpoint.system{advice}"
     )

@@ -7,7 +7,7 @@ dataclass that is a pytree of its numbers. V views.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,6 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.training.returned import check_kept, check_scalar
 
-T = TypeVar("T")
 MOST_READABLE = 100
 """Largest number of numbers of a row that `learned` lists."""
 
@@ -72,6 +71,8 @@ class FadingCorrection(Correction):
 
     rate: float
     final_factor: float
+    averages_neutral: ClassVar[bool] = False
+    """Whether the rows are kept neutral on average over the views."""
 
     def check_options(self) -> None:
         check_number("rate", self.rate, least=0)
@@ -79,6 +80,11 @@ class FadingCorrection(Correction):
 
     def learning_rate(self, progress: Array) -> Array:
         return self.rate * self.final_factor**progress
+
+    def project(self, rows: Array) -> Array:
+        if not self.averages_neutral:
+            return rows
+        return rows - jnp.mean(rows, axis=0, keepdims=True) + jnp.asarray(self.neutral, rows.dtype)[None]
 
 
 @pytree
@@ -94,6 +100,7 @@ class Exposure(FadingCorrection):
     """Factor of the rate at the end of a stage; a system's later stages keep the rate of the first one's end."""
 
     name = "exposure"
+    averages_neutral = True
 
     @property
     def neutral(self) -> np.ndarray:
@@ -101,9 +108,6 @@ class Exposure(FadingCorrection):
 
     def color(self, row: Array, color: Array) -> Array:
         return exposed(row, color)
-
-    def project(self, rows: Array) -> Array:
-        return rows - jnp.mean(rows, axis=0, keepdims=True) + jnp.asarray(self.neutral, rows.dtype)[None]
 
 
 @pytree
@@ -145,34 +149,22 @@ def exposed(exposure: Array, color: Array) -> Array:
 def initial_corrections(
     corrections: Sequence[Correction], names: Sequence[str], origin: Origin | None, dtype: Any
 ) -> tuple[CorrectionState, ...]:
-    """Return the states before a stage: from the earlier stage, or neutral ones.
-
-    Args:
-      corrections: of the stage.
-      names: of the V training views.
-      origin: of the model that the stage starts from.
-      dtype: of the rows.
-    """
-    return tuple(
-        _state(jnp.asarray(np.stack([_known_row(correction, name, origin) for name in names]), dtype))
-        for correction in corrections
-    )
-
-
-def _known_row(correction: Correction, name: str, origin: Origin | None) -> np.ndarray:
-    rows = None if origin is None else origin.corrections.get(correction.name)
-    if origin is None or rows is None or name not in origin.names:
-        return correction.neutral
-    row: np.ndarray = rows[origin.names.index(name)]
-    if row.shape != correction.neutral.shape:
-        shapes = f"{list(correction.neutral.shape)}, as {type(correction).__name__} has them; got {list(row.shape)}"
-        raise ValueError(f"corrections called {correction.name!r} of the model to start from must be {shapes}")
-    return row
-
-
-def _state(rows: Array) -> CorrectionState:
-    moments = adam_init(rows)
-    return CorrectionState(rows, dataclasses.replace(moments, count=jnp.zeros(len(rows), jnp.int32)))
+    """Return the states before a stage, given the names of the V training views: rows of the origin of the model that
+    the stage starts from, where it has them, and neutral ones."""
+    states = []
+    for correction in corrections:
+        neutral, known = correction.neutral, {}
+        if origin is not None and correction.name in origin.corrections:
+            known = dict(zip(origin.names, origin.corrections[correction.name], strict=True))
+        found = [known.get(name, neutral) for name in names]
+        for row in found:
+            if row.shape != neutral.shape:
+                shapes = f"{list(neutral.shape)}, as {type(correction).__name__} has them; got {list(row.shape)}"
+                raise ValueError(f"corrections called {correction.name!r} of the model to start from must be {shapes}")
+        rows = jnp.asarray(np.stack(found), dtype)
+        moments = dataclasses.replace(adam_init(rows), count=jnp.zeros(len(rows), jnp.int32))
+        states.append(CorrectionState(rows, moments))
+    return tuple(states)
 
 
 def check_corrections(states: Sequence[CorrectionState], num_views: int) -> None:
@@ -185,11 +177,6 @@ def check_corrections(states: Sequence[CorrectionState], num_views: int) -> None
             )
 
 
-def rows_of(states: Sequence[CorrectionState], views: Array | None) -> tuple[Array, ...]:
-    """Return the rows [B, ...] of some views [B], for each correction."""
-    return tuple(state.rows[views] for state in states)
-
-
 def corrected_camera(corrections: Sequence[Correction], rows: Sequence[Array], camera: Camera) -> Camera:
     """Return the camera of a view, given its row of each correction.
 
@@ -197,7 +184,8 @@ def corrected_camera(corrections: Sequence[Correction], rows: Sequence[Array], c
       ValueError: naming the correction, if it returns something else than a camera of the same size.
     """
     for correction, row in zip(corrections, rows, strict=True):
-        camera = _kept(correction, "camera", correction.camera(row, camera), camera)
+        before, camera = camera, correction.camera(row, camera)
+        check_kept(f"{type(correction).__name__}.camera", camera, before)
     return camera
 
 
@@ -208,7 +196,8 @@ def corrected_color(corrections: Sequence[Correction], rows: Sequence[Array], co
       ValueError: naming the correction, if it returns something else than colours of the same shape.
     """
     for correction, row in zip(corrections, rows, strict=True):
-        color = _kept(correction, "color", correction.color(row, color), color)
+        before, color = color, correction.color(row, color)
+        check_kept(f"{type(correction).__name__}.color", color, before)
     return color
 
 
@@ -227,60 +216,41 @@ def penalties(corrections: Sequence[Correction], rows: Sequence[Array]) -> list[
     return found
 
 
-def _kept(correction: Correction, method: str, found: T, before: T) -> T:
-    """Return what a method of a correction returned, which must be like what it was given."""
-    check_kept(f"{type(correction).__name__}.{method}", found, before)
-    return found
-
-
 def updated(
     correction: Correction, state: CorrectionState, views: Array, grads: Array, progress: Array
 ) -> CorrectionState:
-    """Return the state after a step of Adam on the rows of the views that were seen.
-
-    Args:
-      correction: owner of the state.
-      state: before.
-      views: [B] int32; one may occur twice.
-      grads: [B, ...] of each view's own loss by its row.
-      progress: share of the stage.
-    """
+    """Return the state after a step of Adam on the rows of the views [B] that were seen, of which one may occur twice;
+    the gradients [B, ...] are of each view's own loss by its row."""
     sums = jnp.zeros_like(state.rows).at[views].add(grads)
     is_seen = jnp.zeros(len(state.rows), bool).at[views].set(True)
     rate = correction.learning_rate(progress)
     check_scalar(f"{type(correction).__name__}.learning_rate", rate)
     step = jax.vmap(lambda row, grad, moments: adam_update(row, grad, moments, rate))(state.rows, sums, state.moments)
 
-    def chosen(new: Array, old: Array) -> Array:
-        return jnp.where(is_seen.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-    rows, moments = jax.tree.map(chosen, (step.params, step.state), (state.rows, state.moments))
-    return CorrectionState(_kept(correction, "project", correction.project(rows), rows), moments)
+    rows, moments = jax.tree.map(
+        lambda new, old: jnp.where(is_seen.reshape(-1, *[1] * (new.ndim - 1)), new, old),
+        (step.params, step.state), (state.rows, state.moments),
+    )  # fmt: skip
+    projected = correction.project(rows)
+    check_kept(f"{type(correction).__name__}.project", projected, rows)
+    return CorrectionState(projected, moments)
 
 
 def corrected_origin(origin: Origin, corrections: Sequence[Correction], states: Sequence[CorrectionState]) -> Origin:
-    """Return the origin with the learned corrections and the corrected training cameras (host).
-
-    Args:
-      origin: of the scene, training views first.
-      corrections: of the stage.
-      states: after it.
-    """
+    """Return a scene's origin, training views first, with the learned corrections and the corrected training cameras
+    (host)."""
     if not corrections:
         return origin
-    rows = {c.name: _with_neutral(c, state, len(origin.names)) for c, state in zip(corrections, states, strict=True)}
+    rows = {}
+    for correction, state in zip(corrections, states, strict=True):
+        own = np.asarray(state.rows)
+        of_test_views = np.broadcast_to(correction.neutral, (len(origin.names) - len(own), *own.shape[1:]))
+        rows[correction.name] = np.concatenate([own, of_test_views.astype(own.dtype)])
     viewmats = origin.viewmats.copy()
     for index in np.flatnonzero(~origin.is_test):
-        own = [jnp.asarray(rows[correction.name][index]) for correction in corrections]
-        viewmats[index] = corrected_camera(corrections, own, origin.cameras[index]).viewmat
+        of_view = [jnp.asarray(rows[correction.name][index]) for correction in corrections]
+        viewmats[index] = corrected_camera(corrections, of_view, origin.cameras[index]).viewmat
     return dataclasses.replace(origin, viewmats=viewmats, corrections=rows)
-
-
-def _with_neutral(correction: Correction, state: CorrectionState, num: int) -> np.ndarray:
-    """Return the rows of training views, followed by neutral ones of test views."""
-    rows = np.asarray(state.rows)
-    neutral = np.broadcast_to(correction.neutral, (num - len(rows), *rows.shape[1:]))
-    return np.concatenate([rows, neutral.astype(rows.dtype)])
 
 
 def learned(origin: Origin) -> Mapping[str, Mapping[str, list[float]]]:
@@ -307,8 +277,8 @@ class BilateralGrid(FadingCorrection):
     2007; Wang et al., 2024, Bilateral Guided Radiance Field Processing). A pixel's map is interpolated trilinearly at
     its place in the image and the luminance of the render.
 
-    Each node is on average over the views the identity. Cameras look at one subject, so that a change which all views
-    share, even one that varies over the picture, would shift the model.
+    On average over the views, each node is the identity: cameras look at one subject, so a change that all views share,
+    even one that varies over the picture, would shift the model.
     """
 
     size: tuple[int, int, int] = static(default=(4, 4, 4))
@@ -321,6 +291,7 @@ class BilateralGrid(FadingCorrection):
     """Weight of the total variation of the grids in the loss."""
 
     name = "bilateral_grid"
+    averages_neutral = True
     bytes_per_pixel = 89  # as XLA reports for the gradient of `sliced`
 
     def check_options(self) -> None:
@@ -340,22 +311,21 @@ class BilateralGrid(FadingCorrection):
     def penalty(self, row: Array) -> Array:
         return self.smoothness * total_variation(row)
 
-    def project(self, rows: Array) -> Array:
-        return rows - jnp.mean(rows, axis=0, keepdims=True) + jnp.asarray(self.neutral, rows.dtype)[None]
-
 
 def sliced(grid: Array, color: Array) -> Array:
-    """Return the colours [H, W, 3] after each pixel's own affine map from the grid.
+    """Return the colours [H, W, 3] after each pixel's own affine map from the grid [L, Gy, Gx, 3, 4].
 
-    The first and last nodes lie at the edges of the image, and at the luminances 0 and 1.
-
-    Args:
-      grid: [L, Gy, Gx, 3, 4].
-      color: [H, W, 3].
+    The first and last nodes are at the edges of the image, and at the luminances 0 and 1.
     """
     levels, rows, columns = grid.shape[:3]
     height, width = color.shape[:2]
-    along_y, along_x = (_hats(num, side, grid.dtype) for num, side in ((rows, height), (columns, width)))
+
+    def hats(num: int, side: int) -> Array:
+        # Weights [side, num] of nodes for linear interpolation at pixel centres.
+        places = (jnp.arange(side, dtype=grid.dtype) + 0.5) / side * (num - 1)
+        return jnp.maximum(1 - jnp.abs(places[:, None] - jnp.arange(num, dtype=grid.dtype)[None]), 0)
+
+    along_y, along_x = hats(rows, height), hats(columns, width)
     luminance = jnp.clip(color @ jnp.asarray(LUMINANCE, color.dtype), 0, 1) * (levels - 1)
 
     @jax.checkpoint
@@ -373,9 +343,3 @@ def total_variation(grid: Array) -> Array:
     """Return the mean squared difference of neighbouring nodes [L, Gy, Gx, ...], summed over the three axes."""
     steps = [jnp.diff(grid, axis=axis) for axis in range(3) if grid.shape[axis] > 1]
     return sum((jnp.mean(step * step) for step in steps), jnp.zeros((), grid.dtype))
-
-
-def _hats(num: int, side: int, dtype: jnp.dtype) -> Array:
-    """Return the weights [side, num] of nodes for linear interpolation at pixel centres."""
-    places = (jnp.arange(side, dtype=dtype) + 0.5) / side * (num - 1)
-    return jnp.maximum(1 - jnp.abs(places[:, None] - jnp.arange(num, dtype=dtype)[None]), 0)

@@ -16,10 +16,9 @@ from a2tg_jax.data.scene import Scene, View, ray_bytes
 from a2tg_jax.events import HostEvent, StepEvent
 from a2tg_jax.host.machine import default_platform, num_threads
 from a2tg_jax.training.batches import NO_EXTRAS, Extras, plan_batches, view_bytes
-from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
-from a2tg_jax.training.start import initial_number, num_rows
+from a2tg_jax.training.start import initial_number
 
 MB = 10**6
 PROCESS = 300 * MB
@@ -100,19 +99,16 @@ def forecast_stages(
 ) -> Iterator[StageForecast]:
     """Yield the forecast of each stage of a system (host; nothing is compiled).
 
-    Args:
-      scene: its photographs and points.
-      system: with its options.
-      num_given: Gaussians of a file instead of the first stage, which takes nothing then; None: it is trained.
-      num_devices: number of devices that train together; bytes are of all of them.
+    If a file gives Gaussians instead of the first stage, `num_given` is their number. Bytes are of all devices that
+    train together.
     """
     stages = system.stages()
     num, floats, shown = initial_number(scene, system, stages[0]), 0.0, None
     if num_given is not None:
         num, stages = num_given, stages[1:]
-        yield _given_stage(system, num)
+        yield StageForecast(Bytes(), system.initial_bytes * num, num, num_programs=0, seconds=0, whole_bytes=0)
     for stage in stages:
-        num = num_rows(stage, num)
+        num = max([num, *(event.num_rows(num, stage.iterations) for event in stage.events)])
         if stage.appearance != shown:
             floats, shown = stage.floats_shown(system.initial_sh_degree), stage.appearance
         own = floats_per_gaussian(system.initial_sh_degree) + floats
@@ -130,32 +126,20 @@ def forecast_stages(
             num = event.num_after(num, stage.iterations)
 
 
-def _given_stage(system: System, num: int) -> StageForecast:
-    """Return the forecast of a first stage in whose place a file gives its Gaussians."""
-    model_bytes = system.initial_bytes * num
-    return StageForecast(Bytes(), model_bytes, num, num_programs=0, seconds=0, whole_bytes=0)
-
-
 def stage_bytes(
     scene: Scene, system: System, stage: Stage, num: int, model_bytes: float, num_devices: int = 1
 ) -> Bytes:
-    """Return the bytes of a stage's last steps, programs and compilation left out.
+    """Return the bytes of a stage's last steps on all devices, without programs and compilation, given its number of
+    rows and the bytes of the model.
 
     Of the views of a batch, several devices draw G at once, each with room for all its rows and pixels. On CPUs every
     device has the images of all of them whole, for SSIM.
-
-    Args:
-      scene: its photographs.
-      system: batch size and tiles.
-      stage: its losses and corrections.
-      num: rows.
-      model_bytes: of the model.
-      num_devices: number of devices that train together; bytes are of all of them.
     """
     at_once = math.gcd(system.batch_size, num_devices)
     images = at_once * (num_devices if default_platform() == "cpu" else 1)
     is_changed = any(isinstance(event, HostEvent) and event.iterations(stage.iterations) for event in stage.events)
     largest, batch = largest_view(scene.train), system.batch_size
+    per_view = sum(BYTES_PER_FLOAT * correction.neutral.size for correction in stage.corrections)
     per_pixel = STEP_PER_PIXEL + GEOMETRY_PER_PIXEL * stage.has_geometry
     pairs = PAIRS_PER_TILE * largest / system.tile_size**2
     per_row = STEP_PER_ROW + STATISTIC_PER_ROW * any(event.statistic for event in stage.events)
@@ -168,15 +152,9 @@ def stage_bytes(
         model=(STATES + 1) * model_bytes,  # what the stage began with stays
         gradients=max(of_step, STATES * model_bytes * is_changed),  # An event holds the old state and the new one.
         pixels=largest * (images * per_pixel + VIEW_PER_PIXEL * (batch - 1)) + at_once * STEP_PER_PAIR * pairs,
-        corrections=correction_bytes(stage.corrections, len(scene.train), largest),
+        corrections=CORRECTION_COPIES * len(scene.train) * per_view
+        + largest * sum(correction.bytes_per_pixel for correction in stage.corrections),
     )
-
-
-def correction_bytes(corrections: Sequence[Correction], num_views: int, num_pixels: int) -> float:
-    """Return the bytes of the corrections of the training views, the largest of which has `num_pixels`."""
-    per_view = sum(BYTES_PER_FLOAT * correction.neutral.size for correction in corrections)
-    per_pixel = sum(correction.bytes_per_pixel for correction in corrections)
-    return CORRECTION_COPIES * num_views * per_view + num_pixels * per_pixel
 
 
 def held_bytes(scene: Scene) -> int:
@@ -203,6 +181,6 @@ def largest_view(views: Sequence[View]) -> int:
 
 
 def iteration_seconds(views: Sequence[View], num: int, downscale: int = 1) -> float:
-    """Return the seconds of an iteration with one view, downscaled further by a factor."""
+    """Return the seconds of an iteration with one view, downscaled by a further factor."""
     pixels = sum(view.camera.width * view.camera.height for view in views) / len(views) / downscale**2
     return (SECONDS_PER_ROW * num + SECONDS_PER_PIXEL * pixels) / num_threads()

@@ -1,7 +1,4 @@
-"""Place where training diverged: iteration, views, and rows of parameters, found after the fact (host).
-
-The step itself only reports that it could not be taken (`step.NOT_FINITE`, `step.EXPLODED`), which costs nothing.
-"""
+"""Place where training diverged, found after the fact: views, and rows of parameters (host)."""
 
 import functools
 from collections.abc import Iterator, Sequence
@@ -18,17 +15,14 @@ EXPLOSION = 100.0
 """A loss that exceeds the stage's first logged loss by this factor is an explosion, …"""
 SMALL_LOSS = 10.0
 """… unless it is no larger than this."""
-TOLD_ROWS = 5
+NAMED_ROWS = 5
 
 
 class DivergedError(ValueError):
     """A loss or gradient is not finite, or the loss exploded. The state before that step is unharmed."""
 
     def __init__(self, message: str, checkpoint: Checkpoint):
-        """Args:
-        message: one line.
-        checkpoint: the state before the step.
-        """
+        """The checkpoint is the state before the step."""
         super().__init__(message)
         self.checkpoint = checkpoint
 
@@ -58,18 +52,14 @@ def _spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:
 
 
 def what_diverged(arguments: tuple[object, ...], names: Sequence[str]) -> str:
-    """Return the views and parameters whose numbers are not finite, or the loss if all of them are finite.
-
-    Args:
-      arguments: of `train_step`, with the state before the step that could not be taken.
-      names: of its views.
-    """
+    """Return the views and parameters whose numbers are not finite, or the loss if all of them are finite, given the
+    arguments of `train_step` before the step that could not be taken, and the names of its views."""
     tried: Attempt = readable(jitted_attempt()(*arguments))
     losses = np.asarray(tried.views.loss)
     found = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
-    found += [f"the gradient by {told}" for told in _not_finite(tried.grads)]
+    found += [f"the gradient by {place}" for place in _not_finite(tried.grads)]
     model, corrections = tried.state.model, tuple(known.rows for known in tried.state.corrections)
-    found += [f"after the step, {told}" for told in _not_finite((model.gaussians, model.appearance, corrections))]
+    found += [f"after the step, {place}" for place in _not_finite((model.gaussians, model.appearance, corrections))]
     return "; ".join(found) or f"the loss of {', '.join(names)} is {np.mean(losses):.4g}"
 
 
@@ -81,6 +71,6 @@ def _not_finite(parameters: tuple[object, ...]) -> Iterator[str]:
             is_bad = ~np.isfinite(numbers).all(axis=tuple(range(1, numbers.ndim)))  # There may be 0 rows.
             if is_bad.any():
                 rows = np.flatnonzero(is_bad)
-                told = ", ".join(map(str, rows[:TOLD_ROWS])) + (", …" if len(rows) > TOLD_ROWS else "")
+                first = ", ".join(map(str, rows[:NAMED_ROWS])) + (", …" if len(rows) > NAMED_ROWS else "")
                 name = (prefix + jax.tree_util.keystr(path)).lstrip(".")
-                yield f"{name} is not finite in {len(rows):,} of {len(numbers):,} rows ({told})"
+                yield f"{name} is not finite in {len(rows):,} of {len(numbers):,} rows ({first})"

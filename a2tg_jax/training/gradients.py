@@ -123,7 +123,7 @@ def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callab
 
 
 class TracedView(NamedTuple):
-    """TracedView that `differentiate` renders, with its corrections, which are differentiated."""
+    """View that `differentiate` renders, with its corrections, which are differentiated."""
 
     camera: Camera
     background: Array
@@ -133,17 +133,6 @@ class TracedView(NamedTuple):
     """The view's row of each correction."""
     target: Any = None
     """Arrays that the loss compares the render with."""
-
-    @property
-    def corrected(self) -> "TracedView":
-        """The view from its corrected camera."""
-        return self._replace(camera=corrected_camera(self.corrections, self.rows, self.camera))
-
-
-def _axes_of(views: TracedView) -> TracedView:
-    """Return the axes of several views in one, for `jax.vmap`: they share the corrections, and the rays of the lens."""
-    cameras = dataclasses.replace(views.camera, viewmat=0, K=0, rays=None)  # type: ignore[arg-type]
-    return TracedView(cameras, background=0, corrections=None, rows=0, target=0)  # type: ignore[arg-type]
 
 
 class Differentiated(NamedTuple):
@@ -176,27 +165,19 @@ def differentiate(
     statistic: Statistic | None,
     has_probe: bool,
 ) -> Differentiated:
-    """Render a view and differentiate its loss: the core of `view_gradients` and of the training step.
+    """Render a view, or G views that several devices draw at once, and differentiate its loss: the core of
+    `view_gradients`, which describes the arguments, and of the training step.
 
-    If several devices draw G views at once, it does so for these.
-
-    Args:
-      loss: function of the model, the corrected view and its render; returns a scalar and any auxiliary value.
-      model: differentiated in all its floats.
-      view: differentiated in its rows. G views have a leading axis, but for the corrections and the camera's rays.
-      settings: with a capacity under jit.
-      has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
-      sh_degree: overrides the settings'; may be traced.
-      statistic: position that the probe measures; None without a probe.
-      has_probe: gather the statistic.
+    The loss is a function of the model, the corrected view and its render, and returns a scalar and any auxiliary
+    value. It is differentiated in all floats of the model and the view's rows. G views have a leading axis, but for the
+    corrections and the camera's rays.
     """
-
     floats, rest = partition(model.appearance)
 
     def of_floats(
         gaussians: Gaussians, floats: Appearance, rows: tuple[Array, ...], probe: Array | None, view: TracedView
     ) -> tuple[Array, tuple[Any, Array]]:
-        seen = view._replace(rows=rows).corrected
+        seen = view._replace(rows=rows, camera=corrected_camera(view.corrections, rows, view.camera))
         shown = dataclasses.replace(model, gaussians=gaussians, appearance=combine(floats, rest))
         output, num_pairs = render_traced(
             gaussians, seen.camera, shown.appearance, view.background, settings,
@@ -208,6 +189,9 @@ def differentiate(
     probe = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if has_probe else None
     with_gradients = jax.value_and_grad(of_floats, argnums=(0, 1, 2, 3), has_aux=True)
     if settings.exchange is not None and settings.exchange.views_at_once > 1:
-        with_gradients = value_and_grad_of_views(of_floats, settings.exchange.views_at_once, _axes_of(view))
+        # Axes of the views, for `jax.vmap`: they share the corrections, and the rays of the lens.
+        cameras: Any = dataclasses.replace(view.camera, viewmat=0, K=0, rays=None)  # type: ignore[arg-type]
+        axes: Any = TracedView(cameras, background=0, corrections=None, rows=0, target=0)  # type: ignore[arg-type]
+        with_gradients = value_and_grad_of_views(of_floats, settings.exchange.views_at_once, axes)
     (value, (auxiliary, num_pairs)), gradients = with_gradients(model.gaussians, floats, view.rows, probe, view)
     return Differentiated(value, auxiliary, num_pairs, *gradients)

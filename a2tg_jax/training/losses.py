@@ -11,7 +11,6 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera, check_is_camera
 from a2tg_jax.core.checks import check_array, check_floats, check_number, check_shape, plain_array
-from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import normalize, safe_divide
 from a2tg_jax.rasterize.kernels import window_scores
 
@@ -56,15 +55,7 @@ def mean_ssim(image: Array, target: Array) -> Array:
     The window is a Gaussian of σ 1.5 and 11 taps; the data range is 1. It equals scikit-image's
     `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1)`.
 
-    Args:
-      image: [H, W, 3], sides of at least 11 pixels.
-      target: [H, W, 3].
-
-    Returns:
-      A scalar, at most 1 up to rounding.
-
-    Raises:
-      ValueError: if the shapes differ or a side is shorter than the window.
+    Both images are [H, W, 3]. ValueError: if their shapes differ or a side is shorter than the window.
     """
     image, target = plain_array("image", image), plain_array("target", target)
     check_same_shape(image, target)
@@ -74,8 +65,7 @@ def mean_ssim(image: Array, target: Array) -> Array:
             f"{image.shape[0]}: use larger images or ssim_weight=0"
         )
     x, y = jnp.moveaxis(image, -1, 0), jnp.moveaxis(target, -1, 0)
-    score = window_scores.Score(_similarity, SSIM_TAPS)
-    return window_scores.mean_score(score, x, y)
+    return window_scores.mean_score(window_scores.Score(_similarity, SSIM_TAPS), x, y)
 
 
 def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product: Array) -> Array:
@@ -115,19 +105,10 @@ def normal_consistency(normal: Array, depth: Array, alpha: Array, camera: Camera
 
 
 def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array, Array]:
-    """Normals of a depth map, from central differences of its back-projected points.
+    """Return normals of a depth map [H, W], from central differences of its back-projected points.
 
-    Args:
-      depth: [H, W] depth along the camera's z axis.
-      is_valid: [H, W] bool, pixels with a depth.
-      camera: the view.
-
-    Returns:
-      [H-2, W-2, 3] unit normals in the world, facing the camera, of all pixels but the border; and [H-2, W-2],
-      whether the pixel and the four neighbours it needs are valid.
-
-    Raises:
-      ValueError: if an image is not of the camera's size.
+    They are [H-2, W-2, 3] unit vectors in the world, facing the camera, of all pixels but the border; and [H-2, W-2],
+    whether the pixel and the four neighbours it needs are valid. ValueError: if an image is not of the camera's size.
     """
     check_is_camera(camera)
     check_floats("depth", depth, (camera.height, camera.width))
@@ -145,39 +126,21 @@ def depth_normals(depth: Array, is_valid: Array, camera: Camera) -> tuple[Array,
     return normalize(normal), is_defined
 
 
-def mean_opacity(opacities: Array, num_live: Array | int) -> Array:
-    """Return the mean of the first `num_live` of N opacities (the opacity regulariser of 3DGS-MCMC)."""
-    return _live_mean(opacities, num_live)
-
-
-def mean_scale(gaussians: Gaussians, num_live: Array | int) -> Array:
-    """Return the mean scale, over both axes, of the first `num_live` rows (the scale regulariser of 3DGS-MCMC)."""
-    check_gaussians(gaussians)
-    return _live_mean(jnp.mean(gaussians.scales, axis=-1), num_live)
+def live_mean(values: Array, num_live: Array) -> Array:
+    """Return the mean of the first `num_live` of N values."""
+    is_live = jnp.arange(values.shape[0], dtype=jnp.int32) < num_live
+    return jnp.sum(jnp.where(is_live, values, 0.0)) / jnp.maximum(num_live, 1).astype(values.dtype)
 
 
 def check_same_shape(image: Array, target: Array) -> None:
     """Raise ValueError unless both are floats [H, W, 3] of one shape."""
     for name, value in (("image", image), ("target", target)):
-        check_array(name, value, _hint(value))
+        hint = "say view_image(view, background)" if hasattr(value, "picture") else ""
+        check_array(name, value, "say output.color" if hasattr(value, "color") else hint)
     if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image and target must both be [H, W, 3]; got {image.shape} and {target.shape}")
     if not (jnp.issubdtype(image.dtype, jnp.floating) and jnp.issubdtype(target.dtype, jnp.floating)):
         raise ValueError(f"image and target must be floats in [0, 1]; got {image.dtype} and {target.dtype}")
-
-
-def _hint(value: object) -> str:
-    """Return what to pass instead of a value that is no image but has one."""
-    if hasattr(value, "color"):
-        return "say output.color"
-    return "say view_image(view, background)" if hasattr(value, "picture") else ""
-
-
-def _live_mean(values: Array, num_live: Array | int) -> Array:
-    check_shape("num_live", num_live, ())
-    num_live = jnp.asarray(num_live, jnp.int32)
-    is_live = jnp.arange(values.shape[0], dtype=jnp.int32) < num_live
-    return jnp.sum(jnp.where(is_live, values, 0.0)) / jnp.maximum(num_live, 1).astype(values.dtype)
 
 
 def back_project(depth: Array, camera: Camera) -> Array:

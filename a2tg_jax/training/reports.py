@@ -1,6 +1,6 @@
-"""Reports of a stage to the user: its progress, a forecast of its duration, and warnings of what goes wrong.
+"""Reports of a stage to the user: its progress, a forecast of its duration, and warnings.
 
-Events that do nothing or compile too often, and training that does not learn, are warned of.
+You are warned of events that do nothing or compile too often, and if training does not learn.
 """
 
 import collections
@@ -10,6 +10,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from jax import Array
 from tqdm import tqdm
 
 from a2tg_jax.data.scene import View, view_image
-from a2tg_jax.events import Change, Event, HostEvent, StepEvent
+from a2tg_jax.events import Change, HostEvent, StepEvent
 from a2tg_jax.host.progress_bars import has_terminal, is_line_due
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.parallel.sharded_rows import on_host
@@ -38,12 +39,7 @@ class Pace:
     """Time of an iteration, and forecasts of a stage's duration: early, and at a half."""
 
     def __init__(self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, may_grow: bool = True):
-        """Args:
-        first: iterations done before.
-        total: the last iteration.
-        now: a clock in seconds.
-        may_grow: whether Gaussians may be added.
-        """
+        """`first` iterations were done before, `total` is the last one, and `now` is a clock in seconds."""
         self._total, self._now, self._may_grow = total, now, may_grow
         self._due = [first, (first + total) // 2]
         self._before: tuple[int, float, int] | None = None
@@ -53,11 +49,7 @@ class Pace:
     def time(self, done: int, num_compiled: int, ahead: int = 0, seconds_a_program: float = 0.0) -> None:
         """Time the iterations since the last call, unless programs were compiled meanwhile.
 
-        Args:
-          done: iterations so far.
-          num_compiled: programs compiled so far.
-          ahead: programs that will be compiled, about.
-          seconds_a_program: time of a compilation.
+        Numbers of iterations and compiled programs are totals so far; `ahead` is about how many will be compiled.
         """
         now = self._now()
         self._ahead, self._seconds_a_program = ahead, seconds_a_program
@@ -73,11 +65,11 @@ class Pace:
         if left is None or not is_due or done >= self._total:
             return None
         growing = "; more if Gaussians are added" if self._may_grow and len(self._due) > 1 else ""
-        told = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration, about {left} for the other "
+        pace = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration"
         self._due = [due for due in self._due[1:] if due > done]
         self._steps, self._seconds = 0, 0.0
         compiling = f"with {counted(self._ahead, 'program')} to compile" if self._ahead else "without compiling"
-        return f"{told}{self._total - done:,}, {compiling}{growing}"
+        return f"{pace}, about {left} for the other {self._total - done:,}, {compiling}{growing}"
 
     def left(self, done: int) -> datetime.timedelta | None:
         """Return the remaining time, known compilations included; None before a step was timed."""
@@ -112,14 +104,11 @@ class ProgressBar:
         self._bar.close()
 
     def tell_pace(self, done: int, num_compiled: int, ahead: int = 0, seconds_a_program: float = 0.0) -> None:
-        """Print a forecast if one is due, after a group of steps that were launched together.
-
-        Args: as of `Pace.time`.
-        """
+        """Print a forecast if one is due, after steps that were launched together. Arguments as `Pace.time`."""
         self._pace.time(done, num_compiled, ahead, seconds_a_program)
-        told = self._pace.told(done)
-        if told is not None and self._is_shown:
-            self._bar.write(f"{self._title}: {told}")
+        forecast = self._pace.told(done)
+        if forecast is not None and self._is_shown:
+            self._bar.write(f"{self._title}: {forecast}")
 
     def update(self, info: StepInfo, row: Mapping[str, float] | None) -> None:
         """Count one iteration; loss and PSNR are running means. `row` is the last one of the history."""
@@ -132,11 +121,11 @@ class ProgressBar:
         self._done += 1
         self._bar.update()
         if row and not self._bar.disable:
-            self._bar.set_postfix_str(self._told(row), refresh=False)
+            self._bar.set_postfix_str(self._figures(row), refresh=False)
         if self._is_plain and is_line_due(self._done, self._total, *self._last_line):
-            self._print(f"{self._done:,} of {self._total:,}, {self._told(row)}")
+            self._print(f"{self._done:,} of {self._total:,}, {self._figures(row)}")
 
-    def _told(self, row: Mapping[str, float] | None) -> str:
+    def _figures(self, row: Mapping[str, float] | None) -> str:
         left = self._pace.left(self._done)
         words = [] if left is None or self._done == self._total else [f"{left} left"]
         words.append(f"loss {self._loss:.4f}, {self._psnr:.2f} dB")
@@ -156,11 +145,11 @@ LEAST_ITERATIONS = 200
 NUM_COMPARED = 16
 """Iterations before the check whose PSNR is averaged."""
 NEARLY_FLAT = 40.0
-"""Photographs that one colour shows this well, in dB, say nothing about whether a model has learned."""
+"""PSNR of one flat colour in dB, above which photographs do not show whether a model has learned."""
 ADVICE = (
-    "Look whether the points and cameras fit (cameras.png of a2tg sfm; in a2tg view RUN, photographs beside the render "
-    "from their cameras), then try fewer initial_gaussians, a lower initial_opacity or "
-    "lower learning rates, and refine_poses if poses may be wrong"
+    "Look whether the points and cameras fit (cameras.png of a2tg sfm; in a2tg view RUN, photographs next to the "
+    "render from their cameras), then try fewer initial_gaussians, a lower initial_opacity or lower learning rates, "
+    "and refine_poses if poses may be wrong"
 )
 FLAT_BACKGROUNDS: dict[Background, float] = {"black": 0.0, "white": 1.0, "random": 0.5}
 
@@ -172,14 +161,7 @@ class LearningCheck:
         self, views: tuple[View, ...], order: BatchOrder, iterations: int, background: Background, *, is_first: bool,
         small_budget: str = "",
     ):  # fmt: skip
-        """Args:
-        views: the training views.
-        order: training views of each iteration.
-        iterations: length of the stage.
-        background: behind transparent photographs.
-        is_first: whether this is the first stage; later ones are not checked.
-        small_budget: what a small memory budget has room for, for the warning.
-        """
+        """Only the first stage (`is_first`) is checked. `small_budget` is what a small memory budget has room for."""
         self._views, self._order, self._level = views, order, FLAT_BACKGROUNDS[background]
         self._advice = f"{small_budget}: raise it" if small_budget else ADVICE
         at = max(round(CHECKED_AFTER * iterations), LEAST_ITERATIONS)
@@ -188,10 +170,9 @@ class LearningCheck:
 
     def observe(self, iteration: int, psnr: float) -> None:
         """Record the training PSNR of an iteration in dB; warn once if it stays low."""
-        if iteration > self._at:
-            return
-        self._seen.append((iteration, psnr))
-        if iteration < self._at:
+        if iteration <= self._at:
+            self._seen.append((iteration, psnr))
+        if iteration != self._at:
             return
         reached, flat = float(np.mean([psnr for _, psnr in self._seen])), []
         for iteration, _ in self._seen:
@@ -214,9 +195,7 @@ def has_learned(psnr: float, flat: float) -> bool:
 def flat_psnr(target: Array, mask: Array | None = None) -> Array:
     """Return the PSNR in dB of the best image of one flat colour, which a model reaches without learning more.
 
-    Args:
-      target: [H, W, 3], clipped to [0, 1] first.
-      mask: [H, W] bool, the pixels that count; None: all of them.
+    The target [H, W, 3] is clipped to [0, 1] first; of the mask [H, W], True pixels count.
     """
     target = jnp.clip(target, 0, 1)
     weight = jnp.ones(target.shape[:2], target.dtype) if mask is None else jnp.asarray(mask, target.dtype)
@@ -231,7 +210,7 @@ MANY_PROGRAMS = 3
 
 @dataclasses.dataclass
 class Effects:
-    """What an event on the host has done so far."""
+    """What an event between steps has done so far."""
 
     num_applied: int = 0
     num_compiled: int = 0
@@ -246,11 +225,7 @@ class StageEffects:
     """What the events of a stage do; each process has the same."""
 
     def __init__(self, stage: Stage, system: System, num_sizes: int):
-        """Args:
-        stage: with its events.
-        system: names the options in messages.
-        num_sizes: number of image sizes, each of which has a program.
-        """
+        """The system names the options in messages; each image size has a program."""
         self._stage, self._system, self._num_sizes = stage, system, num_sizes
         self._on_host: dict[int, tuple[HostEvent, Effects]] = {
             place: (event, Effects()) for place, event in enumerate(stage.events) if isinstance(event, HostEvent)
@@ -259,32 +234,26 @@ class StageEffects:
         self._num_compiled, self._seconds = 0, 0.0
 
     def apply(self, place: int, state: TrainState, change: Change) -> None:
-        """Note a change by the event at a place.
-
-        Args:
-          place: index of the event.
-          state: before the change.
-          change: as the event returned it.
-        """
+        """Record a change of the state by the event at an index."""
         _, own = self._on_host[place]
         before = state.model, state.moments, state.events[place]
         after = change.model, change.moments, change.state
-        is_reshaped = _shapes(before) != _shapes(after)
+        (leaves, structure), (new, new_structure) = jax.tree.flatten(before), jax.tree.flatten(after)
+        is_reshaped: bool = structure != new_structure  # type: ignore[operator]
+        is_reshaped = is_reshaped or [jax.typeof(leaf) for leaf in leaves] != [jax.typeof(leaf) for leaf in new]
         if is_reshaped:
             self._reshaped_by.append(place)
         # Values are compared until the event has changed some once, which is nearly always the first time.
-        own.has_changed = own.has_changed or is_reshaped or not _are_equal(before[:2], after[:2])
+        if not own.has_changed:
+            pairs = zip(*(jax.tree.leaves(tree[:2]) for tree in (before, after)), strict=True)
+            own.has_changed = is_reshaped or not all(a is b or np.array_equal(on_host(a), on_host(b)) for a, b in pairs)
         if own.num_applied == 0 or not change.unused:
             own.unused = change.unused
         own.num_applied += 1
 
     def launch(self, iteration: int, seconds: float | None) -> None:
-        """Note a step that was launched, and warn if an event is why steps are compiled again and again.
-
-        Args:
-          iteration: of the step.
-          seconds: time that its compilation took; None: there was none.
-        """
+        """Record a step that was launched, and the seconds that its compilation took, if any. Warn if an event is why
+        steps are compiled again and again."""
         reshaped_by, self._reshaped_by = self._reshaped_by, []
         if seconds is None:
             return
@@ -327,8 +296,13 @@ class StageEffects:
         """Warn of events none of whose times is in the stage."""
         end = self._stage.iterations
         for event in self._stage.events:
-            first = _first_time(event, end)
-            if first is not None and not 1 <= first <= end:
+            if isinstance(event, StepEvent):
+                times = event.times(end)
+                first = max(1, -(-times.first // times.every)) * times.every if times.num_times else end
+            else:
+                found: Any = event.iterations(end) if isinstance(event, HostEvent) else ()
+                first = next((time for time in found if time >= 1), found[-1] if found else end)
+            if not 1 <= first <= end:
                 warnings.warn(
                     f"stage {self._stage.name!r}: {self._system.path_of(event)} never happens, for it is first due at "
                     f"iteration {first:,} of {end:,}",
@@ -337,36 +311,15 @@ class StageEffects:
 
     def warn_of_unused(self) -> None:
         """Warn of events that happened at all their times and never made a difference."""
-        told = []
+        unused = []
         for event, own in self._on_host.values():
             times = event.iterations(self._stage.iterations)
             if not own.num_applied or own.num_applied < len(times):  # A resumed stage has not seen the first ones.
                 continue
             name = self._system.path_of(event)
             if not own.has_changed:
-                told.append(f"{name} changed nothing, though it happened {own.num_applied:,} times")
+                unused.append(f"{name} changed nothing, though it happened {own.num_applied:,} times")
             elif own.unused:
-                told.append(f"{name}.{own.unused}")
-        if told:
-            warnings.warn(f"stage {self._stage.name!r}: {'; '.join(told)}", stacklevel=2)
-
-
-def _first_time(event: Event, num_iterations: int) -> int | None:
-    """Return the iteration at which an event happens first, or the last one below 1; None if it names no time."""
-    if isinstance(event, StepEvent):
-        times = event.times(num_iterations)
-        return max(1, -(-times.first // times.every)) * times.every if times.num_times else None
-    assert isinstance(event, HostEvent)
-    found = event.iterations(num_iterations)
-    return next((time for time in found if time >= 1), found[-1]) if found else None
-
-
-def _shapes(tree: object) -> tuple[object, list[object]]:
-    leaves, structure = jax.tree.flatten(tree)
-    return structure, [jax.typeof(leaf) for leaf in leaves]
-
-
-def _are_equal(tree: object, other: object) -> bool:
-    """Return whether two trees of the same shapes have the same numbers."""
-    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
-    return all(a is b or np.array_equal(on_host(a), on_host(b)) for a, b in pairs)
+                unused.append(f"{name}.{own.unused}")
+        if unused:
+            warnings.warn(f"stage {self._stage.name!r}: {'; '.join(unused)}", stacklevel=2)

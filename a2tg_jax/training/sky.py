@@ -1,7 +1,7 @@
-"""A sky for the start of training: Gaussians on a distant sphere, where views look and no points lie.
+"""A sky for the start of training: Gaussians on a distant sphere, in directions without points (host).
 
 Each view is divided into cells. A cell is empty if no point of the scene projects near it. A direction belongs to the
-sky if at least a quarter of the views that look there see an empty cell. All of it is on the host.
+sky if at least a quarter of the views that look there see an empty cell.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ REACH = 1.5
 LEAST_SHARE = 0.25
 """Smallest share of the views that look in a direction of the sky and see an empty cell there."""
 MOST_POINTS = 50_000
-"""Number of points beyond which evenly chosen ones stand for all."""
+"""Number of points beyond which evenly chosen ones represent all."""
 LEAST_EMPTY = 0.01
 """Smallest share of empty cells."""
 LOWEST = -0.2
@@ -35,46 +35,47 @@ LOWEST = -0.2
 NOWHERE = 9.0
 """Coordinate of cells without a ray, far from all unit directions."""
 NUMS_TRIED = 20_000, 200_000
-"""Directions all around that find the part; the second number if too few of the first are in it."""
+"""Number of directions all around that find the sky; the second if too few of the first are in it."""
 LEAST_FOUND = 5
-"""Smallest number of these that must be in the part."""
+"""Smallest number of these that must be in the sky."""
 NEAR = 3.0
-"""Largest distance of a direction of the part from one of those found, in spacings of these."""
+"""Largest distance of a direction of the sky from one of those found, in spacings of these."""
 MOST_TRIED = 2_000_000
-"""Largest number of directions all around, of which those in the part are taken."""
+"""Largest number of directions all around, of which those in the sky are taken."""
 MORE = 1.02
 """Factor by which more directions are tried than are likely to be enough."""
 
 
-class Emptiness(NamedTuple):
-    """Cells of one view without points, [C] bool."""
-
-    has_ray: np.ndarray
-    """Whether the lens has a ray there."""
-    is_bare: np.ndarray
-    """Whether the cell has a ray, is above the ground, and no point projects near."""
-    is_empty: np.ndarray
-    """Whether it is bare, and all of its pixels count."""
-
-
 class Cells(NamedTuple):
-    """Cells of one view."""
+    """C cells of one view."""
 
     center: np.ndarray
     """[3] position of the camera."""
-    tree: cKDTree
-    """Unit directions [C, 3] of the cells' centres in the world."""
+    rays: np.ndarray
+    """[C, 3] unit directions of the cells' centres in the world; `NOWHERE` without a ray."""
     spacing: float
     """Largest distance of neighbours among these."""
-    found: Emptiness
-    colors: np.ndarray
-    """[C, 3] mean colours in [0, 1]."""
+    is_bare: np.ndarray
+    """[C] whether the cell has a ray, is above the ground, and no point projects near."""
+    is_empty: np.ndarray
+    """[C] whether it is bare, and all of its pixels count by the view's mask and alpha channel."""
+
+
+def cells_of(view: View, alpha: np.ndarray | None, points: np.ndarray, up: np.ndarray) -> Cells:
+    """Return the cells of a view, given its alpha channel [H, W], if any, the scene's points, and the vertical."""
+    camera = view.camera
+    rays, spacing = cell_rays(camera)
+    counts = np.ones(view.picture.size, bool) if view.mask is None else view.mask.read()
+    counts = counts if alpha is None else counts & (alpha == 255)
+    bare = is_bare(camera, (rays, spacing), points, up)
+    is_whole = _cell_means(counts[..., None], camera)[:, 0] == 1
+    return Cells(np.asarray(camera.center, np.float64), rays, spacing, bare, bare & is_whole)
 
 
 def sky_of(scene: Scene, num: int, *, opacity: float, sh_degree: int) -> Gaussians:
     """Return Gaussians of the sky, evenly spread over the directions that training views see without points.
 
-    They face the cameras' mean, are as wide as they lie apart, and have the mean colour of the photographs there.
+    They face the cameras' mean, are as wide as their spacing, and have the mean colour of the photographs there.
 
     Args:
       scene: its training photographs are each read once.
@@ -85,13 +86,32 @@ def sky_of(scene: Scene, num: int, *, opacity: float, sh_degree: int) -> Gaussia
     Raises:
       ValueError: if no training view sees a sky.
     """
-    up = up_of(scene)
-    cells = [cells_of(view, scene.points, up) for view in scene.train]
-    check_shares([view.found for view in cells], num)
+    up, cells, colors_of_cells = _up_of(scene), [], []
+    for view in scene.train:
+        pixels = view.picture.read()
+        cells.append(cells_of(view, pixels[..., 3] if view.has_alpha else None, scene.points, up))
+        colors_of_cells.append(_cell_means(pixels[..., :3], view.camera) / 255)
+    check_shares(cells, num)
+    trees = [cKDTree(view.rays) for view in cells]
+
+    def votes(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # Whether positions [M, 3] are sky, and the mean colours [M, 3] of the empty cells that they are seen in.
+        num_looking, num_empty = np.zeros((2, len(positions)))
+        sums = np.zeros((len(positions), 3))
+        for view, tree, colors in zip(cells, trees, colors_of_cells, strict=True):
+            reach = REACH / 2 * view.spacing
+            distances, at = tree.query(_units(positions - view.center), distance_upper_bound=reach)
+            rows = np.flatnonzero(np.isfinite(distances))
+            num_looking[rows] += 1
+            rows = rows[view.is_empty[at[rows]]]
+            num_empty[rows] += 1
+            sums[rows] += colors[at[rows]]
+        is_sky = (num_empty > 0) & (num_empty >= LEAST_SHARE * num_looking)
+        return is_sky, sums / np.maximum(num_empty, 1)[:, None]
+
     center, radius = sphere(scene)
-    directions, spacing = even_directions(num, lambda directions: votes(cells, center + radius * directions)[0])
+    directions, spacing = even_directions(num, lambda directions: votes(center + radius * directions)[0])
     means = center + radius * directions
-    colors = votes(cells, means)[1]
     facing = directions * np.where(directions[:, 2:] < 0, -1, 1)  # Splats have two sides.
     x, y, z = facing.T
     quats = np.stack([1 + z, -y, x, np.zeros(num)], axis=1)
@@ -100,26 +120,20 @@ def sky_of(scene: Scene, num: int, *, opacity: float, sh_degree: int) -> Gaussia
         quats=jnp.asarray(quats / np.linalg.norm(quats, axis=1, keepdims=True), jnp.float32),
         log_scales=jnp.full((num, 2), np.log(radius * spacing), jnp.float32),
         logit_opacities=jnp.full(num, np.log(opacity / (1 - opacity)), jnp.float32),
-        sh=jnp.asarray(sh_of_colors(colors, sh_degree), jnp.float32),
+        sh=jnp.asarray(sh_of_colors(votes(means)[1], sh_degree), jnp.float32),
     )
 
 
 def check_sky(scene: Scene, num: int) -> None:
     """Raise ValueError if the training views show no sky, or masks or alpha channels leave it out. Of the photographs,
     those with an alpha channel are read."""
-    up = up_of(scene)
-    check_shares(
-        [
-            emptiness(view.camera, cell_rays(view.camera), scene.points, up, counts_of(view, view.alpha))
-            for view in scene.train
-        ],
-        num,
-    )
+    up = _up_of(scene)
+    check_shares([cells_of(view, view.alpha, scene.points, up) for view in scene.train], num)
 
 
-def check_shares(views: Sequence[Emptiness], num: int) -> None:
+def check_shares(views: Sequence[Cells], num: int) -> None:
     """Raise ValueError unless enough cells of the views are empty for `num` Gaussians."""
-    num_cells = sum(view.has_ray.sum() for view in views)
+    num_cells = sum(has_ray(view.rays).sum() for view in views)
     bare = sum(view.is_bare.sum() for view in views) / num_cells
     empty = sum(view.is_empty.sum() for view in views) / num_cells
     if bare < LEAST_EMPTY:
@@ -135,7 +149,7 @@ def check_shares(views: Sequence[Emptiness], num: int) -> None:
         )
 
 
-def up_of(scene: Scene) -> np.ndarray:
+def _up_of(scene: Scene) -> np.ndarray:
     """Return the vertical [3] of the training cameras."""
     return vertical_of(np.stack([np.asarray(view.camera.viewmat, np.float64) for view in scene.train]))
 
@@ -147,39 +161,9 @@ def sphere(scene: Scene) -> tuple[np.ndarray, float]:
     return center, DISTANCE * float(np.quantile(distances, FAR_SHARE))
 
 
-def counts_of(view: View, alpha: np.ndarray | None) -> np.ndarray:
-    """Return [H, W] whether a pixel counts by the mask and the alpha channel of a view."""
-    counts = np.ones(view.picture.size, bool) if view.mask is None else view.mask.read()
-    return counts if alpha is None else counts & (alpha == 255)
-
-
-def cells_of(view: View, points: np.ndarray, up: np.ndarray) -> Cells:
-    """Return the cells of a view; its photograph is read once. Arguments as of `is_bare`."""
-    camera, pixels = view.camera, view.picture.read()
-    rays, spacing = cell_rays(camera)
-    counts = counts_of(view, pixels[..., 3] if view.has_alpha else None)
-    found, center = emptiness(camera, (rays, spacing), points, up, counts), np.asarray(camera.center, np.float64)
-    return Cells(center, cKDTree(rays), spacing, found, _blocks(pixels[..., :3], camera) / 255)
-
-
-def emptiness(
-    camera: Camera, cells: tuple[np.ndarray, float], points: np.ndarray, up: np.ndarray, counts: np.ndarray
-) -> Emptiness:
-    """Return what is empty in a view, of which the pixels `counts` [H, W] count. Other arguments as of `is_bare`."""
-    bare = is_bare(camera, cells, points, up)
-    is_whole = _blocks(counts[..., None], camera)[:, 0] == 1
-    return Emptiness(has_ray(cells[0]), bare, bare & is_whole)
-
-
 def is_bare(camera: Camera, cells: tuple[np.ndarray, float], points: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return [C] whether a cell of a view has a ray, is above the ground, and no point [P, 3] projects near it.
-
-    Args:
-      camera: of the view.
-      cells: its `cell_rays`.
-      points: [P, 3] of the scene.
-      up: [3] its vertical.
-    """
+    """Return [C] whether a cell of a view has a ray, is above the ground, and no point [P, 3] projects near it; given
+    the view's `cell_rays` and vertical [3]."""
     rays, spacing = cells
     towards = _units(points[:: -(-len(points) // MOST_POINTS)] - np.asarray(camera.center, np.float64))
     is_far = cKDTree(towards).query(rays)[0] > REACH * spacing
@@ -187,16 +171,16 @@ def is_bare(camera: Camera, cells: tuple[np.ndarray, float], points: np.ndarray,
 
 
 def has_ray(rays: np.ndarray) -> np.ndarray:
-    """Return [C] whether cells with the rays [C, 3] of `cell_rays` lie somewhere."""
+    """Return [C] whether `cell_rays` [C, 3] are directions."""
     return np.any(rays != NOWHERE, axis=1)
 
 
 def cell_rays(camera: Camera) -> tuple[np.ndarray, float]:
     """Return unit directions [C, 3] of the cells' centres in the world, and the largest distance of neighbours.
 
-    Cells of a lens that is no pinhole, whose centres have no ray, lie nowhere.
+    Cells of a lens that is no pinhole, whose centres have no ray, are `NOWHERE`.
     """
-    step = _step(camera)
+    step = _cell_side(camera)
     rows, columns = (step * np.arange(side // step) + step // 2 for side in (camera.height, camera.width))
     if camera.rays is None:
         x, y = np.meshgrid(columns + 0.5, rows + 0.5)
@@ -210,36 +194,14 @@ def cell_rays(camera: Camera) -> tuple[np.ndarray, float]:
     return np.where(np.isfinite(rays), rays, NOWHERE).reshape(-1, 3), spacing
 
 
-def votes(cells: Sequence[Cells], positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether positions [M, 3] are sky, and the mean colours [M, 3] of the empty cells that they are seen in."""
-    num_looking, num_empty = np.zeros((2, len(positions)))
-    colors = np.zeros((len(positions), 3))
-    for view in cells:
-        rows, at = _seen(view, positions)
-        num_looking[rows] += 1
-        is_empty = view.found.is_empty[at]
-        rows, at = rows[is_empty], at[is_empty]
-        num_empty[rows] += 1
-        colors[rows] += view.colors[at]
-    is_sky = (num_empty > 0) & (num_empty >= LEAST_SHARE * num_looking)
-    return is_sky, colors / np.maximum(num_empty, 1)[:, None]
-
-
-def _seen(view: Cells, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (rows, cells) [S] of the positions that a view sees."""
-    distances, at = view.tree.query(_units(positions - view.center), distance_upper_bound=REACH / 2 * view.spacing)
-    rows = np.flatnonzero(np.isfinite(distances))
-    return rows, at[rows]
-
-
-def _step(camera: Camera) -> int:
+def _cell_side(camera: Camera) -> int:
     """Return the side of a cell in pixels."""
     return max(1, min(camera.height, camera.width) // CELLS)
 
 
-def _blocks(image: np.ndarray, camera: Camera) -> np.ndarray:
+def _cell_means(image: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the mean [C, channels] of an image [H, W, channels] over each cell."""
-    step = _step(camera)
+    step = _cell_side(camera)
     rows, columns = camera.height // step, camera.width // step
     blocks = image[: rows * step, : columns * step].reshape(rows, step, columns, step, -1)
     return blocks.mean(axis=(1, 3)).reshape(rows * columns, -1)
@@ -253,16 +215,22 @@ def _units(vectors: np.ndarray) -> np.ndarray:
 def even_directions(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
     """Return evenly spread unit directions [num, 3] that are sky, and the angle between neighbours.
 
-    Args:
-      num: how many.
-      is_sky: returns [M] bool for directions [M, 3]. Called for `NUMS_TRIED` directions and those near the sky.
+    `is_sky` returns [M] bool for directions [M, 3]. It is called for `NUMS_TRIED` directions and those near the sky.
 
     Raises:
       ValueError: if there is nearly no sky, or it is too small for that many.
     """
-    coarse, tried = _coarse(is_sky)
+    for tried in NUMS_TRIED:
+        coarse = fibonacci(tried)
+        coarse = coarse[is_sky(coarse)]
+        if len(coarse) >= LEAST_FOUND:
+            break
+    else:
+        raise ValueError(
+            "sky_gaussians: too few training views see the same part of a sky, or it is tiny: leave out sky_gaussians"
+        )
     near, share = cKDTree(coarse), len(coarse) / tried
-    reach, found = NEAR * spacing(tried), np.zeros((0, 3))
+    reach, found = NEAR * _spacing(tried), np.zeros((0, 3))
     while len(found) < num:
         total = int(MORE * num / share) + 1
         if total > MOST_TRIED:
@@ -275,22 +243,10 @@ def even_directions(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tup
         found = found[is_sky(found)]
         share = min(max(len(found), 1) / total, share / MORE)
     chosen = np.linspace(0, len(found) - 1, num).round().astype(int)
-    return found[chosen], spacing(total) * float(np.sqrt(len(found) / num))
+    return found[chosen], _spacing(total) * float(np.sqrt(len(found) / num))
 
 
-def _coarse(is_sky: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, int]:
-    """Return directions that are sky, and how many were tried all around."""
-    for tried in NUMS_TRIED:
-        found = fibonacci(tried)
-        found = found[is_sky(found)]
-        if len(found) >= LEAST_FOUND:
-            return found, tried
-    raise ValueError(
-        "sky_gaussians: too few training views see the same part of a sky, or it is tiny: leave out sky_gaussians"
-    )
-
-
-def spacing(num: int) -> float:
+def _spacing(num: int) -> float:
     """Return the angle between neighbours of `num` directions all around."""
     return float(np.sqrt(4 * np.pi / num))
 

@@ -48,10 +48,8 @@ def initial_model(scene: Scene, system: System) -> Model:
 
 
 def start_colors(scene: Scene) -> np.ndarray:
-    """Return the colours [P, 3] of a scene's points; grey, with a warning, if all points have one other colour.
-
-    Point clouds without colours, from a scanner or a depth map, are often stored as black or white.
-    """
+    """Return the colours [P, 3] of a scene's points; grey, with a warning, if all points have one other colour."""
+    # Point clouds without colours, from a scanner or a depth map, are often stored as black or white.
     colors = np.asarray(scene.colors)
     if len(colors) < 2 or (colors != colors[0]).any() or (np.abs(colors[0] - GREY) < GREY_SLACK).all():
         return colors
@@ -83,10 +81,6 @@ def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaus
     deviation in pixels from the camera where it is largest. k layers of the new opacity 1 − (1 − o)^(1/k) are as opaque
     as one of the given opacity o; the new one is at least `LEAST_OPACITY`. Many opaque layers would hide the splats
     behind them, which then do not learn.
-
-    Args:
-      gaussians: initial Gaussians, with the opacity for splats larger than a pixel.
-      cameras: training cameras.
     """
     sizes = _largest_sizes(gaussians, cameras)
     layers = np.maximum(FILTER_VARIANCE / np.maximum(sizes, SMALLEST_SIDE) ** 2, 1.0)
@@ -107,23 +101,26 @@ def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarra
 
 
 def check_start(scene: Scene, system: System, num_given: int | None = None) -> None:
-    """Refuse points that no training view sees, a first stage whose events cannot work with the initial number of
-    Gaussians, and Gaussians of a sky that no view sees.
+    """Raise ValueError, naming the options to change, if no training view sees any point, the events of the first stage
+    cannot work with the initial number of Gaussians, or no view sees a sky for its Gaussians.
 
-    Args:
-      scene: its photographs and points.
-      system: with its options.
-      num_given: Gaussians of a file instead of the first stage; None: it is trained.
-
-    Raises:
-      ValueError: naming the options to change.
+    If a file gives Gaussians instead of the first stage, `num_given` is their number.
     """
-    stages = system.stages()
-    num = initial_number(scene, system, stages[0]) if num_given is None else num_given
-    if num_given is None:
-        _check_seen(scene, system)
-        _rows_needed(stages[0], num, system)
-    (system.check_number if num_given is None else system.check_given_number)(num)
+    if num_given is not None:
+        system.check_given_number(num_given)
+    else:
+        points, first = np.asarray(scene.points), system.stages()[0]
+        if np.isfinite(points).all() and not system.sky_gaussians:  # `init_from_points` names others.
+            cameras = [view.camera for view in scene.train]
+            sights = [Sight.of(np.asarray(c.viewmat), np.asarray(c.K), (c.height, c.width), c.rays) for c in cameras]
+            if len(unseeing(points, sights)) == len(sights):
+                raise ValueError(
+                    f"scene.points: no training view sees any of the {len(points):,} points: they must be in the "
+                    "world of the views' cameras; scene.transform.apply leads there from the original world"
+                )
+        num = initial_number(scene, system, first)
+        _rows_needed(first, num, system)
+        system.check_number(num)
     if system.sky_gaussians:
         check_sky(scene, system.sky_gaussians)
 
@@ -167,68 +164,42 @@ def check_views(views: tuple[View, ...]) -> None:
                 f"picture of view {view.name} must be uint8 {[height, width, 3]}, as large as its camera says, or have "
                 f"an opacity as 4th channel; got {np.dtype(picture.dtype)} {list(picture.shape)}"
             )
-        if view.mask is not None and view.mask.shape != (height, width):
-            raise ValueError(
-                f"mask of view {view.name} must be {[height, width]}, as large as its camera says; "
-                f"got {list(view.mask.shape)}"
-            )
+        for name, image in (("mask", view.mask), ("depth", view.depth)):
+            if image is not None and image.shape != (height, width):
+                raise ValueError(
+                    f"{name} of view {view.name} must be {[height, width]}, as large as its camera says; "
+                    f"got {list(image.shape)}"
+                )
         if view.mask is not None and not view.mask.num:
             raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or mend its mask")
-        if view.depth is not None and view.depth.shape != (height, width):
-            raise ValueError(
-                f"depth of view {view.name} must be {[height, width]}, as large as its camera says; "
-                f"got {list(view.depth.shape)}"
-            )
         if view.points is not None:
             check_observed_points(view.points, (height, width), f"points of view {view.name}")
 
 
-def _check_seen(scene: Scene, system: System) -> None:
-    """Raise ValueError if no training view sees any of a scene's points, unless there are Gaussians of a sky."""
-    points = np.asarray(scene.points)
-    if not np.isfinite(points).all():
-        return  # `init_from_points` names these.
-    cameras = [view.camera for view in scene.train]
-    sights = [Sight.of(np.asarray(c.viewmat), np.asarray(c.K), (c.height, c.width), c.rays) for c in cameras]
-    if len(unseeing(points, sights)) == len(sights) and not system.sky_gaussians:
-        raise ValueError(
-            f"scene.points: no training view sees any of the {len(points):,} points: they must be in the "
-            "world of the views' cameras; scene.transform.apply leads there from the original world"
-        )
-
-
 def _rows_needed(stage: Stage, num: int, system: System) -> int:
-    """Return the rows that a stage allocates for `num` Gaussians.
-
-    Raises:
-      ValueError: naming the options to change, if an event cannot reach its number.
-    """
+    """Return the rows that a stage allocates for `num` Gaussians. ValueError: naming the options to change, if an event
+    cannot reach its number."""
     rows = num
     for event in stage.events:
         try:
             rows = max(rows, event.num_rows(num, stage.iterations))
         except ValueError as error:
-            told, field, path = str(error), event.limited_by, system.path_of(event)
-            if not (field and told.startswith(field)):
-                raise ValueError(f"{path}: {told}") from error
+            reason, field, path = str(error), event.limited_by, system.path_of(event)
+            if not (field and reason.startswith(field)):
+                raise ValueError(f"{path}: {reason}") from error
             limit = f"{path}.{field}" if system.memory_budget is None else "memory_budget"
-            told = limit + told.removeprefix(field)
-            raise ValueError(f"{told}: raise {system.more_growth()}, or lower {limit}") from error
+            reason = limit + reason.removeprefix(field)
+            raise ValueError(f"{reason}: raise {system.more_growth()}, or lower {limit}") from error
     return rows
 
 
 def initial_number(scene: Scene, system: System, first: Stage) -> int:
-    """Return the number of initial Gaussians: as requested, up to one for each point besides the sky's, and up to the
-    room of the first stage."""
+    """Return the number of initial Gaussians: as requested, at most one for each point plus the sky's, and at most what
+    the first stage has room for."""
     room = len(scene.points) + system.sky_gaussians
     num = min(system.initial_gaussians or room, room)
     caps = [most for event in first.events if (most := event.most_gaussians) is not None]
     return min(num, *caps) if caps else num
-
-
-def num_rows(stage: Stage, num: int) -> int:
-    """Return the number of rows that a stage allocates for `num` Gaussians and those that its events can add."""
-    return max([num, *(event.num_rows(num, stage.iterations) for event in stage.events)])
 
 
 def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> Model:
@@ -236,10 +207,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
 
     If the model's appearance has the stage's options, its arrays are kept; otherwise new ones are allocated, but for
     the shapes of kernels. A stage without shapes takes the nearest Gaussians, with a warning. The number of devices
-    divides the number of rows.
-
-    Raises:
-      ValueError: if Gaussians were to be added to a model whose textures have grown.
+    divides the number of rows. ValueError: if Gaussians would be added to a model whose textures have grown.
     """
     gaussians, shapes, num = model.gaussians, model.appearance.shapes, model.gaussians.num
     room = -(-_rows_needed(stage, num, system) // num_devices) * num_devices

@@ -6,7 +6,7 @@ Here are the terms of the paper and its baselines, one that leaves out what move
 
 import functools
 from collections.abc import Callable
-from typing import Literal, TypeVar
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,10 @@ from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
-from a2tg_jax.training.losses import mean_opacity, mean_scale, normal_consistency, photometric_loss, photometric_parts
+from a2tg_jax.training.losses import live_mean, normal_consistency, photometric_loss, photometric_parts
 from a2tg_jax.training.returned import check_scalar
 
-T = TypeVar("T")
+NOT_LOADED = "target.{name} was not loaded: say {flag}=True, as in Term(function, {flag}=True) for a custom loss term"
 
 
 @pytree
@@ -45,19 +45,16 @@ class Target:
     @property
     def depth(self) -> Array:
         """[H, W] depth map, divided by its largest magnitude, NaN where unknown. Raises ValueError if not loaded."""
-        return _loaded("depth", self.depth_map, "has_depths")
+        if self.depth_map is None:
+            raise ValueError(NOT_LOADED.format(name="depth", flag="has_depths"))
+        return self.depth_map
 
     @property
     def points(self) -> ObservedPoints:
         """Points [S] that the photograph observed. Raises ValueError if they were not loaded."""
-        return _loaded("points", self.observed, "has_points")
-
-
-def _loaded(name: str, value: T | None, flag: str) -> T:
-    if value is None:
-        advice = f"say {flag}=True, as in Term(function, {flag}=True) for a custom loss term"
-        raise ValueError(f"target.{name} was not loaded: {advice}")
-    return value
+        if self.observed is None:
+            raise ValueError(NOT_LOADED.format(name="points", flag="has_points"))
+        return self.observed
 
 
 LossFunction = Callable[[Model, Target, RenderOutput], Array]
@@ -67,11 +64,10 @@ LossFunction = Callable[[Model, Target, RenderOutput], Array]
 class Term:
     """Function of model, target and render, times a weight.
 
-    Example:
-        def roughness(model, target, output):
-            return jnp.mean(jnp.abs(jnp.diff(output.depth, axis=0)))
+    def roughness(model, target, output):
+        return jnp.mean(jnp.abs(jnp.diff(output.depth, axis=0)))
 
-        Term(roughness, weight=0.1, has_geometry=True)
+    Term(roughness, weight=0.1, has_geometry=True)
     """
 
     function: LossFunction = static()
@@ -127,12 +123,12 @@ def distortion(model: Model, target: Target, output: RenderOutput) -> Array:
 
 def opacity(model: Model, target: Target, output: RenderOutput) -> Array:
     """Return the mean opacity of the live splats as their appearance has it (3DGS-MCMC; BBSplat: the mean alpha)."""
-    return mean_opacity(model.appearance.opacities(model.gaussians), model.live_count)
+    return live_mean(model.appearance.opacities(model.gaussians), model.live_count)
 
 
 def scale(model: Model, target: Target, output: RenderOutput) -> Array:
-    """Return the mean scale of the live Gaussians (3DGS-MCMC)."""
-    return mean_scale(model.gaussians, model.live_count)
+    """Return the mean scale, over both axes, of the live Gaussians (3DGS-MCMC)."""
+    return live_mean(jnp.mean(model.gaussians.scales, axis=-1), model.live_count)
 
 
 PATCHES = 32
@@ -145,8 +141,8 @@ REACH = 1
 class RobustPhotometric:
     """The photometric loss over inliers: patches without an outlying residual (`inliers`).
 
-    Passers-by, cars and shadows are on a few photographs only, so that the model cannot show them, and their residual
-    stays large over whole patches. Each step finds them from its own residual, as in RobustNeRF (Sabour et al., 2023).
+    Passers-by, cars and shadows are in few photographs, so the model cannot show them, and their residual stays large
+    over whole patches. Each step finds them from its own residual, as in RobustNeRF (Sabour et al., 2023).
     """
 
     ssim_weight: float = 0.2
@@ -184,31 +180,21 @@ def inliers(residual: Array, share: Array | float, factor: Array | float, mask: 
     height, width = residual.shape
     side = max(1, min(height, width) // PATCHES)
     counts = jnp.ones_like(residual) if mask is None else mask.astype(residual.dtype)
-    sums, nums = (_around(_patch_sums(x, side)) for x in (jax.lax.stop_gradient(residual) * counts, counts))
+
+    def sums_around(image: Array) -> Array:
+        # Sums over square patches, which the right and lower edges may cut off; then over each one's neighbours.
+        zero, padding = jnp.zeros((), image.dtype), ((0, -height % side), (0, -width % side))
+        patches = jax.lax.reduce_window(image, zero, jax.lax.add, (side, side), (side, side), padding)
+        around, reach = (2 * REACH + 1,) * 2, ((REACH, REACH),) * 2
+        return jax.lax.reduce_window(patches, zero, jax.lax.add, around, (1, 1), reach)
+
+    sums, nums = (sums_around(x) for x in (jax.lax.stop_gradient(residual) * counts, counts))
     patches = jnp.where(nums > 0, sums / jnp.maximum(nums, 1), jnp.nan)
     quantiles = jnp.stack([jnp.asarray(0.5, residual.dtype), 1 - jnp.asarray(share, residual.dtype)])
     middle, high = jnp.nanquantile(patches, quantiles)
     is_fine = ~(patches > jnp.maximum(high, factor * middle))
     found = jnp.repeat(jnp.repeat(is_fine, side, axis=0), side, axis=1)
     return found[:height, :width]
-
-
-def _patch_sums(image: Array, side: int) -> Array:
-    """Return the sums over square patches; those at the right and lower edges may be cut off."""
-    zero = jnp.zeros((), image.dtype)
-    return jax.lax.reduce_window(image, zero, jax.lax.add, (side, side), (side, side), _padding(image, side))
-
-
-def _padding(image: Array, side: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    return (0, -image.shape[0] % side), (0, -image.shape[1] % side)
-
-
-def _around(patches: Array) -> Array:
-    """Return the sums over each patch and its neighbours."""
-    side = 2 * REACH + 1
-    zero = jnp.zeros((), patches.dtype)
-    reach = (REACH, REACH), (REACH, REACH)
-    return jax.lax.reduce_window(patches, zero, jax.lax.add, (side, side), (1, 1), reach)
 
 
 DepthKind = Literal["inverse", "depth"]
@@ -254,17 +240,15 @@ class PointDepths:
 def depth_loss(depth: Array, alpha: Array, prior: Array, counts: Array, *, has_shift: bool = True) -> Array:
     """Mean |s·prior + t − alpha/depth| over the pixels that count and are covered.
 
-    s ≥ 0 and t are the least squares solution of this view. No gradient goes through them.
+    s ≥ 0 and t, which is 0 without a shift, are the least squares solution of this view. No gradient goes through them.
+    The loss is 0 if no pixel counts.
 
     Args:
       depth: [H, W] rendered depth Σ z·α·T, not divided by alpha.
       alpha: [H, W] rendered alpha.
       prior: [H, W] inverse depth up to scale and shift.
       counts: [H, W] bool, the pixels in which the prior is known.
-      has_shift: whether there is a shift; without, t = 0.
-
-    Returns:
-      A scalar; 0 if no pixel counts.
+      has_shift: whether there is a shift.
     """
     counts = counts & (alpha > LEAST_ALPHA) & (depth > 0)
     inverse = jnp.where(counts, safe_divide(alpha, depth), 0.0)
@@ -274,33 +258,26 @@ def depth_loss(depth: Array, alpha: Array, prior: Array, counts: Array, *, has_s
 
 
 def points_loss(depth: Array, alpha: Array, points: ObservedPoints, mask: Array | None = None) -> Array:
-    """Mean |1/z − alpha/depth| over the pixels of points of depth z that count and are covered.
+    """Mean |1/z − alpha/depth| over the pixels of points [S] of depth z that count and are covered; 0 without any.
 
-    Args:
-      depth: [H, W] rendered depth Σ z·α·T, not divided by alpha.
-      alpha: [H, W] rendered alpha.
-      points: [S], as `ObservedPoints` has them.
-      mask: [H, W] bool, True at pixels that count; None: all.
-
-    Returns:
-      A scalar; 0 if no point counts.
+    Depth and alpha [H, W] are as in `depth_loss`; the mask [H, W] is True at pixels that count, and None if all do.
     """
-    depth, alpha = (_at(points.pixels, image) for image in (depth, alpha))
+
+    def at_points(image: Array) -> Array:
+        # 0 at pixels beyond the end of the image, which fill up the points of a view with few.
+        values = image.reshape(-1).at[points.pixels]
+        return values.get(mode="fill", fill_value=0, unique_indices=True, indices_are_sorted=True)
+
+    depth, alpha = at_points(depth), at_points(alpha)
     counts = (points.depths > 0) & (alpha > LEAST_ALPHA) & (depth > 0)
     if mask is not None:
-        counts = counts & _at(points.pixels, mask)
+        counts = counts & at_points(mask)
     known = safe_divide(jnp.ones_like(points.depths), points.depths)
     inverse, known = (jnp.where(counts, x, 0.0) for x in (safe_divide(alpha, depth), known))
     return _mean_error(known, inverse, counts)
 
 
-def _at(pixels: Array, image: Array) -> Array:
-    """Return the values [S] of an image [H, W] at pixels in order, 0 at those beyond its end."""
-    return image.reshape(-1).at[pixels].get(mode="fill", fill_value=0, unique_indices=True, indices_are_sorted=True)
-
-
 def _mean_error(one: Array, other: Array, counts: Array) -> Array:
-    """Return the mean absolute difference over those that count; 0 if none does."""
     error = jnp.where(counts, jnp.abs(one - other), 0.0)
     return jnp.sum(error) / jnp.maximum(jnp.sum(counts), 1).astype(error.dtype)
 
