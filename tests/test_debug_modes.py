@@ -1,4 +1,7 @@
-"""Training in the modes of JAX that people debug with: without jit, with checks for NaN, with strict ranks."""
+"""Training in the modes of JAX that people debug with: without jit, and with checks for NaN.
+
+Strict ranks and dtypes hold in all tests (conftest.py).
+"""
 
 import functools
 
@@ -7,38 +10,27 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax.io.config_json import changed_config
-from a2tg_jax.training.registry import SYSTEMS
+from a2tg_jax.training.registry import with_changes
 
-MODES = {
-    "disable_jit": jax.disable_jit,
-    "debug_nans": functools.partial(jax.debug_nans, True),
-    "rank_promotion": functools.partial(jax.numpy_rank_promotion, "raise"),
-}
-QUICK = {("disable_jit", "gaussians-2d-mcmc"), ("debug_nans", "bytewise"), ("debug_nans", "supergaussians")}
-"""Ones that run without --long. Strict ranks, and strict dtypes with them, hold in all tests (conftest.py)."""
-GROWS = {"gaussians-2d", "supergaussians"}
-"""Systems that clone and split, which want room."""
-CASES = [
-    pytest.param(mode, name, marks=[] if (mode, name) in QUICK else pytest.mark.long)
-    for mode in MODES
-    for name in SYSTEMS
-]
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return a2tg.synthetic_scene(num_views=4, width=16, height=12, num_points=30)
+WITHOUT_JIT, CHECKS_FOR_NAN = jax.disable_jit, functools.partial(jax.debug_nans, True)
 
 
 @pytest.mark.filterwarnings("ignore:.*changed nothing")
-@pytest.mark.parametrize(("mode", "name"), CASES)
-def test_a_system_trains(mode, name, scene):
-    """A few steps of each stage, and an event that moves and adds Gaussians."""
-    changes = {"stage1_iterations": 12, "initial_gaussians": 20, "densify": {"cap": 200 if name in GROWS else 21}}
-    if hasattr(a2tg.find_system(name), "stage2_iterations"):
-        changes["stage2_iterations"] = 3
-    system = changed_config(a2tg.find_system(name), changes, "test")
-    with MODES[mode]():
+@pytest.mark.parametrize(
+    ("mode", "name", "cap"),
+    [
+        pytest.param(WITHOUT_JIT, "gaussians-2d-mcmc", 21, marks=pytest.mark.long),
+        pytest.param(CHECKS_FOR_NAN, "bytewise", 21, marks=pytest.mark.long),
+        pytest.param(CHECKS_FOR_NAN, "a2tg", 21, marks=pytest.mark.long),
+        pytest.param(CHECKS_FOR_NAN, "bbsplat", 21, marks=pytest.mark.long),
+        (CHECKS_FOR_NAN, "supergaussians", 200),
+    ],
+)
+def test_a_system_trains(mode, name, cap):
+    """A few steps of each stage, and an event that moves and adds Gaussians, for which clones and halves need room."""
+    scene = a2tg.synthetic_scene(num_views=4, width=16, height=12, num_points=30)
+    changes = {"stage1_iterations": 12, "stage2_iterations": 3, "initial_gaussians": 20, "densify": {"cap": cap}}
+    system = with_changes(a2tg.find_system(name), changes, "test")
+    with mode():
         model = a2tg.fit(scene, system, progress=False).model
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model.gaussians))
