@@ -1,4 +1,4 @@
-"""Events of one's own on the host: rows that they remove, programs that they cause, and what made no difference."""
+"""Custom events: rows that they remove, programs that they cause, what made no difference, and their errors."""
 
 import dataclasses
 import re
@@ -104,7 +104,7 @@ def test_rows_that_cannot_be_removed_are_refused(name, is_kept, message):
 
 
 def test_an_event_that_removes_rows_compiles_nothing(scene):
-    """With rows of other shapes each time is a program, which the third time tells; the model is the same."""
+    """With rows of other shapes each time is a program, of which the third warns; the model is the same."""
 
     def trained(how):
         before = num_compiled(jitted_step())
@@ -117,9 +117,9 @@ def test_an_event_that_removes_rows_compiles_nothing(scene):
     message = (
         r"stage 'own': PruneFaint has changed shapes 3 times, .* it happens 2 times more: keep shapes, by keep_rows\("
     )
-    with pytest.warns(UserWarning, match=message) as told:
+    with pytest.warns(UserWarning, match=message) as caught:
         cut, num_cut = trained("moments")
-    assert len(told) == 1 and num_cut == 6
+    assert len(caught) == 1 and num_cut == 6
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), kept.model, cut.model)
 
 
@@ -129,7 +129,7 @@ def test_moments_of_other_rows_are_refused_with_what_to_say(scene):
 
 
 def test_programs_are_counted_before_and_while_it_trains(scene):
-    """An event is believed to cause a program each time until it has happened, and then what it did."""
+    """An event is expected to cause a program each time until it has happened, and then what it did."""
     event = PruneFaint(last=156)
     system = Own(events=(event,), sh_degree=0, iterations=160)
     assert next(forecast_stages(scene, system)).num_programs == 40
@@ -162,7 +162,7 @@ class Early(PruneFaint):
         return (-1, 0)
 
 
-def test_events_without_effect_are_told(scene):
+def test_events_without_effect_are_warned_of(scene):
     """Each once: those that never happen before the stage, those that changed nothing at its end."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -174,19 +174,19 @@ def test_events_without_effect_are_told(scene):
     ]
 
 
-@pytest.mark.parametrize("given", [{"k_a": 3.0}, {"anisotropic": False}, {}])
-def test_choices_about_anisotropy_that_make_no_difference_are_told(scene, given):
+@pytest.mark.parametrize("given", [{"k_a": 3.0}, pytest.param({}, marks=pytest.mark.long)])
+def test_choices_about_anisotropy_that_make_no_difference_are_warned_of(scene, given):
     """Splats of the built-in scene are round after so few iterations. Defaults are nobody's choice."""
     system = a2tg.A2tg(stage2_iterations=8, initial_gaussians=50, texture=a2tg.Upscale(at=(0.5,), **given))
     start = a2tg.Model(a2tg.init_from_points(scene.points, scene.colors))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         a2tg.training.fit_stage(scene, system, 1, start, progress=False)
-    told = [f"stage 'textures': texture.{name} made no difference, for no Gaussian whose" for name in given]
-    assert [str(one.message)[: len(told[0])] for one in caught] == told
+    wanted = [f"stage 'textures': texture.{name} made no difference, for no Gaussian whose" for name in given]
+    assert [str(one.message)[: len(wanted[0])] for one in caught] == wanted
 
 
-def test_choices_about_anisotropy_that_act_are_not_told():
+def test_choices_about_anisotropy_that_act_are_not_warned_of():
     thin, square = a2tg.Upscale(k_a=3.0), np.ones((2, 2), int)
     assert thin._unused(square, np.array([[0.02, 0.005], [0.02, 0.02]])) is None
     assert re.match(r"k_a made no difference", thin._unused(square, np.array([[0.02, 0.01], [0.02, 0.02]])))
@@ -199,3 +199,37 @@ def test_parameters_learn_by_the_rate_that_is_given(scene):
     still, learned = (fitted(scene, appearance=Rings(), appearance_rate=rate, iterations=3).model for rate in (0, 1e-2))
     np.testing.assert_array_equal(still.appearance.rings, np.tile([0, 0, 0, 2.0], (50, 1)))
     assert np.abs(learned.appearance.rings[:, :3]).max() > 1e-2
+
+
+@a2tg.pytree
+class Failing(a2tg.StepEvent):
+    """A method raises an error."""
+
+    method: str = a2tg.static(default="apply")
+
+    def times(self, num_iterations):
+        if self.method == "times":
+            raise ValueError("no times")
+        return super().times(num_iterations)
+
+    def apply(self, now, model, moments, state):
+        raise ValueError("no Gaussians like these")
+
+
+@a2tg.pytree
+class FailingBetween(PruneFaint):
+    def apply(self, due, model, moments, state):
+        raise ValueError("no Gaussians like these")
+
+
+@pytest.mark.parametrize(
+    ("event", "message"),
+    [
+        (Failing(), "Failing.apply: no Gaussians like these"),
+        (FailingBetween(), "FailingBetween.apply: no Gaussians like these"),
+        (Failing("times"), "Failing.times: no times"),
+    ],
+)
+def test_errors_name_the_event_and_its_method(scene, event, message):
+    with pytest.raises(ValueError, match=f"^stage 'own': {message}$"):
+        fitted(scene, event)
