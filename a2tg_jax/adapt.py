@@ -17,7 +17,7 @@ from a2tg_jax.core.checks import check_int, check_literal, check_number, check_s
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
-from a2tg_jax.events import Change, Due, GradientStatistics, HostEvent, Seen, Statistic, iterations_at
+from a2tg_jax.events import Change, Due, GradientStatistics, HostEvent, Statistic, iterations_at
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.sharded_rows import on_host
 from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures, checked_sizes
@@ -142,12 +142,6 @@ class Upscale(HostEvent):
             return model, moments
         rebuilt = reallocate(textures, textures.sizes, moments, room=room)
         return model.with_textures(rebuilt.textures), rebuilt.moments
-
-    def init(self, model: Model) -> GradientStatistics:
-        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
-
-    def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
-        return state.observe_views(seen.gradients, seen.is_visible)
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
         if model.textures is None:

@@ -1,9 +1,9 @@
 """Events: what changes a model between steps, such as densification, noise, or textures that grow.
 
 An event is a frozen dataclass registered as a pytree. Its numbers (thresholds, weights) are leaves and reach the step
-as traced arguments, so that other values recompile nothing; what chooses shapes or code is static
-(`metadata={"static": True}`). An event either happens inside the step, at fixed shapes (`StepEvent`), or between steps
-on the host, where shapes may change (`HostEvent`). Either may gather a statistic of the gradients until it is past.
+as traced arguments, so that other values recompile nothing; fields that choose shapes or code are `static()`. An event
+either happens inside the step, at fixed shapes (`StepEvent`), or between steps on the host, where shapes may change
+(`HostEvent`). Either may gather a statistic of the gradients until it is past.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ LEAST_LEFT = 2
 
 
 class Times(NamedTuple):
-    """Every so many iterations, from 1, between a first and a last, both included. Host numbers, or traced."""
+    """Every `every` iterations, from 1, between a first and a last, both included. Host numbers, or traced."""
 
     first: Any
     last: Any
@@ -69,8 +69,8 @@ class Seen(NamedTuple):
     cameras: Camera
     """V cameras, stacked."""
     gradients: Array
-    """[V, N, 3] the statistic that the event wants (`render.render_traced`), on the screen in units of half an
-    image; 0 where a Gaussian was not seen."""
+    """[V, N, 3] the event's statistic (`render.render_traced`), on the screen in units of half an image; 0 where a
+    Gaussian was not seen."""
     is_visible: Array
     """[V, N] whether the Gaussian was composited at one pixel at least."""
     colors: Array
@@ -127,18 +127,18 @@ class Change(NamedTuple):
     info: EventInfo = EventInfo()
     rows: np.ndarray | None = None
     """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved.
-    Model, moments and state are in the new order; what other events have gathered then follows."""
+    Model, moments and state are in the new order; statistics of other events follow."""
     unused: str | None = None
-    """Sentence that begins with a field of an event on the host and says that it made no difference this time; None:
-    all did. If it made none in the whole stage, a warning says so."""
+    """Sentence that begins with a field of an event on the host and says that it made no difference this time, or None.
+    You are warned if it made none in the whole stage."""
 
 
 class Event:
     """Base class of both kinds of event.
 
-    Where several devices train together, arrays come as they are, with their rows spread over the devices; whatever
-    `init`, `gather` and an event on the host return is spread again. On the host, read arrays by `on_host`, and place
-    new ones by `placed_like`, which never puts all rows on one device (`parallel.sharded_rows`).
+    Where several devices train together, the rows of arrays are spread over the devices; whatever `init`, `gather` and
+    an event on the host return is spread again. On the host, read arrays by `on_host`, and place new ones by
+    `placed_like`, which never puts all rows on one device (`parallel.sharded_rows`).
     """
 
     prunes_large: ClassVar[bool] = False
@@ -155,7 +155,7 @@ class Event:
 
     @property
     def statistic(self) -> Statistic | None:
-        """Statistic of the gradients that `observe` wants; None: none."""
+        """Statistic of the gradients that `observe` needs; None: none."""
         return None
 
     @property
@@ -164,17 +164,20 @@ class Event:
         return self.statistic is not None
 
     def init(self, model: Model) -> Any:
-        """Return the state that `observe` starts from, a pytree of arrays; () if nothing is gathered.
+        """Return the state that `observe` starts from, a pytree of arrays; by default `GradientStatistics` if the event
+        has a statistic, otherwise ().
 
-        It does not follow rows that another event moves inside the step: what gathers per row wants a stage in which
-        none does. `gather` follows those that move on the host. If several devices train together, they share the rows
-        of these arrays; those made by `parallel.sharded_rows.zeros_beside` are never on one device.
+        It does not follow rows that another event moves inside the step: gather per row only in a stage in which none
+        does. `gather` follows rows that move on the host. If several devices train together, they share the rows of
+        these arrays; arrays made by `parallel.sharded_rows.zeros_beside` are never on one device.
         """
-        return ()
+        if self.statistic is None:
+            return ()
+        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
 
     def gather(self, state: Any, rows: np.ndarray) -> Any:
-        """Return the state whose row i is the former row rows[i] (host). The default wants a row for each Gaussian, or
-        raises ValueError."""
+        """Return the state whose row i is the former row rows[i] (host). ValueError: by default, if an array does not
+        have a row for each Gaussian."""
 
         def moved(leaf: Array) -> Array:
             if leaf.ndim and leaf.shape[0] != len(rows):
@@ -188,7 +191,7 @@ class Event:
 
     def observe(self, state: Any, model: Model, seen: Seen) -> Any:
         """Return the state after the views of an iteration; traced, and called while the event is still ahead."""
-        return state
+        return state.observe_views(seen.gradients, seen.is_visible) if isinstance(state, GradientStatistics) else state
 
     @property
     def most_gaussians(self) -> int | None:
@@ -217,7 +220,7 @@ class StepEvent(Event):
     """Reason why training cannot go on if `EventInfo.is_possible` is False, in terms of the event's fields."""
 
     def times(self, num_iterations: int) -> Times:
-        """Return the times of the event in a stage of so many iterations (host)."""
+        """Return the times of the event in a stage of `num_iterations` (host)."""
         return EVERY_ITERATION
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:

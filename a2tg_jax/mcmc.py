@@ -117,11 +117,10 @@ DrawHosts = Callable[[Array, Array, Array], Array]
 
 
 def plan_relocation(key: Array, opacities: Array, num_live: Array, draw: DrawHosts | None = None) -> Moves:
-    """Plan what `relocate` does to rows of these opacities [N], of which the first `num_live` exist.
-
-    Hosts are drawn by `draw`, or with probability ∝ opacity.
-    """
-    is_live, is_host = _live_and_hosts(opacities, num_live)
+    """Plan what `relocate` does to rows of these opacities [N], of which the first `num_live` exist. Hosts are drawn by
+    `draw`, or with probability ∝ opacity."""
+    is_live = jnp.arange(opacities.shape[0], dtype=jnp.int32) < num_live
+    is_host = is_live & (opacities > DEAD_OPACITY)
     is_dead = is_live & ~is_host
     has_hosts = jnp.any(is_host)
     is_moved = is_dead & has_hosts
@@ -139,17 +138,17 @@ def plan_growth(
     least: Array | int = 0,
     draw: DrawHosts | None = None,
 ) -> Moves:
-    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist.
-
-    They grow to at least `least`, as far as the cap allows. Hosts are drawn by `draw`, or with probability ∝ opacity.
-    """
-    is_live, is_host = _live_and_hosts(opacities, num_live)
+    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist, to at least `least` as
+    far as the cap allows. Hosts are drawn as in `plan_relocation`."""
+    index = jnp.arange(opacities.shape[0], dtype=jnp.int32)
+    is_live = index < num_live
+    is_host = is_live & (opacities > DEAD_OPACITY)
     has_hosts = jnp.any(is_host)
     # n + ⌊n/20⌋ is ⌊1.05·n⌋ in integers, free of rounding.
     wanted = jnp.maximum(jnp.maximum(num_live + 1, num_live + num_live // 20), jnp.asarray(least, jnp.int32))
     wanted = jnp.minimum(jnp.asarray(cap, jnp.int32), wanted)
     grown = jnp.where(has_hosts, jnp.maximum(wanted, num_live), num_live)
-    is_added = ~is_live & (jnp.arange(opacities.shape[0], dtype=jnp.int32) < grown)
+    is_added = ~is_live & (index < grown)
     hosts = draw_hosts(key, opacities, is_host) if draw is None else draw(key, is_host, is_added)
     rows, num_draws = _copied_rows(hosts, is_added)
     info = MoveInfo(jnp.zeros((), jnp.int32), grown - num_live, has_hosts)
@@ -216,12 +215,6 @@ def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
     return rows[jnp.clip(place, 0, jnp.maximum(num_hosts - 1, 0))].astype(jnp.int32)
 
 
-def _live_and_hosts(opacities: Array, num_live: Array) -> tuple[Array, Array]:
-    """Return masks [N] of live rows, and of live rows above the death opacity."""
-    is_live = jnp.arange(opacities.shape[0], dtype=jnp.int32) < num_live
-    return is_live, is_live & (opacities > DEAD_OPACITY)
-
-
 def _copied_rows(hosts: Array, is_target: Array) -> tuple[Array, Array]:
     """Return [N] the row that each row copies, the host for targets, and [N] the number of its draws."""
     num_draws = jnp.zeros(hosts.shape[0], jnp.int32).at[hosts].add(is_target.astype(jnp.int32))
@@ -267,7 +260,7 @@ class Mcmc(StepEvent):
     """Relocation of dead Gaussians and growth to a cap (`relocate`, `grow`), for any appearance."""
 
     cap: int = static(default=500_000)
-    """Largest number of Gaussians; 0: none relocate, and their number stays. A memory_budget takes its place."""
+    """Largest number of Gaussians; 0: none relocate, and their number stays. A memory_budget replaces it."""
 
     limited_by = "cap"
     num_keys: ClassVar[int] = 2

@@ -22,7 +22,6 @@ from a2tg_jax.events import (
     EventInfo,
     GradientStatistics,
     Now,
-    Seen,
     Statistic,
     StepEvent,
     Times,
@@ -56,7 +55,7 @@ class CloneSplitPrune(StepEvent):
     """
 
     cap: int = static(default=500_000)
-    """Largest number of Gaussians and of allocated rows; a memory_budget takes its place. Beyond it the largest
+    """Largest number of Gaussians and of allocated rows; a memory_budget replaces it. Beyond it the largest
     gradients go first and the others are counted."""
     threshold: float = 2e-4
     """Smallest average gradient that is densified, by the position on the screen in units of half an image. With a
@@ -92,12 +91,6 @@ class CloneSplitPrune(StepEvent):
     def num_rows(self, num: int, num_iterations: int) -> int:
         return max(num, self.cap)
 
-    def init(self, model: Model) -> GradientStatistics:
-        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
-
-    def observe(self, state: GradientStatistics, model: Model, seen: Seen) -> GradientStatistics:
-        return state.observe_views(seen.gradients, seen.is_visible)
-
     def apply(self, now: Now, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
         edit, num_refused = self.plan(now, model, state.average())
         model, moments = apply_edit(now.keys[0], edit, model, moments)
@@ -105,7 +98,7 @@ class CloneSplitPrune(StepEvent):
 
     def plan(self, now: Now, model: Model, gradients: Array) -> tuple[Edit, Array]:
         """Return the edit of each row, given its average gradient, and the number of Gaussians without room."""
-        is_kept = is_live(model) & ~self._is_pruned(now, model)
+        is_kept = _is_live(model) & ~self._is_pruned(now, model)
         # A copy of what is pruned would be pruned as well.
         is_wanted = is_kept & (gradients >= self.threshold)
         room = min(model.gaussians.num, self.cap) - jnp.sum(is_kept, dtype=jnp.int32)
@@ -128,11 +121,8 @@ class CloneSplitPrune(StepEvent):
 
 @pytree
 class FillingDensity(CloneSplitPrune):
-    """Variant of `CloneSplitPrune` whose growth in each event is chosen to end at the cap.
-
-    It doubles the largest gradients regardless of the threshold. If pruning would leave too few Gaussians, the most
-    opaque stay.
-    """
+    """Variant of `CloneSplitPrune` whose growth in each event is chosen to end at the cap, regardless of the threshold.
+    If pruning would leave too few Gaussians, the most opaque stay."""
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         count = self.times(num_iterations).num_times
@@ -145,7 +135,7 @@ class FillingDensity(CloneSplitPrune):
 
     def plan(self, now: Now, model: Model, gradients: Array) -> tuple[Edit, Array]:
         assert now.times is not None
-        is_there = is_live(model)
+        is_there = _is_live(model)
         num_live = jnp.sum(is_there, dtype=jnp.int32)
         reached = number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
         reached = jnp.minimum(reached, 2 * num_live)
@@ -159,8 +149,7 @@ class FillingDensity(CloneSplitPrune):
         return self._edit(now, model, is_kept, is_doubled), jnp.zeros((), jnp.int32)
 
 
-def is_live(model: Model) -> Array:
-    """Return a mask [N] of the rows that exist."""
+def _is_live(model: Model) -> Array:
     return jnp.arange(model.gaussians.num, dtype=jnp.int32) < model.live_count
 
 
@@ -186,9 +175,9 @@ def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tupl
     doubled_first = jnp.argsort(~is_doubled, stable=True).astype(jnp.int32)
     is_copy = (index >= num_kept) & (index < num_kept + num_copies)
     rows = jnp.where(is_copy, doubled_first[jnp.maximum(index - num_kept, 0)], kept_first)
-    is_live = index < num_kept + num_copies
-    is_half = edit.is_split[rows] & is_live
-    moments = clear_moments(model, gather_moments(moments, rows), is_copy | is_half | ~is_live)
+    exists = index < num_kept + num_copies
+    is_half = edit.is_split[rows] & exists
+    moments = clear_moments(model, gather_moments(moments, rows), is_copy | is_half | ~exists)
     model = gather_rows(model, rows)
     gaussians = split_in_half(key, model.gaussians, is_half)
     return dataclasses.replace(model, gaussians=gaussians, num_live=num_kept + num_copies), moments

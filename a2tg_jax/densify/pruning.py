@@ -3,7 +3,7 @@
 The measure of a Gaussian is the sum of its blending weights w = α·T over the counted pixels of the training views: the
 share of its colour in the pictures. Densification leaves many Gaussians that are hidden or too faint to matter. Other
 events use statistics of the steps; this one renders, because a weight is no gradient of the loss. `PruneFloaters`
-prunes Gaussians that matter in too few training views, or are close before a camera.
+prunes Gaussians that matter in too few training views, or are close to a camera.
 """
 
 import dataclasses
@@ -80,7 +80,7 @@ class Prune(HostEvent):
 
 
 def during_growth(at: tuple[float, ...], num_iterations: int, growth: Times) -> tuple[float, ...]:
-    """Return the fractions of a stage before its last growth, so that others grow in the place of what is pruned."""
+    """Return the fractions of a stage before its last growth, so that others replace what is pruned."""
     return tuple(fraction for fraction in at if round(fraction * num_iterations) < growth.last_time)
 
 
@@ -94,7 +94,7 @@ class Contributions(NamedTuple):
 
 
 def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contributions:
-    """Return how much each of N Gaussians shows, and in how many views it shows as much as `least` pixels (host).
+    """Return how much each of N Gaussians shows, and in how many views it shows at least `least` pixels (host).
 
     Spare rows show nothing. Of the views, at least one, only cameras and masks are used. The devices over which the
     model's rows are spread draw each view together. If they are of several processes, all of these call it, and get the
@@ -173,9 +173,9 @@ def _weights(
 
 @pytree
 class PruneFloaters(HostEvent):
-    """Event that prunes the Gaussians that show in fewer training views than asked for, or stand close before one.
+    """Event that prunes the Gaussians that show in too few training views, or are close to a camera.
 
-    Each view can hang splats before its own camera that no other view contradicts. It uses the cameras of the scene,
+    Each view can learn splats close to its own camera that no other view contradicts. It uses the cameras of the scene,
     not refined ones.
     """
 

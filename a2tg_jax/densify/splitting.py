@@ -1,6 +1,6 @@
 """Densification that splits where the image is wrong: the schedule of MCMC, with hosts by gradient and halves.
 
-3DGS-MCMC (`mcmc`) draws hosts by opacity and puts copies at the place of the host. They separate slowly, and not where
+3DGS-MCMC (`mcmc`) draws hosts by opacity and puts copies at the host's position. They separate slowly, and not where
 detail is missing. Here the weight of a host is the change of the loss by a move of its own size. Host and copies become
 halves, each at a point drawn from the host and 1.6 times smaller, as in adaptive density control (`densify`).
 
@@ -114,7 +114,7 @@ def split_rows(
 
 
 def logits_of_halves(logit_opacities: Array, pixels: Array) -> Array:
-    """Return the logits of the opacities [N] of the halves of splats, given theirs before.
+    """Return the logits of the opacities [N] of the halves of splats, given the logits before.
 
     The filter draws a splat over an area of max(s², filter²), where s [N] is its standard deviation in pixels. Without
     it, halves would have 1/1.6² of that area. Where the filter makes them k times larger, k in 1..1.6², their opacity

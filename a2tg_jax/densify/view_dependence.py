@@ -161,7 +161,7 @@ def without_idle(table: Coefficients, base_degree: int, idle: float) -> np.ndarr
 def raised_degrees(degrees: np.ndarray, strengths: np.ndarray, budget: float, highest: int = MAX_DEGREE) -> np.ndarray:
     """Return [N] degrees, raised by one in descending order of gradient per added byte within a budget (host).
 
-    Strengths [N, 3] are those of the bands of degree 1, 2 and 3; the budget is in bytes.
+    Strengths [N, 3] are of the bands of degree 1, 2 and 3; the budget is in bytes.
     """
     following = np.minimum(degrees, MAX_DEGREE - 1)
     cost = BYTES_PER_FLOAT * np.asarray([floats_of_band(degree) for degree in (1, 2, 3)])[following]

@@ -10,10 +10,8 @@ from a2tg_jax.core.checks import check_number
 from a2tg_jax.mcmc import Mcmc, Noise
 from a2tg_jax.systems.two_stages import (
     FLOATS_PER_TEXEL,
-    QUICK,
     QUICK_CAP,
     QUICK_TEXELS,
-    SMOKE,
     SMOKE_CAP,
     TwoStages,
     grown_by_mcmc,
@@ -34,7 +32,7 @@ class A2tg(TwoStages):
     densify: Mcmc = Mcmc()
     """MCMC densification (3DGS-MCMC)."""
     noise_in_stage2: bool = False
-    """Whether exploration noise goes on in stage 2, as in the authors' program."""
+    """Whether exploration noise continues in stage 2, as in the authors' program."""
     texture: Upscale = Upscale()
     """Adaptive anisotropic textures."""
     texel_rate: float = 2.5e-3
@@ -68,18 +66,12 @@ class A2tg(TwoStages):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        return {
-            "paper": cls(),
-            "official": cls(noise_in_stage2=True, texture=Upscale.official(), lookup=TextureOptions.official()),
-            "quick": cls(**QUICK, **QUICK_TEXTURES, densify=Mcmc(cap=QUICK_CAP)),
-            "smoke": cls(
-                **SMOKE,
-                **QUICK_TEXTURES,
-                stage2_iterations=120,
-                densify=Mcmc(cap=SMOKE_CAP),
-                texture=Upscale(fraction=0.5, at=(0.1, 0.2)),
-            ),
-        }
+        official = cls(noise_in_stage2=True, texture=Upscale.official(), lookup=TextureOptions.official())
+        quick = QUICK_TEXTURES | {"densify": Mcmc(cap=QUICK_CAP)}
+        growth = {"densify": Mcmc(cap=SMOKE_CAP), "texture": Upscale(fraction=0.5, at=(0.1, 0.2))}
+        smoke = QUICK_TEXTURES | growth | {"stage2_iterations": 120}
+        paper, *short = cls.short_presets(quick, smoke).items()
+        return dict([paper, ("official", official), *short])
 
     def check_options(self) -> None:
         super().check_options()

@@ -18,11 +18,9 @@ from a2tg_jax.mcmc import FillingMcmc, Mcmc, densify_times
 from a2tg_jax.systems.two_stages import (
     FLOATS_PER_TEXEL,
     NO_PRUNING,
-    QUICK,
     QUICK_CAP,
     QUICK_RATES,
     QUICK_TEXELS,
-    SMOKE,
     SMOKE_CAP,
     TwoStages,
     grown_by_density,
@@ -31,9 +29,6 @@ from a2tg_jax.systems.two_stages import (
 )
 from a2tg_jax.training.options import LossConfig
 from a2tg_jax.training.stage import LearningRates, Stage
-
-SURFACES = LossConfig(normal_weight=0.2)
-"""Weights for meshes (docs/meshes.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,12 +54,8 @@ class Gaussians2d(TwoStages):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        return {
-            "paper": cls(),
-            "quick": cls(**QUICK, densify=CloneSplitPrune(cap=QUICK_CAP)),
-            "smoke": cls(**SMOKE, densify=CloneSplitPrune(cap=SMOKE_CAP)),
-            "surfaces": cls(loss=SURFACES),
-        }
+        short = cls.short_presets(*({"densify": CloneSplitPrune(cap=cap)} for cap in (QUICK_CAP, SMOKE_CAP)))
+        return short | {"surfaces": cls(loss=LossConfig(normal_weight=0.2))}  # docs/meshes.md
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,11 +77,7 @@ class Gaussians2dMcmc(TwoStages):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        return {
-            "paper": cls(),
-            "quick": cls(**QUICK, densify=Mcmc(cap=QUICK_CAP)),
-            "smoke": cls(**SMOKE, densify=Mcmc(cap=SMOKE_CAP)),
-        }
+        return cls.short_presets(*({"densify": Mcmc(cap=cap)} for cap in (QUICK_CAP, SMOKE_CAP)))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -117,11 +104,8 @@ class TexturedGaussians(TwoStages):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        return {
-            "paper": cls(),
-            "quick": cls(**QUICK, densify=Mcmc(cap=QUICK_CAP), texel_rate=QUICK_TEXELS),
-            "smoke": cls(**SMOKE, stage2_iterations=120, densify=Mcmc(cap=SMOKE_CAP)),
-        }
+        quick = {"densify": Mcmc(cap=QUICK_CAP), "texel_rate": QUICK_TEXELS}
+        return cls.short_presets(quick, {"stage2_iterations": 120, "densify": Mcmc(cap=SMOKE_CAP)})
 
     def check_options(self) -> None:
         super().check_options()
@@ -175,12 +159,8 @@ class SuperGaussians(TwoStages):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        quick = dataclasses.replace(QUICK_RATES, log_scales=AUTHORS_LOG_SCALES)
-        return {
-            "paper": cls(),
-            "quick": cls(**(QUICK | {"rates": quick}), densify=CloneSplitPrune(cap=QUICK_CAP)),
-            "smoke": cls(**(SMOKE | {"rates": quick}), densify=CloneSplitPrune(cap=SMOKE_CAP)),
-        }
+        rates = {"rates": dataclasses.replace(QUICK_RATES, log_scales=AUTHORS_LOG_SCALES)}
+        return cls.short_presets(*(rates | {"densify": CloneSplitPrune(cap=cap)} for cap in (QUICK_CAP, SMOKE_CAP)))
 
 
 AUTHORS_LOSS = LossConfig(opacity_weight=0.01)
@@ -228,14 +208,8 @@ class BBSplat(TwoStages):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        return {
-            "paper": cls(),
-            "quick": cls(
-                **QUICK, loss=LossConfig(),
-                densify=Mcmc(cap=2_000), billboard=BillboardOptions(rgb=1e-2, alpha=4e-3),
-            ),
-            "smoke": cls(
-                **SMOKE, stage2_iterations=0, loss=LossConfig(), densify=Mcmc(cap=800),
-                billboard=BillboardOptions(side=8, rgb=1e-2, alpha=1e-2),
-            ),
-        }  # fmt: skip
+        quick, smoke = BillboardOptions(rgb=1e-2, alpha=4e-3), BillboardOptions(side=8, rgb=1e-2, alpha=1e-2)
+        return cls.short_presets(
+            {"loss": LossConfig(), "densify": Mcmc(cap=2_000), "billboard": quick},
+            {"loss": LossConfig(), "densify": Mcmc(cap=800), "billboard": smoke, "stage2_iterations": 0},
+        )

@@ -20,7 +20,7 @@ from a2tg_jax.events import Change, Event, Now, StepEvent
 from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import Noise, densify_times
 from a2tg_jax.model import Model
-from a2tg_jax.systems.two_stages import PRUNING, QUICK, SMOKE, TwoStages, pruned
+from a2tg_jax.systems.two_stages import PRUNING, TwoStages, pruned
 from a2tg_jax.training.stage import Stage
 
 
@@ -123,7 +123,7 @@ class Bytewise(TwoStages):
         return self.densify.cap if num is None else num
 
     def _num_kept(self) -> int:
-        """Return the number of Gaussians that fit beside degrees and texels."""
+        """Return the number of Gaussians that fit with degrees and texels."""
         return math.floor(self._num_bytes() * (1 - self._share) / self._own_bytes)
 
     def _num_bytes(self) -> int:
@@ -146,11 +146,8 @@ class Bytewise(TwoStages):
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
-        return {
-            "paper": cls(),
-            "quick": cls(**QUICK, densify=SplitByGradient(QUICK_CAP)),
-            "smoke": cls(**SMOKE, stage2_iterations=120, densify=SplitByGradient(SMOKE_CAP)),
-        }
+        smoke = {"stage2_iterations": 120, "densify": SplitByGradient(SMOKE_CAP)}
+        return cls.short_presets({"densify": SplitByGradient(QUICK_CAP)}, smoke)
 
     def check_options(self) -> None:
         super().check_options()
@@ -196,7 +193,7 @@ class Bytewise(TwoStages):
             )
         if self._num_gaussians() < 2 or self._num_kept() < 2:
             size = self.densify.cap if self.memory_budget is None else self.memory_budget
-            raise ValueError(f"{self._limit} must leave room for 2 Gaussians beside degrees and textures; got {size}")
+            raise ValueError(f"{self._limit} must leave room for 2 Gaussians with degrees and textures; got {size}")
 
     def check_given_number(self, num: int) -> None:
         """Refuse more given Gaussians than degrees and textures leave bytes for."""

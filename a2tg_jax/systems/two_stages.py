@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity
@@ -43,6 +43,11 @@ class TwoStages(System):
     floaters: PruneFloaters = PruneFloaters(min_views=0)
     """Pruning of floaters in the first stage."""
 
+    @classmethod
+    def short_presets(cls, quick: dict[str, Any], smoke: dict[str, Any]) -> dict[str, Self]:
+        """Return the presets "paper", "quick" and "smoke", given the options in which short runs of a system differ."""
+        return {"paper": cls(), "quick": cls(**(QUICK | quick)), "smoke": cls(**(SMOKE | smoke))}
+
     def growing_stage(
         self,
         events: tuple[Event, ...],
@@ -61,30 +66,21 @@ class TwoStages(System):
                 if not floaters.at:
                     raise ValueError(
                         "floaters.at must hold a fraction before the last growth, which is at iteration "
-                        f"{last.last_time:,} of {length:,}, for others grow in the place of what is pruned; got "
+                        f"{last.last_time:,} of {length:,}, for others replace what is pruned; got "
                         f"{shortened(self.floaters.at)}"
                     )
             events = (*events, floaters)
-        return self._stage(0, name, appearance, events, appearance_rate)
+        return Stage(
+            name, appearance, events, self.loss.terms(), self.rates, length, appearance_rate, self.corrections_of(0),
+            raises_sh_degree=True,
+        )  # fmt: skip
 
     def later_stage(
         self, name: str, appearance: Appearance, events: tuple[Event, ...] = (), appearance_rate: object = None
     ) -> Stage:
         """Return a second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
-        return self._stage(1, name, appearance, events, appearance_rate)
-
-    def _stage(self, index: int, name: str, appearance: Appearance, events: tuple[Event, ...], rate: object) -> Stage:
-        return Stage(
-            name=name,
-            appearance=appearance,
-            events=events,
-            losses=self.loss.terms(is_first=index == 0),
-            rates=self.rates,
-            iterations=(self.stage1_iterations, self.stage2_iterations)[index],
-            appearance_rate=rate,
-            corrections=self.corrections_of(index),
-            raises_sh_degree=index == 0,
-        )
+        losses, length = self.loss.terms(is_first=False), self.stage2_iterations
+        return Stage(name, appearance, events, losses, self.rates, length, appearance_rate, self.corrections_of(1))
 
     def continued(self, first: Stage) -> tuple[Stage, ...]:
         """Return a first stage, and a second one without events if it has iterations."""
@@ -123,8 +119,8 @@ def pruned(prune: Prune, num_iterations: int, growth: Callable[[int], Times]) ->
         return ()
     if not prune.at or prune.at[-1] > LAST_PRUNING:
         raise ValueError(
-            f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little grows in the place of "
-            f"what is pruned; got {shortened(prune.at)}: lower the last, or set prune.share to 0"
+            f"prune.at must hold fractions up to {LAST_PRUNING}, after which too little replaces what is pruned; got "
+            f"{shortened(prune.at)}: lower the last, or set prune.share to 0"
         )
     times = growth(num_iterations)
     at = during_growth(prune.at, num_iterations, times)

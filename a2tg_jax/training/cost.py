@@ -90,7 +90,7 @@ class StageForecast:
 
     @property
     def is_trained(self) -> bool:
-        """Whether the stage is trained, and no file takes its place."""
+        """Whether the stage is trained, not given as a file."""
         return self.num_programs > 0
 
 
