@@ -36,7 +36,6 @@ def ones_like_moments(gaussians):
     return ones, ones
 
 
-@functools.cache
 def binomial_sum(opacity: float, num: int) -> float:
     """S as 3DGS-MCMC writes it, in 60 decimal digits because its terms cancel."""
     with decimal.localcontext(prec=60):
@@ -132,15 +131,12 @@ def test_relocate_moves_every_dead_row_onto_live_hosts():
         np.testing.assert_array_equal(np.asarray(leaf).reshape(gaussians.num, -1).max(1), np.where(is_zero, 0, 1))
 
 
-def test_relocation_preserves_the_opacity_at_the_centre():
+def test_relocation_preserves_the_opacity_at_the_centre_and_stops_at_51_shares():
     """One host, three dead rows: four equal copies, which composite to the host's own opacity."""
     gaussians = random_gaussians(NUM, opacities=[0.9] + [0.001] * 63)
     moved = jit_relocate(KEY, gaussians, ones_like_moments(gaussians), 4).gaussians[:4]
     np.testing.assert_allclose(1 - np.prod(1 - np.asarray(moved.opacities, np.float64)), 0.9, rtol=1e-6)
     np.testing.assert_array_equal(moved.means, np.tile(gaussians.means[0], (4, 1)))
-
-
-def test_one_host_of_many_stops_at_51_shares():
     gaussians = random_gaussians(NUM, opacities=[0.999] + [0.001] * 63)
     moved = jit_relocate(KEY, gaussians, ones_like_moments(gaussians), NUM).gaussians
     np.testing.assert_allclose(moved.opacities, 1 - 0.001 ** (1 / 51), rtol=1e-4)
@@ -155,13 +151,12 @@ def test_without_hosts_nothing_changes_and_it_is_said(num_live):
         jax.tree.map(np.testing.assert_array_equal, (result.gaussians, result.moments), (gaussians, moments))
 
 
-@pytest.mark.parametrize(
-    "num_live, cap, wanted", [(1, 64, 2), (19, 64, 20), (40, 64, 42), (59, 64, 61), (40, 41, 41), (64, 64, 64)]
-)
-def test_growth_counts(num_live, cap, wanted):
+def test_growth_counts():
     gaussians = random_gaussians(NUM)
-    result = jit_grow(KEY, gaussians, ones_like_moments(gaussians), num_live, cap)
-    assert (int(result.num_live), int(result.info.num_added)) == (wanted, wanted - num_live)
+    counts = ((1, 64, 2), (19, 64, 20), (40, 64, 42), (59, 64, 61), (40, 41, 41), (64, 64, 64))
+    for num_live, cap, wanted in counts:
+        result = jit_grow(KEY, gaussians, ones_like_moments(gaussians), num_live, cap)
+        assert (int(result.num_live), int(result.info.num_added)) == (wanted, wanted - num_live)
 
 
 def test_growth_copies_hosts_into_new_rows_with_zero_moments():
@@ -189,12 +184,7 @@ def test_bad_arguments_are_named():
 @pytest.mark.parametrize("step", [relocate, lambda *args: grow(*args, NUM)], ids=["relocate", "grow"])
 def test_one_trace_serves_every_live_count(step):
     traces = []
-
-    def traced(*args):
-        traces.append(None)
-        return step(*args)
-
-    traced = jax.jit(traced)
+    traced = jax.jit(lambda *args: traces.append(None) or step(*args))
     gaussians, *_ = dead_and_live()
     moments = ones_like_moments(gaussians)
     for num_live in (10, 40, 63):
@@ -233,15 +223,12 @@ def test_a_million_small_weights_keep_their_probability():
     np.testing.assert_allclose(distinct, 1 - math.exp(-mean), rtol=5e-3)
 
 
-def test_a_single_row_is_its_own_host():
+def test_a_single_row_is_its_own_host_and_no_rows_stay_none():
     assert draw_hosts(KEY, jnp.asarray([0.5]), jnp.asarray([True])) == 0
-
-
-@pytest.mark.parametrize("step", [relocate, lambda *args: grow(*args, 0)], ids=["relocate", "grow"])
-def test_no_rows_stay_none(step):
     none = random_gaussians(0)
-    moved = step(KEY, none, ones_like_moments(none), 0)
-    assert moved.gaussians.num == 0 and int(moved.num_live) == 0
+    for step in (relocate, functools.partial(grow, cap=0)):
+        moved = step(KEY, none, ones_like_moments(none), 0)
+        assert moved.gaussians.num == 0 and int(moved.num_live) == 0
 
 
 def test_noise_lies_in_the_plane_with_the_splats_covariance(x64):
