@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lab.fingerprint import fingerprint
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
@@ -178,12 +177,6 @@ def test_compared_with_another_system_it_keeps_its_degrees():
     compared = compared_system("bytewise", a2tg.A2tg.preset("quick"), "quick")
     assert compared.initial_sh_degree == 0 and compared.sh_degree == 3
     assert compared_system("gaussians-2d-mcmc", Bytewise.preset("quick"), "quick").initial_sh_degree == 3
-
-
-def test_without_a_least_exponent_there_is_no_event():
-    whole = Bytewise.preset("quick", exponents={"least": 0.0})
-    assert "LimitExponents" not in fingerprint(whole, 0)
-    assert "LimitExponents" in fingerprint(Bytewise.preset("quick"), 0)
 
 
 @pytest.mark.long

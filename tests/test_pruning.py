@@ -120,18 +120,15 @@ def test_times_must_exist():
     assert Prune(at=(0.5, 1.0)).iterations(100) == (50, 100)
 
 
-@pytest.mark.parametrize(
-    "event, message",
-    [
+def test_impossible_numbers_are_refused_before_training():
+    stage = a2tg.Gaussians2dMcmc.preset("smoke").stages()[0]
+    for event, message in (
         (Prune(share=1.0), r"Prune\.share must be at least 0 and below 1; got 1.0$"),
         (Prune(share=-0.1), r"Prune\.share must be"),
         (Prune(keep=1), r"Prune\.keep must be at least 2; got 1$"),
-    ],
-)
-def test_impossible_numbers_are_refused_before_training(event, message):
-    stage = a2tg.Gaussians2dMcmc.preset("smoke").stages()[0]
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(stage, events=(event,)).check()
+    ):
+        with pytest.raises(ValueError, match=message):
+            dataclasses.replace(stage, events=(event,)).check()
 
 
 def test_two_gaussians_are_left_at_least():

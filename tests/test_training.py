@@ -30,7 +30,7 @@ from a2tg_jax.core.pytree import num_compiled, pytree
 from a2tg_jax.core.table import Shape
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.training import LearningRates, LossConfig, Session, Stage, fit_stage, like, loop
+from a2tg_jax.training import LossConfig, Session, Stage, fit_stage, like, loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model, padded
@@ -207,15 +207,6 @@ def test_overflow_loses_nothing(scene):
     assert (num_small, num_ample) == (1, 1)
     assert (small.num_regrown, ample.num_regrown) == (1, 0)
     jax.tree.map(np.testing.assert_array_equal, small.state, ample.state)
-
-
-def test_infinite_learning_rate_is_said_and_harms_nothing(scene):
-    config = dataclasses.replace(CONFIG, rates=LearningRates(quats=float("inf")))
-    run = StageRun(scene, config, 0, initial_model(scene, config))
-    kept = jax.tree.map(np.array, run.state)
-    with pytest.raises(ValueError, match=r"not finite at iteration 1 of stage gaussians, view \S+"):
-        run.steps(1, 1)
-    jax.tree.map(np.testing.assert_array_equal, run.state, kept)
 
 
 def test_a_budget_that_the_model_exceeds_is_refused(scene, trained):

@@ -175,7 +175,9 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> Non
     arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
     state = dataclasses.replace(state, moments=_packed(model, state.moments))
     rest = _rest(state), dataclasses.asdict(checkpoint.history)
-    write_archive(path, header, arrays | _named_arrays((model.gaussians, rest)))
+    for place, leaf in jax.tree_util.tree_leaves_with_path((model.gaussians, rest)):
+        arrays[jax.tree_util.keystr(place)] = np.asarray(leaf)
+    write_archive(path, header, arrays)
 
 
 def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = None) -> Checkpoint:
@@ -191,13 +193,10 @@ def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = 
     """
     header, arrays = read_archive(path)
     with reading(path):
-        return _checkpoint_of(header, arrays, str(path), system)
+        return _checkpoint_of(header, arrays, system_from_dict(header["system"], str(path), system))
 
 
-def _checkpoint_of(
-    header: dict[str, Any], arrays: dict[str, np.ndarray], where: str, system: type[System] | None
-) -> Checkpoint:
-    options = system_from_dict(header["system"], where, system)
+def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], options: System) -> Checkpoint:
     options.check()
     stages, index, is_ahead = options.stages(), header["stage"], header["is_ahead"]
     if type(index) is not int or not 0 <= index < len(stages):
@@ -215,7 +214,7 @@ def _checkpoint_of(
     wanted: TrainState = jax.eval_shape(lambda: initial_state(stage, model, [""]))
     events = (event if ahead else None for event, ahead in zip(wanted.events, is_ahead, strict=True))
     wanted = dataclasses.replace(wanted, events=tuple(events))
-    terms = header.get("terms", [])  # no history of an older version has them
+    terms = header["terms"]
     if not isinstance(terms, list) or not all(isinstance(name, str) for name in terms):
         raise ValueError(f"terms must be a list of names; got {shortened(terms)}")
     kept = _rest(wanted), dict.fromkeys(COLUMNS, 0) | {"terms": dict.fromkeys(terms, 0)}
@@ -225,15 +224,14 @@ def _checkpoint_of(
     history = History(**columns)
     check_state(state, wanted, stage)
     check_history(history)
-    counts = {name: header.get(name, 0) for name in ("num_restored", "num_refused")}
+    counts = {name: header[name] for name in ("num_restored", "num_refused")}
     for name, count in counts.items():
-        check_count(name, count, MOST_COUNTED)
-    machine = config_from_dict(Machine, header["machine"], "machine") if "machine" in header else None
-    devices = config_from_dict(Devices, header.get("devices", {}), "devices")
+        check_count(name, count, np.iinfo(np.int32).max)
+    machine = config_from_dict(Machine, header["machine"], "machine")
+    devices = config_from_dict(Devices, header["devices"], "devices")
     return Checkpoint(options, index, state, history, machine=machine, devices=devices, **counts)
 
 
-MOST_COUNTED = 2**31 - 1
 LONGEST_DIFFERENCE = 300
 """Largest number of characters of the options that differ from a checkpoint's."""
 SHOWN = "shown/"
@@ -260,16 +258,9 @@ def _packed(model: Model, moments: AdamState) -> AdamState:
     return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))
 
 
-def _named_arrays(tree: object, *, only_names: bool = False) -> dict[str, Any]:
-    """Return the leaves of a pytree under the names of their paths, in the order of the tree."""
-    paths = jax.tree_util.tree_flatten_with_path(tree)[0]
-    return {jax.tree_util.keystr(path): None if only_names else np.asarray(leaf) for path, leaf in paths}
-
-
 def _filled(template: object, arrays: dict[str, np.ndarray]) -> Any:
-    """Return a tree of the template's structure with the array of its name at each leaf."""
-    leaves = [arrays[name] for name in _named_arrays(template, only_names=True)]
-    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+    """Return a tree of the template's structure with the array of its path at each leaf."""
+    return jax.tree_util.tree_map_with_path(lambda path, _: arrays[jax.tree_util.keystr(path)], template)
 
 
 def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
