@@ -223,10 +223,7 @@ class TestStart:
                 {"sky_gaussians": 99, "densify": {"cap": 100}},
                 r"room for 2 others among the 100 that training starts from at most; got 99: .* raise densify\.cap$",
             ),
-            (
-                {"sky_gaussians": 60, "initial_gaussians": 60},
-                "among the 60 .* got 60: lower sky_gaussians, or raise init",
-            ),
+            ({"sky_gaussians": 60, "initial_gaussians": 60}, "the 60 .* got 60: lower sky_gaussians, or raise init"),
             (
                 {"sky_gaussians": 50, "memory_budget": "10kB", "initial_gaussians": None},
                 "among the 43 .* or raise memory_budget$",
