@@ -112,7 +112,7 @@ class EventInfo(NamedTuple):
     """Outcome of an event inside the step, traced."""
 
     is_possible: Any = True
-    """False: training cannot go on (`StepEvent.impossible` says why), and the step is not taken."""
+    """False: training cannot continue (`StepEvent.impossible` says why), and the step is not taken."""
     num_refused: Any = 0
     """Number of Gaussians that found no room."""
 
@@ -217,7 +217,7 @@ class StepEvent(Event):
     num_keys: ClassVar[int] = 1
     """Random keys that `apply` uses."""
     impossible: ClassVar[str] = ""
-    """Reason why training cannot go on if `EventInfo.is_possible` is False, in terms of the event's fields."""
+    """Reason why training cannot continue if `EventInfo.is_possible` is False, in terms of the event's fields."""
 
     def times(self, num_iterations: int) -> Times:
         """Return the times of the event in a stage of `num_iterations` (host)."""

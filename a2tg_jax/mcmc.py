@@ -37,7 +37,7 @@ class MoveInfo(NamedTuple):
     num_added: Array
     """Rows added by `grow`; 0 from `relocate`."""
     has_hosts: Array
-    """False when no Gaussian above the death opacity is left: nothing was changed, and training cannot go on."""
+    """False when no Gaussian above the death opacity is left: nothing was changed, and training cannot continue."""
 
 
 class MoveResult(NamedTuple):

@@ -84,7 +84,7 @@ def draw_weights(model: Model, state: SplitStatistics) -> Array:
 def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: Array) -> Array:
     """Draw a host [N] int32 for every target with probability ∝ weight, none twice before each was drawn once.
 
-    The order of log-weights plus Gumbel noise is that of successive draws without replacement (Yellott, 1977). Only the
+    The order of log-weights plus Gumbel noise equals successive draws without replacement (Yellott, 1977). Only the
     entries of targets have a meaning, if there are any hosts.
     """
     noisy = jnp.log(weights) + jax.random.gumbel(key, weights.shape, weights.dtype)
@@ -118,7 +118,7 @@ def logits_of_halves(logit_opacities: Array, pixels: Array) -> Array:
 
     The filter draws a splat over an area of max(s², filter²), where s [N] is its standard deviation in pixels. Without
     it, halves would have 1/1.6² of that area. Where the filter makes them k times larger, k in 1..1.6², their opacity
-    is 1 − (1 − o)^(1/k), at least that of the dead. Splats of 0 pixels, which no view has shown, keep theirs.
+    is 1 − (1 − o)^(1/k), but not below the death opacity. Splats of 0 pixels, which no view has shown, keep theirs.
     """
     before = jnp.maximum(pixels * pixels, FILTER_VARIANCE)
     after = jnp.maximum((pixels / SPLIT_SHRINK) ** 2, FILTER_VARIANCE)

@@ -50,7 +50,7 @@ def photometric_parts(image: Array, target: Array, *, ssim_weight: float | Array
 
 
 def mean_ssim(image: Array, target: Array) -> Array:
-    """Structural similarity, averaged over the windows that lie wholly inside the image (Wang et al., 2004).
+    """Structural similarity, averaged over the windows that are wholly inside the image (Wang et al., 2004).
 
     The window is a Gaussian of σ 1.5 and 11 taps; the data range is 1. It equals scikit-image's
     `structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1)`.

@@ -199,7 +199,7 @@ class Stage:
         }  # fmt: skip
         for name, kind in kinds.items():
             parts: Any = getattr(self, name)
-            check_kind(f"{where} {name}", parts, (tuple, list), "one of them stands in (…,)")
+            check_kind(f"{where} {name}", parts, (tuple, list), "wrap a single one: (…,)")
             for index, part in enumerate(parts):
                 label = f"{where} {name}[{index}]"
                 is_function = inspect.isroutine(part)
