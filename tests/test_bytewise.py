@@ -52,7 +52,6 @@ def test_presets_can_be_trained(preset):
         (0, (0.1, 0.05)),
         pytest.param(1, (0.2, 0.0), marks=pytest.mark.long),
         pytest.param(2, (0.0, 0.1), marks=pytest.mark.long),
-        pytest.param(0, (0.0, 0.0), marks=pytest.mark.long),
     ],
 )
 def test_every_mix_fills_its_bytes(scene, base_degree, shares):

@@ -116,6 +116,7 @@ def test_parameters_that_nothing_but_adam_changed_are_not_checked_again(scene, m
     assert sizes == [1 + 5 * 60 + 60], "the loss, five gradients and the rotations"
 
 
+@pytest.mark.long
 def test_an_explosion_is_seen_in_the_step(scene):
     with pytest.raises(
         DivergedError, match=r"exploded at iteration \d+ of stage .*, view \S+: the loss of \S+ is \d"

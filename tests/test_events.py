@@ -103,6 +103,7 @@ def test_rows_that_cannot_be_removed_are_refused(name, is_kept, message):
         a2tg.keep_rows(model, adam_init(partition(model)[0]), (), is_kept)
 
 
+@pytest.mark.long
 def test_an_event_that_removes_rows_compiles_nothing(scene):
     """With rows of other shapes each time is a program, of which the third warns; the model is the same."""
 
@@ -174,7 +175,8 @@ def test_events_without_effect_are_warned_of(scene):
     ]
 
 
-@pytest.mark.parametrize("given", [{"k_a": 3.0}, pytest.param({}, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("given", [{"k_a": 3.0}, {}])
 def test_choices_about_anisotropy_that_make_no_difference_are_warned_of(scene, given):
     """Splats of the built-in scene are round after so few iterations. Defaults are nobody's choice."""
     system = a2tg.A2tg(stage2_iterations=8, initial_gaussians=50, texture=a2tg.Upscale(at=(0.5,), **given))
@@ -231,5 +233,5 @@ class FailingBetween(PruneFaint):
     ],
 )
 def test_errors_name_the_event_and_its_method(scene, event, message):
-    with pytest.raises(ValueError, match=f"^stage 'own': {message}$"):
+    with pytest.raises(ValueError, match=f"^stage 'own': {message}"):
         fitted(scene, event)

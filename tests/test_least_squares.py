@@ -76,6 +76,7 @@ def test_many_steps_are_at_the_least_error():
     np.testing.assert_allclose(found - flat, expected, atol=1e-4)
 
 
+@pytest.mark.long
 def test_a_few_steps_lower_the_error_and_leave_the_rest():
     model, _, camera = banded(3, template=Appearance(texture=Texture(start=(2, 2))))
     views = some_views(model, camera)

@@ -167,7 +167,7 @@ def test_regularisers_see_live_rows_only():
     assert live_mean(gaussians.opacities, 0) == 0
 
 
-@pytest.mark.parametrize("shape", [(11, 18), (12, 26), (40, 51), (90, 333)])
+@pytest.mark.parametrize("shape", [(11, 18), (40, 51), (90, 333)])
 @pytest.mark.parametrize(("dtype", "rtol"), [(np.float64, 1e-10), (np.float32, 2e-3)])
 def test_ssim_and_its_gradients_are_the_same_without_native_loops(monkeypatch, x64, shape, dtype, rtol):
     """In float32 the variances, differences of means of about 0.3, keep four digits where they are about 0.01."""

@@ -56,7 +56,7 @@ def test_hosts_are_drawn_by_gradient_and_size():
             key, model.gaussians.opacities, jnp.int32(LIVE), LIVE + 1, LIVE + 1, by_weight(wanted)
         ).rows[LIVE]
     )
-    counts = np.bincount(jax.vmap(grown)(jax.random.split(KEY, 40_000)), minlength=NUM)
+    counts = np.bincount(jax.vmap(grown)(jax.random.split(KEY, 10_000)), minlength=NUM)
     can_host = (np.arange(NUM) < LIVE) & (np.asarray(model.gaussians.opacities) > 0.005)
     expected = np.where(can_host, wanted, 0)
     expected *= counts.sum() / expected.sum()

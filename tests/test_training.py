@@ -31,7 +31,6 @@ from a2tg_jax.core.table import Shape
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import LossConfig, Session, Stage, fit_stage, like, loop
-from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
@@ -243,17 +242,13 @@ def test_wrong_arguments_of_fit_are_refused(scene, trained):
 
 
 @pytest.mark.long
-def test_views_of_two_sizes_wherever_they_are_kept(scene, monkeypatch, request):
+def test_views_of_two_sizes(scene):
     """More views a batch than there are of a size, and a cap below the requested Gaussians."""
-    if passes_in_its_own_process(request):
-        return
     larger = synthetic_scene(num_views=8, width=48, height=30, num_points=150).train
     mixed = dataclasses.replace(scene, train=(scene.train[0], larger[1], scene.train[2]))
     config = Gaussians2dMcmc(stage1_iterations=6, batch_size=3, initial_gaussians=100, densify=Mcmc(cap=40))
-    resident = fit(mixed, config, progress=False)
-    assert resident.model.num == 40
-    monkeypatch.setattr(loop, "PhotoStore", lambda *given: PhotoStore(*given, room=0))
-    assert_same(fit(mixed, config, progress=False), resident)
+    result = fit(mixed, config, progress=False)
+    assert result.model.num == 40 and np.isfinite(result.history.loss).all()
 
 
 def test_a_full_disk_leaves_the_older_checkpoint(trained, tmp_path):
