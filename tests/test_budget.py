@@ -143,7 +143,7 @@ SHAPES = {"round": (ROUND, ROUND), "thin": (WIDE, TALL), "mixed": (WIDE, ROUND)}
 
 @pytest.mark.parametrize(
     "texture_cap, rounds, budget",
-    [(1, 1, "60.1kB"), (2, 3, 0.1234), (4, 1, "60.1kB"), (4, 3, 0.1234), (16, 4, "60.1kB")],
+    [(1, 1, "60kB"), (2, 3, 0.1234), (4, 1, "60kB"), (4, 3, 0.1234), (16, 4, "60kB")],
 )
 @pytest.mark.parametrize("shape", SHAPES)
 def test_textures_take_what_gaussians_leave(budget, shape, texture_cap, rounds):
