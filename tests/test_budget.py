@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_models import some_now
 
 import a2tg_jax as a2tg
 from a2tg_jax.adapt import Upscale
@@ -19,8 +20,8 @@ from a2tg_jax.core.gaussians import init_from_points, logit
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.densify.clone_split import FillingDensity
-from a2tg_jax.events import Due, GradientStatistics, Now, Times
-from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict
+from a2tg_jax.events import Due, GradientStatistics
+from a2tg_jax.io.config_json import config_from_dict, config_to_dict
 from a2tg_jax.mcmc import FillingMcmc
 from a2tg_jax.model import Model
 from a2tg_jax.training.fitting import warn_of_budget
@@ -113,7 +114,9 @@ def test_monte_carlo_growth_leaves_the_cap(x64, dtype, num_iterations, count):
     model = jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, model)
     event, moments = FillingMcmc(300), adam_init(partition(model)[0])
     times = event.times(num_iterations)
-    apply = jax.jit(lambda iteration, *rest: event.apply(now(iteration, num_iterations, times, 2), *rest, ()))
+    apply = jax.jit(
+        lambda iteration, *rest: event.apply(some_now(iteration, num_iterations, times, num_keys=2), *rest, ())
+    )
     counts = [4]
     for iteration in range(1, num_iterations + 1):
         if times.is_due(iteration):
@@ -176,19 +179,13 @@ def random_model(seed: int, num: int, num_live: int, opacities) -> Model:
     return Model(gaussians, num_live=jnp.asarray(num_live, jnp.int32))
 
 
-def now(iteration, num_iterations: int, times: Times, num_keys: int = 1) -> Now:
-    whole = lambda number: jnp.asarray(number, jnp.int32)  # noqa: E731
-    key, rate, scale = jax.random.split(jax.random.key(0), num_keys), jnp.float32(1e-4), jnp.float32(1.0)
-    return Now(key, whole(iteration), rate, whole(num_iterations), scale, times)
-
-
 @pytest.mark.parametrize("faint", [0.0, 0.3, 0.9])
 def test_density_control_reaches_its_cap_whatever_is_pruned(faint):
     """Row by row: those that stay, those that are doubled, and their number after every event."""
     num, num_live, num_iterations = 100, 30, 100
     event = FillingDensity(num, threshold=0.5)
     times = event.times(num_iterations)
-    plan = jax.jit(lambda iteration, *seen: event.plan(now(iteration, num_iterations, times), *seen))
+    plan = jax.jit(lambda iteration, *seen: event.plan(some_now(iteration, num_iterations, times), *seen))
     rng = np.random.default_rng(1)
     due = [iteration for iteration in range(1, num_iterations) if times.is_due(iteration)]
     assert len(due) == times.num_times == 4

@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_models import some_now
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, logit, rotation_matrices
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.densify.clone_split import CloneSplitPrune, Edit, OpacityReset, apply_edit, reset_interval
-from a2tg_jax.events import Change, EventInfo, Now, Seen, read_probe
+from a2tg_jax.events import Change, EventInfo, Seen, read_probe
 from a2tg_jax.model import Model
 
 NUM, LIVE, SCENE_SCALE = 60, 25, 2.0
@@ -35,13 +36,6 @@ def random_model(seed: int) -> Model:
 def ones(model: Model):
     moments = adam_init(partition(model)[0])
     return dataclasses.replace(moments, mu=jax.tree.map(jnp.ones_like, moments.mu))
-
-
-def now(iteration: int, num_iterations: int = 30_000, num_keys: int = 1) -> Now:
-    numbers = (jnp.asarray(x, jnp.int32) for x in (iteration, num_iterations))
-    keys = jax.random.split(jax.random.key(0), num_keys)
-    iteration_, num = numbers
-    return Now(keys, iteration_, jnp.float32(1e-4), num, jnp.float32(SCENE_SCALE))
 
 
 def twin_plan(event: CloneSplitPrune, model: Model, gradients, iteration: int, num_iterations: int, num_rows: int):
@@ -72,7 +66,7 @@ def test_plan_is_that_of_the_twin(cap):
     for seed, iteration in itertools.product(range(3), (600, 3_000, 3_050, 3_100, 9_000)):
         model = random_model(seed)
         gradients = np.random.default_rng(seed).uniform(0, 8e-4, NUM).astype(np.float32)
-        edit, refused = plan(now(iteration), model, jnp.asarray(gradients))
+        edit, refused = plan(some_now(iteration, 30_000, scene_scale=SCENE_SCALE), model, jnp.asarray(gradients))
         kept, cloned, split, wanted_refused = twin_plan(event, model, gradients, iteration, 30_000, NUM)
         assert kept and (cloned | split)
         for mask, rows in ((edit.is_kept, kept), (edit.is_cloned, cloned), (edit.is_split, split)):
@@ -142,7 +136,7 @@ def test_opacity_reset_and_what_adam_forgets(is_traced):
     model = random_model(2)
 
     def apply(model, moments):
-        return OpacityReset(0.05).apply(now(3_000, num_keys=0), model, moments, ())
+        return OpacityReset(0.05).apply(some_now(3_000, 30_000, num_keys=0), model, moments, ())
 
     def happen(model, moments):
         unchanged = Change(model, moments, (), EventInfo())
@@ -170,5 +164,5 @@ def test_times_are_the_published_ones_scaled(num_iterations, interval):
 def test_pruning_every_gaussian_is_impossible():
     model = random_model(0)
     event = CloneSplitPrune(NUM, least_opacity=0.9)
-    change = event.apply(now(600), model, ones(model), event.init(model))
+    change = event.apply(some_now(600, 30_000), model, ones(model), event.init(model))
     assert not bool(change.info.is_possible)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_models import some_now
 from test_mcmc import random_gaussians
 
 import a2tg_jax as a2tg
@@ -21,7 +22,7 @@ from a2tg_jax.densify.splitting import (
     logits_of_halves,
     split_rows,
 )
-from a2tg_jax.events import GradientStatistics, Now, Seen, Times
+from a2tg_jax.events import GradientStatistics, Seen, Times
 from a2tg_jax.mcmc import plan_growth, plan_relocation
 from a2tg_jax.model import Model
 
@@ -171,10 +172,7 @@ def test_the_last_event_leaves_the_cap():
     event, times = SplitByGradient(390), Times(10, 40, 10)
     counts = []
     for iteration in (10, 20, 30, 40):
-        now = Now(
-            jax.random.split(KEY, 2), jnp.int32(iteration), jnp.float32(1e-3), jnp.int32(50), jnp.float32(1), times
-        )
-        change = event.apply(now, model, moments, statistics)
+        change = event.apply(some_now(iteration, 50, times, num_keys=2), model, moments, statistics)
         model, moments, statistics = change.model, change.moments, change.state
         counts.append(int(model.num_live))
     assert counts == sorted(counts) and counts[-1] == 390 and counts[0] > LIVE
