@@ -210,8 +210,10 @@ def test_density_control_reaches_its_cap_whatever_is_pruned(faint):
     assert num_live == num
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name, budget", BUDGETS.items())
+@pytest.mark.parametrize(
+    "name, budget",
+    [pytest.param(*item, marks=[] if item[0] == "gaussians-2d-mcmc" else pytest.mark.long) for item in BUDGETS.items()],
+)
 def test_a_trained_model_takes_its_budget_and_never_more(scene, name, budget):
     system = smoke(name, memory_budget=budget)
     result = a2tg.fit(scene, system, progress=False)

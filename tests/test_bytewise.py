@@ -46,14 +46,8 @@ def test_presets_can_be_trained(preset):
     Bytewise.preset(preset).check()
 
 
-@pytest.mark.parametrize(
-    "base_degree, shares",
-    [
-        (0, (0.1, 0.05)),
-        pytest.param(1, (0.2, 0.0), marks=pytest.mark.long),
-        pytest.param(2, (0.0, 0.1), marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("base_degree, shares", [(0, (0.1, 0.05)), (1, (0.2, 0.0)), (2, (0.0, 0.1))])
 def test_every_mix_fills_its_bytes(scene, base_degree, shares):
     view, texture = shares
     system = smoke(base_degree=base_degree, view_dependence_share=view, texture_share=texture)

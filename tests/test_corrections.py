@@ -11,8 +11,8 @@ from scipy.linalg import expm
 from toy_system import Toy
 
 from a2tg_jax import (
-    A2tg,
     Gaussians2d,
+    Gaussians2dMcmc,
     find_system,
     fit,
     load_checkpoint,
@@ -29,7 +29,7 @@ from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.corrections import Exposure, PoseRefinement, exposed, initial_corrections, updated
 
-SYSTEM = A2tg(
+SYSTEM = Gaussians2dMcmc(
     stage1_iterations=24, stage2_iterations=16, initial_gaussians=80, densify=Mcmc(cap=90), exposure=True,
     refine_poses=True,
 )  # fmt: skip

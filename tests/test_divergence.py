@@ -129,7 +129,8 @@ def test_each_restoration_has_another_order(scene):
     assert seen[0] == tuple(BatchOrder(scene.train, 1, 5).indices(i)[0] for i in range(1, 22))
 
 
-@pytest.mark.parametrize(("calls", "stage"), [pytest.param(17, 0, marks=pytest.mark.long), (40, 1)])
+@pytest.mark.long
+@pytest.mark.parametrize(("calls", "stage"), [(17, 0), (40, 1)])
 def test_a_stop_between_any_two_steps_changes_nothing(scene, tmp_path, calls, stage):
     system = A2tg(stage1_iterations=24, stage2_iterations=20, texture=Upscale(at=(0.3, 0.6)), seed=3, **SIZES)
     left, kept = iter(range(calls)), []

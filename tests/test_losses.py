@@ -58,7 +58,7 @@ def test_gradient_equals_central_differences_at_every_pixel(x64, weight):
     np.testing.assert_allclose(jax.jit(jax.grad(loss))(image.ravel()), differences, rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.parametrize("is_native", [True, False])
+@pytest.mark.parametrize("is_native", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_first_and_second_derivatives_in_both_modes(monkeypatch, x64, is_native):
     """Forward mode is the gradient along a direction; second derivatives are differences of gradients."""
     monkeypatch.setattr(platforms, "has_native", lambda: is_native)
@@ -78,7 +78,7 @@ def test_first_and_second_derivatives_in_both_modes(monkeypatch, x64, is_native)
         np.testing.assert_allclose(second, (ahead - behind) / (2 * eps), atol=1e-6 * jnp.abs(seconds[0]).max())
 
 
-@pytest.mark.parametrize("is_native", [True, False])
+@pytest.mark.parametrize("is_native", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_ssim_of_a_batch_under_vmap_and_jit(monkeypatch, is_native):
     monkeypatch.setattr(platforms, "has_native", lambda: is_native)
     pairs = [random_pair(14, 31, 0.1, np.float32, seed) for seed in range(3)]

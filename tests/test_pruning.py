@@ -43,6 +43,7 @@ def test_weights_are_those_of_the_oracle(seed):
     np.testing.assert_allclose(masked, shown + expected, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.long
 def test_weights_are_summed_over_views_of_any_size():
     model, camera = (
         Model(some_state()[0].gaussians),

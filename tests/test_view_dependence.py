@@ -89,13 +89,14 @@ def test_gradients_are_those_of_the_dense_coefficients():
     np.testing.assert_allclose(found.gaussians.means, expected.gaussians.means, atol=1e-10)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "template",
     [
         Appearance(texture=Texture(start=(2, 1)), exponents=Exponents()),
-        pytest.param(Appearance(texture=Texture(start=(0, 0))), marks=pytest.mark.long),
-        pytest.param(MovableKernels(), marks=pytest.mark.long),
-        pytest.param(Billboards(side=3), marks=pytest.mark.long),
+        Appearance(texture=Texture(start=(0, 0))),
+        MovableKernels(),
+        Billboards(side=3),
     ],
 )
 def test_whatever_else_is_shown_is_as_without(template, tmp_path):
