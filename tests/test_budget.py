@@ -21,7 +21,7 @@ from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.densify.clone_split import FillingDensity
 from a2tg_jax.events import Due, GradientStatistics
-from a2tg_jax.io.config_json import config_from_dict, config_to_dict
+from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict
 from a2tg_jax.mcmc import FillingMcmc
 from a2tg_jax.model import Model
 from a2tg_jax.training.fitting import warn_of_budget

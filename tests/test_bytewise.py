@@ -22,7 +22,6 @@ from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.results.record import compared_system
 from a2tg_jax.systems.bytewise import Bytewise, LimitExponents
 from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint
-from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import a2tg_jax as a2tg
-from a2tg_jax.training.registry import with_changes
+from a2tg_jax.io.config_json import changed_config
 
 WITHOUT_JIT, CHECKS_FOR_NAN = jax.disable_jit, functools.partial(jax.debug_nans, True)
 
@@ -29,7 +29,7 @@ def test_a_system_trains(mode, name, cap):
     """A few steps of each stage, and an event that moves and adds Gaussians, for which clones and halves need room."""
     scene = a2tg.synthetic_scene(num_views=4, width=16, height=12, num_points=30)
     changes = {"stage1_iterations": 12, "stage2_iterations": 3, "initial_gaussians": 20, "densify": {"cap": cap}}
-    system = with_changes(a2tg.find_system(name), changes, "test")
+    system = changed_config(a2tg.find_system(name), changes, "test")
     with mode():
         model = a2tg.fit(scene, system, progress=False).model
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model.gaussians))

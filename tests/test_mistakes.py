@@ -492,7 +492,6 @@ CALLS = {
     "normal_consistency(None, MAP, MAP, CAMERA)": "normal … [12, 16, 3] … NoneType",
     "normal_consistency(IMAGE, MAP, MAP, VIEW)": "camera … Camera … View … view.camera",
     "depth_normals(MAP, MAP[:5] > 0, CAMERA)": "is_valid … [12, 16] … [5, 16]",
-    "mean_scale(GAUSSIANS, jnp.ones(7))": "num_live … [] … [7]",
     "color_fit(IMAGE, IMAGE, np.ones((12, 16), int))": "mask … bools … int64",
     "relocated(num_live=jnp.ones(7))": "num_live … [] … [7]",
     "relocated(moments=(jnp.ones((6, 3)),))": "moments … 7 rows",

@@ -12,10 +12,10 @@ from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.core.gaussians import SH_C0, rotation_matrices
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.densify.pruning import shown_in
+from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.results.record import RunRecord, SceneSource
 from a2tg_jax.training import SYSTEMS
 from a2tg_jax.training.cost import forecast_stages
-from a2tg_jax.training.registry import with_changes
 from a2tg_jax.training.sky import MOST_TRIED, cell_rays, even_directions, is_bare, sky_of, sphere
 from a2tg_jax.training.start import check_start, initial_model
 
