@@ -259,17 +259,16 @@ def test_sh_rotations_compose():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(2))
-def test_world_and_camera_moved_together_show_the_same(x64, seed):
-    rng = np.random.default_rng(seed)
+def test_world_and_camera_moved_together_show_the_same(x64):
+    rng = np.random.default_rng(0)
     as_double = lambda x: jnp.asarray(x, jnp.float64)  # noqa: E731
-    gaussians = jax.tree.map(as_double, some_gaussians(20, seed))
+    gaussians = jax.tree.map(as_double, some_gaussians(20))
     gaussians = dataclasses.replace(gaussians, log_scales=gaussians.log_scales + 1.5)
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[2, 3] = Rotation.random(rng=rng).as_matrix(), 5
     camera = Camera(as_double(viewmat), as_double([[30, 0, 16], [0, 30, 12], [0, 0, 1]]), 32, 24)
     textures = textures_from_arrays([rng.uniform(size=(2, 4, 4)) for _ in range(20)])
-    world = some_world(seed)
+    world = some_world()
     moved = dataclasses.replace(camera, viewmat=as_double(world.apply_to_viewmat(viewmat)))
     before = render_image(gaussians, camera, textures)
     after = render_image(transform_gaussians(gaussians, world), moved, textures)

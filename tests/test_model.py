@@ -82,9 +82,8 @@ def test_only_rows_that_exist_are_kept(tmp_path):
     assert loaded.num_bytes == model.num_bytes == 232 * 4 + 16 * (1 + 8 + 4 + 4)
 
 
-@pytest.mark.parametrize("num", [0, pytest.param(1, marks=pytest.mark.long)])
-def test_few_gaussians_without_an_origin(tmp_path, num):
-    model = Model(some_gaussians(num), Appearance(texture=Texture(textures_from_arrays(some_textures(num)))))
+def test_no_gaussians_without_an_origin(tmp_path):
+    model = Model(some_gaussians(0), Appearance(texture=Texture(textures_from_arrays([]))))
     save_model(tmp_path / "m.npz", model)
     assert_same_model(load_model(tmp_path / "m.npz"), model)
     camera = as_camera(draw_scene(0), "float32")
