@@ -25,7 +25,7 @@ from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.rasterize.compositor import composite
 from a2tg_jax.rasterize.kernels.jaxprs import PixelFunctions
 from a2tg_jax.rasterize.kernels.native import composite as native
-from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats, project_gaussians, settings_of_pass
+from a2tg_jax.rasterize.splats import PassSettings, Splats, project_gaussians, settings_of_pass
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 from a2tg_jax.rasterize.views import capacity_for, pairs_of_view
 from a2tg_jax.render import appearance_of
@@ -100,7 +100,7 @@ def main() -> None:
             args.out.write_text(json.dumps({"bounds": found}, indent=1) + "\n")
 
 
-def count(num: int, kind: str, width: int, height: int) -> tuple[Work, KernelSpec]:
+def count(num: int, kind: str, width: int, height: int) -> tuple[Work, PassSettings]:
     """Count the work of the random workload's view, and return the specification of its kernels."""
     gaussians, camera = random_scene(num, width, height)
     textures = random_textures(num, kind)
@@ -112,7 +112,7 @@ def count(num: int, kind: str, width: int, height: int) -> tuple[Work, KernelSpe
     compositing, texels, regions = settings_of_pass(
         appearance, splats, grid, settings.near_plane, has_geometry=False, compositor="native", tile_batch=1
     )
-    counting = compositing._replace(kernel=dataclasses.replace(compositing.kernel, statistic="position"))
+    counting = compositing._replace(statistic="position")
     jacobian = camera.K @ camera.viewmat[:3, :3]
     view = View(counting, splats, texels, regions, cutoff, jacobian)
     counts = np.asarray(view.counts(lists))
@@ -128,7 +128,7 @@ def count(num: int, kind: str, width: int, height: int) -> tuple[Work, KernelSpe
 class View:
     """A view to composite with different tile lists."""
 
-    settings: CompositingSettings
+    settings: PassSettings
     splats: Splats
     texels: jax.Array
     regions: TextureRegion | None
@@ -176,7 +176,7 @@ def beginning(lists: TileLists, ids: np.ndarray, starts: np.ndarray, lengths: np
     return lists._replace(ids=jnp.asarray(kept), starts=jnp.asarray(ends, jnp.int32))
 
 
-def stages(work: Work, spec: KernelSpec) -> list[Stage]:
+def stages(work: Work, spec: PassSettings) -> list[Stage]:
     """Return the least work of each stage of a step."""
     num, row, size = work.num, FLOAT * spec.num_floats, FLOAT * floats_per_gaussian(3)
     texels, image = FLOAT * spec.num_columns * work.num_texels, FLOAT * 3 * work.num_pixels

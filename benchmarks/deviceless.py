@@ -103,7 +103,7 @@ def programs():
     from a2tg_jax.appearance import Appearance, StaticShading, Texture
     from a2tg_jax.core.bilinear import TextureRegion
     from a2tg_jax.rasterize.compositor import composite
-    from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, Splats
+    from a2tg_jax.rasterize.splats import PassSettings, Splats
     from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
     num, grid = NUM_GAUSSIANS, TileGrid(WIDTH, HEIGHT, TILE_SIZE)
@@ -117,8 +117,9 @@ def programs():
     for name, static, *places in (("plain", plain, floats(1, 0), None), ("textured", textured, texels, regions)):
         for statistic in (None, "position"):
             columns = places[0].shape[1]
-            spec = KernelSpec(static, 0, columns, "float32", TILE_SIZE, 0.2, has_geometry=False, statistic=statistic)
-            settings = CompositingSettings(spec, grid, "cuda", 1)
+            shown = static, 0, columns, 3, "float32", grid, 0.2, False, statistic
+            settings = PassSettings(*shown, compositor="cuda", tile_batch=1)
+            spec = settings.kernel
             inputs = splats, *places, floats(num), lists, floats(3, 3), floats(num, 4)
 
             def forward(*inputs, settings=settings):

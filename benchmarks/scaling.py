@@ -36,7 +36,7 @@ from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.geometry import NEAR_PLANE, screen_bounds
 from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.parallel.exchange import BorderRoom, ImageBands
-from a2tg_jax.rasterize.splats import drawn_splats, num_numbers
+from a2tg_jax.rasterize.splats import drawn_splats
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from benchmarks.workload import random_scene
@@ -44,7 +44,8 @@ from experiments.lab.markdown import table as markdown
 
 NUMS, DEVICES = (100_000, 1_000_000, 4_000_000), (1, 2, 4, 8, 16, 64)
 WIDTH, HEIGHT = 1600, 1060
-PROBE, CUTOFF = 4, 1
+SPLAT, PROBE, CUTOFF = 9 + 1 + 3 + 3, 4, 1
+"""Numbers of a travelling row: homography, opacity, colour and normal of a splat; its statistic, and its cutoff."""
 CHANNELS = 4
 """Numbers of a pixel that travel: its colour and its transmittance."""
 SKY, KEPT_IN_SKY = 0.3, 7
@@ -56,7 +57,7 @@ STATES = 4
 
 def row_bytes() -> tuple[int, int]:
     """Return the bytes of a travelling row, and of its gradient."""
-    splat = num_numbers(True, 3) + PROBE
+    splat = SPLAT + PROBE
     return BYTES_PER_FLOAT * (splat + CUTOFF), BYTES_PER_FLOAT * splat
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from a2tg_jax.rasterize.kernels import cuda
-from a2tg_jax.rasterize.kernels.cuda.printing import C_TYPES, Argument, c_function
-from a2tg_jax.rasterize.kernels.cuda.source import block_threads, num_parts, source
+from a2tg_jax.rasterize.kernels.cuda.source import C_TYPES, Argument, block_threads, c_function, num_parts, source
 
 cl = pytest.importorskip("pyopencl", reason="the GPU kernels run on CPUs as OpenCL: pip install 'pyopencl[pocl]'")
 
@@ -48,7 +47,7 @@ def run(spec, name, num_tiles, inputs, results, totals):
     # OpenCL has no empty buffers.
     arrays = [array if array.size else np.zeros(1) for array in (*inputs, *results, *totals)]
     buffers = [cl.Buffer(queue().context, flags, hostbuf=array) for array in arrays]
-    threads, blocks = block_threads(spec.tile_size), num_tiles * num_parts(spec.tile_size)
+    threads, blocks = block_threads(spec.grid.tile_size), num_tiles * num_parts(spec.grid.tile_size)
     _kernel(spec, name)(queue(), (blocks * threads,), (threads,), *buffers)
     found = [np.array(array) for array in (*results, *totals)]
     for array, buffer in zip(found, buffers[len(inputs) :], strict=True):

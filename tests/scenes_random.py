@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from oracle import DEFAULT_RULES, Float, Rules, Scene
 
 from a2tg_jax import (
@@ -28,6 +29,13 @@ CAPACITY = 8192
 
 TEXTURE_SIZES = [(1, 1), (1, 4), (4, 1), (2, 2), (4, 4), (8, 8), (16, 16), (2, 1), (16, 2), (3, 5)]
 """(Tv, Tu) of the textures, in turn; the same multiset in every scene, so that their shapes compile once."""
+
+
+def quick_then_long(quick: list, others: list) -> list:
+    """Cases of a test, of which the others run with `--long` only."""
+    others = [each if isinstance(each, tuple) else (each,) for each in others]
+    return [*quick, *(pytest.param(*each, marks=pytest.mark.long) for each in others)]
+
 
 Splat = tuple[Float, Float, Float, float]
 """Mean in the camera's frame, quaternion in the camera's frame, log-scales, logit opacity."""

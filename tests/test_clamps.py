@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes_random import quick_then_long
 from small_values import some_gaussians
 
 import a2tg_jax as a2tg
@@ -49,7 +50,7 @@ def test_clamped_numbers_are_those_of_numpy():
     np.testing.assert_array_equal(at_least(x, 0.0), np.maximum(x, 0))
 
 
-@pytest.mark.parametrize("compositor", ["native", "xla", "cuda"])
+@pytest.mark.parametrize("compositor", quick_then_long(["native"], ["xla", "cuda"]))
 def test_a_splat_that_starts_black_takes_the_colour_of_the_photographs(compositor):
     target = jnp.broadcast_to(jnp.asarray([0.8, 0.4, 0.2])[None, None], (16, 16, 3))
     settings = a2tg.RenderSettings(compositor=compositor, capacity=64)
@@ -63,57 +64,35 @@ def test_a_splat_that_starts_black_takes_the_colour_of_the_photographs(composito
         return tuple(adam_update(gaussians, gradient, moments, jax.tree.map(lambda _: 0.02, gaussians))), None
 
     start = a2tg.init_from_points([[0.0, 0, 0], [0, 0, 9]], np.zeros((2, 3)), sh_degree=0)[:1]
-    assert (jax.grad(loss)(one_splat(0.0)).sh < 0).all()  # on the very edge, too
+    assert (jax.jit(jax.grad(loss))(one_splat(0.0)).sh < 0).all()  # on the very edge, too
     start = dataclasses.replace(one_splat(), sh=start.sh)
-    (end, _), _ = jax.jit(lambda state: jax.lax.scan(step, state, None, 1500))((start, adam_init(start)))
+    (end, _), _ = jax.jit(lambda state: jax.lax.scan(step, state, None, 500))((start, adam_init(start)))
     weights = np.asarray(a2tg.render_image(end, CAMERA, settings=settings).alpha)
     nearest = target[0, 0] * (weights.sum() / (weights**2).sum())  # least squares
     np.testing.assert_allclose(end.sh[0, 0] * SH_C0 + 0.5, nearest, rtol=0.02)
 
 
 def test_initial_colours_lie_inside():
-    colors = np.asarray([[0.0, 0.5, 1.0], [0.02, 0.9, 0.3]])
-    sh = a2tg.init_from_points(np.eye(3)[:2], colors).sh
+    sh = a2tg.init_from_points(np.eye(3)[:2], np.asarray([[0.0, 0.5, 1.0], [0.02, 0.9, 0.3]])).sh
     np.testing.assert_allclose(sh[:, 0] * SH_C0 + 0.5, [[0.05, 0.5, 1.0], [0.05, 0.9, 0.3]], atol=1e-6)
 
 
-def with_colors(color):
+def test_points_of_one_colour_have_none_and_a_missing_channel_is_learned():
     scene = a2tg.synthetic_scene(width=32, height=24, num_views=4, num_points=50)
-    return dataclasses.replace(scene, colors=np.broadcast_to(np.asarray(color, np.float32), scene.colors.shape))
-
-
-@pytest.mark.parametrize("color", [(0, 0, 0), (1, 1, 1), (0.2, 0, 0)])
-def test_a_cloud_of_one_colour_has_none(color):
-    with pytest.warns(UserWarning, match=r"all 50 points of synthetic have one colour \(.*\): taken as points without"):
-        np.testing.assert_array_equal(start_colors(with_colors(color)), 0.5)
-
-
-def test_other_clouds_keep_their_colours():
-    grey, scene = with_colors((0.502, 0.502, 0.502)), with_colors((0, 0, 0))
-    colors = np.array(scene.colors)
-    colors[3] = 0.1
-    for kept in (grey, dataclasses.replace(scene, colors=colors)):
-        np.testing.assert_array_equal(start_colors(kept), kept.colors)
-
-
-def test_black_points_train_as_grey_ones(shared):
-    """6.3 dB before; a channel that is 0 in all points stayed 0 for ever."""
-    scene = a2tg.load_scene(shared / "scenes" / "fox", downscale=8)
-    system = dataclasses.replace(a2tg.Gaussians2dMcmc.preset("quick"), stage1_iterations=600, stage2_iterations=200)
-    no_red = np.array(scene.colors) * np.asarray([0, 1, 1], np.float32)
-
-    def trained(colors):
-        model = a2tg.fit(dataclasses.replace(scene, colors=colors), system).model
-        return a2tg.evaluate(scene.test, model).psnr, model.render(scene.test[0].camera).color
-
-    grey, _ = trained(np.full_like(scene.colors, 0.5))
-    with pytest.warns(UserWarning, match="have one colour"):
-        black, _ = trained(np.zeros_like(scene.colors))
-    assert black == grey
-    without_red, image = trained(no_red)
-    assert without_red > grey - 1.5
-    red = np.mean(a2tg.view_image(scene.test[0])[..., 0])
-    assert abs(np.clip(image[..., 0], 0, 1).mean() - red) < 0.15 * red
+    with_colors = lambda colors: dataclasses.replace(scene, colors=np.asarray(colors, np.float32))  # noqa: E731
+    for color in ((0, 0, 0), (1, 1, 1), (0.2, 0, 0)):
+        with pytest.warns(UserWarning, match=r"all 50 points of synthetic have one colour \(.*\): taken as points"):
+            np.testing.assert_array_equal(start_colors(with_colors(np.full((50, 3), color))), 0.5)
+    nearly_black = np.zeros((50, 3))
+    nearly_black[3] = 0.1
+    no_red = scene.colors * np.asarray([0, 1, 1], np.float32)
+    for kept in (np.full((50, 3), 0.502), nearly_black, no_red):
+        np.testing.assert_array_equal(start_colors(with_colors(kept)), np.asarray(kept, np.float32))
+    system = a2tg.Gaussians2d.preset("smoke", stage1_iterations=150, densify=None)
+    model = a2tg.fit(with_colors(no_red), system, progress=False).model
+    found, wanted = (np.asarray(image)[..., 0] for image in (
+        model.render(scene.train[0].camera).color, a2tg.view_image(scene.train[0])))  # fmt: skip
+    assert abs(np.clip(found, 0, 1).mean() - wanted.mean()) < 0.15 * wanted.mean()
 
 
 def with_texels(texels, options):
@@ -124,25 +103,23 @@ def gradient_of_texels(appearance, gaussians):
     """The gradient that would brighten or thicken the splat at each texel."""
     floats, places = partition(appearance)
 
+    @jax.jit
     def total(floats):
-        settings = a2tg.RenderSettings(capacity=64)
         appearance = combine(floats, places)
+        settings = a2tg.RenderSettings(capacity=64)
         return jnp.sum(a2tg.render_appearance(gaussians, CAMERA, appearance, settings=settings).color)
 
     return jax.grad(total)(floats).textures.buckets[0][0]
 
 
-def test_texels_on_their_bounds_can_leave_them():
+@pytest.mark.parametrize("options", [TextureOptions(), TextureOptions(rgb="unit"), UNIT], ids=["signed", "unit", "max"])
+def test_texels_on_their_bounds_can_leave_them_and_projection_keeps_the_image(options):
     texels = np.full((2, 2, 4), 0.5, np.float32)
     texels[0, 0], texels[1, 1, :3] = 0, 1
-    for options in (TextureOptions(), TextureOptions(rgb="unit"), UNIT):
-        assert (gradient_of_texels(with_texels(texels, options), one_splat()) != 0).all(), options
-
-
-@pytest.mark.parametrize("options", [TextureOptions(rgb="unit"), UNIT])
-def test_projection_keeps_the_image_and_returns_texels_to_where_they_learn(options):
-    rng = np.random.default_rng(0)
-    texels = rng.uniform(-0.5, 1.5, (3, 4, 4)).astype(np.float32)
+    assert (gradient_of_texels(with_texels(texels, options), one_splat()) != 0).all()
+    if options.rgb == "signed":
+        return
+    texels = np.random.default_rng(0).uniform(-0.5, 1.5, (2, 2, 4)).astype(np.float32)
     if options.alpha == "projected":
         texels[..., 3] = 0.7
     appearance = with_texels(texels, options)
@@ -165,12 +142,12 @@ def test_alphas_at_their_cap_can_fade():
 
 
 def test_exponents_at_their_limit_have_a_gradient():
-    gaussians = some_gaussians(5)
+    gaussians, settings = some_gaussians(5), a2tg.RenderSettings(capacity=1024)
     limit = jnp.full(5, np.arctanh(np.log(0.6) / LARGEST_LOG_EXPONENT), jnp.float32)
     camera = a2tg.Camera(jnp.eye(4).at[2, 3].set(4.0), CAMERA.K, 16, 16)
 
     def total(shapes):
         appearance = Appearance(exponents=Exponents(shapes))
-        return jnp.sum(a2tg.render_appearance(gaussians, camera, appearance).color)
+        return jnp.sum(a2tg.render_appearance(gaussians, camera, appearance, settings=settings).color)
 
-    assert np.count_nonzero(jax.grad(total)(limit)) >= 3
+    assert np.count_nonzero(jax.jit(jax.grad(total))(limit)) >= 3

@@ -1,4 +1,4 @@
-"""Scenes that several processes read together: threads, each with a folder of its own, in place of processes."""
+"""Scenes that several processes read together: threads instead of processes, each with its own folder."""
 
 import collections
 import functools
@@ -14,7 +14,6 @@ from test_captures import write_polycam
 from test_data_colmap import write_scene as write_colmap
 from test_masks import left_half, write_mask
 from test_pictures import KINDS, write_scene
-from test_rays import write_fisheye
 
 from a2tg_jax import load_scene
 from a2tg_jax.data import decoding, load, photo_reading, photo_store
@@ -180,18 +179,23 @@ def test_a_file_missing_in_one_copy_is_told_to_all(tmp_path, together, index):
     assert told.startswith(f"{folders[index]}: has no sparse model")
 
 
+def divided(folder, together, decoded, num, **options):
+    """The scene as one process loads it; two processes find the same, and decode `num` photographs and masks."""
+    alone = load_scene(folder, **options)
+    decoded.clear()
+    scenes = together(*loading(copies(folder, 2), room=0, **options))
+    assert decoded["scene0"] + decoded["scene1"] == num
+    for scene in scenes:
+        assert_same_views(scene, alone)
+    return alone
+
+
 def test_masks_are_told_to_all(tmp_path, together, decoded):
     write_colmap(tmp_path / "scene")
     for view in load_scene(tmp_path / "scene").train[::2]:
         write_mask(tmp_path / "scene" / "masks" / f"{view.name}.png", left_half())
-    folders = copies(tmp_path / "scene", 2)
     with pytest.warns(UserWarning, match="photographs have no mask"):
-        alone = load_scene(tmp_path / "scene")
-        decoded.clear()
-        scenes = together(*loading(folders, room=0))
-    assert decoded["scene0"] + decoded["scene1"] == 9 + 4, "photographs and masks"
-    for scene in scenes:
-        assert_same_views(scene, alone)
+        divided(tmp_path / "scene", together, decoded, 9 + 4)  # photographs and masks
 
 
 def test_masks_of_another_programs_pixels_are_made_by_one_process_each(tmp_path, together, decoded):
@@ -200,14 +204,9 @@ def test_masks_of_another_programs_pixels_are_made_by_one_process_each(tmp_path,
         pixels = np.full_like(Image.open(file), 200)
         pixels[:, :10] = 0
         Image.fromarray(pixels).save(file)
-    alone = load_scene(tmp_path / "scene")
+    alone = divided(tmp_path / "scene", together, decoded, 4)
     masks = [view.mask for view in (*alone.train, *alone.test)]
     assert len({mask for mask in masks if mask is not None}) > 1, "borders of two kinds"
-    decoded.clear()
-    scenes = together(*loading(copies(tmp_path / "scene", 2), room=0))
-    assert decoded["scene0"] + decoded["scene1"] == 4
-    for scene in scenes:
-        assert_same_views(scene, alone)
 
 
 def test_masks_of_opacity_are_made_by_one_process_each(tmp_path, together, decoded):
@@ -218,25 +217,11 @@ def test_masks_of_opacity_are_made_by_one_process_each(tmp_path, together, decod
         Image.fromarray(pixels).save(name)
     for name in sorted((folder / "images").iterdir())[1::2]:
         Image.open(name).convert("RGB").save(name)
-    alone, stored = load_scene(folder, alpha="mask"), load_scene(folder)
+    stored = load_scene(folder)
     num = sum(view.has_alpha for view in (*stored.train, *stored.test))
-    assert num == 2, "three files have an alpha channel; that of one is opaque, and is dropped"
-    decoded.clear()
-    scenes = together(*loading(copies(folder, 2), alpha="mask", room=0))
-    assert decoded["scene0"] + decoded["scene1"] == 6
+    assert num == 2, "three files have an alpha channel; one of these is opaque, and is dropped"
+    alone = divided(folder, together, decoded, 6, alpha="mask")
     assert any(view.mask is not None for view in alone.train)
-    for scene in scenes:
-        assert_same_views(scene, alone)
-
-
-def test_rays_of_kept_lenses_need_no_pixels(tmp_path, together, decoded):
-    (tmp_path / "scene").mkdir()
-    folder = write_fisheye(tmp_path / "scene", focal=11.0)
-    alone = load_scene(folder, lens="keep")
-    decoded.clear()
-    for scene in together(*loading(copies(folder, 2), lens="keep", room=0)):
-        assert_same_views(scene, alone)
-        np.testing.assert_array_equal(scene.train[0].camera.rays, alone.train[0].camera.rays)
 
 
 def test_processes_must_have_the_same_photographs(tmp_path, together):
@@ -255,31 +240,26 @@ def test_processes_must_have_the_same_photographs(tmp_path, together):
     assert told.startswith(f"process 2 has other photographs than process 0: none, not {last} downscaled by 1; ")
 
 
-@pytest.mark.parametrize(
-    ("option", "values"),
-    [("downscale", (1, 2)), ("test_every", (8, 4)), ("alpha", ("transparency", "mask")), ("lens", ("undistort", "x"))],
-)
-def test_processes_must_have_the_same_options(tmp_path, together, option, values):
+def test_processes_must_have_the_same_options(tmp_path, together):
     folder = write_scene(tmp_path / "scene")
-    calls = [functools.partial(load_scene, folder, is_divided=True, **{option: value}) for value in values]
-    difference = f"{option}={values[1]}, not {option}={values[0]}; "
-    told = error_of_all(together(*calls, seconds=20))
-    assert told.startswith(f"process 1 has other options of the scene than process 0: {difference}")
+    options = {"downscale": (1, 2), "test_every": (8, 4), "alpha": ("transparency", "mask"), "lens": ("undistort", "x")}
+    for option, values in options.items():
+        calls = [functools.partial(load_scene, folder, is_divided=True, **{option: value}) for value in values]
+        difference = f"{option}={values[1]}, not {option}={values[0]}; "
+        told = error_of_all(together(*calls, seconds=20))
+        assert told.startswith(f"process 1 has other options of the scene than process 0: {difference}")
 
 
-@pytest.mark.parametrize(
-    ("path", "changes", "difference"),
-    [
-        (SYNTHETIC, {}, "scene=synthetic, not scene=from files"),
-        ("", {"validation": True}, "validation=True, not validation=False"),
-        ("", {"alpha": "mask"}, "alpha=mask, not alpha=transparency"),
-    ],
-)
-def test_processes_of_a_run_must_have_the_same_options(tmp_path, together, path, changes, difference):
+def test_processes_of_a_run_must_have_the_same_options(tmp_path, together):
     folder = str(write_scene(tmp_path / "scene"))
-    sources = SceneSource(folder), SceneSource(path or folder, **changes)
-    told = error_of_all(together(*(functools.partial(one.load, is_divided=True) for one in sources), seconds=20))
-    assert told.startswith(f"process 1 has other options of the scene than process 0: {difference}; ")
+    for path, changes, difference in (
+        (SYNTHETIC, {}, "scene=synthetic, not scene=from files"),
+        (folder, {"validation": True}, "validation=True, not validation=False"),
+        (folder, {"alpha": "mask"}, "alpha=mask, not alpha=transparency"),
+    ):
+        sources = SceneSource(folder), SceneSource(path, **changes)
+        told = error_of_all(together(*(functools.partial(one.load, is_divided=True) for one in sources), seconds=20))
+        assert told.startswith(f"process 1 has other options of the scene than process 0: {difference}; ")
 
 
 def test_processes_at_different_steps_end(together):

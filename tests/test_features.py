@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, draw_smooth_scene
+from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, draw_smooth_scene, quick_then_long
 
 from a2tg_jax import Appearance, Model, RenderSettings, pytree, render_appearance, render_image
 
@@ -28,7 +28,7 @@ def weighted(scene, features, background):
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(
     ("channels", "compositor"),
-    [(1, "native"), (3, "native"), (8, "native"), (64, "native"), (64, "xla"), (8, "autodiff")],
+    quick_then_long([(8, "native")], [(1, "native"), (3, "native"), (64, "native"), (64, "xla"), (8, "autodiff")]),
 )
 def test_features_are_weighted_as_colours_are(channels, compositor):
     """On a scene with textures, whose alpha counts; the gradients in features and background are the weights."""
@@ -55,11 +55,11 @@ def test_features_are_weighted_as_colours_are(channels, compositor):
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize(("channels", "compositor"), [(3, "native"), (8, "native"), (64, "native")])
-def test_gradients_in_geometry_are_those_of_differences(channels, compositor):
+@pytest.mark.parametrize("channels", quick_then_long([8], [64]))
+def test_gradients_in_geometry_are_those_of_differences(channels):
     """Along one direction of all the Gaussians' numbers."""
     features, camera = jnp.asarray(some_features(6, channels)), as_camera(SMOOTH, "float64")
-    settings = RenderSettings(capacity=1024, compositor=compositor)
+    settings = RenderSettings(capacity=1024, compositor="native")
 
     @jax.jit
     @jax.value_and_grad
@@ -78,6 +78,7 @@ def test_gradients_in_geometry_are_those_of_differences(channels, compositor):
     assert not jnp.any(gradient.sh) and jnp.all(jnp.any(gradient.means != 0, axis=1))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("gpu_kernels")
 def test_gpu_kernels_show_features():
     scene = draw_scene(4, num=4, width=8, height=8)
@@ -127,13 +128,20 @@ def test_an_appearance_may_have_other_colours_than_three():
 
 def test_mistakes_are_named():
     gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
-    show = functools.partial(render_image, gaussians, camera)
     features = jnp.asarray(some_features(8, 5), jnp.float32)
-    with pytest.raises(ValueError, match=r"features must be \[8, D\]; got \[7, 5\]"):
-        show(features=features[:7])
-    with pytest.raises(ValueError, match=r"features must be floats; got int32"):
-        show(features=jnp.zeros((8, 5), jnp.int32))
-    with pytest.raises(ValueError, match=r"features must be float32 as the means are, D >= 1; got float32\[8, 0\]"):
-        show(features=features[:, :0])
-    with pytest.raises(ValueError, match=r"background must be \[5\]; got \[3\]"):
-        show(features=features, background=(0, 0, 0))
+    for given, words in (
+        ({"features": features[:7]}, r"features must be \[8, D\]; got \[7, 5\]"),
+        ({"features": jnp.zeros((8, 5), jnp.int32)}, "features must be floats; got int32"),
+        ({"features": features[:, :0]}, r"features must be float32 as the means are, D >= 1; got float32\[8, 0\]"),
+        ({"features": features, "background": (0, 0, 0)}, r"background must be \[5\]; got \[3\]"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            render_image(gaussians, camera, **given)
+
+    @pytree
+    class Odd(Appearance):
+        def shade(self, numbers, values, u, v):
+            return None
+
+    with pytest.raises(ValueError, match=r"Odd\.shade must return \(residual, factor\): .*; it returned None"):
+        render_appearance(gaussians, camera, Odd(features=features))

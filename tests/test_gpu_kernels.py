@@ -10,26 +10,29 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene
+from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene, quick_then_long
 
 from a2tg_jax import RenderSettings, render_image
 from a2tg_jax.appearance import Appearance, StaticShading, Texture
+from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.rasterize.kernels.cuda import composite, nvrtc
-from a2tg_jax.rasterize.kernels.cuda.printing import PRIMITIVES, Argument, c_function
-from a2tg_jax.rasterize.kernels.cuda.source import source
+from a2tg_jax.rasterize.kernels.cuda.source import PRIMITIVES, Argument, c_function, source
 from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable, example, trace
 from a2tg_jax.rasterize.kernels.native import lanes as of_native
-from a2tg_jax.rasterize.splats import KernelSpec
+from a2tg_jax.rasterize.splats import PassSettings
+from a2tg_jax.rasterize.tiles import TileGrid
+from a2tg_jax.rasterize.views import render_traced
 
-NOT_PRINTED = {"bitcast_convert_type", "shift_left", "shift_right_arithmetic"}
+NOT_PRINTED = {"bitcast_convert_type", "shift_right_arithmetic"}
 """Primitives of the formulas of native loops, which GPU kernels have no use for."""
 
 
-def spec_of(has_textures=True, dtype="float32", tile_size=16, has_geometry=True, statistic="position"):
+def source_of(has_textures=True, dtype="float32", tile_size=16):
     textures = as_textures(draw_scene(4, num=8), "float32")
-    appearance = Appearance(texture=Texture(textures)) if has_textures else Appearance()
+    static = StaticShading.of(Appearance(texture=Texture(textures)) if has_textures else Appearance())
     columns = 4 if has_textures else 0
-    return KernelSpec(StaticShading.of(appearance), 0, columns, dtype, tile_size, 0.2, has_geometry, statistic)
+    settings = PassSettings(static, 0, columns, 3, dtype, TileGrid(0, 0, tile_size), 0.2, True, "position")
+    return source(settings, "cuda")
 
 
 @pytest.fixture
@@ -43,7 +46,7 @@ def has_nvrtc():
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("tile_size", [5, 16, 24])
 def test_nvrtc_compiles_them(has_textures, dtype, tile_size):
-    text = source(spec_of(has_textures, dtype, tile_size), "cuda")
+    text = source_of(has_textures, dtype, tile_size)
     for capability in ("7.5", "9.0", "12.0"):
         program = nvrtc.ptx(text, capability)
         assert ".entry forward(" in program and ".entry backward(" in program
@@ -56,11 +59,11 @@ def test_they_fit_the_registers_of_two_blocks(tmp_path, has_textures, most):
     """128 registers of 256 threads are half of those that an H200's processor has; none are spilled."""
     if shutil.which("ptxas") is None:
         pytest.skip("ptxas is not installed; it comes with CUDA's compiler")
-    (tmp_path / "tiles.ptx").write_text(nvrtc.ptx(source(spec_of(has_textures), "cuda"), "9.0"))
+    (tmp_path / "tiles.ptx").write_text(nvrtc.ptx(source_of(has_textures), "9.0"))
     command = ["ptxas", "-v", "-arch=sm_90", "tiles.ptx", "-o", "tiles.cubin"]
-    told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stderr
-    assert max(map(int, re.findall(r"Used (\d+) registers", told))) <= most
-    assert set(re.findall(r"(\d+) bytes spill", told)) == {"0"}
+    log = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stderr
+    assert max(map(int, re.findall(r"Used (\d+) registers", log))) <= most
+    assert set(re.findall(r"(\d+) bytes spill", log)) == {"0"}
 
 
 def test_nvrtc_tells_what_it_refuses(has_nvrtc):
@@ -85,6 +88,12 @@ def test_xla_takes_them():
         assert f"name = {name}" in call and "block_x = 256" in call and "grid_x = 6 " in call
 
 
+def assert_all_close(found, wanted, rtol, atol):
+    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(b, a, rtol=rtol, atol=atol * max(1.0, float(jnp.abs(a).max(initial=0))))
+
+
+@pytest.mark.long
 @pytest.mark.usefixtures("gpu_kernels", "x64")
 @pytest.mark.parametrize(("num", "tile_size", "size"), [(300, 16, (33, 18)), (1, 5, (7, 9)), (90, 24, (24, 30))])
 def test_long_lists_and_odd_tiles(num, tile_size, size):
@@ -100,10 +109,33 @@ def test_long_lists_and_odd_tiles(num, tile_size, size):
         return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
 
     differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
-    (_, expected), wanted = differentiate(gaussians, textures.buckets, "native")
-    (_, output), found = differentiate(gaussians, textures.buckets, "cuda")
-    for a, b in zip(jax.tree.leaves((expected, wanted)), jax.tree.leaves((output, found)), strict=True):
-        np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-11 * max(1.0, float(jnp.abs(a).max(initial=0))))
+    found, wanted = (differentiate(gaussians, textures.buckets, name) for name in ("cuda", "native"))
+    assert_all_close(found, wanted, 1e-9, 1e-11)
+
+
+@pytest.mark.usefixtures("gpu_kernels")
+@pytest.mark.parametrize(
+    ("has_textures", "statistic"),
+    quick_then_long([(True, "position")], [(False, "position"), (False, "screen"), (False, "center")]),
+)
+def test_gpu_kernels_are_those_of_xla(has_textures, statistic):
+    """Interpreted, on a small scene: the image, the gradient, and a statistic."""
+    scene = draw_scene(4, num=16, width=19, height=13)
+    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
+    appearance = Appearance(texture=Texture(as_textures(scene, "float32"))) if has_textures else Appearance()
+    floats, rest = partition(appearance)
+
+    def loss(gaussians, floats, probe, compositor):
+        settings, shown = RenderSettings(compositor=compositor, capacity=1024), combine(floats, rest)
+        output, _ = render_traced(gaussians, camera, shown, jnp.ones(3), settings, probe=probe, statistic=statistic)
+        return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
+
+    differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True), static_argnums=3)
+    inputs = gaussians, floats, jnp.zeros((gaussians.num, 4))
+    wanted, found = (differentiate(*inputs, name) for name in ("xla", "cuda"))
+    assert wanted[0][1].alpha.max() > 0.5 and wanted[1][2][:, 3].max() > 10
+    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-4, atol=2e-5 * float(jnp.abs(a).max()))
 
 
 def test_every_primitive_of_native_loops_is_printed():
@@ -118,16 +150,9 @@ def program(x, y):
         *(x + y, x - y, x * y, x / y, -x, jnp.sqrt(abs(x)), lax.square(x), lax.integer_pow(y, -3), abs(x) ** 2.5),
         *(jnp.clip(x, -1, y), jnp.minimum(x, y), jnp.maximum(x, y), jnp.sign(x), jnp.floor(x), jnp.ceil(y)),
         *(x == y, x != y, x < y, x <= y, x > y, x >= y, ~(x < y), (x > 0) & (y > 0), (x > 0) | (y > 0)),
-        *(
-            lax.div(whole, jnp.int32(3)),
-            whole.astype(x.dtype),
-            jnp.sign(whole),
-            abs(whole),
-            ~whole | (whole & 6),
-            whole.astype(bool),
-        ),
-        *(jnp.where(x > 0, x, y), lax.select_n(jnp.clip(whole, 0, 2), x, y, x + 1), lax.stop_gradient(x)),
-        *(jnp.exp(x), jnp.log(abs(y)), jnp.sin(x), jnp.cos(y), jax.nn.sigmoid(y)),
+        *(lax.div(whole, jnp.int32(3)), whole.astype(x.dtype), jnp.sign(whole), abs(whole), ~whole | (whole & 6)),
+        *(whole.astype(bool), jnp.where(x > 0, x, y), lax.select_n(jnp.clip(whole, 0, 2), x, y, x + 1)),
+        *(lax.stop_gradient(x), jnp.exp(x), jnp.log(abs(y)), jnp.sin(x), jnp.cos(y), jnp.tanh(x), jax.nn.sigmoid(y)),
     )
 
 

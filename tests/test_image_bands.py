@@ -1,14 +1,22 @@
-"""Borders between bands: as even as rows of tiles allow, for any counts. `on_devices` composites with them."""
+"""Bands of an image and several views at once, as several devices draw them. `on_devices` composites with both."""
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 
 from a2tg_jax.core.geometry import homographies, screen_bounds
-from a2tg_jax.parallel.exchange import BorderRoom, ImageBands
+from a2tg_jax.parallel.exchange import (
+    BorderRoom,
+    ImageBands,
+    map_views,
+    of_all_views,
+    of_own_view,
+    value_and_grad_of_views,
+)
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, tile_rectangles
 
 TILE = 8
@@ -74,6 +82,7 @@ def test_the_largest_room_is_for_any_borders(tile, height, num):
         np.testing.assert_array_equal(bands.sums(jnp.asarray(pairs, jnp.int32), borders).sum(), pairs.sum())
 
 
+@pytest.mark.long
 def test_rows_of_tiles_have_the_pairs_of_the_lists():
     scene = draw_scene(3, num=200, width=64, height=45)
     M, _ = homographies(as_gaussians(scene, "float32"), as_camera(scene, "float32"))
@@ -81,17 +90,42 @@ def test_rows_of_tiles_have_the_pairs_of_the_lists():
     boxes = tile_rectangles(screen_bounds(M, cutoff, 0.2), grid)
     bands = ImageBands.of(grid, 3)
     pairs = np.asarray(bands.pairs_of_rows(boxes))
-    for row in range(grid.rows):
-        above, here = (
-            tile_lists(M, cutoff, 0.2, grid, 1 << 15, height=jnp.int32(min(45, end * TILE))) for end in (row, row + 1)
-        )
-        assert pairs[row] == float(here.num_pairs) - float(above.num_pairs) > 0
+    pairs_above = jax.jit(lambda height: tile_lists(M, cutoff, 0.2, grid, 1 << 15, height=height).num_pairs)
+    sums = [float(pairs_above(jnp.int32(min(45, end * TILE)))) for end in range(grid.rows + 1)]
+    np.testing.assert_array_equal(pairs, np.diff(sums))
+    assert (pairs > 0).all()
     borders = bands.borders(jnp.asarray(pairs))
     reached = np.asarray(bands.reached(boxes, borders))
     first, end = np.asarray(boxes.y0), np.asarray(boxes.y0 + boxes.counts // jnp.maximum(boxes.columns, 1))
     for band, (top, bottom) in enumerate(itertools.pairwise(np.asarray(borders))):
-        expected = [
-            count > 0 and bool(set(range(a, b)) & set(range(top, bottom)))
-            for a, b, count in zip(first, end, np.asarray(boxes.counts), strict=True)
-        ]
-        np.testing.assert_array_equal(reached[band], expected)
+        is_reached = (np.asarray(boxes.counts) > 0) & (np.maximum(first, top) < np.minimum(end, bottom))
+        np.testing.assert_array_equal(reached[band], is_reached)
+
+
+@pytest.mark.parametrize("num_at_once", [2, 4])
+def test_views_at_once_have_the_values_and_gradients_of_one_view_after_the_other(num_at_once):
+    rng = np.random.default_rng(0)
+    gaussians, params, probe = jnp.asarray(rng.normal(size=(5, 3))), jnp.asarray(0.7), jnp.zeros((5, 3))
+    rows, views = jnp.asarray(rng.normal(size=(4, 3))), jnp.asarray(rng.normal(size=(4, 5)))
+
+    def loss_of(draw):
+        def loss(gaussians, params, rows, probe, view):
+            shown = draw(gaussians * params + rows[None]) + probe
+            return jnp.sum(view[:, None] * shown**2), shown[0]
+
+        return loss
+
+    def differentiated(derivative):
+        def run(arrays):
+            value, (by_gaussians, by_params, *others) = derivative(gaussians, params, arrays[0], probe, arrays[1])
+            return (value, by_gaussians, others), by_params
+
+        return run
+
+    # What a view shows, twice its own, computed for all views at once.
+    together = value_and_grad_of_views(loss_of(lambda x: of_own_view(2 * of_all_views(x))), num_at_once, 0)
+    one = jax.value_and_grad(loss_of(lambda x: 2 * x), argnums=(0, 1, 2, 3), has_aux=True)
+    expected, by_params = jax.lax.map(differentiated(one), (rows, views))
+    found, means = jax.jit(lambda arrays: map_views(differentiated(together), arrays, num_at_once))((rows, views))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(b, a, rtol=1e-5), expected, found)
+    np.testing.assert_allclose(jnp.mean(means), jnp.mean(by_params), rtol=1e-5)

@@ -10,23 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from scenes_random import as_camera, as_gaussians, as_textures, draw_scene
+from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, quick_then_long
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import Appearance, Exponents, StaticShading, Texture, TextureOptions, gaussian_cutoff
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import homographies
-from a2tg_jax.core.pytree import combine, partition, pytree, static
+from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists, total_pairs
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.texture import textures_from_arrays
 
+long = pytest.mark.long
+
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("tile_size", [8, 16])
-def test_lists_are_those_of_xla(monkeypatch, tile_size, dtype):
+def test_lists_are_those_of_xla(monkeypatch, dtype):
     monkeypatch.setattr(native, "SPLATS_PER_THREAD", 100)
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 100)
     monkeypatch.setattr(ffi, "num_threads", lambda: 3)
@@ -35,47 +36,50 @@ def test_lists_are_those_of_xla(monkeypatch, tile_size, dtype):
     M, _ = homographies(gaussians, camera)
     # Equal depths, to see ties in order of the index.
     splats = M.at[:, 2, 2].set(jnp.round(M[:, 2, 2], 1)), gaussian_cutoff(gaussians.opacities), 0.2
-    grid = TileGrid(scene.width, scene.height, tile_size)
-    ours = jax.jit(lambda: native.tile_lists(*splats, grid, 20_000))()
-    expected = jax.jit(lambda: tile_lists(*splats, grid, 20_000))()
-    np.testing.assert_array_equal(ours.starts, expected.starts)
-    num_pairs = int(ours.starts[-1])
-    assert num_pairs > 500
-    np.testing.assert_array_equal(ours.ids[:num_pairs], expected.ids[:num_pairs])
-    assert ours.num_pairs == expected.num_pairs and not ours.overflow
-
+    for tile_size in (8, 16):
+        grid = TileGrid(scene.width, scene.height, tile_size)
+        ours = jax.jit(lambda grid=grid: native.tile_lists(*splats, grid, 20_000))()
+        expected = jax.jit(lambda grid=grid: tile_lists(*splats, grid, 20_000))()
+        np.testing.assert_array_equal(ours.starts, expected.starts)
+        num_pairs = int(ours.starts[-1])
+        assert num_pairs > 500
+        np.testing.assert_array_equal(ours.ids[:num_pairs], expected.ids[:num_pairs])
+        assert ours.num_pairs == expected.num_pairs and not ours.overflow
     full = jax.jit(lambda: native.tile_lists(*splats, grid, 100))()
     assert full.overflow and full.starts[-1] == 0
 
 
-@pytest.mark.parametrize("num_threads", [2, 3])
-def test_threads_share_the_work_and_nothing_else(monkeypatch, num_threads):
+def assert_all_close(found, wanted, rtol, atol):
+    """Leaves agree; `atol` is in units of the largest entry of each."""
+    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(b, a, rtol=rtol, atol=atol * float(jnp.abs(a).max()))
+
+
+def test_threads_share_the_work_and_nothing_else(monkeypatch):
     """Images are bit for bit those of one thread; gradients, summed by thread, are equal to rounding."""
     scene = draw_scene(3, num=60)
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    textures = as_textures(scene, "float32")
+    textures, settings = as_textures(scene, "float32"), RenderSettings(capacity=8192)
 
-    def loss(gaussians, buckets):
-        output = render_image(gaussians, camera, dataclasses.replace(textures, buckets=buckets))
-        return jnp.sum(output.color**2) + jnp.sum(output.depth), output
+    @jax.jit
+    def differentiate(gaussians, buckets):
+        def loss(gaussians, buckets):
+            shown = dataclasses.replace(textures, buckets=buckets)
+            output = render_image(gaussians, camera, shown, settings=settings)
+            return jnp.sum(output.color**2) + jnp.sum(output.depth), output
 
-    differentiate = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
-    monkeypatch.setattr(ffi, "num_threads", lambda: 1)
-    (_, one), expected = differentiate(gaussians, textures.buckets)
-    monkeypatch.setattr(ffi, "num_threads", lambda: num_threads)
+        return jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(gaussians, buckets)
+
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 10)
-    (_, many), found = differentiate(gaussians, textures.buckets)
-    np.testing.assert_array_equal(many.color, one.color)
-    np.testing.assert_array_equal(many.depth, one.depth)
-    for a, b in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
-        np.testing.assert_allclose(b, a, rtol=1e-4, atol=1e-5 * float(jnp.abs(a).max()))
-
-
-def test_parts_cover_all_tiles():
-    starts = np.concatenate([[0], np.cumsum(np.random.default_rng(0).integers(0, 500, 100))]).astype(np.int32)
-    parts = native._parts(starts)
-    assert parts[0][0] == 0 and parts[-1][1] == 100
-    assert all(one[1] == other[0] for one, other in itertools.pairwise(parts))
+    found = []
+    for num_threads in (1, 2, 3):
+        monkeypatch.setattr(ffi, "num_threads", lambda num=num_threads: num)
+        found.append(jax.block_until_ready(differentiate(gaussians, textures.buckets)))
+    ((_, one), expected), *others = found
+    for (_, many), gradients in others:
+        np.testing.assert_array_equal(many.color, one.color)
+        np.testing.assert_array_equal(many.depth, one.depth)
+        assert_all_close(gradients, expected, 1e-4, 1e-5)
 
 
 @pytree(kw_only=True)
@@ -102,7 +106,7 @@ class Halves(Appearance):
 
 @pytest.mark.usefixtures("x64")
 def test_any_appearance_is_compiled():
-    scene = draw_scene(9)
+    scene = draw_scene(9, num=20, width=19, height=13)
     gaussians, camera = as_gaussians(scene, "float64"), as_camera(scene, "float64")
     halves = jnp.asarray(np.random.default_rng(0).normal(size=(gaussians.num, 2, 3)))
 
@@ -116,8 +120,7 @@ def test_any_appearance_is_compiled():
     (_, image), found = differentiate(gaussians, halves, "native")
     assert jnp.abs(wanted[1]).max() > 1e-3
     np.testing.assert_allclose(image, expected, atol=1e-10)
-    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
-        np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-10 * float(jnp.abs(a).max()))
+    assert_all_close(found, wanted, 1e-9, 1e-10)
 
 
 @pytree
@@ -142,34 +145,17 @@ def test_an_appearance_without_translation_is_left_to_xla():
         show(compositor="native")
 
 
-@pytest.mark.usefixtures("gpu_kernels")
-@pytest.mark.parametrize(
-    ("has_textures", "statistic"), [(False, "position"), (True, "position"), (False, "screen"), (False, "center")]
-)
-def test_gpu_kernels_are_those_of_xla(has_textures, statistic):
-    """Interpreted, on a small scene: the image, the gradient, and a statistic."""
-    scene = draw_scene(4, num=16, width=19, height=13)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    appearance = Appearance(texture=Texture(as_textures(scene, "float32"))) if has_textures else Appearance()
-    floats, rest = partition(appearance)
+OPTIONS = TextureOptions("align-corners", "identity", "unit")
 
-    def loss(gaussians, floats, probe, compositor):
-        settings, shown = RenderSettings(compositor=compositor, capacity=1024), combine(floats, rest)
-        output, _ = render_traced(gaussians, camera, shown, jnp.ones(3), settings, probe=probe, statistic=statistic)
-        return jnp.sum(output.color**2) + jnp.sum(output.depth) + jnp.sum(output.normal * output.color), output
 
-    differentiate = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True), static_argnums=3)
-    inputs = gaussians, floats, jnp.zeros((gaussians.num, 4))
-    (_, expected), wanted = differentiate(*inputs, "xla")
-    (_, output), found = differentiate(*inputs, "cuda")
-    assert expected.alpha.max() > 0.5 and wanted[2][:, 3].max() > 10
-    for a, b in zip(jax.tree.leaves((expected, wanted)), jax.tree.leaves((output, found)), strict=True):
-        np.testing.assert_allclose(b, a, rtol=1e-4, atol=2e-5 * float(jnp.abs(a).max()))
+PLAIN = TextureOptions()
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("options", [TextureOptions(), TextureOptions("align-corners", "identity", "unit")])
-@pytest.mark.parametrize("compositor", ["native", "xla", "cuda"])
+@pytest.mark.parametrize(
+    ("compositor", "options"),
+    quick_then_long([("native", PLAIN)], [("native", OPTIONS), *itertools.product(["xla", "cuda"], [PLAIN, OPTIONS])]),
+)
 def test_a_splat_without_a_texture_shows_its_gaussian(compositor, options):
     """As one with a texel that changes nothing: the oracle's image, and the same gradients of all else."""
     scene = draw_scene(4, num=16, width=19, height=13)
@@ -196,14 +182,14 @@ def test_a_splat_without_a_texture_shows_its_gaussian(compositor, options):
     # A neutral texel has a gradient, what is empty has none.
     for arrays in (wanted[2], found[2]):
         arrays[:] = [array for none, array in zip(is_empty, arrays, strict=True) if not none]
-    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
-        np.testing.assert_allclose(b, a, rtol=1e-10, atol=1e-12 * float(jnp.abs(a).max()))
+    assert_all_close(found, wanted, 1e-10, 1e-12)
     if options == TextureOptions():
         expected = oracle.render(scene._replace(textures=neutral))
         assert expected.margin.min() > 1e-9
         np.testing.assert_allclose(found[0], expected.color, atol=1e-9)
 
 
+@long
 @pytest.mark.usefixtures("x64")
 def test_mixed_precisions_are_composited_in_the_larger():
     """Gaussians and textures in float32 under a float64 camera: the gradients keep their dtypes.
@@ -225,20 +211,15 @@ def test_mixed_precisions_are_composited_in_the_larger():
         (_, image), found = differentiate(gaussians, textures.buckets, as_camera(scene, "float64"))
     assert image.dtype == jnp.float64
     assert np.mean(abs(np.asarray(image) - np.asarray(expected)) < 1e-5) > 0.99
-    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
-        assert a.dtype == b.dtype == jnp.float32
-        np.testing.assert_allclose(b, a, rtol=0, atol=2e-2 * float(jnp.abs(a).max()))
+    assert {leaf.dtype for leaf in jax.tree.leaves((found, wanted))} == {jnp.dtype("float32")}
+    assert_all_close(found, wanted, 0, 2e-2)
 
 
-def test_kernels_have_the_same_name_in_every_process():
+def test_names_of_kernels_are_the_same_in_every_process_and_others_for_a_class_defined_again():
     """XLA's compilation cache finds them by the name, which contains no address of an object."""
-    textures = as_textures(draw_scene(4, num=8), "float32")
+    scene = draw_scene(4, num=8, width=16, height=16)
+    textures = as_textures(scene, "float32")
     assert " at 0x" not in repr(StaticShading.of(Appearance(texture=Texture(textures), exponents=Exponents())))
-
-
-def test_a_class_defined_again_is_compiled_again():
-    scene = draw_scene(9)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
 
     def image(residual):
         @pytree
@@ -246,7 +227,7 @@ def test_a_class_defined_again_is_compiled_again():
             def shade(self, numbers, values, u, v):
                 return (residual * jnp.ones_like(u),) * 3, None
 
-        return render_appearance(gaussians, camera, Again()).color
+        return render_appearance(as_gaussians(scene, "float32"), as_camera(scene, "float32"), Again()).color
 
     assert jnp.max(jnp.abs(image(0.0) - image(0.5))) > 0.1
 
@@ -270,6 +251,7 @@ def test_large_sums_of_pairs_lose_no_small_count():
     assert abs(float(total_pairs(counts)) - (2**28 + 100_000)) <= 64
 
 
+@long
 def test_without_llvmlite_xla_composites():
     script = """
 import sys

@@ -22,22 +22,19 @@ from scenes_random import (
 )
 
 from a2tg_jax import (
-    Appearance,
     Camera,
     RenderOutput,
     RenderSettings,
-    Texture,
     allocate_textures,
     init_from_points,
-    parameter_bytes,
     plan_render,
     render_image,
     texture_arrays,
 )
-from a2tg_jax.model import Model
 
 FIELDS = ("color", "alpha", "depth", "normal")
 rendered = functools.partial(render_scene, dtype="float64")
+x64 = pytest.mark.usefixtures("x64")
 
 
 def assert_same(one: RenderOutput, other: RenderOutput, tolerance: float = 1e-12):
@@ -62,38 +59,40 @@ def rotate_sh(sh: Float, rotation: Float) -> Float:
     return np.linalg.lstsq(after, before, rcond=None)[0] @ sh
 
 
-@pytest.mark.usefixtures("x64")
-def test_initial_textures_are_no_textures():
-    scene = draw_scene(1)
+@x64
+def test_textures_that_change_nothing():
+    """Initial ones are none, a constant one of any size is its one texel, and colour is affine in RGB texels."""
+    scene, rng = draw_scene(1), np.random.default_rng(0)
     textures = allocate_textures(np.array([texture.shape[:2] for texture in scene.textures]))
     neutral = [np.asarray(texture) for texture in texture_arrays(textures)]
     assert_same(rendered(scene._replace(textures=neutral)), rendered(scene._replace(textures=None)))
-
-
-@pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_constant_texture_of_any_size_is_its_one_texel(seed):
-    scene = draw_scene(seed)
     single = [texture[:1, :1] for texture in scene.textures]
     constant = [np.broadcast_to(one, texture.shape) for one, texture in zip(single, scene.textures, strict=True)]
     assert_same(rendered(scene._replace(textures=constant)), rendered(scene._replace(textures=single)))
+    other = [np.concatenate([rng.normal(size=(*t.shape[:2], 3)), t[..., 3:]], axis=-1) for t in scene.textures]
+    mixed = [0.3 * a + 0.7 * b for a, b in zip(scene.textures, other, strict=True)]
+    colors = [rendered(scene._replace(textures=textures)).color for textures in (scene.textures, other, mixed)]
+    np.testing.assert_allclose(colors[2], 0.3 * colors[0] + 0.7 * colors[1], atol=1e-12)
 
 
-@pytest.mark.usefixtures("x64")
+@x64
 @pytest.mark.parametrize("seed", [0, 1])
-def test_order_of_the_gaussians_does_not_matter(seed):
+def test_order_of_the_gaussians_and_scale_and_sign_of_quaternions_do_not_matter(seed):
     scene = draw_scene(seed)
     order = np.random.default_rng(seed).permutation(len(scene.means))
     fields = ("means", "quats", "log_scales", "logit_opacities", "sh")
     permuted = {name: getattr(scene, name)[order] for name in fields}
     textures = [scene.textures[i] for i in order]
     assert_same(rendered(scene._replace(textures=textures, **permuted)), rendered(scene))
+    assert_same(rendered(scene._replace(quats=-3 * scene.quats)), rendered(scene), 1e-9)
 
 
-@pytest.mark.usefixtures("x64")
+@x64
 @pytest.mark.parametrize("seed", [0, 1])
 def test_moving_world_and_camera_together(seed):
     scene, rotation = draw_scene(seed), rotation_of(seed + 10)
+    # The helper that moves worlds inverts the oracle's rotation.
+    np.testing.assert_allclose(oracle.rotation_matrix(quaternion(rotation)), rotation, atol=1e-12)
     # The camera centre −Rcᵀt moves along only where Rc is a rotation to more digits than float32 has.
     left, _, right = np.linalg.svd(scene.viewmat[:3, :3])
     scene.viewmat[:3, :3] = left @ right
@@ -113,47 +112,34 @@ def test_moving_world_and_camera_together(seed):
     assert_same(dataclasses.replace(there, geometry=turned), rendered(scene), 1e-8)
 
 
-@pytest.mark.usefixtures("x64")
-def test_quaternions_need_no_unit_length_and_have_two_signs():
-    scene = draw_scene(2)
-    assert_same(rendered(scene._replace(quats=-3 * scene.quats)), rendered(scene), 1e-9)
-
-
-@pytest.mark.usefixtures("x64")
-def test_color_is_affine_in_rgb_texels():
-    scene = draw_scene(4)
-    rng = np.random.default_rng(0)
-    other = [np.concatenate([rng.normal(size=(*t.shape[:2], 3)), t[..., 3:]], axis=-1) for t in scene.textures]
-    mixed = [0.3 * a + 0.7 * b for a, b in zip(scene.textures, other, strict=True)]
-    colors = [rendered(scene._replace(textures=textures)).color for textures in (scene.textures, other, mixed)]
-    np.testing.assert_allclose(colors[2], 0.3 * colors[0] + 0.7 * colors[1], atol=1e-12)
-
-
-@pytest.mark.parametrize("seed", [0, 4])
-def test_tile_size_does_not_show(seed):
+@pytest.mark.long
+def test_tile_size_does_not_show():
     """In float32 as well, up to rounding on splats seen edge-on: a short screen bound would show as a step of 1/255."""
-    scene = draw_scene(seed)
-    images = [render_scene(scene, "float32", as_settings(tile_size=size)) for size in (8, 16, 64)]
-    for image in images[1:]:
-        assert_same(image, images[0], 3e-4)
+    for seed in (0, 4):
+        images = [render_scene(draw_scene(seed), "float32", as_settings(tile_size=size)) for size in (8, 16, 64)]
+        for image in images[1:]:
+            assert_same(image, images[0], 3e-4)
 
 
-@pytest.mark.usefixtures("x64")
+@x64
 def test_colors_mix_over_the_background():
     scene = draw_scene(6)
-    black = rendered(scene._replace(background=np.zeros(3)))
-    shown = rendered(scene)
+    black, shown = rendered(scene._replace(background=np.zeros(3))), rendered(scene)
     expected = black.color + (1 - black.alpha)[..., None] * jnp.asarray(scene.background)[None, None]
     np.testing.assert_allclose(shown.color, expected, atol=1e-12)
     np.testing.assert_array_equal(shown.depth, black.depth)
     np.testing.assert_array_equal(shown.normal, black.normal)
 
 
+def inputs_of(scene: Scene):
+    return as_gaussians(scene, "float32"), as_camera(scene, "float32"), as_textures(scene, "float32")
+
+
 def test_the_same_shapes_are_traced_once():
     """Other values are not traced again, nor are textures of the same sizes in another order: the buckets are alike."""
     scene = draw_scene(0)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    settings = plan_render(gaussians, [camera], as_textures(scene, "float32"))
+    gaussians, camera, textures = inputs_of(scene)
+    settings = plan_render(gaussians, [camera], textures)
     num_traces = 0
 
     @jax.jit
@@ -170,9 +156,7 @@ def test_the_same_shapes_are_traced_once():
 
 @pytest.mark.parametrize("transform", [jax.jit, lambda draw: lambda x: jax.vmap(draw)(x[None])], ids=["jit", "vmap"])
 def test_a_missing_capacity_says_what_to_do(transform):
-    scene = draw_scene(0)
-    camera = as_camera(scene, "float32")
-    gaussians = as_gaussians(scene, "float32")
+    gaussians, camera, _ = inputs_of(draw_scene(0))
 
     def draw(means):
         return render_image(dataclasses.replace(gaussians, means=means), camera).color
@@ -183,37 +167,28 @@ def test_a_missing_capacity_says_what_to_do(transform):
 
 def draw_with(settings: RenderSettings, scene: Scene) -> RenderOutput:
     """The float32 image under given settings, capacity included, under jit."""
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    background = jnp.asarray(scene.background, jnp.float32)
-    return jitted_renderer(settings)(gaussians, camera, as_textures(scene, "float32"), background)
+    return jitted_renderer(settings)(*inputs_of(scene), jnp.asarray(scene.background, jnp.float32))
 
 
-@pytest.mark.parametrize("capacity", [10, 200, 600])
-def test_too_small_a_capacity_is_flagged(capacity):
+def test_too_small_a_capacity_is_flagged_and_a_plan_holds_for_all_its_cameras():
     """Either the flag is up or the image is whole."""
     scene = draw_scene(0)
-    output = draw_with(as_settings(capacity=capacity), scene)
-    assert capacity > 10 or output.overflow
-    if not output.overflow:
-        assert_same(output, render_scene(scene, "float32"), 1e-6)
-
-
-def test_a_plan_holds_for_all_its_cameras():
-    scene = draw_scene(0)
+    for capacity in (10, 200, 600):
+        output = draw_with(as_settings(capacity=capacity), scene)
+        assert capacity > 10 or output.overflow
+        if not output.overflow:
+            assert_same(output, render_scene(scene, "float32"), 1e-6)
     views = [scene._replace(viewmat=other.viewmat, K=other.K) for other in map(draw_scene, (0, 1, 2))]
-    gaussians, textures = as_gaussians(scene, "float32"), as_textures(scene, "float32")
+    gaussians, _, textures = inputs_of(scene)
     settings = plan_render(gaussians, [as_camera(view, "float32") for view in views], textures)
-    for view in views:
-        assert not draw_with(settings, view).overflow
+    assert not any(draw_with(settings, view).overflow for view in views)
 
 
 def test_cameras_can_be_batched():
     scene = draw_scene(2)
-    gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
-    textures = as_textures(scene, "float32")
-    offsets = np.array([[0, 0, 0], [0.1, 0, 0], [0, -0.2, 0.3]])
+    gaussians, camera, textures = inputs_of(scene)
     views = []
-    for offset in offsets:
+    for offset in ([0, 0, 0], [0.1, 0, 0], [0, -0.2, 0.3]):
         viewmat = scene.viewmat.copy()
         viewmat[:3, 3] += offset
         views.append(scene._replace(viewmat=viewmat))
@@ -230,30 +205,14 @@ def test_cameras_can_be_batched():
         assert_same(jax.tree.map(lambda x, i=i: x[i], batched), render_scene(view, "float32"), 3e-4)
 
 
-def test_quaternion_of_a_rotation():
-    """The helper that moves worlds in these tests inverts the oracle's rotation."""
-    rotation = rotation_of(3)
-    np.testing.assert_allclose(oracle.rotation_matrix(quaternion(rotation)), rotation, atol=1e-12)
-
-
-def test_a_model_reports_its_bytes():
-    scene = draw_scene(0)
-    gaussians, textures = as_gaussians(scene, "float32"), as_textures(scene, "float32")
-    model = Model(gaussians, Appearance(texture=Texture(textures)))
-    assert model.num_bytes == parameter_bytes(gaussians, textures)
-    assert Model(gaussians).num_bytes == 232 * gaussians.num
-
-
-@pytest.mark.parametrize("compositor", ["native", "xla"])
 @pytest.mark.parametrize("has_textures", [False, True])
-def test_no_gaussians_show_the_background(compositor, has_textures):
+def test_no_gaussians_show_the_background(has_textures):
     nothing = init_from_points([[0, 0, 1], [0, 0, 2]], np.zeros((2, 3)))[:0]
     textures = allocate_textures(np.zeros((0, 2), np.int64)) if has_textures else None
     camera = Camera(jnp.eye(4), jnp.asarray([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 17, 13)
-    settings = RenderSettings(compositor=compositor)
 
     def draw(gaussians):
-        return render_image(gaussians, camera, textures, background=(0.1, 0.2, 0.3), settings=settings)
+        return render_image(gaussians, camera, textures, background=(0.1, 0.2, 0.3))
 
     output = draw(nothing)
     np.testing.assert_array_equal(output.color, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (13, 17, 3)))

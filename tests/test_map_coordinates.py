@@ -62,6 +62,18 @@ def xyz(rows: np.ndarray) -> np.ndarray:
     return np.stack([rows[name].astype(np.float64) for name in "xyz"], axis=1)
 
 
+def in_original_world(model: a2tg.Model) -> np.ndarray:
+    return model.origin.transform.inverse().apply(np.asarray(model.gaussians.means, np.float64))
+
+
+def positions_of_ply(path) -> np.ndarray:
+    """The positions in a PLY, with the offset that it names."""
+    comments, rows = ply_parts(path.read_bytes())
+    (offset,) = (np.array(line.split()[1:], float) for line in comments if line.startswith("offset "))
+    assert (offset == np.rint(offset)).all() and np.abs(xyz(rows)).max() < 10
+    return xyz(rows) + offset
+
+
 def farthest(found: np.ndarray, true: np.ndarray) -> float:
     """The largest distance of a true position from the nearest one found; files may change the order."""
     return float(np.linalg.norm(found[:, None] - true, axis=-1).min(axis=0).max())
@@ -72,14 +84,11 @@ def test_a_ply_of_map_coordinates_is_exact_with_the_offset_that_it_names(tmp_pat
     with pytest.warns(UserWarning, match=r"a\.ply: positions are relative to \(43123\d, 541122\d, 31\d\)") as told:
         a2tg.save_ply(tmp_path / "a.ply", model)
     assert len(told) == 1
-    comments, rows = ply_parts((tmp_path / "a.ply").read_bytes())
-    (offset,) = (line.split()[1:] for line in comments if line.startswith("offset "))
-    offset = np.array(offset, float)
-    assert (offset == np.rint(offset)).all()
-    assert np.abs(xyz(rows)).max() < 10
-    assert np.abs(xyz(rows) + offset - true).max() < 1e-6
+    assert np.abs(positions_of_ply(tmp_path / "a.ply") - true).max() < 1e-6
+    _, rows = ply_parts((tmp_path / "a.ply").read_bytes())
     with pytest.warns(UserWarning, match="positions are relative to"):
         np.testing.assert_array_equal(a2tg.load_ply(tmp_path / "a.ply").means, xyz(rows).astype(np.float32))
+    assert np.abs(read_ply_points(tmp_path / "a.ply").points - true).max() < 1e-6
 
 
 def positions_in(data: bytes, suffix: str, num: int) -> np.ndarray:
@@ -94,45 +103,40 @@ def positions_in(data: bytes, suffix: str, num: int) -> np.ndarray:
     return np.frombuffer(read["positions"], "<f4").reshape(-1, 3)
 
 
-@pytest.mark.parametrize("suffix", [".splat", ".ksplat", ".sog", ".spz", ".compressed.ply"])
-def test_files_of_other_programs_are_relative_to_the_offset_that_is_told(tmp_path, suffix):
+@pytest.mark.parametrize("suffix", [".splat", ".ksplat", ".sog", ".spz", ".compressed.ply", ".ply"])
+def test_files_are_relative_to_an_offset_which_some_hold(tmp_path, suffix):
     pytest.importorskip("gaussforge")
     model, true = map_scene()
-    with pytest.warns(UserWarning, match="positions are relative to") as told:
+    with pytest.warns(UserWarning, match="positions are relative to") as warned:
         a2tg.save_splats(tmp_path / f"a{suffix}", model)
-    offset = str(told[0].message).partition("(")[2].partition(")")[0]
-    found = positions_in((tmp_path / f"a{suffix}").read_bytes(), suffix, model.num).astype(np.float64)
-    assert np.abs(found).max() < 10
-    most = 5e-3 if suffix == ".compressed.ply" else 1e-3  # 11 bits within chunks of 8 m.
-    assert farthest(found + np.array([float(word) for word in offset.split(",")]), true) < most
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog"])
-def test_the_offset_comes_back(tmp_path, suffix):
     if suffix != ".ply":
-        pytest.importorskip("gaussforge")
-    model, true = map_scene()
-    with pytest.warns(UserWarning, match="positions are relative to"):
-        a2tg.save_splats(tmp_path / f"a{suffix}", model)
+        offset = str(warned[0].message).partition("(")[2].partition(")")[0]
+        found = positions_in((tmp_path / f"a{suffix}").read_bytes(), suffix, model.num).astype(np.float64)
+        assert np.abs(found).max() < 10
+        most = 5e-3 if suffix == ".compressed.ply" else 1e-3  # 11 bits within chunks of 8 m.
+        assert farthest(found + np.array([float(word) for word in offset.split(",")]), true) < most
+    if suffix not in (".ply", ".compressed.ply", ".sog"):
+        return
     again = a2tg.load_splats(tmp_path / f"a{suffix}")
-    found = again.origin.transform.inverse().apply(np.asarray(again.gaussians.means, np.float64))
-    assert farthest(found, true) < 5e-3
+    assert farthest(in_original_world(again), true) < 5e-3
     with pytest.warns(UserWarning, match="positions are relative to"):
         a2tg.save_ply(tmp_path / "b.ply", again)
-    comments, rows = ply_parts((tmp_path / "b.ply").read_bytes())
-    (offset,) = (line.split()[1:] for line in comments if line.startswith("offset "))
-    assert farthest(xyz(rows) + np.array(offset, float), true) < 5e-3
+    assert farthest(positions_of_ply(tmp_path / "b.ply"), true) < 5e-3
 
 
-def test_the_offset_is_in_the_header_of_sog(tmp_path):
+def test_sog_and_spz_hold_scenes_that_only_lie_far_away(tmp_path):
+    """The header of the one has the offset; the other has no place for it."""
     pytest.importorskip("gaussforge")
     with pytest.warns(UserWarning, match=r"'offset' in its meta\.json"):
         a2tg.save_splats(tmp_path / "a.sog", map_scene()[0])
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         assert np.abs(np.array(json.loads(archive.read("meta.json"))["offset"]) - UTM).max() < 4
+    with pytest.warns(UserWarning, match=r"relative to \(\d+, (0|-?[1-9]), (0|-?[1-9])\).*no place"):
+        a2tg.save_splats(tmp_path / "a.spz", map_scene(np.array([3000.0, 0.0, 0.0]))[0])
+    assert np.abs(a2tg.load_splats(tmp_path / "a.spz").gaussians.means).max() < 10
 
 
-def test_world_coordinates_stay_whole_in_float64(tmp_path):
+def test_world_coordinates_stay_whole_in_float64(tmp_path, capsys):
     model, true = map_scene()
     a2tg.save_model(tmp_path / "a.npz", model)
     assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "a.ply"), "--float64"]) == 0
@@ -140,24 +144,11 @@ def test_world_coordinates_stay_whole_in_float64(tmp_path):
     assert rows.dtype["x"] == np.float64
     assert not any(line.startswith("offset") for line in comments)
     assert np.abs(xyz(rows) - true).max() < 1e-8
-    again = a2tg.load_splats(tmp_path / "a.ply")
-    found = again.origin.transform.inverse().apply(np.asarray(again.gaussians.means, np.float64))
-    assert np.abs(found - true).max() < 1e-6
+    assert np.abs(in_original_world(a2tg.load_splats(tmp_path / "a.ply")) - true).max() < 1e-6
     assert main(["export", str(tmp_path / "a.npz"), "--ply", str(tmp_path / "b.ply"), "--float64"]) == 0
     assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
-
-
-def test_float64_of_another_format_is_refused(tmp_path, capsys):
-    a2tg.save_model(tmp_path / "a.npz", map_scene()[0])
     assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "a.glb"), "--float64"]) != 0
     assert "--float64 needs an OUT that ends in .ply" in capsys.readouterr().err
-
-
-def test_points_of_a_ply_with_an_offset_are_in_the_map(tmp_path):
-    model, true = map_scene()
-    with pytest.warns(UserWarning, match="positions are relative to"):
-        a2tg.save_ply(tmp_path / "a.ply", model)
-    assert np.abs(read_ply_points(tmp_path / "a.ply").points - true).max() < 1e-6
 
 
 def test_an_offset_that_is_no_number_is_refused_and_other_comments_are_ignored(tmp_path):
@@ -188,14 +179,6 @@ def test_scenes_near_the_origin_have_no_offset(tmp_path, suffix):
         if suffix == ".ply":
             _, rows = ply_parts((tmp_path / "a.ply").read_bytes())
             np.testing.assert_array_equal(xyz(rows), true.astype(np.float32))
-
-
-def test_spz_holds_scenes_that_only_lie_far_away(tmp_path):
-    pytest.importorskip("gaussforge")
-    model, _ = map_scene(np.array([3000.0, 0.0, 0.0]))
-    with pytest.warns(UserWarning, match=r"relative to \(\d+, (0|-?[1-9]), (0|-?[1-9])\).*no place"):
-        a2tg.save_splats(tmp_path / "a.spz", model)
-    assert np.abs(a2tg.load_splats(tmp_path / "a.spz").gaussians.means).max() < 10
 
 
 def test_float32_positions_far_away_are_not_moved(tmp_path):
@@ -270,31 +253,22 @@ def test_files_whose_nodes_lie_in_a_map_are_read_without_rounding(tmp_path, suff
     if suffix == ".glb":  # Numbers stand in the file as in the model, and +y is up there.
         means = means @ np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
     true = np.concatenate([means + UTM, means + UTM + [0, 0, 5]])
-    again = found.origin.transform.inverse().apply(np.asarray(found.gaussians.means, np.float64))
-    assert np.abs(again - true).max() < 1e-5
-
-
-def map_mesh() -> tuple[a2tg.Mesh, Similarity, np.ndarray]:
-    model, true = map_scene()
-    faces = np.arange(39, dtype=np.int32).reshape(13, 3)
-    colors = np.full((40, 3), 100, np.uint8)
-    return a2tg.Mesh(np.asarray(model.gaussians.means), faces, colors), model.origin.transform, true
+    assert np.abs(in_original_world(found) - true).max() < 1e-5
 
 
 def test_meshes_hold_map_coordinates(tmp_path):
-    mesh, transform, true = map_mesh()
+    """Near the origin they have nine digits and no extras."""
+    model, true = map_scene()
+    faces = np.arange(39, dtype=np.int32).reshape(13, 3)
+    mesh = a2tg.Mesh(np.asarray(model.gaussians.means), faces, np.full((40, 3), 100, np.uint8))
     for suffix in (".ply", ".obj", ".glb"):
-        a2tg.save_mesh(tmp_path / f"a{suffix}", mesh, transform)
+        a2tg.save_mesh(tmp_path / f"a{suffix}", mesh, model.origin.transform)
     _, rows = ply_parts((tmp_path / "a.ply").read_bytes())
     assert np.abs(xyz(rows) - true).max() < 1e-8
     lines = [line.split() for line in (tmp_path / "a.obj").read_text().splitlines() if line.startswith("v ")]
     assert np.abs(np.array([line[1:4] for line in lines], float) - true).max() < 1e-6
     glb = (tmp_path / "a.glb").read_bytes()
     assert np.abs(in_map(glb_positions(glb), json_of(glb)["nodes"][0]["extras"]["a2tg"]) - true).max() < 1e-6
-
-
-def test_meshes_near_the_origin_have_nine_digits_and_no_extras(tmp_path):
-    mesh, _, _ = map_mesh()
     near = Similarity(0.25, TURN, np.zeros(3))
     for suffix in (".obj", ".glb"):
         a2tg.save_mesh(tmp_path / f"a{suffix}", mesh, near)
@@ -344,5 +318,4 @@ def test_models_with_different_offsets_are_joined_with_a_warning_whose_advice_wo
         a2tg.concatenate(models)
     move = eval(str(told[0].message).partition("transform it by ")[2], {"models": models})
     joined = a2tg.concatenate([models[0], models[1].transform(move)])
-    found = joined.origin.transform.inverse().apply(np.asarray(joined.gaussians.means, np.float64))
-    assert np.abs(found - np.concatenate([true for _, true in scenes])).max() < 1e-5
+    assert np.abs(in_original_world(joined) - np.concatenate([true for _, true in scenes])).max() < 1e-5

@@ -1,22 +1,9 @@
 """The oracle against values worked out by hand, and its statistic against differences."""
 
 import numpy as np
+import oracle
 import pytest
-from oracle import (
-    DEFAULT_RULES,
-    Rules,
-    Scene,
-    composite,
-    gradient_statistic,
-    homography,
-    intersect,
-    lookup,
-    render,
-    sh_basis,
-    shown_texture,
-    splat_layer,
-    splat_layers,
-)
+from oracle import DEFAULT_RULES, Rules, Scene, lookup, render, shown_texture, splat_layer, splat_layers
 from scenes_random import draw_scene
 
 FOCAL = 20.0
@@ -26,22 +13,11 @@ EDGE_ON = [np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]
 
 def hand_scene(means, quats, log_scales, opacities, colors, textures=None, background=(0.0, 0.0, 0.0)) -> Scene:
     """Splats of constant colour before a camera at the origin that looks along +z, 16×12 pixels."""
-    opacities = np.array(opacities)
-    sh = np.zeros((len(means), 16, 3))
+    opacities, sh = np.array(opacities), np.zeros((len(means), 16, 3))
     sh[:, 0] = (np.array(colors) - 0.5) * np.sqrt(4 * np.pi)
-    return Scene(
-        means=np.array(means, float),
-        quats=np.array(quats, float),
-        log_scales=np.array(log_scales, float),
-        logit_opacities=np.log(opacities / (1 - opacities)),
-        sh=sh,
-        viewmat=np.eye(4),
-        K=np.array([[FOCAL, 0, 8], [0, FOCAL, 6], [0, 0, 1]]),
-        width=16,
-        height=12,
-        textures=textures,
-        background=np.array(background),
-    )
+    splats = *(np.array(x, float) for x in (means, quats, log_scales)), np.log(opacities / (1 - opacities)), sh
+    K = np.array([[FOCAL, 0, 8], [0, FOCAL, 6], [0, 0, 1]])
+    return Scene(*splats, np.eye(4), K, 16, 12, textures, np.array(background))
 
 
 def test_a_facing_splat_has_the_closed_form():
@@ -105,13 +81,10 @@ def test_lookup_along_two_texels(rules, u, expected):
     np.testing.assert_allclose(texel[0, 0, 3], expected)
 
 
-def test_u_indexes_columns_and_v_rows():
+def test_u_indexes_columns_and_unit_rgb_is_clamped_before_interpolation():
     texture = np.arange(6.0).reshape(2, 3, 1) * np.ones(4)
     texel, _, _ = lookup(texture, np.array([[2.0]]), np.array([[-1.5]]), Rules())
     np.testing.assert_allclose(texel[0, 0], 2)
-
-
-def test_unit_rgb_is_clamped_before_interpolation():
     textures = [np.array([[[-1.0, 2.0, 0.5, 1.0], [1.0, 0.0, 0.5, 1.0]]])]
     scene = hand_scene([[0, 0, 4]], [FACING], [[0, 0]], [0.5], [[1, 1, 1]], textures)
     texture = shown_texture(scene, 0, Rules(rgb="unit"))
@@ -133,7 +106,7 @@ def test_spherical_harmonics_are_orthonormal():
     for cos_angle, weight in zip(cos_angles, weights, strict=True):
         for azimuth in azimuths:
             sin_angle = np.sqrt(1 - cos_angle**2)
-            basis = sh_basis(np.array([sin_angle * np.cos(azimuth), sin_angle * np.sin(azimuth), cos_angle]))
+            basis = oracle.sh_basis(np.array([sin_angle * np.cos(azimuth), sin_angle * np.sin(azimuth), cos_angle]))
             gram += np.outer(basis, basis) * weight * np.pi / 8
     np.testing.assert_allclose(gram, np.eye(16), atol=1e-12)
 
@@ -151,12 +124,12 @@ def test_statistic_against_differences():
         is_free = (base[i].alpha > 0) & (moved.alpha > 0) & ~base[i].is_capped
         layers = list(base)
         layers[i] = base[i]._replace(alpha=np.where(is_free, moved.alpha, base[i].alpha))
-        return np.sum(composite(layers, scene.background).color * cotangent, axis=-1)
+        return np.sum(oracle.composite(layers, scene.background).color * cotangent, axis=-1)
 
     expected = [
         [np.sum(abs(objective(i, j, 1e-6) - objective(i, j, -1e-6))) / 2e-6 for j in range(3)] for i in range(20)
     ]
-    statistic = gradient_statistic(scene, cotangent)
+    statistic = oracle.gradient_statistic(scene, cotangent)
     assert np.count_nonzero(statistic) > 30
     np.testing.assert_allclose(statistic, expected, atol=1e-6)
 
@@ -165,14 +138,14 @@ def test_statistic_against_differences():
 def test_gradients_of_rho_against_differences(i):
     """ε = 1e-6: M[0, 2] and M[1, 2], which by M[2, 2] are the projected mean; low-pass filter and hit apart."""
     scene = draw_scene(3, num=20, width=9, height=7)
-    M, jacobian = homography(scene, i)
-    hits = intersect(M, jacobian, 9, 7, 0.2)
+    M, jacobian = oracle.homography(scene, i)
+    hits = oracle.intersect(M, jacobian, 9, 7, 0.2)
     for axis in range(2):
         ends = []
         for step in (1e-6, -1e-6):
             moved = M.copy()
             moved[axis, 2] += step * M[2, 2]
-            ends.append(intersect(moved, jacobian, 9, 7, 0.2).rho)
+            ends.append(oracle.intersect(moved, jacobian, 9, 7, 0.2).rho)
         found = hits.rho_gradients["screen"][..., axis] + hits.rho_gradients["center"][..., axis]
         expected = (ends[0] - ends[1]) / 2e-6
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * abs(expected).max())

@@ -1,17 +1,14 @@
 """Images of the renderer against the oracle, on random scenes with every kind of splat and texture size."""
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
 from oracle import DEFAULT_RULES, OFFICIAL, Rules, Scene
-from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene, render_scene
+from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene, quick_then_long, render_scene
 
 from a2tg_jax import RenderOutput, RenderSettings, render_image
 
-COMPOSITORS = ("native", "xla")
 FIELDS = ("color", "alpha", "depth", "normal")
 OPTIONS = {
     "align-corners": Rules(uv="align-corners", sh_degree=2),
@@ -35,80 +32,74 @@ def errors(output: RenderOutput, expected: oracle.Image, is_compared: np.ndarray
     return found
 
 
-def assert_equal_in_float64(scene: Scene, rules: Rules, settings: RenderSettings):
+def assert_equal_in_float64(scene: Scene, rules: Rules, output: RenderOutput):
     """All pixels agree to 1e-9; every scene here keeps its decisions farther than that from the thresholds."""
     expected = oracle.render(scene, rules)
-    assert expected.margin.min() > 1e-9
-    output = render_scene(scene, "float64", settings)
+    assert expected.margin.min() > 1e-9 and output.color.dtype == jnp.float64
     for name, error in errors(output, expected, np.full(expected.alpha.shape, True)).items():
-        assert output.color.dtype == jnp.float64
         assert error.max() < 1e-9, name
 
 
-@pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("compositor", COMPOSITORS)
-@pytest.mark.parametrize("tile_size", [8, 16, 32])
-@pytest.mark.parametrize("seed", [0, 3, 4, 9])
-def test_float64(seed, tile_size, compositor):
-    settings = as_settings(tile_size=tile_size, compositor=compositor)
-    assert_equal_in_float64(draw_scene(seed), DEFAULT_RULES, settings)
+CASES = {
+    **{f"{name}-{size}": dict(compositor=name, tile_size=size) for name in ("native", "xla") for size in (8, 16, 32)},
+    # Tiles that fill no vector, and any number of tiles at once.
+    **{f"native-{size}": dict(compositor="native", tile_size=size) for size in (3, 5)},
+    **{f"xla-batches-{size}": dict(compositor="xla", tile_batch=size) for size in (0, 1, 5)},
+}
+QUICK = ["native-8", "native-5", "xla-8"]
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("tile_size", [3, 5])
-def test_float64_with_tiles_that_fill_no_vector(tile_size):
-    assert_equal_in_float64(draw_scene(3), DEFAULT_RULES, as_settings(tile_size=tile_size, compositor="native"))
+@pytest.mark.parametrize("case", quick_then_long(QUICK, sorted(CASES.keys() - QUICK)))
+def test_float64(case):
+    for seed in (0, 3, 4, 9):
+        scene = draw_scene(seed)
+        assert_equal_in_float64(scene, DEFAULT_RULES, render_scene(scene, "float64", as_settings(**CASES[case])))
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("tile_batch", [0, 1, 5])
-def test_float64_with_so_many_tiles_at_once(tile_batch):
-    assert_equal_in_float64(draw_scene(4), DEFAULT_RULES, as_settings(tile_batch=tile_batch, compositor="xla"))
-
-
-@pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("compositor", COMPOSITORS)
-@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize("compositor", quick_then_long(["native"], ["xla"]))
+@pytest.mark.parametrize("option", quick_then_long(["all"], list(OPTIONS)[:4]))
 def test_float64_options(option, compositor):
-    assert_equal_in_float64(draw_scene(9), OPTIONS[option], as_settings(OPTIONS[option], compositor=compositor))
+    scene, rules = draw_scene(9), OPTIONS[option]
+    output = render_scene(scene, "float64", as_settings(rules, compositor=compositor))
+    assert_equal_in_float64(scene, rules, output)
 
 
 @pytest.mark.usefixtures("x64")
 def test_official_preset_is_all_the_options():
-    assert_equal_in_float64(draw_scene(5), OFFICIAL, RenderSettings.official())
+    scene = draw_scene(5)
+    assert_equal_in_float64(scene, OFFICIAL, render_scene(scene, "float64", RenderSettings.official()))
 
 
 @pytest.mark.usefixtures("x64")
-def test_float64_without_textures():
-    assert_equal_in_float64(draw_scene(9)._replace(textures=None), DEFAULT_RULES, RenderSettings())
-
-
-@pytest.mark.usefixtures("x64")
-def test_equal_depths_are_ordered_by_index():
+def test_without_textures_and_with_equal_depths_which_are_ordered_by_index():
     scene = draw_scene(3)
-    pairs = np.arange(len(scene.means)) // 2 * 2
-    assert_equal_in_float64(scene._replace(means=scene.means[pairs]), DEFAULT_RULES, RenderSettings())
+    scene = scene._replace(means=scene.means[np.arange(len(scene.means)) // 2 * 2])
+    for each in (draw_scene(9)._replace(textures=None), scene):
+        assert_equal_in_float64(each, DEFAULT_RULES, render_scene(each, "float64", as_settings(compositor="native")))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (17, 33)])
 def test_image_sizes(width, height):
-    assert_equal_in_float64(draw_scene(2, num=20, width=width, height=height), DEFAULT_RULES, as_settings(tile_size=8))
+    scene = draw_scene(2, num=20, width=width, height=height)
+    assert_equal_in_float64(scene, DEFAULT_RULES, render_scene(scene, "float64", as_settings(tile_size=8)))
 
 
-@pytest.mark.parametrize(("compositor", "tile_size"), [("native", 8), ("native", 16), ("xla", 8)])
-@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5, 6, 7])
-def test_float32(seed, compositor, tile_size):
+@pytest.mark.parametrize(("compositor", "tile_size"), quick_then_long([("native", 8)], [("native", 16), ("xla", 8)]))
+def test_float32(compositor, tile_size):
     """99% of the pixels to 1e-5 and 99.9% to 3e-4, leaving out those that decide within 1e-4 of a threshold."""
-    scene = draw_scene(seed)
-    expected = oracle.render(scene)
-    is_compared = expected.margin > 1e-4
-    assert is_compared.mean() > 0.95
-    output = render_scene(scene, "float32", as_settings(tile_size=tile_size, compositor=compositor))
-    for name, error in errors(output, expected, is_compared).items():
-        assert output.color.dtype == jnp.float32
-        assert np.mean(error < 1e-5) >= 0.99, name
-        assert np.mean(error < 3e-4) >= 0.999, name
+    for seed in range(8):
+        scene = draw_scene(seed)
+        expected = oracle.render(scene)
+        is_compared = expected.margin > 1e-4
+        assert is_compared.mean() > 0.95
+        output = render_scene(scene, "float32", as_settings(tile_size=tile_size, compositor=compositor))
+        for name, error in errors(output, expected, is_compared).items():
+            assert output.color.dtype == jnp.float32
+            assert np.mean(error < 1e-5) >= 0.99 and np.mean(error < 3e-4) >= 0.999, (seed, name)
 
 
 @pytest.mark.usefixtures("x64")
@@ -117,21 +108,13 @@ def test_an_eager_call_finds_its_own_capacity():
     inputs = as_gaussians(scene, "float64"), as_camera(scene, "float64"), as_textures(scene, "float64")
     output = render_image(*inputs, background=scene.background.tolist())
     assert not output.overflow
-    expected = oracle.render(scene)
-    for name, error in errors(output, expected, np.full(expected.alpha.shape, True)).items():
-        assert error.max() < 1e-9, name
+    assert_equal_in_float64(scene, DEFAULT_RULES, output)
 
 
 def test_a_scene_wholly_behind_the_camera_is_background():
     scene = draw_scene(0)
     away = scene.viewmat.copy()
     away[2] = [0, 0, 0, -1]
-    output = render_scene(scene._replace(viewmat=away), "float32")
+    output = render_scene(scene._replace(viewmat=away), "float32", as_settings(compositor="native", tile_size=8))
     np.testing.assert_array_equal(output.alpha, 0)
     np.testing.assert_array_equal(output.color, np.broadcast_to(np.float32(scene.background), output.color.shape))
-
-
-def test_settings_are_a_frozen_value():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        RenderSettings().tile_size = 4
-    assert hash(RenderSettings()) == hash(RenderSettings())

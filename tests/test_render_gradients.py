@@ -1,4 +1,5 @@
-"""Gradients of the renderer against central differences of the oracle, and finite gradients on degenerate scenes."""
+"""Gradients of the renderer against differences of the oracle, the statistics of densification, and finite gradients on
+degenerate scenes."""
 
 import dataclasses
 import functools
@@ -19,6 +20,7 @@ from scenes_random import (
     as_textures,
     draw_scene,
     draw_smooth_scene,
+    quick_then_long,
 )
 
 from a2tg_jax import (
@@ -33,6 +35,8 @@ from a2tg_jax import (
     texture_arrays,
     textures_from_arrays,
 )
+from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.render import appearance_of
 
 EPSILON = 3e-6
 """Step of the central differences: losses of about 50 round off to 50·1e-16/ε = 2e-9, and steps of 1e-6 and 1e-5 were
@@ -41,8 +45,9 @@ CLEARANCE = 1e-3
 """Relative distance of every decision and kink from its threshold: hundreds of steps, so that none is crossed."""
 SMOOTH_SEEDS = [53, 161]
 """Scenes found to keep that clearance under the default rules and under the official ones."""
-FIELDS = ("color", "alpha", "depth", "normal")
+CHANNELS = {"color": (3,), "alpha": (), "depth": (), "normal": (3,)}
 LEAVES = ["means", "quats", "log_scales", "logit_opacities", "sh", "viewmat", "K", "background"]
+long = pytest.mark.long
 
 
 class Inputs(NamedTuple):
@@ -57,18 +62,21 @@ class Inputs(NamedTuple):
 
 def as_inputs(scene: Scene, dtype: str) -> tuple[Inputs, Inputs]:
     """The scene's differentiable inputs, and the places of its textures."""
-    textures = as_textures(scene, dtype)
-    camera = as_camera(scene, dtype)
-    background = jnp.asarray(scene.background, dtype)
-    return partition(Inputs(as_gaussians(scene, dtype), textures, camera.viewmat, camera.K, background))
+    camera, background = as_camera(scene, dtype), jnp.asarray(scene.background, dtype)
+    inputs = as_gaussians(scene, dtype), as_textures(scene, dtype), camera.viewmat, camera.K, background
+    return partition(Inputs(*inputs))
 
 
 def draw_weights(scene: Scene) -> dict[str, Float]:
     """Fixed random weights of every channel of every output."""
     rng = np.random.default_rng(0)
-    shape = (scene.height, scene.width)
-    channels = {"color": (3,), "alpha": (), "depth": (), "normal": (3,)}
-    return {name: rng.normal(size=(*shape, *channels[name])) for name in FIELDS}
+    return {name: rng.normal(size=(scene.height, scene.width, *shape)) for name, shape in CHANNELS.items()}
+
+
+def weighted_sum(inputs: Inputs, weights, size: tuple[int, int], settings) -> jax.Array:
+    camera = Camera(inputs.viewmat, inputs.K, *size)
+    output = render_image(inputs.gaussians, camera, inputs.textures, background=inputs.background, settings=settings)
+    return sum(jnp.sum(getattr(output, name) * weight) for name, weight in weights.items())
 
 
 @functools.cache
@@ -81,15 +89,7 @@ def jitted_gradient(settings: RenderSettings) -> Callable[..., Any]:
     return jax.jit(jax.value_and_grad(loss), static_argnums=3)
 
 
-def weighted_sum(inputs: Inputs, weights, size: tuple[int, int], settings) -> jax.Array:
-    """The weighted sum of all outputs."""
-    camera = Camera(inputs.viewmat, inputs.K, *size)
-    output = render_image(inputs.gaussians, camera, inputs.textures, background=inputs.background, settings=settings)
-    return sum(jnp.sum(getattr(output, name) * weight) for name, weight in weights.items())
-
-
 def package_gradient(scene: Scene, dtype: str, settings: RenderSettings) -> tuple[jax.Array, Inputs]:
-    """The loss and its gradient, under jit."""
     inputs, places = as_inputs(scene, dtype)
     weights = {name: jnp.asarray(weight, dtype) for name, weight in draw_weights(scene).items()}
     settings = dataclasses.replace(settings, capacity=CAPACITY)
@@ -104,6 +104,7 @@ def oracle_loss(scene: Scene, rules: Rules, name: str, texels: list[Float] | Non
     """
     weights, base = draw_weights(scene), getattr(scene, name)
     layers = oracle.splat_layers(scene, rules, texels)
+    largest_alpha = lambda textures: max(texture[..., 3].max() for texture in textures)  # noqa: E731
 
     def loss(value: Float | list[Float]) -> float:
         moved = scene._replace(**{name: value})
@@ -120,20 +121,13 @@ def oracle_loss(scene: Scene, rules: Rules, name: str, texels: list[Float] | Non
     return loss
 
 
-def largest_alpha(textures: list[Float]) -> float:
-    return max(texture[..., 3].max() for texture in textures)
-
-
 def differences(value: Float, loss: Callable[[Float], float]) -> Float:
     """Central difference quotient of `loss` by every entry of `value`, one at a time."""
     gradient = np.zeros_like(value)
     for index in np.ndindex(value.shape):
-        ends = []
-        for step in (EPSILON, -EPSILON):
-            moved = value.copy()
-            moved[index] += step
-            ends.append(loss(moved))
-        gradient[index] = (ends[0] - ends[1]) / (2 * EPSILON)
+        step = np.zeros_like(value)
+        step[index] = EPSILON
+        gradient[index] = (loss(value + step) - loss(value - step)) / (2 * EPSILON)
     return gradient
 
 
@@ -155,20 +149,13 @@ def smooth_scene(seed: int, rules: Rules) -> Scene:
     return scene
 
 
-def leaf_of(gradient: Inputs, name: str) -> jax.Array:
-    """The gradient of one leaf by its name in the oracle's scene."""
-    return getattr(gradient, name) if hasattr(gradient, name) else getattr(gradient.gaussians, name)
-
-
 def assert_leaves_match(gradient: Inputs, scene: Scene, rules: Rules, texels: list[Float] | None = None):
-    """Every leaf but the textures, by differences with the given lookups or, without them, with lookups that move."""
+    """Every leaf, by differences with the given lookups or, without them, with lookups that move; and every texel."""
     for name in LEAVES:
-        expected = differences(getattr(scene, name), oracle_loss(scene, rules, name, texels))
-        assert_gradients_close(leaf_of(gradient, name), expected, name)
-
-
-def assert_textures_match(gradient: Inputs, scene: Scene, rules: Rules):
-    """Every texel of every texture, by differences."""
+        found = getattr(gradient, name) if hasattr(gradient, name) else getattr(gradient.gaussians, name)
+        assert_gradients_close(found, differences(getattr(scene, name), oracle_loss(scene, rules, name, texels)), name)
+    if gradient.textures is None:
+        return
     loss = oracle_loss(scene, rules, "textures")
     for i, found in enumerate(texture_arrays(gradient.textures)):
 
@@ -178,74 +165,64 @@ def assert_textures_match(gradient: Inputs, scene: Scene, rules: Rules):
         assert_gradients_close(found, differences(scene.textures[i], loss_of_one), f"texture {i}")
 
 
+def assert_all_close(found, wanted, rtol: float, atol: float):
+    """Leaves agree; `atol` is in units of the largest entry of each."""
+    for one, other in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(other, one, rtol=rtol, atol=atol * abs(np.asarray(one)).max())
+
+
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("compositor", ["native", "xla"])
-@pytest.mark.parametrize("seed", SMOOTH_SEEDS)
+@pytest.mark.parametrize(
+    ("seed", "compositor"), quick_then_long([(53, "native")], [(161, "native"), (53, "xla"), (161, "xla")])
+)
 def test_every_leaf_against_differences(seed, compositor):
     scene = smooth_scene(seed, DEFAULT_RULES)
     _, gradient = package_gradient(scene, "float64", RenderSettings(compositor=compositor))
     assert_leaves_match(gradient, scene, DEFAULT_RULES)
-    assert_textures_match(gradient, scene, DEFAULT_RULES)
 
 
+@long
 @pytest.mark.usefixtures("x64")
-def test_official_gradients_stop_at_the_lookup():
+def test_official_gradients_stop_at_the_lookup_and_textures_may_be_missing():
     """The official preset has the gradient with what the lookups gave held fixed."""
     scene = smooth_scene(SMOOTH_SEEDS[0], OFFICIAL)
     texels = [layer.texel for layer in oracle.splat_layers(scene, OFFICIAL)]
     _, gradient = package_gradient(scene, "float64", RenderSettings.official())
     assert_leaves_match(gradient, scene, OFFICIAL, texels)
-    assert_textures_match(gradient, scene, OFFICIAL)
+    plain = smooth_scene(SMOOTH_SEEDS[0], DEFAULT_RULES)._replace(textures=None)
+    _, gradient = package_gradient(plain, "float64", RenderSettings())
+    assert_leaves_match(gradient, plain, DEFAULT_RULES)
 
 
+@long
 @pytest.mark.usefixtures("x64")
-def test_gradients_without_textures_against_differences():
-    scene = smooth_scene(SMOOTH_SEEDS[0], DEFAULT_RULES)._replace(textures=None)
-    _, gradient = package_gradient(scene, "float64", RenderSettings())
-    assert_leaves_match(gradient, scene, DEFAULT_RULES)
-
-
-@pytest.mark.usefixtures("x64")
-def test_gradients_do_not_depend_on_tiles():
+def test_gradients_do_not_depend_on_tiles_or_on_how_they_are_called():
     """Nor on who composites how many at once; the last row of the viewmat and the buckets' padding have none."""
-    scene = draw_scene(3)
+    scene = draw_scene(3, num=30, width=23, height=17)
     _, expected = package_gradient(scene, "float64", as_settings(tile_size=32))
     np.testing.assert_array_equal(expected.viewmat[3], 0)
     for settings in (as_settings(), as_settings(compositor="xla"), as_settings(compositor="xla", tile_batch=0)):
-        _, gradient = package_gradient(scene, "float64", settings)
-        for one, other in zip(jax.tree.leaves(expected), jax.tree.leaves(gradient), strict=True):
-            np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * abs(np.asarray(one)).max())
-
+        assert_all_close(package_gradient(scene, "float64", settings)[1], expected, 1e-9, 1e-9)
     repacked = textures_from_arrays(texture_arrays(expected.textures))
     for bucket, without_padding in zip(expected.textures.buckets, repacked.buckets, strict=True):
         np.testing.assert_allclose(np.sum(abs(bucket[..., :3])), np.sum(abs(without_padding[..., :3])))
 
-
-@pytest.mark.usefixtures("x64")
-def test_an_eager_gradient_is_the_planned_one():
-    scene = draw_smooth_scene(SMOOTH_SEEDS[0])
     inputs, places = as_inputs(scene, "float64")
     weights = {name: jnp.asarray(weight) for name, weight in draw_weights(scene).items()}
-
-    def loss(inputs: Inputs) -> jax.Array:
-        return weighted_sum(combine(inputs, places), weights, (scene.width, scene.height), RenderSettings())
-
-    eager = jax.grad(loss)(inputs)
+    size = scene.width, scene.height
+    eager = jax.grad(lambda inputs: weighted_sum(combine(inputs, places), weights, size, RenderSettings()))(inputs)
     planned = plan_render(inputs.gaussians, [as_camera(scene, "float64")], as_textures(scene, "float64"))
-    _, jitted = jitted_gradient(planned)(inputs, places, weights, (scene.width, scene.height))
-    for one, other in zip(jax.tree.leaves(eager), jax.tree.leaves(jitted), strict=True):
-        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * abs(np.asarray(one)).max())
+    assert_all_close(jitted_gradient(planned)(inputs, places, weights, size)[1], eager, 1e-9, 1e-9)
 
 
 @pytest.mark.usefixtures("x64")
 def test_float32_gradients_are_those_of_float64():
     """To 1e-3 of the largest entry: float32 carries about 1e-7 through a few thousand sums and divisions."""
-    scene = smooth_scene(SMOOTH_SEEDS[1], DEFAULT_RULES)
-    (_, exact), (_, rounded) = (package_gradient(scene, dtype, RenderSettings()) for dtype in ("float64", "float32"))
-    floats, _ = zip(partition(exact), partition(rounded), strict=True)
-    for one, other in zip(*map(jax.tree.leaves, floats), strict=True):
-        assert other.dtype == jnp.float32
-        np.testing.assert_allclose(other, one, rtol=0, atol=1e-3 * abs(np.asarray(one)).max())
+    scene, settings = smooth_scene(SMOOTH_SEEDS[1], DEFAULT_RULES), RenderSettings(compositor="native")
+    (_, exact), (_, rounded) = (package_gradient(scene, dtype, settings) for dtype in ("float64", "float32"))
+    (exact, _), (rounded, _) = partition(exact), partition(rounded)
+    assert {leaf.dtype for leaf in jax.tree.leaves(rounded)} == {jnp.dtype("float32")}
+    assert_all_close(rounded, exact, 0, 1e-3)
 
 
 def degenerate_scene() -> Scene:
@@ -265,10 +242,57 @@ def degenerate_scene() -> Scene:
     return scene
 
 
-@pytest.mark.parametrize("settings", [RenderSettings(), RenderSettings.official()], ids=["default", "official"])
-@pytest.mark.parametrize("draw", [lambda: draw_scene(8), degenerate_scene], ids=["random", "degenerate"])
-def test_values_and_gradients_are_finite(draw, settings):
-    value, gradient = package_gradient(draw(), "float32", settings)
-    assert np.isfinite(value)
-    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
-        np.testing.assert_array_equal(np.isfinite(leaf), True, err_msg=jax.tree_util.keystr(path))
+@pytest.mark.parametrize(
+    "settings", [RenderSettings(), pytest.param(RenderSettings.official(), marks=long)], ids=["default", "official"]
+)
+def test_values_and_gradients_are_finite(settings):
+    for scene in (draw_scene(8), degenerate_scene()):
+        value, gradient = package_gradient(scene, "float32", settings)
+        assert np.isfinite(value)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+            np.testing.assert_array_equal(np.isfinite(leaf), True, err_msg=jax.tree_util.keystr(path))
+
+
+@functools.cache
+def jitted_statistic(settings: RenderSettings, which: str, size: tuple[int, int]) -> Callable[..., Any]:
+    """Gradient at the probe [N, 4] as a function of Gaussians, camera, appearance, background and the colour's
+    cotangent: the statistic, and the number of pixels composited."""
+
+    def loss(probe, gaussians, viewmat, K, appearance, background, cotangent):
+        given = gaussians, Camera(viewmat, K, *size), appearance, background, settings
+        output, _ = render_traced(*given, has_geometry=False, probe=probe, statistic=which)
+        return jnp.sum(output.color * cotangent)
+
+    return jax.jit(jax.grad(loss))
+
+
+OTHERS = {
+    "xla": (DEFAULT_RULES, as_settings(compositor="xla"), [(4, "position"), (4, "screen"), (4, "center")]),
+    "xla, all tiles at once": (
+        DEFAULT_RULES, as_settings(compositor="xla", tile_size=16, tile_batch=0), [(9, "position")]
+    ),
+    "official": (OFFICIAL, RenderSettings.official(), [(4, "position"), (9, "position")]),
+}  # fmt: skip
+NATIVE = DEFAULT_RULES, as_settings(), [(4, "position"), (9, "position"), (4, "screen"), (4, "center")]
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize(
+    ("rules", "settings", "cases"),
+    [pytest.param(*NATIVE, id="native"), *(pytest.param(*each, id=name, marks=long) for name, each in OTHERS.items())],
+)
+def test_statistics_are_the_closed_forms_of_the_oracle(rules, settings, cases):
+    settings = dataclasses.replace(settings, capacity=CAPACITY)
+    for seed, which in cases:
+        scene = draw_scene(seed)
+        cotangent = np.random.default_rng(seed).normal(size=(scene.height, scene.width, 3))
+        inputs = Inputs(*(combine(*as_inputs(scene, "float64"))))
+        gradient = jitted_statistic(settings, which, (scene.width, scene.height))
+        appearance = appearance_of(inputs.gaussians, inputs.textures, settings)
+        given = inputs.gaussians, inputs.viewmat, inputs.K, appearance, inputs.background, jnp.asarray(cotangent)
+        found = np.asarray(gradient(jnp.zeros((len(scene.means), 4)), *given))
+        expected = oracle.gradient_statistic(scene, cotangent, rules, which)
+        assert np.count_nonzero(expected) > 20
+        np.testing.assert_allclose(found[:, :3], expected, rtol=1e-8, atol=1e-10 * expected.max())
+        num_pixels = np.count_nonzero(oracle.render(scene, rules).weights, axis=(1, 2))
+        np.testing.assert_array_equal(found[:, 3], num_pixels)

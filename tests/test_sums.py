@@ -29,60 +29,42 @@ def draw_images(rng, is_shared: bool):
     return np.concatenate([first[:, None], sizes], axis=1).astype(np.int32), int(ends[-1])
 
 
-def results_of(dtype, length: int, has_tap: bool):
-    return [np.full(shape, 7, dtype) for shape in ((NUM, 5), (length, COLUMNS), (NUM if has_tap else 1, 4))]
+def results_of(length: int, has_probe: bool):
+    return [np.full(shape, 7, np.float32) for shape in ((NUM, 5), (length, COLUMNS), (NUM if has_probe else 1, 4))]
 
 
-def numbers_of(position: int, count: int) -> np.ndarray:
-    """What pair `position` adds."""
-    return np.random.default_rng(position).normal(size=count).astype(np.float32)
-
-
-def add(ids, starts, part, images, splats, texels, probe):
-    """What a thread does, in numpy."""
+def add(ids, starts, part, images, splats, texels, probe, places=None, *more):
+    """What a thread does, in numpy: with the extra rows that the loop is given, or without places in its own copy."""
     for position in range(starts[part[0]], starts[part[1]]):
-        splat = ids[position]
-        splats[splat] += numbers_of(position, 5)
+        numbers = np.random.default_rng(position).normal(size=5).astype(np.float32)
+        splat, place = ids[position], -1 if places is None else places[position]
+        row, own = (splat, (splats, texels, probe)) if place < 0 else (place, more)
+        own[0][row] += numbers
         if len(probe) == NUM:
-            probe[splat] += numbers_of(position, 4)
-        if texels is not None:
-            first, height, width = images[splat]
-            texels[first : first + height * width] += numbers_of(position, COLUMNS)
-
-
-def add_beside(
-    ids, starts, part, images, splats, texels, probe, places, more_splats, more_texels, more_probe, more_first
-):
-    """The same, with the rows that the loop is given."""
-    for position in range(starts[part[0]], starts[part[1]]):
-        splat, place = ids[position], places[position]
-        rows = (splats, texels, probe, splat) if place < 0 else (more_splats, more_texels, more_probe, place)
-        rows[0][rows[3]] += numbers_of(position, 5)
-        if len(probe) == NUM:
-            rows[2][rows[3]] += numbers_of(position, 4)
+            own[2][row] += numbers[:4]
         first, height, width = images[splat]
-        first = first if place < 0 else more_first[place]
-        rows[1][first : first + height * width] += numbers_of(position, COLUMNS)
+        first = first if place < 0 else more[3][place]
+        own[1][first : first + height * width] += numbers[:COLUMNS]
 
 
 @pytest.mark.parametrize("is_shared", [False, True])
-@pytest.mark.parametrize("has_tap", [False, True])
+@pytest.mark.parametrize("has_probe", [False, True])
 @pytest.mark.parametrize("borders", [[0, 40], [0, 13, 40], [0, 9, 10, 10, 25, 40]])
-def test_sums_are_those_of_full_copies(borders, has_tap, is_shared):
+def test_sums_are_those_of_full_copies(borders, has_probe, is_shared):
     rng = np.random.default_rng(0)
     ids, starts = draw_lists(rng)
     images, length = draw_images(rng, is_shared)
     assert _overlap(images) == is_shared
     parts = list(itertools.pairwise(borders))
-    copies = [[np.zeros_like(x) for x in results_of(np.float32, length, has_tap)] for _ in parts]
+    copies = [[np.zeros_like(x) for x in results_of(length, has_probe)] for _ in parts]
     for part, copy in zip(parts, copies, strict=True):
         add(ids, starts, part, images, *copy)
     expected = [sum(more, start=first) for first, *more in zip(*copies, strict=True)]
 
-    found = results_of(np.float32, length, has_tap)
+    found = results_of(length, has_probe)
     room = SumsOfParts(ids, starts, images, found, parts)
     for index in np.random.default_rng(1).permutation(len(parts)):
-        add_beside(ids, starts, parts[index], images, *room.outputs(index))
+        add(ids, starts, parts[index], images, *room.outputs(index))
     room.add_up()
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_array_equal(a.view(np.int32), b.view(np.int32))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import os
 import subprocess
 import sys
 
@@ -16,24 +17,18 @@ from a2tg_jax import Camera, RenderSettings, combine, partition, render_image
 
 SCENE = draw_scene(1, num=4, width=8, height=8)
 SMOOTH = draw_smooth_scene(53, width=8, height=8)
-SETTINGS = RenderSettings(capacity=1024)
 CAMERA = as_camera(SCENE, "float32")
-
-
-def shown(gaussians, viewmat=CAMERA.viewmat):
-    camera = Camera(viewmat, CAMERA.K, CAMERA.width, CAMERA.height)
-    return render_image(gaussians, camera, settings=SETTINGS).color
-
-
-def loss(gaussians, viewmat=CAMERA.viewmat):
-    return jnp.sum(shown(gaussians, viewmat) ** 2)
+VIEWMATS = jnp.stack([CAMERA.viewmat, CAMERA.viewmat.at[0, 3].add(0.05)])
 
 
 def some_gaussians():
     return as_gaussians(SCENE, "float32")
 
 
-VIEWMATS = jnp.stack([CAMERA.viewmat, CAMERA.viewmat.at[0, 3].add(0.05)])
+def loss(gaussians, viewmat=CAMERA.viewmat, compositor="auto"):
+    camera = Camera(viewmat, CAMERA.K, CAMERA.width, CAMERA.height)
+    settings = RenderSettings(capacity=1024, compositor=compositor)
+    return jnp.sum(render_image(gaussians, camera, settings=settings).color ** 2)
 
 
 @functools.cache
@@ -44,18 +39,9 @@ def expected():
     return jnp.stack(values), jax.tree.map(lambda a, b: a + b, *gradients)
 
 
-def total(losses):
-    """Of a function that gives the losses of both views: their gradient."""
-    return jax.jit(jax.grad(lambda gaussians: jnp.sum(losses(gaussians))))(some_gaussians())
-
-
-def in_scan(gaussians):
-    return jax.lax.scan(lambda carry, viewmat: (carry, loss(gaussians, viewmat)), 0, VIEWMATS)[1]
-
-
 WAYS = {
     "vmap": lambda gaussians: jax.vmap(loss, in_axes=(None, 0))(gaussians, VIEWMATS),
-    "scan": in_scan,
+    "scan": lambda gaussians: jax.lax.scan(lambda carry, view: (carry, loss(gaussians, view)), 0, VIEWMATS)[1],
     "map": lambda gaussians: jax.lax.map(functools.partial(loss, gaussians), VIEWMATS),
     "remat": lambda gaussians: jax.lax.map(functools.partial(jax.checkpoint(loss), gaussians), VIEWMATS),
 }
@@ -65,41 +51,90 @@ WAYS = {
 def test_first_derivatives_come_through(way):
     """Values and gradients are those of the views one by one, under jit."""
     values, gradient = expected()
-    np.testing.assert_allclose(jax.jit(WAYS[way])(some_gaussians()), values, rtol=1e-5)
-    for a, b in zip(jax.tree.leaves(total(WAYS[way])), jax.tree.leaves(gradient), strict=True):
+
+    def of_sum(gaussians):
+        losses = WAYS[way](gaussians)
+        return jnp.sum(losses), losses
+
+    (_, found), of_way = jax.jit(jax.value_and_grad(of_sum, has_aux=True))(some_gaussians())
+    np.testing.assert_allclose(found, values, rtol=1e-5)
+    for a, b in zip(jax.tree.leaves(of_way), jax.tree.leaves(gradient), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
 def test_donated_buffers():
-    step = jax.jit(lambda g: jax.tree.map(lambda x, d: x - 1e-3 * d, g, jax.grad(loss)(g)), donate_argnums=0)
-    wanted = jax.tree.map(lambda x, d: x - 1e-3 * d, some_gaussians(), jax.jit(jax.grad(loss))(some_gaussians()))
-    found = step(some_gaussians())
+    step = lambda g: jax.tree.map(lambda x, d: x - 1e-3 * d, g, jax.grad(loss)(g))  # noqa: E731
+    wanted, found = jax.jit(step)(some_gaussians()), jax.jit(step, donate_argnums=0)(some_gaussians())
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), found, wanted)
 
 
-PMAP = """
-import jax, jax.numpy as jnp, numpy as np
+SEVERAL_DEVICES = """
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec as P
 from a2tg_jax import Camera, RenderSettings, init_from_points, render_image
+from a2tg_jax.training.losses import mean_ssim
 
-gaussians = init_from_points([[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2]], [[1, 1, 1]] * 3, sh_degree=0)
+gaussians = init_from_points([[0, 0, 2], [0.1, 0, 2], [0, 0.1, 2]], [[1, 1, 1]] * 3)
+mesh = jax.make_mesh((2,), ("views",), axis_types=(jax.sharding.AxisType.Auto,))
 viewmats = jnp.stack([jnp.eye(4), jnp.eye(4).at[0, 3].set(0.1)])
 
-def loss(gaussians, viewmat):
-    camera = Camera(viewmat, jnp.asarray([[20.0, 0, 4], [0, 20, 4], [0, 0, 1]]), 8, 8)
-    return jnp.sum(render_image(gaussians, camera, settings=RenderSettings(capacity=1024)).color ** 2)
+def show(gaussians, viewmat):
+    camera = Camera(viewmat, jnp.asarray([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
+    return render_image(gaussians, camera, settings=RenderSettings(capacity=1024, compositor="native")).color
 
-found = jax.pmap(jax.value_and_grad(loss), in_axes=(None, 0))(gaussians, viewmats)
-wanted = [jax.value_and_grad(loss)(gaussians, viewmat) for viewmat in viewmats]
+def shown(gaussians, viewmats, check_vma):
+    one = lambda gaussians, viewmats: show(gaussians, viewmats[0])[None]
+    specs = dict(mesh=mesh, in_specs=(P(), P("views")), out_specs=P("views"), check_vma=check_vma)
+    return jax.shard_map(one, **specs)(gaussians, viewmats)
+
+def loss(gaussians, viewmats, check_vma):
+    return jnp.sum(shown(gaussians, viewmats, check_vma) ** 2)
+
+found = jax.jit(shown, static_argnums=2)(gaussians, viewmats, True)
+expected = jnp.stack([show(gaussians, viewmat) for viewmat in viewmats])
+np.testing.assert_allclose(found, expected, atol=1e-6)
+assert expected.max() > 0.05 and jnp.abs(found[0] - found[1]).max() > 0.01
+of_view = jax.value_and_grad(lambda g, viewmat: jnp.sum(show(g, viewmat) ** 2))
+wanted = [of_view(gaussians, viewmat) for viewmat in viewmats]
+total = sum(gradient.means for _, gradient in wanted)
+for check_vma in (True, False):
+    gradient = jax.jit(jax.grad(loss), static_argnums=2)(gaussians, viewmats, check_vma)
+    np.testing.assert_allclose(gradient.means, total, rtol=1e-3, atol=1e-4)
+
+values, gradients = jax.pmap(of_view, in_axes=(None, 0))(gaussians, viewmats)
 for k in range(2):
-    np.testing.assert_allclose(found[0][k], wanted[k][0], rtol=1e-5)
-    np.testing.assert_allclose(found[1].means[k], wanted[k][1].means, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(values[k], wanted[k][0], rtol=1e-5)
+    np.testing.assert_allclose(gradients.means[k], wanted[k][1].means, rtol=1e-4, atol=1e-5)
+
+photo = jnp.linspace(0, 1, 32 * 32 * 3).reshape(32, 32, 3)
+photos = jnp.stack([photo**2, photo**3])
+means = lambda photo, photos: jax.vmap(mean_ssim, in_axes=(None, 0))(photo, photos)
+both = jax.shard_map(means, mesh=mesh, in_specs=(P(), P("views")), out_specs=P("views"))
+wanted, found = (jax.grad(lambda x, f=f: jnp.sum(f(x, photos)))(photo) for f in (means, both))
+np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-7)
+
+def as_if_equal(gaussians, viewmats):
+    one = lambda gaussians, viewmats: show(gaussians, viewmats[0])
+    return jax.shard_map(one, mesh=mesh, in_specs=(P(), P("views")), out_specs=P())(gaussians, viewmats)
+
+try:
+    as_if_equal(gaussians, viewmats)
+except ValueError as error:
+    assert "out_specs" in str(error)
+else:
+    raise AssertionError("pictures that differ between devices passed for one")
 """
 
 
-def test_pmap(monkeypatch):
-    """In a process with two devices; `tests/test_shard_map.py` has the test of `shard_map`."""
-    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=0")
-    done = subprocess.run([sys.executable, "-c", PMAP], capture_output=True, text=True, check=False, timeout=300)
+@pytest.mark.long
+def test_shard_map_and_pmap(monkeypatch):
+    """Two devices each render a view, in a process that has rendered nothing before: the first rendering may be inside
+    a shard_map."""
+    monkeypatch.setenv("XLA_FLAGS", f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2")
+    command = [sys.executable, "-c", SEVERAL_DEVICES]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
 
 
@@ -115,31 +150,8 @@ MODES = {
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("compositor", ["native", "xla"])
 def test_other_derivatives_name_the_compositor_to_use(mode, compositor):
-    def of_compositor(gaussians):
-        settings = RenderSettings(capacity=1024, compositor=compositor)
-        return jnp.sum(render_image(gaussians, CAMERA, settings=settings).color)
-
     with pytest.raises(ValueError, match=rf"compositor='{compositor}' is .*RenderSettings\(compositor='autodiff'\)"):
-        MODES[mode](of_compositor, some_gaussians())
-
-
-def smooth_loss():
-    """A loss of all that a textured scene shows, by gaussians and texels, and where to differentiate it."""
-    gaussians, camera = as_gaussians(SMOOTH, "float64"), as_camera(SMOOTH, "float64")
-    parameters, places = partition((gaussians, as_textures(SMOOTH, "float64")))
-    settings = RenderSettings(capacity=1024, compositor="autodiff")
-    rng = np.random.default_rng(0)
-    weights = jnp.asarray(rng.normal(size=(8, 8, 9)))
-
-    def loss(parameters):
-        gaussians, textures = combine(parameters, places)
-        output = render_image(gaussians, camera, textures, settings=settings)
-        images = [output.color, output.alpha[..., None], output.depth[..., None], output.normal]
-        images = jnp.concatenate([*images, output.distortion[..., None]], axis=-1)
-        return jnp.sum(weights * images + images**2)
-
-    direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), parameters)
-    return loss, parameters, direction
+        MODES[mode](functools.partial(loss, compositor=compositor), some_gaussians())
 
 
 def moved(parameters, direction, step):
@@ -160,27 +172,41 @@ def dot(a, b):
 
 @pytest.mark.usefixtures("x64")
 def test_autodiff_shows_what_the_oracle_shows():
-    for scene in (draw_scene(4, num=12, width=19, height=13), SMOOTH):
-        found, wanted = render_scene(scene, "float64", RenderSettings(compositor="autodiff")), oracle.render(scene)
-        for field in ("color", "alpha", "depth", "normal"):
-            np.testing.assert_allclose(getattr(found, field), getattr(wanted, field), atol=1e-9)
+    scene = draw_scene(4, num=12, width=19, height=13)
+    found, wanted = render_scene(scene, "float64", RenderSettings(compositor="autodiff")), oracle.render(scene)
+    for field in ("color", "alpha", "depth", "normal"):
+        np.testing.assert_allclose(getattr(found, field), getattr(wanted, field), atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("x64")
 def test_derivatives_of_autodiff_are_those_of_differences():
-    """First derivatives in both modes and second ones, forward over reverse, along one direction."""
-    loss, parameters, direction = smooth_loss()
+    """First derivatives in both modes and second ones, forward over reverse, along one direction of Gaussians and
+    texels, of a loss of all that a textured scene shows."""
+    gaussians, camera = as_gaussians(SMOOTH, "float64"), as_camera(SMOOTH, "float64")
+    parameters, places = partition((gaussians, as_textures(SMOOTH, "float64")))
+    settings, rng = RenderSettings(capacity=1024, compositor="autodiff"), np.random.default_rng(0)
+    weights = jnp.asarray(rng.normal(size=(8, 8, 9)))
+    direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), parameters)
+
+    def loss(parameters):
+        gaussians, textures = combine(parameters, places)
+        output = render_image(gaussians, camera, textures, settings=settings)
+        images = [output.color, output.alpha[..., None], output.depth[..., None], output.normal]
+        images = jnp.concatenate([*images, output.distortion[..., None]], axis=-1)
+        return jnp.sum(weights * images + images**2)
+
     value, slope = jax.jit(lambda d: jax.jvp(loss, (parameters,), (d,)))(direction)
     differentiate, step = jax.jit(jax.value_and_grad(loss)), 3e-6
     here, gradient = differentiate(parameters)
     np.testing.assert_allclose([value, slope], [here, dot(gradient, direction)], rtol=1e-9)
     (more, ahead), (less, behind) = (differentiate(moved(parameters, direction, by)) for by in (step, -step))
     np.testing.assert_allclose(slope, (more - less) / (2 * step), rtol=1e-6)
-
     curvature = jax.jit(lambda x: jax.jvp(jax.grad(loss), (x,), (direction,))[1])(parameters)
     assert_differences(curvature, ahead, behind, step)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("x64")
 def test_gradient_of_a_gradient():
     camera, gaussians = as_camera(SCENE, "float64"), as_gaussians(SCENE, "float64")
@@ -212,11 +238,11 @@ def test_autodiff_has_the_gradient_of_the_other_compositors():
 
         return jax.jit(jax.grad(loss))(as_gaussians(scene, "float64"))
 
-    found, wanted = gradient("autodiff"), gradient("native")
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+    for a, b in zip(*map(jax.tree.leaves, (gradient("autodiff"), gradient("native"))), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-9 * float(jnp.abs(b).max()))
 
 
+@pytest.mark.long
 def test_an_eager_call_finds_its_capacity_in_forward_mode():
     def brightness(factor):
         scaled = jax.tree.map(lambda leaf: factor * leaf, some_gaussians())

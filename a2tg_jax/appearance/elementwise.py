@@ -77,7 +77,9 @@ class StaticShading:
 
         def shade(numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array) -> tuple[Residual, Factor]:
             shaded = own.shade(numbers[:-CURVE] if has_curve else numbers, values, u, v)
-            return (None, shaded[1]) if has_features else shaded
+            # `check_shading` names a result of another form.
+            is_pair = isinstance(shaded, tuple | list) and len(shaded) == 2
+            return (None, shaded[1]) if has_features and is_pair else shaded
 
         def falloff(numbers: tuple[Array, ...], rho: Array) -> Array:
             return falloff_of(Curve(*numbers[-CURVE:]), rho) if has_curve else own.falloff(numbers, rho)

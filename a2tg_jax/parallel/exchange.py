@@ -25,7 +25,7 @@ from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.geometry import screen_bounds
 from a2tg_jax.parallel.sharded_rows import everywhere, mesh_of, placed, sharding_of_rows
 from a2tg_jax.rasterize.compositor import Composited, composite, list_tiles
-from a2tg_jax.rasterize.splats import CompositingSettings, Splats, pack_splats, unpack_splats
+from a2tg_jax.rasterize.splats import PassSettings, Splats, pack_splats, unpack_splats
 from a2tg_jax.rasterize.tile_pixels import TilePixels, band_pixels, tile_pixels
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
 
@@ -217,7 +217,7 @@ def exchange_among(devices: Sequence[jax.Device]) -> Exchange:
 
 
 def composite_on_devices(
-    settings: CompositingSettings, exchange: Exchange, capacity: int, splats: Splats, texels: Array,
+    settings: PassSettings, exchange: Exchange, capacity: int, splats: Splats, texels: Array,
     regions: TextureRegion | None, cutoff: Array, jacobian: Array, probe: Array, rays: Array | None,
 ) -> Composited:  # fmt: skip
     """Composite a view as `compositor.composite` does on one device, with its arguments: each device a band.
@@ -237,7 +237,7 @@ def composite_on_devices(
 
 
 def _composite_views(
-    settings: CompositingSettings, exchange: Exchange, capacity: int, texels: Array,
+    settings: PassSettings, exchange: Exchange, capacity: int, texels: Array,
     regions: TextureRegion | None, rays: Array | None, splats: Splats, cutoff: Array, jacobian: Array, probe: Array,
 ) -> Composited:  # fmt: skip
     """Composite G views, the leading axis of splats, cutoff, jacobian and probe, which share the rays of a lens."""
@@ -269,7 +269,7 @@ def share_of_a_band(num_bands: int) -> float:
 
 
 def _composite_band(
-    settings: CompositingSettings, exchange: Exchange, capacity: int, bands: ImageBands, splats: Splats,
+    settings: PassSettings, exchange: Exchange, capacity: int, bands: ImageBands, splats: Splats,
     regions: TextureRegion | None, cutoff: Array, probe: Array, texels: Array, jacobian: Array,
     pixels: TilePixels | None,
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
@@ -279,7 +279,7 @@ def _composite_band(
     most_sent = min(num, max(1, math.ceil(capacity * exchange.rows_per_pair)))
     # Borders of bands [G, D/G + 1], the same on all devices, and which bands are reached by each of its n splats.
     boxes = jax.vmap(
-        lambda M, cutoff: tile_rectangles(screen_bounds(M, cutoff, settings.kernel.near_plane), settings.grid, pixels)
+        lambda M, cutoff: tile_rectangles(screen_bounds(M, cutoff, settings.near_plane), settings.grid, pixels)
     )(jax.lax.stop_gradient(splats.M), cutoff)
     most = jnp.int32((2**31 - 1) // exchange.num)  # No sum over devices overflows.
     pairs = jax.lax.psum(jnp.clip(jax.vmap(bands.pairs_of_rows)(boxes), 0, most), AXIS)

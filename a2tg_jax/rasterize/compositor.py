@@ -5,10 +5,6 @@ has a `forward` and a `backward` with the same arguments and results, and JAX ch
 platform (`kernels.platforms`). The compositor "autodiff" has no gradient of its own.
 
 The backward pass walks front to back too (`rasterize.pixel.absorb_vjp`), so that nothing is stored per pixel and splat.
-
-Native loops, CUDA kernels and the loops of XLA are differentiated once, in reverse mode. JAX's own errors in other
-modes name neither the renderer nor a remedy; those here do. (Under `vmap` of tangents, as in `jax.jacfwd`, JAX's error
-comes first.)
 """
 
 import functools
@@ -26,7 +22,7 @@ from a2tg_jax.parallel.sharded_rows import cotangent_of
 from a2tg_jax.rasterize import tiles
 from a2tg_jax.rasterize.kernels import xla
 from a2tg_jax.rasterize.kernels.platforms import by_platform, choose, instead_of
-from a2tg_jax.rasterize.splats import CompositingSettings, PassInputs, Splats, Wanted
+from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats
 from a2tg_jax.rasterize.tile_pixels import TilePixels
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
@@ -42,37 +38,29 @@ ADVICE = (
 class Composited(NamedTuple):
     """Image of a view without its background."""
 
-    channels: Array
-    """[D, H, W]; D is red, green, blue(, depth, depth², normal x, y, z)."""
-    transmittance: Array
-    """[H, W] of what is behind all splats."""
-    num_pairs: Array
-    """Number of pairs, the least capacity."""
-    overflow: Array
-    """Whether the capacity was too small."""
+    channels: Array  # [D, H, W]; D is red, green, blue(, depth, depth², normal x, y, z)
+    transmittance: Array  # [H, W] of what is behind all splats
+    num_pairs: Array  # number of pairs, the least capacity
+    overflow: Array  # whether the capacity was too small
 
 
 def composite(
-    settings: CompositingSettings, splats: Splats, texels: Array, regions: TextureRegion | None, cutoff: Array,
+    settings: PassSettings, splats: Splats, texels: Array, regions: TextureRegion | None, cutoff: Array,
     lists: TileLists, jacobian: Array, probe: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return channels [D, H, W] and final transmittance [H, W]; D is red, green, blue(, depth, depth², normal x, y, z).
+    """Return channels [D, H, W] and final transmittance [H, W], as `Composited` has them.
 
     Args:
-      settings: static options.
-      splats: N splats.
-      texels: [T, C] texels of the appearance, differentiated.
-      regions: [N] places of the textures among them; None without textures.
-      cutoff: [N] squared distance beyond which each splat is invisible.
-      lists: splats of each tile.
+      settings: static settings of the pass.
+      splats, texels, regions, cutoff, lists: fields of `PassInputs`; splats and texels are differentiated.
       jacobian: [3, 3] ∂M[:, 2]/∂μ = K·Rc, used only by the statistic.
-      probe: [N, 4] zeros. Its gradient is not of the image: columns 0 to 2 are the statistic, Σ_pixels of
+      probe: [N, 4] zeros. Its gradient is not the image's: columns 0 to 2 are the statistic, Σ_pixels of
         `rasterize.pixel.positional_gradient`, column 3 the number of pixels in which the splat was composited.
     """
     # Kernels follow regions without checking them.
     regions = None if regions is None else within_texels(regions, texels.shape[0])
     if settings.compositor == "autodiff":
-        if settings.kernel.statistic:
+        if settings.statistic:
             raise ValueError("the statistic of densification needs another compositor than 'autodiff'")
         inputs = PassInputs(splats, texels, regions, cutoff, lists)
 
@@ -81,53 +69,54 @@ def composite(
 
         # JAX differentiates the code itself, which it must therefore trace for all platforms.
         per_platform = {"cpu": on("cpu")} if settings.tile_batch is None else {}
-        channels, transmittance = jax.lax.platform_dependent(inputs, default=on("other"), **per_platform)
+        images = jax.lax.platform_dependent(inputs, default=on("other"), **per_platform)
     else:
         mark = functools.partial(_reverse_only, settings.compositor)
         splats, texels, probe = jax.tree.map(mark, (splats, texels, probe))
-        arrays = splats, texels, regions, cutoff, lists, jacobian, probe
-        channels, transmittance = _composite_tiles(settings, *arrays)
-    return _assemble(channels, settings.grid), _assemble(transmittance, settings.grid)
+        images = _composite_tiles(settings, splats, texels, regions, cutoff, lists, jacobian, probe)
+    channels, transmittance = (_assemble(image, settings.grid) for image in images)
+    return channels, transmittance
+
+
+def _assemble(tiles: Array, grid: TileGrid) -> Array:
+    """Assemble tiles [tiles, ..., P] into one image [..., H, W]."""
+    inner, size = tiles.shape[1:-1], grid.tile_size
+    # [rows, columns, ..., y, x] to [..., rows, y, columns, x]; the last tiles may reach beyond the image.
+    blocks = tiles.reshape(grid.rows, grid.columns, *inner, size, size)
+    image = jnp.moveaxis(blocks, (0, 1), (-4, -2))
+    return image.reshape(*inner, grid.rows * size, grid.columns * size)[..., : grid.height, : grid.width]
 
 
 def list_tiles(
-    settings: CompositingSettings, M: Array, cutoff: Array, capacity: int, pixels: TilePixels | None = None,
+    settings: PassSettings, M: Array, cutoff: Array, capacity: int, pixels: TilePixels | None = None,
     height: Array | None = None,
 ) -> TileLists:  # fmt: skip
     """List the splats that touch each tile of a pass, as `tiles.tile_lists` does, by native loops where they run.
 
     If the tiles have pixels with rays, XLA lists the splats, and the height is not used.
     """
-    grid, near_plane = settings.grid, settings.kernel.near_plane
+    grid = settings.grid
     if pixels is not None:
-        return tiles.tile_lists(M, cutoff, near_plane, grid, capacity, pixels)
+        return tiles.tile_lists(M, cutoff, settings.near_plane, grid, capacity, pixels)
     integers = [jax.ShapeDtypeStruct((num,), jnp.int32) for num in (capacity, grid.num + 1)]
     results = (*integers, jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_))
-    static = settings.compositor, near_plane, grid, capacity
-    ids, starts, num_pairs, overflow = by_platform(_lists_on, static, results, M, cutoff, height)
+    ids, starts, num_pairs, overflow = by_platform(_lists_on, (settings, capacity), results, M, cutoff, height)
     return TileLists(ids, starts, num_pairs, overflow, height=height)
 
 
-def _lists_on(platform: str, compositor: Wanted, near_plane: float, grid: TileGrid, capacity: int) -> Any:
+def _lists_on(platform: str, settings: PassSettings, capacity: int) -> Any:
     def lists(M: Array, cutoff: Array, height: Array | None) -> tuple[Array, ...]:
-        chosen = _kernels(compositor, platform)
         # CUDA kernels have no lists of their own.
-        tile_lists = getattr(chosen, "tile_lists", tiles.tile_lists)
-        return tuple(tile_lists(M, cutoff, near_plane, grid, capacity, height=height)[:4])
+        tile_lists = getattr(_kernels(settings, platform), "tile_lists", tiles.tile_lists)
+        return tuple(tile_lists(M, cutoff, settings.near_plane, settings.grid, capacity, height=height)[:4])
 
     return lists
 
 
-def _forward(settings: CompositingSettings, *arrays: Any) -> tuple[Array, Array]:
-    """Return channels [tiles, D, P] and transmittance [tiles, P], P pixels a tile.
-
-    Args:
-      settings: static options.
-      arrays: fields of `PassInputs`, jacobian and probe.
-    """
-    inputs = PassInputs(*arrays[:5])
-    tiles, pixels = settings.grid.num, settings.grid.tile_size**2
-    shapes = (tiles, settings.kernel.num_channels, pixels), (tiles, pixels)
+def _forward(settings: PassSettings, *arrays: Any) -> tuple[Array, Array]:
+    """Return channels [tiles, D, P] and transmittance [tiles, P], given fields of `PassInputs`, jacobian and probe."""
+    inputs, tiles = PassInputs(*arrays[:5]), settings.grid.num
+    shapes = (tiles, settings.num_channels, settings.num_pixels), (tiles, settings.num_pixels)
     results = tuple(jax.ShapeDtypeStruct(shape, inputs.splats.M.dtype) for shape in shapes)
     return _by_platform("forward", settings, results, inputs)
 
@@ -135,13 +124,13 @@ def _forward(settings: CompositingSettings, *arrays: Any) -> tuple[Array, Array]
 _composite_tiles = jax.custom_vjp(_forward, nondiff_argnums=(0,))
 
 
-def _composite_tiles_fwd(settings: CompositingSettings, *arrays: Any) -> tuple[tuple[Array, Array], tuple[Any, ...]]:
+def _composite_tiles_fwd(settings: PassSettings, *arrays: Any) -> tuple[tuple[Array, Array], tuple[Any, ...]]:
     shown = _forward(settings, *arrays)
     return shown, (*arrays, *shown)
 
 
 def _composite_tiles_bwd(
-    settings: CompositingSettings, residuals: tuple[Any, ...], cotangents: tuple[Array, Array]
+    settings: PassSettings, residuals: tuple[Any, ...], cotangents: tuple[Array, Array]
 ) -> tuple[Splats, Array, None, None, None, None, Array]:
     *arrays, channels, transmittance = residuals
     g, g_transmittance = cotangents
@@ -158,30 +147,26 @@ def _composite_tiles_bwd(
 _composite_tiles.defvjp(_composite_tiles_fwd, _composite_tiles_bwd)
 
 
-def _by_platform(which: str, settings: CompositingSettings, results: Any, *arrays: object) -> Any:
-    """Call `forward` or `backward` of the kernels of the platform that JAX compiles for."""
+def _by_platform(which: str, settings: PassSettings, results: Any, *arrays: object) -> Any:
     advice = ADVICE.format(compositor=settings.compositor)
     return by_platform(_pass_on, (which, settings), results, *arrays, advice=advice)
 
 
-def _pass_on(platform: str, which: str, settings: CompositingSettings) -> Any:
-    kernels, spec = _kernels(settings.compositor, platform), settings.kernel
-    if kernels is not xla and (reason := kernels.refusal(spec)):
-        instead_of(settings.compositor, type(spec.static.appearance), reason)
+def _pass_on(platform: str, which: str, settings: PassSettings) -> Any:
+    kernels = _kernels(settings, platform)
+    if kernels is not xla and (reason := kernels.refusal(settings.kernel)):
+        instead_of(settings.compositor, type(settings.static.appearance), reason)
         kernels = xla
     return functools.partial(getattr(kernels, which), _batched_on(platform, settings))
 
 
-def _kernels(wanted: Wanted, platform: str) -> Any:
-    """Return the module of kernels for a platform; imported here, where it is used, as not all packages are installed.
-
-    `native` needs llvmlite, and programs on CPUs have no use for `cuda`.
-    """
-    chosen = choose(wanted, platform)
+def _kernels(settings: PassSettings, platform: str) -> Any:
+    chosen = choose(settings.compositor, platform)
+    # Imported here: `native` needs llvmlite, which may be missing, and programs on CPUs do not use `cuda`.
     return xla if chosen in ("xla", "autodiff") else importlib.import_module(f"{xla.__package__}.{chosen}.composite")
 
 
-def _batched_on(platform: str, settings: CompositingSettings) -> CompositingSettings:
+def _batched_on(platform: str, settings: PassSettings) -> PassSettings:
     """Return the settings with the number of tiles that XLA composites at once on a platform."""
     num = settings.tile_batch
     if num is None:
@@ -189,21 +174,13 @@ def _batched_on(platform: str, settings: CompositingSettings) -> CompositingSett
     return settings._replace(tile_batch=min(num or settings.grid.num, settings.grid.num))
 
 
-def _assemble(tiles: Array, grid: TileGrid) -> Array:
-    """Assemble tiles [tiles, ..., P] into one image [..., H, W]."""
-    inner = tiles.shape[1:-1]
-    # [rows, columns, ..., y, x] to [..., rows, y, columns, x]; the last tiles may reach beyond the image.
-    blocks = tiles.reshape(grid.rows, grid.columns, *inner, grid.tile_size, grid.tile_size)
-    image = jnp.moveaxis(blocks, (0, 1), (-4, -2))
-    size = grid.tile_size
-    return image.reshape(*inner, grid.rows * size, grid.columns * size)[..., : grid.height, : grid.width]
-
-
 def _refuse(compositor: str) -> NoReturn:
     raise ValueError(ADVICE.format(compositor=compositor))
 
 
-# The identity, in the linear map of tangents. Reverse mode transposes it away; only forward mode runs it.
+# Kernels are differentiated once, in reverse mode. JAX's own errors in other modes name neither the renderer nor a
+# remedy. So inputs pass through an identity whose linear map of tangents is this primitive: reverse mode transposes it
+# away, and only forward mode runs it. (Under `vmap` of tangents, as in `jax.jacfwd`, JAX's error comes first.)
 _tangent_p = Primitive("a2tg_reverse_only")
 _tangent_p.def_impl(lambda tangent, *, compositor: _refuse(compositor))
 _tangent_p.def_abstract_eval(lambda tangent, *, compositor: tangent)

@@ -25,6 +25,8 @@ MIN_TRANSMITTANCE = 1e-4
 Triple = tuple[Array, Array, Array]
 Rows = tuple[Triple, Triple, Triple]
 """Rows of a homography."""
+TileNumbers = tuple[Array, ...]
+"""Centre (x, y) of a tile, and with rays of its own the four numbers of its frame, row by row."""
 State = tuple[Array, Array, Array]
 """Transmittance and liveness behind a splat, and `suffix_sum` of the splats behind it."""
 Statistic = Literal["position", "screen", "center"]
@@ -34,82 +36,46 @@ Statistic = Literal["position", "screen", "center"]
 class Splat(NamedTuple):
     """Differentiable numbers of a splat, without its texture."""
 
-    M: Rows
-    """Rows of the homography from (u, v, 1) to pixels."""
-    opacity: Array
-    """Peak opacity, before the falloff."""
-    color: tuple[Array, ...]
-    """Own colours: red, green and blue of the spherical harmonics, or D features."""
-    normal: Triple | None
-    """Normal in the world, facing the camera; None if only colour is composited."""
-    numbers: tuple[Array, ...] = ()
-    """Numbers of its appearance (`Appearance.numbers`)."""
+    M: Rows  # rows of the homography from (u, v, 1) to pixels
+    opacity: Array  # peak opacity, before the falloff
+    color: tuple[Array, ...]  # own colours: red, green and blue of the spherical harmonics, or D features
+    normal: Triple | None  # normal in the world, facing the camera; None if only colour is composited
+    numbers: tuple[Array, ...] = ()  # numbers of its appearance (`Appearance.numbers`)
 
 
 class Planes(NamedTuple):
     """Splat seen from a tile: p = k × l is linear in the pixel (x, y), relative to the tile's centre."""
 
-    p0: Triple
-    """Coefficients of x, y and 1 in p₀, where u = p₀/p₂."""
-    p1: Triple
-    """Coefficients of p₁, where v = p₁/p₂."""
-    p2: Triple
-    """Coefficients of p₂."""
-    determinant: Array
-    """det(M); over p₂ it is the depth of the hit."""
-    center_x: Array
-    """Horizontal coordinate of the projected mean, in pixels from the tile's centre."""
-    center_y: Array
-    """Vertical coordinate of the projected mean."""
-    depth: Array
-    """Depth of the mean."""
-
-
-TileNumbers = tuple[Array, ...]
-"""Centre (x, y) of a tile, and with rays of its own the four numbers of its frame, row by row."""
+    p0: Triple  # coefficients of x, y and 1 in p₀, where u = p₀/p₂
+    p1: Triple  # coefficients of p₁, where v = p₁/p₂
+    p2: Triple  # coefficients of p₂
+    determinant: Array  # det(M); over p₂ it is the depth of the hit
+    center_x: Array  # horizontal coordinate of the projected mean, in pixels from the tile's centre
+    center_y: Array  # vertical coordinate of the projected mean
+    depth: Array  # depth of the mean
 
 
 class Hit(NamedTuple):
     """Hit of a pixel's ray with a splat."""
 
-    u: Array
-    """Coordinate along the first axis, in standard deviations; 0 without a hit."""
-    v: Array
-    """Coordinate along the second axis."""
+    u: Array  # coordinate along the first axis, in standard deviations; 0 without a hit
+    v: Array  # coordinate along the second axis
     rho: Array
     """Squared distance for the falloff, min(u² + v², 2·|(x, y) − c|²). Without the low-pass filter, u² + v², and
     infinity without a hit."""
-    depth: Array
-    """Depth of the hit, or of the mean if the low-pass filter decides."""
-    is_ray: Array
-    """Whether the hit decides ρ, not the low-pass filter."""
+    depth: Array  # depth of the hit, or of the mean if the low-pass filter decides
+    is_ray: Array  # whether the hit decides ρ, not the low-pass filter
 
 
 class Shown(NamedTuple):
     """Alpha and channels of a splat at a pixel."""
 
-    alpha: Array
-    """Alpha in [0, max_alpha]; 0 if it would be less than 1/255."""
-    channels: tuple[Array, ...]
-    """Colours; and depth, depth², normal x, y, z if the splat has a normal."""
+    alpha: Array  # alpha in [0, max_alpha]; 0 if it would be less than 1/255
+    channels: tuple[Array, ...]  # colours; and depth, depth², normal x, y, z if the splat has a normal
 
 
 def _cross(a: Triple, b: Triple) -> Triple:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _in_frame(tile: TileNumbers, along_x: Array, along_y: Array) -> tuple[Array, Array]:
-    """Return a gradient by a place of the image plane as one by the place in the tile's frame."""
-    if len(tile) == 2:
-        return along_x, along_y
-    _, _, xx, xy, yx, yy = tile
-    # ∂L/∂place = Fᵀ·∂L/∂pixel for pixel = F·place: this solves for ∂L/∂pixel.
-    inverse = 1 / (xx * yy - xy * yx)
-    return (yy * along_x - yx * along_y) * inverse, (xx * along_y - xy * along_x) * inverse
-
-
-def _mixed(p: Array, a: Triple, q: Array, b: Triple) -> Triple:
-    return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
 
 
 def planes_of(M: Rows, tile: TileNumbers) -> Planes:
@@ -120,22 +86,18 @@ def planes_of(M: Rows, tile: TileNumbers) -> Planes:
     x, y, *frame = tile
     last = M[2]
     # Counting pixels from the tile's centre before the cross products keeps float32 exact to 1e-4.
-    first = (M[0][0] - x * last[0], M[0][1] - x * last[1], M[0][2] - x * last[2])
-    second = (M[1][0] - y * last[0], M[1][1] - y * last[1], M[1][2] - y * last[2])
+    first: Any = tuple(M[0][k] - x * last[k] for k in range(3))
+    second: Any = tuple(M[1][k] - y * last[k] for k in range(3))
     if frame:
         xx, xy, yx, yy = frame
-        first, second = _mixed(xx, first, xy, second), _mixed(yx, first, yy, second)
-    # (x·M₂ − M₀) × (y·M₂ − M₁) is bilinear: x and y multiply the cross products with the last row.
+        rows = list(zip(first, second, strict=True))
+        first, second = tuple(xx * p + xy * q for p, q in rows), tuple(yx * p + yy * q for p, q in rows)
+    # 2DGS: the pixel's ray is the intersection of the planes k = x·M₂ − M₀ and l = y·M₂ − M₁, and p = k × l. It is
+    # bilinear: x and y multiply the cross products with the last row, and x·y the one of the last row with itself, 0.
     a, b, c = _cross(second, last), _cross(last, first), _cross(first, second)
-    return Planes(
-        p0=(a[0], b[0], c[0]),
-        p1=(a[1], b[1], c[1]),
-        p2=(a[2], b[2], c[2]),
-        determinant=last[0] * c[0] + last[1] * c[1] + last[2] * c[2],
-        center_x=first[2] / last[2],
-        center_y=second[2] / last[2],
-        depth=last[2],
-    )
+    p0, p1, p2 = ((a[k], b[k], c[k]) for k in range(3))
+    determinant = last[0] * c[0] + last[1] * c[1] + last[2] * c[2]
+    return Planes(p0, p1, p2, determinant, center_x=first[2] / last[2], center_y=second[2] / last[2], depth=last[2])
 
 
 def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pass: bool = True) -> Hit:
@@ -145,7 +107,7 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pas
     """
     p0, p1, p2 = (plane[0] * x + plane[1] * y + plane[2] for plane in planes[:3])
     # Far out on a nearly parallel plane u² would overflow, as would 1/p₂² for the tiniest splats: the divisor is
-    # clamped there, with a finite gradient.
+    # clamped there, with a finite gradient. With |u| <= ∛max, u² and its product with u stay finite.
     far, tiny = float(np.cbrt(np.finfo(p2.dtype).max)), float(np.sqrt(np.finfo(p2.dtype).tiny))
     q0, q1, q2, determinant = jax.lax.stop_gradient((p0, p1, p2, planes.determinant))
     least = jnp.maximum(jnp.maximum(jnp.abs(q0), jnp.abs(q1)), jnp.abs(determinant)) * (1 / far)
@@ -178,12 +140,8 @@ def show(
 ) -> Shown:
     """Return α = min(functions.max_alpha, o·falloff(ρ)·T_A), or 0 below 1/255, and the channels that it weighs.
 
-    Args:
-      functions: the functions of the appearance.
-      splat: the splat; its homography is not read.
-      hit: hit of the ray with the splat.
-      values: interpolated values of the splat's texture.
-      rho_probe: zero, added to ρ of the falloff to read the gradient there; or None.
+    `values` are interpolated from the splat's texture, and the splat's homography is not read. `rho_probe` is zero,
+    added to ρ of the falloff to read the gradient there.
     """
     residual, factor = functions.shade(splat.numbers, values, hit.u, hit.v)
     # The slope of a falloff at infinity may be NaN.
@@ -221,13 +179,8 @@ def absorb_vjp(
     B = Σ g·c·α·T over the splats behind + g_T·T_final is linear in 1 − α of this splat, so that
     ∂L/∂α = T·(g·c) − B/(1 − α). Nothing is stored per pixel and splat, and α never reaches 1.
 
-    Args:
-      alpha, transmittance, is_live: as for `absorb`.
-      suffix_sum: B with this splat's own g·c·α·T still in it.
-      shown: g·c, the cotangent's product with this splat's channels.
-
-    Returns:
-      weight; transmittance and is_live behind the splat; B of the splats behind it; and ∂L/∂α.
+    `suffix_sum` is B with this splat's own g·c·α·T still in it, `shown` is g·c. The results are weight, transmittance
+    and liveness behind the splat, B of the splats behind it, and ∂L/∂α.
     """
     weight, after, live_after = absorb(alpha, transmittance, is_live)
     suffix_sum = suffix_sum - weight * shown
@@ -243,10 +196,8 @@ class Cotangents(NamedTuple):
     color: tuple[Array, ...]
     normal: Triple | None
     numbers: tuple[Array, ...]
-    values: tuple[Array, ...]
-    """Cotangents of the values of the splat's texture."""
-    rho: Array | None
-    """∂L/∂ρ through the falloff, if requested."""
+    values: tuple[Array, ...]  # cotangents of the values of the splat's texture
+    rho: Array | None  # ∂L/∂ρ through the falloff, if requested
 
 
 def blend(
@@ -263,11 +214,10 @@ def blend_vjp(
     functions: Elementwise, near_plane: float, planes: Planes, splat: Splat, lookup: Lookup | None, x: Array, y: Array,
     transmittance: Array, is_live: Array, suffix_sum: Array, g: Sequence[Array], has_rho: bool,
 ) -> tuple[State, Array, Cotangents]:  # fmt: skip
-    """Differentiate `blend`; `suffix_sum` and `g` are those of `absorb_vjp`, g channel by channel.
+    """Differentiate `blend`, with `suffix_sum` as for `absorb_vjp` and the cotangents g of the channels.
 
-    Returns:
-      (transmittance, is_live, suffix_sum) behind the splat, its weight, and its Cotangents. These are valid only if the
-      weight is positive; elsewhere they may not even be finite.
+    Returns (transmittance, is_live, suffix_sum) behind the splat, its weight, and its Cotangents. These are valid only
+    if the weight is positive; elsewhere they may not even be finite.
     """
 
     def of_floats(
@@ -301,14 +251,7 @@ def positional_gradient(
     of 2D Gaussians). With a frame, it is by pixels of the image.
     "center": ∂L/∂M₀₂·M₂₂ and ∂L/∂M₁₂·M₂₂, signed, if the hit decides, else 0 (2DGS); likewise.
 
-    Args:
-      statistic: kind of statistic.
-      M: rows of the homography.
-      x, y: the pixel, from the tile's centre.
-      tile: as for `planes_of`.
-      d_rho: ∂L/∂ρ through the falloff.
-      jacobian: rows of ∂M[:, 2]/∂μ = K·Rc.
-      near_plane, has_low_pass: as for `intersect`.
+    `d_rho` is ∂L/∂ρ through the falloff, `jacobian` has the rows of ∂M[:, 2]/∂μ = K·Rc.
     """
     axes = tuple((row[0], row[1]) for row in M)
     mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_rho)) for row in M)
@@ -325,9 +268,14 @@ def positional_gradient(
         components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
         return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]
     # c = (M₀₂, M₁₂)/M₂₂, so that this is ∂L/∂c if the low-pass filter decides.
-    on_screen = _in_frame(tile, d_mean[0] * mean[2], d_mean[1] * mean[2])
+    dx, dy = d_mean[0] * mean[2], d_mean[1] * mean[2]
+    if len(tile) == 6:
+        # ∂L/∂place = Fᵀ·∂L/∂pixel for pixel = F·place: this solves for ∂L/∂pixel.
+        _, _, xx, xy, yx, yy = tile
+        inverse = 1 / (xx * yy - xy * yx)
+        dx, dy = (yy * dx - yx * dy) * inverse, (xx * dy - xy * dx) * inverse
     if statistic == "center":
-        along_x, along_y = (jnp.where(is_ray, number, 0.0) for number in on_screen)
+        dx, dy = jnp.where(is_ray, dx, 0.0), jnp.where(is_ray, dy, 0.0)
     else:
-        along_x, along_y = (jnp.where(is_ray, 0.0, jnp.abs(number)) for number in on_screen)
-    return along_x, along_y, jnp.zeros_like(along_x)
+        dx, dy = jnp.where(is_ray, 0.0, jnp.abs(dx)), jnp.where(is_ray, 0.0, jnp.abs(dy))
+    return dx, dy, jnp.zeros_like(dx)

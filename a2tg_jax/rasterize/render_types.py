@@ -58,10 +58,9 @@ class RenderSettings:
         for name, least in (("capacity", 1), ("tile_batch", 0)):
             if getattr(self, name) is not None:
                 check_int(name, getattr(self, name), least, otherwise=", or None")
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+        for name, value in vars(self).items():
             if isinstance(value, np.integer):
-                object.__setattr__(self, field.name, int(value))
+                object.__setattr__(self, name, int(value))
 
     def finer(self, camera: Camera) -> Camera:
         """Return the view at the size at which it is drawn: `supersample` times its own."""
@@ -69,7 +68,7 @@ class RenderSettings:
         return camera if factor == 1 else resize_camera(camera, factor * camera.width, factor * camera.height)
 
     def transform(self, similarity: Similarity) -> "RenderSettings":
-        """Return settings that show a model in the world of `similarity` as these show it in its own."""
+        """Return the settings that show a model transformed by `similarity` as these show the model itself."""
         return dataclasses.replace(self, near_plane=self.near_plane * similarity.scale)
 
     @staticmethod

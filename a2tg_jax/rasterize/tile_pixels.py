@@ -15,51 +15,24 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.cameras import Camera
-
 PRIOR = 1e-6
 """Weight of the unit matrix, per pixel, where a tile's pixels do not tell its frame: a single row or column of them."""
-
-
-class Spans(NamedTuple):
-    """Coordinates along an axis that the tiles of each column, or row, cover."""
-
-    reached: Array
-    """Largest coordinate of the tiles so far; ascending."""
-    begun: Array
-    """Smallest coordinate of the tiles from here on; ascending."""
 
 
 class TilePixels(NamedTuple):
     """Pixels of every tile. Coordinates without a frame are pixels of the image plane of K."""
 
-    centers: Array
-    """[T, 2] mean place of a tile's rays."""
-    frames: Array
-    """[T, 2, 2] matrices from the image plane to the tile's frame, in pixels of the image."""
-    offsets: Array
-    """[T, 2, P] places of the pixels from the centre, in the tile's frame; 0 without a ray."""
-    is_seen: Array
-    """[T, P] whether a pixel lies in the image and has a ray."""
-    boxes: Array
-    """[T, 4] left, top, right and bottom edge of the tile's rays; an empty box without any."""
-    magnifications: Array
-    """[T] bound of the length in the image plane of one pixel of the image."""
-
-
-def pixels_of(camera: Camera, tile_size: int) -> TilePixels | None:
-    """Return the pixels of all tiles of a camera with rays; None for a pinhole camera."""
-    return None if camera.rays is None else tile_pixels(camera.rays, tile_size)
+    centers: Array  # [T, 2] mean place of a tile's rays
+    frames: Array  # [T, 2, 2] matrices from the image plane to the tile's frame, in pixels of the image
+    offsets: Array  # [T, 2, P] places of the pixels from the centre, in the tile's frame; 0 without a ray
+    is_seen: Array  # [T, P] whether a pixel lies in the image and has a ray
+    boxes: Array  # [T, 4] left, top, right and bottom edge of the tile's rays; an empty box without any
+    magnifications: Array  # [T] bound of the length in the image plane of one pixel of the image
 
 
 def tile_pixels(rays: Array, tile_size: int, num_rows: int | None = None) -> TilePixels:
-    """Return the pixels of all tiles.
-
-    Args:
-      rays: [H, W, 2] places of the pixels' rays in the image plane; not finite where a pixel has none.
-      tile_size: side of a tile.
-      num_rows: number of rows of tiles; pixels below the image have no ray. None: those of the image.
-    """
+    """Return the pixels of all tiles, given the places [H, W, 2] of their rays in the image plane, which are not finite
+    where a pixel has none; with `num_rows` also tiles below the image, whose pixels have no ray."""
     height, width = rays.shape[:2]
     num_rows, num_columns = -(-height // tile_size) if num_rows is None else num_rows, -(-width // tile_size)
     margins = (0, num_rows * tile_size - height), (0, num_columns * tile_size - width), (0, 0)
@@ -67,7 +40,8 @@ def tile_pixels(rays: Array, tile_size: int, num_rows: int | None = None) -> Til
     blocks = padded.reshape(num_rows, tile_size, num_columns, tile_size, 2).transpose(0, 2, 4, 1, 3)
     places = blocks.reshape(num_rows * num_columns, 2, tile_size**2)
     is_seen = jnp.all(jnp.isfinite(places), axis=1)
-    boxes = _boxes(places, is_seen)
+    low = jnp.min(jnp.where(is_seen[:, None], places, jnp.inf), axis=2)
+    high = jnp.max(jnp.where(is_seen[:, None], places, -jnp.inf), axis=2)
     centers, jacobians = _fitted(places, is_seen, tile_size)
     frames = jnp.linalg.inv(jacobians)
     offsets = jnp.where(is_seen[:, None], places - centers[:, :, None], 0.0)
@@ -76,25 +50,18 @@ def tile_pixels(rays: Array, tile_size: int, num_rows: int | None = None) -> Til
         frames=frames,
         offsets=jnp.einsum("tij,tjp->tip", frames, offsets, precision="highest"),
         is_seen=is_seen,
-        boxes=boxes,
+        boxes=jnp.concatenate([low, high], axis=1),
         # The Frobenius norm bounds the length of the image of a unit vector.
         magnifications=jnp.sqrt(jnp.sum(jacobians**2, axis=(1, 2))),
     )
 
 
 def band_pixels(pixels: TilePixels, first: Array, num: int, num_shown: Array) -> TilePixels:
-    """Return the pixels of so many tiles in a row, from tile `first` on, of which the last ones may not be shown."""
+    """Return the pixels of `num` consecutive tiles from tile `first` on, of which `num_shown` are shown."""
     band: TilePixels = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, num), pixels)
     is_shown = (jnp.arange(num, dtype=jnp.int32) < num_shown)[:, None]
     nowhere = jnp.asarray([[jnp.inf, jnp.inf, -jnp.inf, -jnp.inf]], band.boxes.dtype)
     return band._replace(is_seen=band.is_seen & is_shown, boxes=jnp.where(is_shown, band.boxes, nowhere))
-
-
-def _boxes(places: Array, is_seen: Array) -> Array:
-    """Return the boxes [T, 4] around the rays of each tile."""
-    low = jnp.min(jnp.where(is_seen[:, None], places, jnp.inf), axis=2)
-    high = jnp.max(jnp.where(is_seen[:, None], places, -jnp.inf), axis=2)
-    return jnp.concatenate([low, high], axis=1)
 
 
 def _fitted(places: Array, is_seen: Array, tile_size: int) -> tuple[Array, Array]:
@@ -120,29 +87,24 @@ def _fitted(places: Array, is_seen: Array, tile_size: int) -> tuple[Array, Array
     return centers, covariance @ jnp.linalg.inv(spread)
 
 
-def spans_of(pixels: TilePixels, num_columns: int, reach: Array) -> tuple[Spans, Spans]:
-    """Return the spans of the columns and of the rows, so many pixels of the image wider at each side.
+def covered_tiles(
+    pixels: TilePixels, num_columns: int, reach: Array, low: tuple[Array, Array], high: tuple[Array, Array]
+) -> tuple[tuple[Array, Array], ...]:
+    """Return the first column that the boxes low..high may reach [N], and their number; and likewise the rows.
 
-    Args:
-      pixels: of all tiles.
-      num_columns: number C of columns.
-      reach: pixels.
+    Tiles are `reach` pixels of the image wider at each side.
     """
     margins = (reach * pixels.magnifications)[:, None]
-    low, high = pixels.boxes[:, :2] - margins, pixels.boxes[:, 2:] + margins
-    low, high = (edge.reshape(-1, num_columns, 2) for edge in (low, high))
-    spans = []
+    edges = pixels.boxes[:, :2] - margins, pixels.boxes[:, 2:] + margins
+    begins, ends = (edge.reshape(-1, num_columns, 2) for edge in edges)
+    found = []
     for axis in range(2):  # Over the rows for the columns, over the columns for the rows.
         # Lenses bend rows and columns, so that spans overlap and need not be in order. The largest end so far and the
-        # least begin from here on are, and contain them: `covered` can search them by halves.
-        begun, reached = jnp.min(low[..., axis], axis=axis), jnp.max(high[..., axis], axis=axis)
-        spans.append(Spans(jax.lax.cummax(reached), jax.lax.cummin(begun, reverse=True)))
-    return spans[0], spans[1]
-
-
-def covered(spans: Spans, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the first of the columns, or rows, that [low, high] may reach [N], and their number."""
-    first = jnp.searchsorted(spans.reached, low, side="left").astype(jnp.int32)
-    end = jnp.searchsorted(spans.begun, high, side="right").astype(jnp.int32)
-    is_covered = (low <= high) & (first < end)
-    return jnp.where(is_covered, first, 0), jnp.where(is_covered, end - first, 0)
+        # least begin from here on are, and contain them: they can be searched by halves.
+        begun, reached = jnp.min(begins[..., axis], axis=axis), jnp.max(ends[..., axis], axis=axis)
+        begun, reached = jax.lax.cummin(begun, reverse=True), jax.lax.cummax(reached)
+        first = jnp.searchsorted(reached, low[axis], side="left").astype(jnp.int32)
+        end = jnp.searchsorted(begun, high[axis], side="right").astype(jnp.int32)
+        is_covered = (low[axis] <= high[axis]) & (first < end)
+        found.append((jnp.where(is_covered, first, 0), jnp.where(is_covered, end - first, 0)))
+    return tuple(found)

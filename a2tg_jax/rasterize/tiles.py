@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.geometry import Outline, ScreenBounds, screen_bounds
-from a2tg_jax.rasterize.tile_pixels import TilePixels, covered, spans_of
+from a2tg_jax.rasterize.tile_pixels import TilePixels, covered_tiles
 
 
 class TileGrid(NamedTuple):
@@ -39,18 +39,12 @@ class TileGrid(NamedTuple):
 class TileLists(NamedTuple):
     """Splats of each tile, front to back."""
 
-    ids: Array
-    """[capacity] splat indices, tile after tile."""
-    starts: Array
-    """[tiles + 1] start of each tile's list in `ids`."""
-    num_pairs: Array
-    """Number of pairs before the outline test, as a float; the capacity must hold it."""
-    overflow: Array
-    """Whether the pairs did not fit; the lists are then empty."""
-    pixels: TilePixels | None = None
-    """Pixels of the tiles, if the camera has a ray for each pixel."""
-    height: Array | None = None
-    """int32 rows of pixels that are shown; None: those of the grid."""
+    ids: Array  # [capacity] splat indices, tile after tile
+    starts: Array  # [tiles + 1] start of each tile's list in `ids`
+    num_pairs: Array  # number of pairs before the outline test, as a float; the capacity must hold it
+    overflow: Array  # whether the pairs did not fit; the lists are then empty
+    pixels: TilePixels | None = None  # pixels of the tiles, if the camera has a ray for each pixel
+    height: Array | None = None  # int32 rows of pixels that are shown; None: those of the grid
 
     def height_in(self, grid: TileGrid) -> Any:
         """Return the rows of pixels that are shown of a grid."""
@@ -58,7 +52,7 @@ class TileLists(NamedTuple):
 
 
 class Rectangles(NamedTuple):
-    """Tiles x0 <= x < x0 + columns, y0 <= y < y0 + rows of each splat, and their number."""
+    """Tiles x0 <= x < x0 + columns, y0 <= y < y0 + counts/columns of each splat, and their number."""
 
     x0: Array
     y0: Array
@@ -72,9 +66,9 @@ def tile_rectangles(bounds: ScreenBounds, grid: TileGrid, pixels: TilePixels | N
         x0, columns = _tile_span(bounds.left, bounds.right, grid.width, grid.tile_size)
         y0, rows = _tile_span(bounds.top, bounds.bottom, grid.height, grid.tile_size)
     else:
-        spans_x, spans_y = spans_of(pixels, grid.columns, jnp.max(bounds.outline.radius, initial=0.0))
-        x0, columns = covered(spans_x, bounds.left, bounds.right)
-        y0, rows = covered(spans_y, bounds.top, bounds.bottom)
+        reach = jnp.max(bounds.outline.radius, initial=0.0)
+        low, high = (bounds.left, bounds.top), (bounds.right, bounds.bottom)
+        (x0, columns), (y0, rows) = covered_tiles(pixels, grid.columns, reach, low, high)
     # Without rows there are no columns either: counts may be divided by them.
     columns = jnp.where(rows > 0, columns, jnp.int32(0))
     return Rectangles(x0, y0, columns, columns * rows)
@@ -82,60 +76,36 @@ def tile_rectangles(bounds: ScreenBounds, grid: TileGrid, pixels: TilePixels | N
 
 def _tile_span(low: Array, high: Array, size: int, tile_size: int) -> tuple[Array, Array]:
     """Return the first tile along an axis with a pixel centre in [low, high], and the number of such tiles."""
-
-    def as_pixels(x: Array) -> Array:
-        return jnp.clip(x, -1.0, 1e6).astype(jnp.int32)
-
     nothing, last_pixel, side = jnp.int32(0), jnp.int32(size - 1), jnp.int32(tile_size)
-    # Pixel k has its centre at k + ½.
-    first = jnp.maximum(as_pixels(jnp.ceil(low - 0.5)), nothing)
-    last = jnp.minimum(as_pixels(jnp.floor(high - 0.5)), last_pixel)
+    # Pixel k has its centre at k + ½. Clipped as floats, for the conversion of larger ones is not defined.
+    edges = jnp.ceil(low - 0.5), jnp.floor(high - 0.5)
+    first, last = (jnp.clip(edge, -1.0, 1e6).astype(jnp.int32) for edge in edges)
+    first, last = jnp.maximum(first, nothing), jnp.minimum(last, last_pixel)
     # Not //, which is slower for the sake of negative numbers; only `last` can be one, -1, less than `first`.
     begin, end = jax.lax.div(first, side), jax.lax.div(last, side) + 1
     return begin, jnp.where(last < first, nothing, end - begin)
 
 
-def count_pairs(bounds: ScreenBounds, grid: TileGrid, pixels: TilePixels | None = None) -> Array:
-    """Return the number of pairs before the outline test, as a float, which cannot wrap."""
-    return total_pairs(tile_rectangles(bounds, grid, pixels).counts)
-
-
 def total_pairs(counts: Array) -> Array:
-    """Return the sum of counts [N] as a float32, to a few units in the last place.
-
-    Blocks are summed as integers first, so that no small count is lost beside a large sum.
-    """
+    """Return the sum of counts [N] as a float32, which cannot wrap, to a few units in the last place."""
+    # Blocks are summed as integers first, so that no small count is lost in a large sum.
     blocks = jnp.pad(counts, (0, -counts.shape[0] % 256)).reshape(-1, 256)
     return jnp.sum(jnp.sum(blocks, axis=1, dtype=jnp.int32).astype(jnp.float32))
-
-
-def exceeds(total: Array, capacity: int) -> Array:
-    """Return whether a number of pairs, known to a relative error of about 2⁻²⁰, may exceed the capacity."""
-    return total + jnp.floor(total * 2.0**-20) > capacity
 
 
 def outline_touches(outline: Outline, x0: Array, y0: Array, tile_size: int) -> Array:
     """Return whether an outline reaches a pixel centre of the tile with first pixel (x0, y0); element-wise."""
 
-    def distance_to_box(origin_x: Array, origin_y: Array) -> tuple[Array, Array, Array, Array]:
+    def box_from(origin_x: Array, origin_y: Array) -> tuple[Array, Array, Array, Array]:
         left, top = x0 + 0.5 - origin_x, y0 + 0.5 - origin_y
         return left, left + (tile_size - 1), top, top + (tile_size - 1)
 
-    return _touches(outline, distance_to_box)
+    return _touches(outline, box_from)
 
 
-def outline_touches_rays(outline: Outline, box: Array, magnification: Array) -> Array:
-    """Return whether outlines [N] may reach rays in boxes [N, 4], of pixels that long in the image plane [N]."""
-
-    def distance_to_box(origin_x: Array, origin_y: Array) -> tuple[Array, Array, Array, Array]:
-        return box[:, 0] - origin_x, box[:, 2] - origin_x, box[:, 1] - origin_y, box[:, 3] - origin_y
-
-    return _touches(outline._replace(radius=outline.radius * magnification), distance_to_box)
-
-
-def _touches(outline: Outline, distance_to_box: Callable[[Array, Array], tuple[Array, Array, Array, Array]]) -> Array:
+def _touches(outline: Outline, box_from: Callable[[Array, Array], tuple[Array, Array, Array, Array]]) -> Array:
     """Return whether an outline reaches a box, given its left, right, top and bottom edge from an origin."""
-    left, right, top, bottom = distance_to_box(outline.ellipse_x, outline.ellipse_y)
+    left, right, top, bottom = box_from(outline.ellipse_x, outline.ellipse_y)
     xx, xy, yy = outline.xx, outline.xy, outline.yy
     # The nearest point of the box in the ellipse's metric lies on one of the two sides that face the centre.
     x_side, y_side = jnp.clip(0.0, left, right), jnp.clip(0.0, top, bottom)
@@ -148,7 +118,7 @@ def _touches(outline: Outline, distance_to_box: Callable[[Array, Array], tuple[A
     # In the ellipse's metric, points at distance 1 have yy·x² − 2·xy·x·y + xx·y² = xx·yy − xy².
     nearest = jnp.minimum(squared_distance(x_side, y_on_side), squared_distance(x_on_side, y_side))
     is_in_ellipse = nearest <= (xx * yy - xy * xy)
-    left, right, top, bottom = distance_to_box(outline.mean_x, outline.mean_y)
+    left, right, top, bottom = box_from(outline.mean_x, outline.mean_y)
     nearest = jnp.clip(0.0, left, right) ** 2 + jnp.clip(0.0, top, bottom) ** 2
     return is_in_ellipse | (nearest <= outline.radius**2) | outline.is_clipped
 
@@ -162,22 +132,23 @@ def tile_lists(
     Args:
       M, cutoff, near_plane: of N splats, as for `core.geometry.screen_bounds`.
       grid: tiles of the image.
-      capacity: number of pairs that fit, before the outline test; `overflow` tells if there were more.
-      pixels: of the tiles, if the camera has a ray for each pixel.
-      height: int32 rows of pixels that are shown, at most those of the grid; None: all.
+      capacity: number of pairs that fit, before the outline test.
+      pixels: pixels of the tiles, if the camera has a ray for each pixel.
+      height: int32 rows of pixels that are shown, at most the grid's; None: all.
     """
     bounds, depths = screen_bounds(M, cutoff, near_plane), M[:, 2, 2]
     order = jnp.argsort(depths, stable=True)
     shown = grid if height is None else grid._replace(height=height)  # type: ignore[arg-type]
     rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, shown, pixels))
     total = total_pairs(rectangles.counts)
-    overflow = exceeds(total, capacity)
+    # The total is known to a relative error of about 2⁻²⁰.
+    overflow = total + jnp.floor(total * 2.0**-20) > capacity
     # Empty lists instead of some that lack splats: an image that is plainly wrong, at no cost.
     counts = jnp.where(overflow, 0, rectangles.counts)
     ends = jnp.cumsum(counts)
     num = depths.shape[0]
     # One place for each pair: splat `rank` in depth order has the places from ends − counts on, and pair number `local`
-    # of its rectangle lies in its column local mod columns. Places that are left, up to the capacity, are not kept.
+    # of its rectangle is in its column local mod columns. Places that are left, up to the capacity, are not kept.
     rank = jnp.repeat(jnp.arange(num, dtype=jnp.int32), counts, total_repeat_length=capacity)
     position = jnp.arange(capacity, dtype=jnp.int32)
     local = position - (ends - counts)[rank]
@@ -191,9 +162,12 @@ def tile_lists(
         tile_x, tile_y = (x * grid.tile_size).astype(dtype), (y * grid.tile_size).astype(dtype)
         is_touched = outline_touches(per_pair, tile_x, tile_y, grid.tile_size)
     else:
-        # Places that are left may lie in no tile.
+        # Places that are left may be in no tile.
         own = jnp.minimum(y * grid.columns + x, grid.num - 1)
-        is_touched = outline_touches_rays(per_pair, pixels.boxes[own], pixels.magnifications[own])
+        left, top, right, bottom = pixels.boxes[own].T
+        # The radius of the low-pass filter is in pixels of the image: here as long as they are in the image plane.
+        outline = per_pair._replace(radius=per_pair.radius * pixels.magnifications[own])
+        is_touched = _touches(outline, lambda x, y: (left - x, right - x, top - y, bottom - y))
     # Pairs that are not kept sort behind all tiles.
     is_kept = (position < ends[-1]) & is_touched
     tile = jnp.where(is_kept, y * grid.columns + x, grid.num)

@@ -22,9 +22,9 @@ from a2tg_jax.rasterize.compositor import Composited, composite, list_tiles
 from a2tg_jax.rasterize.kernels.platforms import check_compositor
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import Geometry, RenderOutput, RenderSettings
-from a2tg_jax.rasterize.splats import drawn_splats, num_channels, project_gaussians, settings_of_pass
-from a2tg_jax.rasterize.tile_pixels import pixels_of
-from a2tg_jax.rasterize.tiles import TileGrid, count_pairs
+from a2tg_jax.rasterize.splats import drawn_splats, project_gaussians, settings_of_pass
+from a2tg_jax.rasterize.tile_pixels import tile_pixels
+from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles, total_pairs
 
 
 def render_traced(
@@ -47,7 +47,7 @@ def render_traced(
       background: [3] colour, or as many numbers as the appearance has colours.
       settings: static options, with a capacity.
       has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
-      sh_degree: replaces that of the settings; may be traced.
+      sh_degree: highest degree of spherical harmonics, instead of the settings'; may be traced.
       num_live: number of rows that exist; may be traced.
       probe: [N, 4] zeros, at which the gradient is the statistic and the number of pixels (`compositor.composite`).
       statistic: kind of statistic (`rasterize.pixel.positional_gradient`); not used without a probe.
@@ -73,9 +73,12 @@ def render_traced(
         return RenderOutput(color, alpha, output.overflow, geometry), num_pairs
     # Before anything is traced, so that the error does not come from deep within JAX.
     check_compositor(settings.compositor)
-    num = gaussians.means.shape[0]
+    num, num_colors = gaussians.num, num_colors_of(appearance)
     if num == 0:
-        return _empty_view(camera, num_colors_of(appearance), has_geometry, background), jnp.zeros((), jnp.float32)
+        size = camera.height, camera.width
+        channels = jnp.zeros((num_colors + 5 * has_geometry, *size), background.dtype)
+        nothing = channels, jnp.ones(size, background.dtype), num_colors, has_geometry, background, jnp.asarray(False)
+        return _output(*nothing), jnp.zeros((), jnp.float32)
     degree = settings.sh_degree if sh_degree is None else sh_degree
     splats, cutoff = project_gaussians(gaussians, camera, appearance, settings.near_plane, degree, num_live)
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
@@ -90,8 +93,8 @@ def render_traced(
     capacity = settings.capacity or 0
     if settings.exchange is None:
         # Which tiles a splat touches is piecewise constant.
-        M, pixels = jax.lax.stop_gradient(splats.M), pixels_of(camera, settings.tile_size)
-        lists = list_tiles(compositing, M, cutoff, capacity, pixels)
+        pixels = None if camera.rays is None else tile_pixels(camera.rays, settings.tile_size)
+        lists = list_tiles(compositing, jax.lax.stop_gradient(splats.M), cutoff, capacity, pixels)
         image = composite(compositing, splats, texels, regions, cutoff, lists, jacobian, probe)
         shown = Composited(*image, lists.num_pairs, lists.overflow)
     else:
@@ -101,16 +104,7 @@ def render_traced(
     # A splat with a number that is not finite spoils the whole image: a sum would hide it behind the splats in front.
     taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(shown.channels.dtype)
     channels, transmittance = shown.channels + taint, shown.transmittance + taint
-    output = _output(channels, transmittance, splats.colors.shape[1], has_geometry, background, shown.overflow)
-    return output, shown.num_pairs
-
-
-def _empty_view(camera: Camera, num_colors: int, has_geometry: bool, background: Array) -> RenderOutput:
-    """Return the output of a view without Gaussians."""
-    size = camera.height, camera.width
-    channels = jnp.zeros((num_channels(has_geometry, num_colors), *size), background.dtype)
-    transmittance = jnp.ones(size, background.dtype)
-    return _output(channels, transmittance, num_colors, has_geometry, background, jnp.asarray(False))
+    return _output(channels, transmittance, num_colors, has_geometry, background, shown.overflow), shown.num_pairs
 
 
 def _output(
@@ -195,13 +189,11 @@ def pairs_to_draw(
 
 @functools.cache
 def _jitted_count() -> jax.stages.Wrapped:
-    return jax.jit(_count_pairs, static_argnums=(3, 4))
+    def count(
+        gaussians: Gaussians, camera: Camera, appearance: Appearance, tile_size: int, near_plane: float, num_live: Any
+    ) -> Array:
+        bounds = screen_bounds(*drawn_splats(gaussians, camera, appearance, num_live), near_plane)
+        pixels = None if camera.rays is None else tile_pixels(camera.rays, tile_size)
+        return total_pairs(tile_rectangles(bounds, TileGrid(camera.width, camera.height, tile_size), pixels).counts)
 
-
-def _count_pairs(
-    gaussians: Gaussians, camera: Camera, appearance: Appearance, tile_size: int, near_plane: float, num_live: Any
-) -> Array:
-    M, cutoff = drawn_splats(gaussians, camera, appearance, num_live)
-    pixels = pixels_of(camera, tile_size)
-    bounds = screen_bounds(M, cutoff, near_plane)
-    return count_pairs(bounds, TileGrid(camera.width, camera.height, tile_size), pixels)
+    return jax.jit(count, static_argnums=(3, 4))

@@ -4,6 +4,7 @@
 """
 
 import concurrent.futures
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -16,7 +17,7 @@ from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.bilinear import Lookup, Sample, TextureRegion
 from a2tg_jax.rasterize import pixel
-from a2tg_jax.rasterize.splats import KernelSpec
+from a2tg_jax.rasterize.splats import PassSettings
 
 Equation = core.JaxprEqn
 V = TypeVar("V")
@@ -45,11 +46,8 @@ def example(dtype: DTypeLike) -> Any:
 def trace(function: Callable[..., object], *examples: object) -> tuple[core.ClosedJaxpr, Any]:
     """Return the jaxpr of a function of scalars, and the tree structure of its result.
 
-    The jaxpr does not depend on what is being traced around it, such as the axes of a `shard_map` or a mesh.
-
-    Args:
-      function: function to trace.
-      examples: pytrees of `example`, one per argument.
+    The jaxpr does not depend on what is being traced around it, such as the axes of a `shard_map` or a mesh. The
+    examples are pytrees of `example`, one per argument.
     """
     closed, shape = in_clean_context(lambda: jax.make_jaxpr(function, return_shape=True)(*examples))
     return closed, jax.tree.structure(shape)
@@ -67,6 +65,33 @@ def in_clean_context(work: Callable[[], object]) -> Any:
     # The caller waits: nothing runs at the same time.
     with concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="a2tg-trace") as pool:
         return pool.submit(with_rules).result()
+
+
+def _whole_power(x: Array, y: int) -> Array:
+    """Return x^y by repeated squaring: bits of |y| from the lowest on, as the power runs through x, x², x⁴, …"""
+    power, left, result = x, abs(y), None
+    while left:
+        if left & 1:
+            result = power if result is None else result * power
+        left >>= 1
+        power = power * power if left else power
+    result = jnp.ones_like(x) if result is None else result
+    return 1 / result if y < 0 else result
+
+
+FORMULAS: dict[str, Callable[..., Array]] = {
+    "integer_pow": _whole_power,
+    "logistic": lambda x: 1 / (1 + jnp.exp(-x)),
+    # Zeros keep their sign, and NaN stays NaN.
+    "sign": lambda x: jnp.where(x > 0, jnp.ones_like(x), jnp.where(x < 0, -jnp.ones_like(x), x)),
+    "square": lambda x: x * x,
+}
+"""Primitives that are made of others, by name; they take the parameters of the equation."""
+
+
+@functools.cache
+def _formula(name: str, dtype: str, **parameters: Any) -> core.ClosedJaxpr:
+    return trace(functools.partial(FORMULAS[name], **parameters), example(dtype))[0]
 
 
 def make_code(
@@ -99,54 +124,56 @@ def make_code(
         return literal(number, atom.aval.dtype)
 
     for equation in inner.eqns:
-        name = equation.primitive.name
-        if name not in CALLS and name not in primitives:
-            error = Untranslatable(f"{target} have no translation for the primitive '{name}'")
-            error.primitive = name
-            raise error
-        operands = [read(atom) for atom in equation.invars]
+        name, operands = equation.primitive.name, [read(atom) for atom in equation.invars]
         if name in CALLS:
             called = equation.params["jaxpr"] if "jaxpr" in equation.params else equation.params["call_jaxpr"]
             results = make_code(called, operands, literal, primitives, target)
-        else:
+        elif name in FORMULAS:
+            parameters = {"y": equation.params["y"]} if name == "integer_pow" else {}
+            formula = _formula(name, operand_dtype(equation).name, **parameters)
+            results = make_code(formula, operands, literal, primitives, target)
+        elif name in primitives:
             results = [primitives[name](operands, equation)]
+        else:
+            error = Untranslatable(f"{target} have no translation for the primitive '{name}'")
+            error.primitive = name
+            raise error
         values.update(zip(equation.outvars, results, strict=True))
     return [read(atom) for atom in inner.outvars]
 
 
 def operand_dtype(equation: Equation) -> np.dtype:
-    """Return the dtype of an equation's first operand."""
     return np.dtype(equation.invars[0].aval.dtype)  # type: ignore[attr-defined]
 
 
 def result_dtype(equation: Equation) -> np.dtype:
-    """Return the dtype of an equation's result."""
     return np.dtype(equation.outvars[0].aval.dtype)  # type: ignore[attr-defined]
 
 
 class PixelFunctions:
-    """Jaxprs of scalars for one spec.
+    """Jaxprs of scalars for the settings of a kernel.
 
     `prepare` and `prepare_vjp` run once per splat and tile; `reach`, `forward` and `backward` run at every pixel.
     """
 
-    def __init__(self, spec: KernelSpec):
-        self.spec, self._functions = spec, spec.static.functions
-        number, integer, flag = example(spec.dtype), example(jnp.int32), example(jnp.bool_)
+    def __init__(self, settings: PassSettings):
+        self.settings, self._functions = settings, settings.static.functions
+        number, integer, flag = example(settings.dtype), example(jnp.int32), example(jnp.bool_)
         triple = (number,) * 3
-        normal, numbers = triple if spec.has_geometry else None, (number,) * spec.num_own_numbers
-        splat = pixel.Splat((triple,) * 3, number, (number,) * spec.num_colors, normal, numbers)
-        values = (number,) * spec.num_columns
+        normal, numbers = triple if settings.has_geometry else None, (number,) * settings.num_own_numbers
+        splat = pixel.Splat((triple,) * 3, number, (number,) * settings.num_colors, normal, numbers)
+        values = (number,) * settings.num_columns
         region = TextureRegion(integer, integer, integer) if values else None
         lookup = Lookup(region, Sample(values, values, values)) if region else None
 
-        tile = (number,) * spec.num_tile_numbers
+        tile = (number,) * (6 if settings.has_rays else 2)
+        self.num_tile_numbers = len(tile)
         self.prepare, structure = trace(pixel.planes_of, splat.M, tile)
         self.num_planes = structure.num_leaves
         planes = jax.tree.unflatten(structure, [number] * structure.num_leaves)
         self.prepare_vjp, _ = trace(_planes_vjp, splat.M, tile, planes)
         self.reach, _ = trace(self._reach, planes, region, number, number)
-        at_pixel, channels = (number, number, number, flag), (number,) * spec.num_channels
+        at_pixel, channels = (number, number, number, flag), (number,) * settings.num_channels
         self.forward, _ = trace(self._forward, planes, splat, values, *at_pixel, channels)
         of_backward = number, channels, tile, (triple,) * 3
         self.backward, _ = trace(self._backward, planes, splat, lookup, *at_pixel, *of_backward)
@@ -155,7 +182,7 @@ class PixelFunctions:
         self, planes: pixel.Planes, region: TextureRegion | None, x: Array, y: Array
     ) -> tuple[Array, tuple[Array, ...]]:
         """Return the squared distance ρ of the pixel, and the position of the texture lookup."""
-        hit = pixel.intersect(planes, x, y, self.spec.near_plane, self._functions.has_low_pass)
+        hit = pixel.intersect(planes, x, y, self.settings.near_plane, self._functions.has_low_pass)
         return hit.rho, () if region is None else self._functions.texel_position(region, hit.u, hit.v)
 
     def _forward(
@@ -164,7 +191,7 @@ class PixelFunctions:
     ) -> tuple[Array, Array, tuple[Array, ...]]:  # fmt: skip
         """Return transmittance and liveness behind the splat, and the channels with it."""
         at_pixel = planes, splat, values, x, y, transmittance, is_live
-        added, transmittance, is_live = pixel.blend(self._functions, self.spec.near_plane, *at_pixel)
+        added, transmittance, is_live = pixel.blend(self._functions, self.settings.near_plane, *at_pixel)
         return transmittance, is_live, tuple(total + more for total, more in zip(channels, added, strict=True))
 
     def _backward(
@@ -173,46 +200,45 @@ class PixelFunctions:
         jacobian: pixel.Rows,
     ) -> tuple[pixel.State, Array, tuple[Array, ...], Any]:  # fmt: skip
         """Return the state behind the splat, whether it contributes, the cotangents of the values, and all others."""
-        spec, functions = self.spec, self._functions
+        near_plane, statistic, functions = self.settings.near_plane, self.settings.statistic, self._functions
         at_pixel = planes, splat, lookup, x, y, transmittance, is_live, suffix_sum, g
-        state, weight, d = pixel.blend_vjp(functions, spec.near_plane, *at_pixel, spec.statistic is not None)
+        state, weight, d = pixel.blend_vjp(functions, near_plane, *at_pixel, statistic is not None)
         added: tuple[Array, ...] = ()
-        if spec.statistic and d.rho is not None:
+        if statistic and d.rho is not None:
             added = pixel.positional_gradient(
-                spec.statistic, splat.M, x, y, tile, d.rho, jacobian, spec.near_plane, functions.has_low_pass
+                statistic, splat.M, x, y, tile, d.rho, jacobian, near_plane, functions.has_low_pass
             )
         # Without weight the cotangents may be anything, NaN included; kernels leave them out.
         return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
 
 
 def _planes_vjp(M: pixel.Rows, tile: pixel.TileNumbers, d_planes: pixel.Planes) -> pixel.Rows:
-    """Return the cotangent of M, given that of its planes."""
     return jax.vjp(lambda M: pixel.planes_of(M, tile), M)[1](d_planes)[0]
 
 
-def refusal_of(spec: KernelSpec, translate: Callable[[KernelSpec], object]) -> str | None:
-    """Return why a kind of kernels cannot be made for a spec; None if `translate` makes them."""
+def refusal_of(settings: PassSettings, translate: Callable[[PassSettings], object]) -> str | None:
+    """Return why a kind of kernels cannot be made for settings; None if `translate` makes them."""
     try:
-        translate(spec)
+        translate(settings)
     except Untranslatable as error:
-        return str(error) + (_place_of(error.primitive, spec) if error.primitive else "")
+        return str(error) + (_place_of(error.primitive, settings) if error.primitive else "")
     return None
 
 
-def _place_of(primitive: str, spec: KernelSpec) -> str:
+def _place_of(primitive: str, settings: PassSettings) -> str:
     """Return in which function of an appearance a primitive occurs, as in " in MyRule.shade"; "" if in none."""
 
     def gradient(*given: Any) -> Any:
         results, pull_back = jax.vjp(function, *given)
         return pull_back(results)
 
-    for name, given in spec.arguments.of(()).items():
-        function = getattr(spec.static.functions, name)
+    for name, given in settings.arguments.of(()).items():
+        function = getattr(settings.static.functions, name)
         if primitive in _primitives(trace(function, *given)[0]):
-            return f" in {spec.static.name}.{name}"
+            return f" in {settings.static.name}.{name}"
         # Texture regions are integers, which have no gradient.
         if name != "texel_position" and primitive in _primitives(trace(gradient, *given)[0]):
-            return f" in the gradient of {spec.static.name}.{name}"
+            return f" in the gradient of {settings.static.name}.{name}"
     return ""
 
 

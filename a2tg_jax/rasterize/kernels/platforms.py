@@ -1,8 +1,7 @@
 """Code by platform: which compositor runs on it, and functions whose code depends on it.
 
 JAX knows the platform of a computation when it lowers it, from the devices of its arguments: the CPU, an NVIDIA GPU, or
-another one. Unlike `jax.lax.platform_dependent`, which traces the code of all platforms, `by_platform` traces that of
-this one only.
+another one. `jax.lax.platform_dependent` traces the code of all platforms, `by_platform` only the code of this one.
 """
 
 import functools
@@ -36,8 +35,6 @@ REMEDIES: dict[Compositor, str] = {
     "cuda": "JAX on an NVIDIA GPU and NVRTC: pip install 'a2tg-jax[cuda13]'",
 }
 """Requirements of the same compositors."""
-CodeOf = Callable[..., Callable[..., Any]]
-"""Function of a platform ("cpu", "cuda" or "other") and of static arguments that returns a function of arrays."""
 
 
 def check_compositor(wanted: Wanted) -> None:
@@ -49,11 +46,7 @@ def check_compositor(wanted: Wanted) -> None:
 
 
 def choose(wanted: Wanted, platform: str) -> Compositor:
-    """Return the compositor that is wanted, or with "auto" the fastest one for a platform.
-
-    Args:
-      wanted: a compositor, or "auto".
-      platform: platform that JAX compiles for, "cpu", "cuda" or another.
+    """Return the compositor that is wanted, or with "auto" the fastest one for the platform that JAX compiles for.
 
     Raises:
       ValueError: if the compositor does not run on that platform, or a package that it needs is not installed.
@@ -75,24 +68,15 @@ def is_available(compositor: Compositor, platform: str) -> bool:
 
 
 def wants_determinism() -> bool:
-    """Return whether XLA_FLAGS in the environment ask for reproducible results on GPUs.
-
-    The CUDA kernels add atomically, so that their results are not.
-    """
-    asked = dict.fromkeys(DETERMINISM_FLAGS, False)
-    for word in os.environ.get("XLA_FLAGS", "").split():
-        flag, _, value = word.partition("=")
-        if flag in asked:
-            asked[flag] = value.lower() in ("", "true", "1")
-    return any(asked.values())
+    """Return whether XLA_FLAGS request reproducible results on GPUs, which the CUDA kernels' atomic sums are not."""
+    words = (word.partition("=") for word in os.environ.get("XLA_FLAGS", "").split())
+    # Of a flag that occurs several times, the last one holds.
+    given = {flag: value.lower() in ("", "true", "1") for flag, _, value in words}
+    return any(given.get(flag, False) for flag in DETERMINISM_FLAGS)
 
 
 def instead_of(wanted: Wanted, appearance: type, reason: str) -> None:
-    """Warn, once per class, that XLA composites an appearance that kernels cannot run.
-
-    Raises:
-      ValueError: if a compositor is required by name.
-    """
+    """Warn, once per class, that XLA composites an appearance that kernels cannot run; ValueError if they must."""
     if wanted != "auto":
         raise ValueError(f"compositor={wanted!r} cannot run {appearance.__name__}: {reason}. Say 'xla', or 'auto'")
     _warn_of_fallback(appearance, reason)
@@ -109,7 +93,7 @@ def has_native() -> bool:
     try:
         if importlib.util.find_spec("llvmlite") is None:
             return False
-    except ValueError:  # sys.modules["llvmlite"] is None: somebody has ruled it out.
+    except ValueError:  # sys.modules["llvmlite"] is None, as programs do to rule it out.
         return False
     from a2tg_jax.rasterize.kernels.native import ffi
 
@@ -131,7 +115,7 @@ def has_cuda() -> bool:
 
 
 def by_platform(
-    code_of: CodeOf,
+    code_of: Callable[..., Callable[..., Any]],
     static: tuple[Hashable, ...],
     results: object,
     *arrays: object,
@@ -140,8 +124,8 @@ def by_platform(
     """Call `code_of(platform, *static)(*arrays)`, for the platform that JAX compiles for.
 
     Args:
-      code_of: module-level function.
-      static: further arguments of it.
+      code_of: module-level function of a platform ("cpu", "cuda" or "other") and of static arguments.
+      static: static arguments.
       results: pytree of `jax.ShapeDtypeStruct`, the same on all platforms.
       arrays: pytrees of arrays.
       advice: message of the ValueError that is raised if JAX differentiates the call.
@@ -165,7 +149,7 @@ def _lower(platform: str, context: Any, *operands: object, **parameters: Any) ->
 
 
 def _run(
-    platform: str, *flat: Array, code_of: CodeOf, static: Any, structure: object, shapes: object, axes: Any, advice: str
+    platform: str, *flat: Array, code_of: Any, static: Any, structure: object, shapes: object, axes: Any, advice: str
 ) -> list[Array]:
     def function(*flat: Array) -> list[Array]:
         return jax.tree.leaves(code_of(platform, *static)(*jax.tree.unflatten(structure, flat)))

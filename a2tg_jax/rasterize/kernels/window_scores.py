@@ -25,14 +25,14 @@ class Score(NamedTuple):
 
     function: Callable[[Array, Array, Array, Array], Array]
     """Element-wise function of the means of x, y, x² + y² and x·y."""
-    taps: tuple[float, ...]
-    """Weights of a window along one axis, symmetric."""
+    taps: tuple[float, ...]  # weights of a window along one axis, symmetric
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def mean_score(score: Score, x: Array, y: Array) -> Array:
     """Return the average over all windows of images [C, H, W]."""
-    return by_platform(_code_of, ("mean_score", score), jax.ShapeDtypeStruct((), jnp.result_type(x, y)), x, y)
+    # Under jit, XLA drops the slopes, which are not used.
+    return value_and_slopes(score, x, y)[0]
 
 
 @functools.partial(mean_score.defjvp, symbolic_zeros=True)
@@ -52,7 +52,7 @@ def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Ar
     """Return the average, and its derivatives by x and y; under jit, XLA drops one that is not used."""
     value = jax.ShapeDtypeStruct((), jnp.result_type(x, y))
     slopes = (jax.ShapeDtypeStruct(image.shape, image.dtype) for image in (x, y))
-    return by_platform(_code_of, ("value_and_slopes", score), (value, *slopes), x, y)
+    return by_platform(_code_of, (score,), (value, *slopes), x, y)
 
 
 @value_and_slopes.defjvp
@@ -61,58 +61,49 @@ def _value_and_slopes_jvp(score: Score, primals: tuple[Array, Array], tangents: 
     return value_and_slopes(score, *primals), jax.jvp(plain, primals, tangents)[1]
 
 
-def _code_of(platform: str, name: str, score: Score) -> Callable[[Array, Array], Any]:
+def _code_of(platform: str, score: Score) -> Callable[[Array, Array], Any]:
     """Return a function of plain array code, or of `native.ssim` where native loops run and take the images."""
 
     def code(x: Array, y: Array) -> Any:
-        plain = {"mean_score": plain_mean_score, "value_and_slopes": plain_value_and_slopes}[name]
         if is_available("native", platform) and x.dtype == y.dtype and x.dtype in (jnp.float32, jnp.float64):
             ssim = importlib.import_module(f"{__package__}.native.ssim")  # Here, where llvmlite is installed.
             if x.shape[2] >= ssim.least_width(x.dtype, len(score.taps)):
-                return getattr(ssim, name)(score, x, y)
-        return plain(score, x, y)
+                return ssim.value_and_slopes(score, x, y)
+        return plain_value_and_slopes(score, x, y)
 
     return code
 
 
-def plain_mean_score(score: Score, x: Array, y: Array) -> Array:
-    """Return the average over all windows of images [C, H, W]."""
-    # The mean of y is blurred apart, so that no gradient is computed for it where y is constant. The two second moments
-    # are needed only as their sum: four blurs instead of five.
-    blurred = window_mean(jnp.concatenate([x, x * x + y * y, x * y]), score.taps)
-    mean_x, mean_squares, mean_product = jnp.split(blurred, 3)
-    return jnp.mean(score.function(mean_x, window_mean(y, score.taps), mean_squares, mean_product))
-
-
 def plain_value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return the average, and its derivatives by x and y."""
-    value, slopes = jax.value_and_grad(functools.partial(plain_mean_score, score), argnums=(0, 1))(x, y)
+    """Return the average, and its derivatives by x and y, by array code."""
+
+    def mean(x: Array, y: Array) -> Array:
+        # The mean of y is blurred separately, so that no gradient is computed for it where y is constant. The two
+        # second moments are needed only as their sum: four blurs instead of five.
+        blurred = window_mean(jnp.concatenate([x, x * x + y * y, x * y]), score.taps)
+        mean_x, mean_squares, mean_product = jnp.split(blurred, 3)
+        return jnp.mean(score.function(mean_x, window_mean(y, score.taps), mean_squares, mean_product))
+
+    value, slopes = jax.value_and_grad(mean, argnums=(0, 1))(x, y)
     return value, *slopes
 
 
 def window_mean(images: Array, taps: tuple[float, ...]) -> Array:
-    """Return the weighted mean under a window of T × T at every place where it fits: [..., H, W] → [..., H-T+1, W-T+1].
-
-    Args:
-      images: [..., H, W], at least as large as the window.
-      taps: T weights along one axis, symmetric.
-    """
+    """Return the mean weighted by T × T symmetric taps, where the window fits: [..., H, W] → [..., H-T+1, W-T+1]."""
     return window_mean_p.bind(images, taps=taps)
 
 
 def _window_mean(images: Array, *, taps: tuple[float, ...]) -> Array:
-    return _blur(_blur(images, taps, images.ndim - 2), taps, images.ndim - 1)
-
-
-def _blur(x: Array, taps: tuple[float, ...], axis: int) -> Array:
-    """Apply the taps along one axis, as a sum of shifted slices (faster than a convolution on CPUs)."""
     num, half = len(taps), len(taps) // 2
-    size = x.shape[axis] - num + 1
-    shifted = [jax.lax.slice_in_dim(x, tap, tap + size, axis=axis) for tap in range(num)]
-    pairs = [(shifted[tap] + shifted[-1 - tap]) * taps[tap] for tap in range(half)]
-    middle = [shifted[half] * taps[half]] if num % 2 else []
-    # Without the barrier XLA fuses the two passes into one of T² taps.
-    return jax.lax.optimization_barrier(functools.reduce(operator.add, middle + pairs))
+    # Along each axis a sum of shifted slices, which is faster than a convolution on CPUs.
+    for axis in (images.ndim - 2, images.ndim - 1):
+        size = images.shape[axis] - num + 1
+        shifted = [jax.lax.slice_in_dim(images, tap, tap + size, axis=axis) for tap in range(num)]
+        terms = [shifted[half] * taps[half]] if num % 2 else []
+        terms += [(shifted[tap] + shifted[-1 - tap]) * taps[tap] for tap in range(half)]
+        # Without the barrier XLA fuses the two passes into one of T² taps.
+        images = jax.lax.optimization_barrier(functools.reduce(operator.add, terms))
+    return images
 
 
 def _shape(images: Any, *, taps: tuple[float, ...]) -> Any:
@@ -121,7 +112,7 @@ def _shape(images: Any, *, taps: tuple[float, ...]) -> Any:
 
 
 def _transposed(cotangent: Array, _: object, *, taps: tuple[float, ...]) -> list[Array]:
-    """Return the same mean of the padded cotangent, as the window is symmetric; that of slices would be slow."""
+    """Return the same mean of the padded cotangent, as the window is symmetric; transposed slices would be slow."""
     margin = len(taps) - 1
     padded = jnp.pad(cotangent, [(0, 0)] * (cotangent.ndim - 2) + [(margin, margin)] * 2)
     return [window_mean(jax.lax.optimization_barrier(padded), taps)]

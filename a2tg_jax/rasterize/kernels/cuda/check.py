@@ -19,7 +19,7 @@ from a2tg_jax.rasterize.kernels import xla
 from a2tg_jax.rasterize.kernels.cuda import composite as cuda
 from a2tg_jax.rasterize.kernels.cuda.source import source
 from a2tg_jax.rasterize.kernels.jaxprs import in_clean_context
-from a2tg_jax.rasterize.splats import CompositingSettings, KernelSpec, PassInputs, Splats
+from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists
 
 MOST_DIFFERENCE = 1e-3
@@ -43,40 +43,32 @@ def _failure() -> str | None:
         device = jax.local_devices(backend="cuda")[0]
     except RuntimeError:  # Something is compiled for a GPU of another machine.
         return None
+    driver = Path("/proc/driver/nvidia/version")
+    version = driver.read_text(encoding="utf-8") if driver.is_file() else cuda_of_driver()
+    key = version, device.device_kind, jax.__version__, jaxlib_version, source(_inputs()[0].kernel, "cuda")
     # An empty file stands for kernels that agree.
-    file = cache_folder() / f"cuda-kernels-{_key(device)}.txt"
+    file = cache_folder() / f"cuda-kernels-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.txt"
     with contextlib.suppress(OSError):
         return file.read_text(encoding="utf-8") or None
     try:
         difference = largest_difference(device)
-        told = "" if difference <= MOST_DIFFERENCE else f"CUDA kernels differ from XLA by {100 * difference:.2g} %"
+        reason = "" if difference <= MOST_DIFFERENCE else f"CUDA kernels differ from XLA by {100 * difference:.2g} %"
     except Exception as error:  # Whatever it is, XLA can draw.
-        told = " ".join(f"CUDA kernels failed: {type(error).__name__}: {error}".split())[:300]
-    told = told and f"{told}; please report this, and delete {file} to check them again"
+        reason = " ".join(f"CUDA kernels failed: {type(error).__name__}: {error}".split())[:300]
+    reason = reason and f"{reason}; please report this, and delete {file} to check them again"
     with contextlib.suppress(OSError), replacing(file) as partial:
-        partial.write_text(told, encoding="utf-8")
-    return told or None
-
-
-def _key(device: Any) -> str:
-    driver = Path("/proc/driver/nvidia/version")
-    known = driver.read_text(encoding="utf-8") if driver.is_file() else cuda_of_driver()
-    text = known, device.device_kind, jax.__version__, jaxlib_version, source(_inputs()[0].kernel, "cuda")
-    return hashlib.sha256(repr(text).encode()).hexdigest()[:16]
+        partial.write_text(reason, encoding="utf-8")
+    return reason or None
 
 
 def largest_difference(device: object) -> float:
-    """Return the largest difference between kernels and XLA, of the arrays of a textured view and of its gradient.
-
-    Args:
-      device: GPU on which both run.
-    """
+    """Return the largest difference between kernels and XLA on a GPU, of a textured view's arrays and gradient."""
     settings, (splats, texels, regions, cutoff, jacobian, probe, g) = _inputs()
 
     def drawn(kernels: Any, *arrays: Any) -> list[Any]:
         splats, texels, regions, cutoff, jacobian, probe, g = arrays
         # A capacity for every splat in every tile: nothing overflows.
-        lists = tile_lists(splats.M, cutoff, settings.kernel.near_plane, GRID, NUM * GRID.num)
+        lists = tile_lists(splats.M, cutoff, settings.near_plane, GRID, NUM * GRID.num)
         inputs = PassInputs(splats, texels, regions, cutoff, lists)
         channels, transmittance = kernels.forward(settings, inputs)
         # The transmittance has the cotangent 1.
@@ -91,8 +83,8 @@ def largest_difference(device: object) -> float:
     return float(np.max([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs if b.size]))
 
 
-def _inputs() -> tuple[CompositingSettings, tuple[Any, ...]]:
-    """Return the static options, the arrays of kernels and the cotangent of the image."""
+def _inputs() -> tuple[PassSettings, tuple[Any, ...]]:
+    """Return the settings of the pass, the arrays of kernels and the cotangent of the image."""
     rng = np.random.default_rng(0)
 
     def draw(low: float, high: float, *shape: int) -> Any:
@@ -112,8 +104,7 @@ def _inputs() -> tuple[CompositingSettings, tuple[Any, ...]]:
     texels, sides, first = draw(0.1, 0.9, 4, 4).reshape(-1, 4), *(draw(n, n).astype(np.int32) for n in (2, 0))
     regions = TextureRegion(first + 4 * np.arange(NUM, dtype=np.int32), sides, sides)
     static = StaticShading.of(Appearance(texture=Texture()))
-    kernel = KernelSpec(static, 0, 4, "float32", GRID.tile_size, 0.2, has_geometry=True, statistic="position")
-    settings = CompositingSettings(kernel, GRID, "auto", tile_batch=GRID.num)
-    g = rng.normal(size=(GRID.num, kernel.num_channels, GRID.tile_size**2)).astype(np.float32)
+    settings = PassSettings(static, 0, 4, 3, "float32", GRID, 0.2, True, "position", tile_batch=0)
+    g = rng.normal(size=(GRID.num, settings.num_channels, settings.num_pixels)).astype(np.float32)
     jacobian, probe = np.diag([40, 40, 1]).astype(np.float32), draw(0, 0, 4)
     return settings, (splats, texels, regions, gaussian_cutoff(splats.opacities), jacobian, probe, g)

@@ -17,15 +17,7 @@ from jax import Array
 from a2tg_jax.rasterize.kernels.cuda import nvrtc
 from a2tg_jax.rasterize.kernels.cuda.source import block_threads, num_parts, source
 from a2tg_jax.rasterize.kernels.jaxprs import refusal_of
-from a2tg_jax.rasterize.splats import (
-    CompositingSettings,
-    KernelSpec,
-    PassInputs,
-    Splats,
-    pack_inputs,
-    split_image,
-    unpack_gradients,
-)
+from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats, pack_inputs, unpack_gradients
 
 TARGET = "__gpu$xla.gpu.ptx"
 DEFAULT_CAPABILITY = "9.0"
@@ -33,68 +25,54 @@ DEFAULT_CAPABILITY = "9.0"
 
 
 @functools.cache
-def refusal(spec: KernelSpec) -> str | None:
+def refusal(kernel: PassSettings) -> str | None:
     """Return why an appearance cannot run in GPU kernels; None if it can."""
-    if spec.has_rays:
+    if kernel.has_rays:
         return "CUDA kernels do not draw cameras with rays"
-    return refusal_of(spec, functools.partial(source, dialect="cuda"))
+    return refusal_of(kernel, functools.partial(source, dialect="cuda"))
 
 
-def forward(settings: CompositingSettings, inputs: PassInputs) -> tuple[Array, Array]:
+def forward(settings: PassSettings, inputs: PassInputs) -> tuple[Array, Array]:
     """Return channels [tiles, D, P] and transmittance [tiles, P], as `xla.forward` does."""
-    spec = settings.kernel
-    size = settings.grid.num, spec.num_channels + 1, spec.tile_size**2
+    size = settings.grid.num, settings.num_channels + 1, settings.num_pixels
     shape = jax.ShapeDtypeStruct(size, inputs.splats.M.dtype)
-    (image,) = launch(spec, "forward", settings.grid.num, pack_inputs(settings, inputs), [shape])
-    return split_image(image)
+    (image,) = launch(settings.kernel, "forward", settings.grid.num, pack_inputs(settings, inputs), [shape])
+    return image[:, :-1], image[:, -1]
 
 
 def backward(
-    settings: CompositingSettings, inputs: PassInputs, jacobian: Array, probe: Array, g: Array, suffix_sum: Array
+    settings: PassSettings, inputs: PassInputs, jacobian: Array, probe: Array, g: Array, suffix_sum: Array
 ) -> tuple[Splats, Array, Array]:
     """Return the cotangents of splats, texels and probe, as `xla.backward` does."""
-    spec, dtype = settings.kernel, np.dtype(settings.kernel.dtype)
+    dtype = np.dtype(settings.dtype)
     given = (*pack_inputs(settings, inputs), *(array.astype(dtype) for array in (g, suffix_sum, jacobian)))
     # Blocks add to these atomically: they start as zeros, and are operands that the call returns.
-    totals = [jnp.zeros(shape, dtype) for shape in spec.gradient_shapes(inputs)]
-    found = launch(spec, "backward", settings.grid.num, given, [], totals)
+    totals = [jnp.zeros(shape, dtype) for shape in settings.gradient_shapes(inputs)]
+    found = launch(settings.kernel, "backward", settings.grid.num, given, [], totals)
     return unpack_gradients(settings, found, inputs, probe)
 
 
-def capability() -> str:
-    """Return the least compute capability of this process's GPUs."""
-    try:
-        found: list[str] = [device.compute_capability for device in jax.local_devices(backend="cuda")]
-    except RuntimeError:
-        return DEFAULT_CAPABILITY
-    return min(found, key=lambda text: [int(part) for part in text.split(".")])
-
-
 def launch(
-    spec: KernelSpec, name: str, num_tiles: int, inputs: Sequence[Array], results: Sequence[object],
+    kernel: PassSettings, name: str, num_tiles: int, inputs: Sequence[Array], results: Sequence[object],
     totals: Sequence[Array] = (),
 ) -> list[Array]:  # fmt: skip
     """Run a kernel of `source.source` on a GPU.
 
-    Args:
-      spec: what the kernel is made for.
-      name: the kernel's name; its parameters are pointers to inputs, then to results or totals.
-      num_tiles: tiles of the image.
-      inputs: arrays that it reads.
-      results: shapes and dtypes of the arrays that it writes whole.
-      totals: arrays that it adds to.
-
-    Returns:
-      The results, then the totals.
+    Its parameters are pointers to the inputs, which it reads, then to results, which it writes whole and which are
+    given by shape and dtype, or totals, which it adds to. Returns the results, then the totals.
     """
-    program = nvrtc.ptx(source(spec, "cuda"), capability())
+    try:
+        found = [device.compute_capability for device in jax.local_devices(backend="cuda")]
+    except RuntimeError:
+        found = [DEFAULT_CAPABILITY]
+    capability = min(found, key=lambda text: [int(part) for part in text.split(".")])
+    program, tile_size = nvrtc.ptx(source(kernel, "cuda"), capability), kernel.grid.tile_size
     shapes = [*results, *(jax.typeof(total) for total in totals)]
     # XLA passes operands before results: an aliased operand and its result are one buffer, passed twice.
     aliases = {len(inputs) + k: len(results) + k for k in range(len(totals))}
     call = jax.ffi.ffi_call(TARGET, shapes, input_output_aliases=aliases, vmap_method="sequential")
     attributes = {f"{kind}_{axis}": np.int32(1) for kind in ("grid", "block") for axis in "xyz"}
-    attributes["grid_x"] = np.int32(num_tiles * num_parts(spec.tile_size))
-    attributes["block_x"] = np.int32(block_threads(spec.tile_size))
+    attributes["grid_x"] = np.int32(num_tiles * num_parts(tile_size))
+    attributes["block_x"] = np.int32(block_threads(tile_size))
     attributes["shared_mem_bytes"] = np.int32(0)  # Beyond what the kernel declares.
-    found = call(*inputs, *totals, name=name, kernel_type="ptx", kernel_data=program, **attributes)
-    return list(found)
+    return list(call(*inputs, *totals, name=name, kernel_type="ptx", kernel_data=program, **attributes))

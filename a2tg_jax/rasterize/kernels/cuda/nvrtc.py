@@ -6,7 +6,6 @@ import importlib.util
 import re
 from pathlib import Path
 
-OPTIONS = ("--std=c++17",)
 LEAST_ISA = {7: "8.1", 8: "8.1", 9: "8.1", 10: "8.8", 12: "8.8"}
 """PTX version that the kernels need, by the major compute capability: 8.1 brought atomic sums of four floats."""
 
@@ -36,7 +35,7 @@ def _library() -> ctypes.CDLL:
         raise ModuleNotFoundError(
             "GPU kernels need NVRTC, which is not installed: pip install 'a2tg-jax[cuda13]', or [cuda12]"
         )
-    # NVRTC opens its builtins by name, and does not look beside itself for them.
+    # NVRTC opens its builtins by name, and does not look for them in its own folder.
     for builtins in sorted(path.parent.glob("*nvrtc-builtins*")):
         ctypes.CDLL(str(builtins), mode=getattr(ctypes, "RTLD_GLOBAL", 0))
     return ctypes.CDLL(str(path))
@@ -44,11 +43,7 @@ def _library() -> ctypes.CDLL:
 
 @functools.cache
 def ptx(source: str, capability: str) -> str:
-    """Compile CUDA C++ to PTX.
-
-    Args:
-      source: the text; its kernels are `extern "C"`.
-      capability: compute capability of the GPU, such as "9.0".
+    """Compile CUDA C++ to PTX for a compute capability, such as "9.0".
 
     Raises:
       CompilationError: with NVRTC's log.
@@ -57,22 +52,16 @@ def ptx(source: str, capability: str) -> str:
     library, program = _library(), ctypes.c_void_p()
     _check(library.nvrtcCreateProgram(ctypes.byref(program), source.encode(), b"tiles.cu", 0, None, None))
     try:
-        options = [f"--gpu-architecture=compute_{capability.replace('.', '')}", *OPTIONS]
+        options = [f"--gpu-architecture=compute_{capability.replace('.', '')}", "--std=c++17"]
         array = (ctypes.c_char_p * len(options))(*(option.encode() for option in options))
         if library.nvrtcCompileProgram(program, len(options), array):
             raise CompilationError(f"NVRTC refused a kernel:\n{_text(program, 'ProgramLog')}")
-        return _declared(_text(program, "PTX"), capability)
+        text, least = _text(program, "PTX"), LEAST_ISA.get(int(capability.split(".")[0]))
+        # The version that the kernels need instead of NVRTC's own, which a driver refuses if it is older.
+        declared = r"\g<0>" if least is None else f".version {least}"
+        return re.sub(r"^\.version \S+", declared, text, count=1, flags=re.MULTILINE)
     finally:
         library.nvrtcDestroyProgram(ctypes.byref(program))
-
-
-def _declared(text: str, capability: str) -> str:
-    """Declare the PTX version that the kernels need, not NVRTC's own: a driver refuses versions newer than itself.
-
-    The version stays NVRTC's own for capabilities that are not known here.
-    """
-    least = LEAST_ISA.get(int(capability.split(".")[0]))
-    return text if least is None else re.sub(r"^\.version \S+", f".version {least}", text, count=1, flags=re.MULTILINE)
 
 
 def _text(program: ctypes.c_void_p, what: str) -> str:

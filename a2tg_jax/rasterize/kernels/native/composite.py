@@ -19,15 +19,7 @@ from a2tg_jax.rasterize.kernels.native import ffi
 from a2tg_jax.rasterize.kernels.native.lists import ListFunctions, list_functions
 from a2tg_jax.rasterize.kernels.native.llvm_code import CompiledFunction
 from a2tg_jax.rasterize.kernels.native.passes import compiled_passes, packed_pixels
-from a2tg_jax.rasterize.splats import (
-    CompositingSettings,
-    KernelSpec,
-    PassInputs,
-    Splats,
-    pack_inputs,
-    split_image,
-    unpack_gradients,
-)
+from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats, pack_inputs, unpack_gradients
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
 PAIRS_PER_THREAD, SPLATS_PER_THREAD, ROWS_PER_THREAD = 2_000, 10_000, 2_000
@@ -35,131 +27,56 @@ PAIRS_PER_THREAD, SPLATS_PER_THREAD, ROWS_PER_THREAD = 2_000, 10_000, 2_000
 
 
 @functools.cache
-def refusal(spec: KernelSpec) -> str | None:
+def refusal(kernel: PassSettings) -> str | None:
     """Return why an appearance cannot run in native loops; None if it can, after compiling them."""
-    return refusal_of(spec, compiled_passes)
+    return refusal_of(kernel, compiled_passes)
 
 
-def forward(settings: CompositingSettings, inputs: PassInputs) -> tuple[Array, Array]:
+def forward(settings: PassSettings, inputs: PassInputs) -> tuple[Array, Array]:
     """Return channels [tiles, D, P] and transmittance [tiles, P], as `xla.forward` does."""
-    spec, dtype = settings.kernel, inputs.splats.M.dtype
-    name = _registered(spec, "forward", _forward_handler)
-    shape = settings.grid.num, spec.num_channels + 1, spec.tile_size**2
-    (image,) = ffi.call(name, [(shape, dtype)], *_packed(settings, inputs))
-    return split_image(image)
+    shape = settings.grid.num, settings.num_channels + 1, settings.num_pixels
+    name = _registered(settings.kernel, "forward", _forward_handler)
+    (image,) = ffi.call(name, [(shape, inputs.splats.M.dtype)], *_packed(settings, inputs))
+    return image[:, :-1], image[:, -1]
 
 
 def backward(
-    settings: CompositingSettings, inputs: PassInputs, jacobian: Array, probe: Array, g: Array, suffix_sum: Array
+    settings: PassSettings, inputs: PassInputs, jacobian: Array, probe: Array, g: Array, suffix_sum: Array
 ) -> tuple[Splats, Array, Array]:
     """Return the cotangents of splats, texels and probe, as `xla.backward` does."""
-    spec, dtype = settings.kernel, inputs.splats.M.dtype
-    name = _registered(spec, "backward", _backward_handler)
+    dtype = inputs.splats.M.dtype
     cotangents = [array.astype(dtype) for array in (g, suffix_sum, jacobian)]
-    shapes = [(shape, dtype) for shape in spec.gradient_shapes(inputs)]
+    shapes = [(shape, dtype) for shape in settings.gradient_shapes(inputs)]
+    name = _registered(settings.kernel, "backward", _backward_handler)
     found = ffi.call(name, shapes, *_packed(settings, inputs), *cotangents)
     return unpack_gradients(settings, found, inputs, probe)
 
 
-def _packed(settings: CompositingSettings, inputs: PassInputs) -> tuple[Array, ...]:
+def _packed(settings: PassSettings, inputs: PassInputs) -> tuple[Array, ...]:
     """Return `pack_inputs`, with the pixels of the tiles before the last."""
     *packed, size = pack_inputs(settings, inputs)
-    return (*packed, packed_pixels(settings.kernel, inputs.lists.pixels, inputs.splats.M.dtype), size)
-
-
-def tile_lists(
-    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, height: Array | None = None
-) -> TileLists:
-    """List the splats of each tile; arguments and result are those of `rasterize.tiles.tile_lists`."""
-    key = str(M.dtype), grid.tile_size, near_plane
-    name = ffi.registered(
-        f"lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_functions(*key))
-    )
-    results = ((capacity,), jnp.int32), ((grid.num + 1,), jnp.int32), ((), jnp.float32), ((), jnp.bool_)
-    size = jnp.asarray([grid.columns, grid.width, grid.height if height is None else height], jnp.int32)
-    ids, starts, num_pairs, overflow = ffi.call(name, results, M, cutoff.astype(M.dtype), size)
-    return TileLists(ids, starts, num_pairs, overflow, height=height)
-
-
-def _list_handler(functions: ListFunctions, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
-    """List the splats of each tile, on all ffi."""
-    M, cutoff, size = arguments
-    ids, starts, total, overflow = results
-    columns, width, height = map(int, size)
-    num = len(cutoff)
-    outlines, rectangles = np.empty((num, len(Outline._fields)), M.dtype), np.empty((num, 4), np.int32)
-
-    def bound(first: int, last: int, _: int) -> None:
-        functions.bound(*_addresses(M, cutoff, outlines, rectangles), first, last, width, height)
-
-    ffi.run_spans(bound, ffi.even_spans(num, SPLATS_PER_THREAD))
-    room = int(rectangles[:, 3].sum(dtype=np.int64))
-    total[...], overflow[...] = room, room > len(ids)
-    # XLA hands over buffers as they are, and places behind the last pair are not written.
-    starts[:], ids[:] = 0, 0
-    if overflow:
-        return
-    order = _depth_order(M[:, 2, 2], np.flatnonzero(rectangles[:, 3]))
-    # A counting sort. Each thread lists the pairs of a range of splats, and places them behind those of nearer ranges.
-    begins = np.concatenate([[0], np.cumsum(rectangles[order, 3], dtype=np.int64)])
-    spans = _parts(begins)
-    counts = np.zeros((len(spans), len(starts) - 1), np.int32)
-    tiles, splats = np.empty((2, max(1, room)), np.int32)
-
-    def find(first: int, last: int, index: int) -> None:
-        found = tiles[begins[first] :], splats[begins[first] :]
-        buffers = order[first:], rectangles, outlines, counts[index], *found
-        functions.find(*_addresses(*buffers), last - first, columns)
-
-    ffi.run_spans(find, spans)
-    np.cumsum(counts.sum(axis=0), out=starts[1:])
-    # Where each thread begins in each tile's list: behind the pairs that threads of nearer splats found there.
-    cursors = starts[:-1] + np.cumsum(counts, axis=0, dtype=np.int32) - counts
-
-    def place(first: int, _: int, index: int) -> None:
-        found = tiles[begins[first] :], splats[begins[first] :]
-        functions.place(*_addresses(*found, cursors[index], ids), int(counts[index].sum()))
-
-    ffi.run_spans(place, spans)
-
-
-def _depth_order(depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """Sort the visible splats by depth, ties by index; int32. float32 depths are sorted by radix, 16 bits at a time."""
-    depths = depths[visible]
-    if depths.dtype != np.float32:
-        return visible[np.argsort(depths, kind="stable")].astype(np.int32)
-    # Depths of visible splats are positive, and positive floats are ordered as their bits.
-    bits = depths.view(np.uint32)
-    order = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
-    order = order[np.argsort((bits >> 16).astype(np.uint16)[order], kind="stable")]
-    return visible[order].astype(np.int32)
+    return (*packed, packed_pixels(settings, inputs.lists.pixels), size)
 
 
 def _registered(
-    spec: KernelSpec, which: Literal["forward", "backward"], make_handler: Callable[[CompiledFunction], ffi.Handler]
+    kernel: PassSettings, which: Literal["forward", "backward"], make_handler: Callable[[CompiledFunction], ffi.Handler]
 ) -> str:
-    """Return the name under which XLA knows a pass of a spec."""
 
     def handler() -> ffi.Handler:
-        return make_handler(getattr(compiled_passes(spec), which))
+        return make_handler(getattr(compiled_passes(kernel), which))
 
-    return ffi.registered(f"{which} {spec!r}", (which, spec), handler)
-
-
-def _addresses(*arrays: np.ndarray) -> list[int]:
-    return [array.ctypes.data for array in arrays]
+    return ffi.registered(f"{which} {kernel!r}", (which, kernel), handler)
 
 
 def _forward_handler(run: CompiledFunction) -> ffi.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
         *inputs, size = arguments
-        starts = inputs[1]
         pointers = _addresses(*inputs, results[0])
 
         def part(first: int, last: int, _: int) -> None:
             run(*pointers, first, last, *map(int, size))
 
-        ffi.run_spans(part, _parts(starts))
+        ffi.run_spans(part, _parts(starts=inputs[1]))
 
     return handler
 
@@ -167,33 +84,35 @@ def _forward_handler(run: CompiledFunction) -> ffi.Handler:
 def _backward_handler(run: CompiledFunction) -> ffi.Handler:
     def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
         *inputs, size, g, suffix_sum, jacobian = arguments
-        starts = inputs[1]
+        ids, starts, _, regions, *_ = inputs
         parts = _parts(starts)
-        room = SumsOfParts(inputs[0], starts, inputs[3], results, parts)
-        given = _addresses(*inputs, g, suffix_sum, jacobian)
+        sums = SumsOfParts(ids, starts, regions, results, parts)
+        pointers = _addresses(*inputs, g, suffix_sum, jacobian)
 
         def part(first: int, last: int, index: int) -> None:
-            run(*given, *_addresses(*room.outputs(index)), first, last, *map(int, size))
+            run(*pointers, *_addresses(*sums.outputs(index)), first, last, *map(int, size))
 
         ffi.run_spans(part, parts)
-        room.add_up()
+        sums.add_up()
 
     return handler
+
+
+def _addresses(*arrays: np.ndarray) -> list[int]:
+    return [array.ctypes.data for array in arrays]
 
 
 def _parts(starts: np.ndarray) -> list[ffi.Span]:
     """Split tiles, or splats, into ranges with about as many pairs each, one per thread that is worth starting.
 
-    Args:
-      starts: [items + 1] start of each item's pairs.
+    `starts` [items + 1] has the start of each item's pairs.
     """
     num_items, num_pairs = len(starts) - 1, int(starts[-1])
     count = max(1, min(ffi.num_threads(), num_pairs // PAIRS_PER_THREAD))
     # A tile costs one more than its pairs, so that tiles without pairs are divided, too.
     work = starts.astype(np.int64) + np.arange(num_items + 1)
     borders = np.searchsorted(work, np.linspace(0, work[-1], count + 1)[1:-1]).tolist()
-    borders = [0, *borders, num_items]
-    return list(itertools.pairwise(borders))
+    return list(itertools.pairwise([0, *borders, num_items]))
 
 
 class SumsOfParts:
@@ -222,25 +141,38 @@ class SumsOfParts:
         for result in results:
             result[...] = 0
         d_splats, d_texels, d_probe = self.results = results
-        spans = [(int(starts[first]), int(starts[last])) for first, last in parts]
-        self.places, self.splats, self.borders = _places(ids, spans, len(d_splats))
+        # The extra row of every pair, −1 if it has none; the splat of every extra row; the borders between the parts'.
+        self.places = np.full(max(1, starts[parts[-1][1]]), -1, np.int32)
+        self.borders, splats_of_parts = [0], []
+        is_listed, row = np.zeros(len(d_splats), bool), np.empty(len(d_splats), np.int32)
+        for index, (first, last) in enumerate(parts):
+            listed = ids[starts[first] : starts[last]]
+            again = np.flatnonzero(is_listed[listed]) if index else np.zeros(0, np.int64)
+            splats = np.unique(listed[again])
+            row[splats] = self.borders[-1] + np.arange(len(splats), dtype=np.int32)
+            # `row` needs no reset: it is read only where this part has just written it.
+            self.places[starts[first] + again] = row[listed[again]]
+            if index + 1 < len(parts):
+                is_listed[listed] = True
+            splats_of_parts.append(splats)
+            self.borders.append(self.borders[-1] + len(splats))
+        self.splats = np.concatenate(splats_of_parts)
         num = max(1, len(self.splats))
-        self.more_splats = np.zeros((num, d_splats.shape[1]), d_splats.dtype)
-        self.more_probe = np.zeros((num, d_probe.shape[1]), d_probe.dtype)
+        self.more_splats, self.more_probe = (np.zeros((num, x.shape[1]), x.dtype) for x in (d_splats, d_probe))
         has_textures = d_texels.shape[1] > 0 and len(regions) == len(d_splats)
         self.regions = regions[self.splats] if has_textures else np.zeros((0, 3), np.int32)
-        areas = self.regions[:, 1].astype(np.int64) * self.regions[:, 2]
-        self.is_shared = has_textures and len(parts) > 1 and _overlap(regions)
         # Where textures share texels, two parts may add to the same one: each has its own copy of all.
+        self.is_shared = has_textures and len(parts) > 1 and _overlap(regions)
         if self.is_shared:
             self.texels_of_parts = [d_texels, *(np.zeros_like(d_texels) for _ in parts[1:])]
-            self.more_texels, self.more_first = self.texels_of_parts, self.regions[:, 0]
+            self.more_texels, more_first = self.texels_of_parts, self.regions[:, 0]
         else:
+            areas = self.regions[:, 1].astype(np.int64) * self.regions[:, 2]
             self.ends = np.concatenate([[0], np.cumsum(areas)])
             self.texels_of_parts = [d_texels] * len(parts)
             self.more_texels = [np.zeros((max(1, self.ends[-1]), d_texels.shape[1]), d_texels.dtype)] * len(parts)
-            self.more_first = self.ends[:-1]
-        self.more_first = np.append(self.more_first, 0).astype(np.int32)
+            more_first = self.ends[:-1]
+        self.more_first = np.append(more_first, 0).astype(np.int32)
 
     def outputs(self, index: int) -> list[np.ndarray]:
         """Return the buffers that the backward pass adds to in a part, from `d_splats` on."""
@@ -249,7 +181,6 @@ class SumsOfParts:
         return [d_splats, self.texels_of_parts[index], d_probe, self.places, *more]
 
     def add_up(self) -> None:
-        """Add the extra rows to the results, in the order of the parts."""
         for first, last in itertools.pairwise(self.borders):
             # A splat has at most one extra row in a part, so that threads can divide them.
             spans = ffi.even_spans(last - first, ROWS_PER_THREAD)
@@ -271,39 +202,76 @@ class SumsOfParts:
             d_texels[entries + np.repeat(self.regions[first:last, 0] - begins, ends - begins)] += more
 
 
-def _places(ids: np.ndarray, spans: list[ffi.Span], num: int) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Assign extra rows to the pairs of splats that an earlier part lists.
-
-    Args:
-      ids: [pairs] splats.
-      spans: range of each part's pairs.
-      num: number of splats.
-
-    Returns:
-      The extra row of every pair, −1 if it has none; the splat of every extra row; and the borders between the parts'
-      extra rows.
-    """
-    places, is_listed, row = np.full(max(1, spans[-1][1]), -1, np.int32), np.zeros(num, bool), np.empty(num, np.int32)
-    again: list[np.ndarray] = []
-    borders = [0]
-    for index, (first, last) in enumerate(spans):
-        listed = ids[first:last]
-        pairs = np.flatnonzero(is_listed[listed]) if index else np.zeros(0, np.int64)
-        splats = np.unique(listed[pairs])
-        row[splats] = borders[-1] + np.arange(len(splats), dtype=np.int32)
-        places[first + pairs] = row[listed[pairs]]
-        # `row` needs no reset: it is read only where this part has just written it.
-        if index + 1 < len(spans):
-            is_listed[listed] = True
-        again.append(splats)
-        borders.append(borders[-1] + len(splats))
-    return places, np.concatenate(again), borders
-
-
 def _overlap(regions: np.ndarray) -> bool:
-    """Return whether two textures share texels."""
     first, area = regions[:, 0].astype(np.int64), regions[:, 1].astype(np.int64) * regions[:, 2]
     # Sorted by first texel; the area comes along in the lower bits.
     both = np.sort(first << 32 | area)
     first, area = both >> 32, both & 0xFFFFFFFF
     return bool(np.any(first[:-1] + area[:-1] > first[1:]))
+
+
+def tile_lists(
+    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, height: Array | None = None
+) -> TileLists:
+    """List the splats of each tile, with the arguments and result of `rasterize.tiles.tile_lists`."""
+    key = str(M.dtype), grid.tile_size, near_plane
+    name = ffi.registered(
+        f"lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_functions(*key))
+    )
+    results = ((capacity,), jnp.int32), ((grid.num + 1,), jnp.int32), ((), jnp.float32), ((), jnp.bool_)
+    size = jnp.asarray([grid.columns, grid.width, grid.height if height is None else height], jnp.int32)
+    ids, starts, num_pairs, overflow = ffi.call(name, results, M, cutoff.astype(M.dtype), size)
+    return TileLists(ids, starts, num_pairs, overflow, height=height)
+
+
+def _list_handler(functions: ListFunctions, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+    M, cutoff, size = arguments
+    ids, starts, total, overflow = results
+    columns, width, height = map(int, size)
+    num = len(cutoff)
+    outlines, rectangles = np.empty((num, len(Outline._fields)), M.dtype), np.empty((num, 4), np.int32)
+
+    def bound(first: int, last: int, _: int) -> None:
+        functions.bound(*_addresses(M, cutoff, outlines, rectangles), first, last, width, height)
+
+    ffi.run_spans(bound, ffi.even_spans(num, SPLATS_PER_THREAD))
+    room = int(rectangles[:, 3].sum(dtype=np.int64))
+    total[...], overflow[...] = room, room > len(ids)
+    # XLA hands over buffers as they are, and places behind the last pair are not written.
+    starts[:], ids[:] = 0, 0
+    if overflow:
+        return
+    visible = np.flatnonzero(rectangles[:, 3])
+    order = visible[_depth_order(M[visible, 2, 2])].astype(np.int32)
+    # A counting sort. Each thread lists the pairs of a range of splats, and places them behind those of nearer ranges.
+    begins = np.concatenate([[0], np.cumsum(rectangles[order, 3], dtype=np.int64)])
+    spans = _parts(begins)
+    counts = np.zeros((len(spans), len(starts) - 1), np.int32)
+    tiles, splats = np.empty((2, max(1, room)), np.int32)
+
+    def find(first: int, last: int, index: int) -> None:
+        found = tiles[begins[first] :], splats[begins[first] :]
+        buffers = order[first:], rectangles, outlines, counts[index], *found
+        functions.find(*_addresses(*buffers), last - first, columns)
+
+    ffi.run_spans(find, spans)
+    np.cumsum(counts.sum(axis=0), out=starts[1:])
+    # Where each thread begins in each tile's list: behind the pairs that threads of nearer splats found there.
+    cursors = starts[:-1] + np.cumsum(counts, axis=0, dtype=np.int32) - counts
+
+    def place(first: int, _: int, index: int) -> None:
+        found = tiles[begins[first] :], splats[begins[first] :]
+        functions.place(*_addresses(*found, cursors[index], ids), int(counts[index].sum()))
+
+    ffi.run_spans(place, spans)
+
+
+def _depth_order(depths: np.ndarray) -> np.ndarray:
+    """Return the order of the depths of visible splats, ties by index."""
+    if depths.dtype != np.float32:
+        return np.argsort(depths, kind="stable")
+    # Depths of visible splats are positive, and positive floats are ordered as their bits. These are sorted 16 at a
+    # time, from the lowest: numpy's stable sort of 16-bit integers is a radix sort.
+    bits = depths.view(np.uint32)
+    order = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
+    return order[np.argsort((bits >> 16).astype(np.uint16)[order], kind="stable")]

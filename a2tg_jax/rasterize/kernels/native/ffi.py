@@ -4,8 +4,8 @@ Handlers divide their work among threads (`run_spans`).
 
 XLA may still compute on its own threads when a program ends. A thread that then waits for Python's GIL never gets it:
 the program crashes or hangs. So these threads pass a gate in native code, which closes at the end. Threads that come
-later return with an error; the gate waits for those inside. The same holds for daemon threads of Python that wait for
-arrays in native code: the program ends once XLA has computed what they wait for, or met the error.
+later return with an error, and the end waits for the ones inside. Daemon threads of Python that wait for arrays in
+native code are in the same danger: the program ends once XLA has computed their arrays, or met the error.
 """
 
 import atexit
@@ -15,6 +15,7 @@ import ctypes
 import functools
 import hashlib
 import itertools
+import math
 import os
 import re
 import signal
@@ -29,11 +30,9 @@ import jax
 import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
-from llvmlite import ir
 
 from a2tg_jax.host.machine import num_threads as num_threads
 from a2tg_jax.rasterize.kernels.native import llvm_code
-from a2tg_jax.rasterize.kernels.native.llvm_code import INT, LONG, POINTER
 
 Handler = Callable[[list[np.ndarray], list[np.ndarray]], None]
 """Function of arguments and results, views of XLA's buffers: it reads the arguments and fills the results."""
@@ -51,65 +50,25 @@ DTYPES = {1: np.bool_, 4: np.int32, 5: np.int64, 8: np.uint32, 11: np.float32, 1
 _pointer, _size, _int = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 
 
-class _Version(ctypes.Structure):
-    _fields_ = (("struct_size", _size), ("extension", _pointer), ("major", _int), ("minor", _int))
+def _structure(name: str, **fields: Any) -> Any:
+    return type(name, (ctypes.Structure,), {"_fields_": (("struct_size", _size), *fields.items())})
 
 
-class _Metadata(ctypes.Structure):
-    _fields_ = (("struct_size", _size), ("version", _Version), ("traits", ctypes.c_uint32))
-
-
-class _Extension(ctypes.Structure):
-    _fields_ = (("struct_size", _size), ("kind", _int), ("next", _pointer), ("metadata", ctypes.POINTER(_Metadata)))
-
-
-class _ErrorArguments(ctypes.Structure):
-    _fields_ = (("struct_size", _size), ("extension", _pointer), ("message", ctypes.c_char_p), ("code", _int))
-
-
-class _Api(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", _size),
-        ("extension", _pointer),
-        ("version", _Version),
-        ("internal", _pointer),
-        ("create_error", ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_ErrorArguments))),
-    )
-
-
-class _Buffer(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", _size),
-        ("extension", _pointer),
-        ("dtype", _int),
-        ("data", _pointer),
-        ("rank", ctypes.c_int64),
-        ("dims", ctypes.POINTER(ctypes.c_int64)),
-    )
-
-
-class _Buffers(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", _size),
-        ("extension", _pointer),
-        ("num", ctypes.c_int64),
-        ("kinds", _pointer),
-        ("buffers", ctypes.POINTER(ctypes.POINTER(_Buffer))),
-    )
-
-
-class _CallFrame(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", _size),
-        ("extension", ctypes.POINTER(_Extension)),
-        ("api", ctypes.POINTER(_Api)),
-        ("context", _pointer),
-        ("stage", _int),
-        ("arguments", _Buffers),
-        ("results", _Buffers),
-    )
-
-
+_Version = _structure("Version", extension=_pointer, major=_int, minor=_int)
+_Metadata = _structure("Metadata", version=_Version, traits=ctypes.c_uint32)
+_Extension = _structure("Extension", kind=_int, next=_pointer, metadata=ctypes.POINTER(_Metadata))
+_ErrorArguments = _structure("ErrorArguments", extension=_pointer, message=ctypes.c_char_p, code=_int)
+_CreateError = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_ErrorArguments))
+_Api = _structure("Api", extension=_pointer, version=_Version, internal=_pointer, create_error=_CreateError)
+_Buffer = _structure(
+    "Buffer", extension=_pointer, dtype=_int, data=_pointer, rank=ctypes.c_int64, dims=ctypes.POINTER(ctypes.c_int64)
+)
+_BufferPointers = ctypes.POINTER(ctypes.POINTER(_Buffer))
+_Buffers = _structure("Buffers", extension=_pointer, num=ctypes.c_int64, kinds=_pointer, buffers=_BufferPointers)
+_CallFrame = _structure(
+    "CallFrame", extension=ctypes.POINTER(_Extension), api=ctypes.POINTER(_Api), context=_pointer, stage=_int,
+    arguments=_Buffers, results=_Buffers,
+)  # fmt: skip
 _Entry = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_CallFrame))
 _LOCK = threading.RLock()
 _AT_THE_END = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, b"the program is ending", INTERNAL_ERROR)
@@ -122,7 +81,7 @@ SECONDS_TO_RETURN = 0.1
 
 
 def installed_version() -> tuple[int, int] | None:
-    """Return the version of the interface in the headers that jaxlib brings; None if it brings none."""
+    """Return the version of the interface in the headers of the installed jaxlib; None if it has none."""
     header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     if not header.is_file():
         return None
@@ -161,13 +120,7 @@ def registered(description: str, key: Hashable, make_handler: Callable[[], Handl
 
 
 def call(name: str, results: Sequence[tuple[tuple[int, ...], DTypeLike]], *inputs: Array) -> list[Array]:
-    """Call a registered handler inside a computation.
-
-    Args:
-      name: name from `registered`.
-      results: shape and dtype of each result.
-      inputs: arguments of the handler.
-    """
+    """Call a handler of `registered` inside a computation, given the shape and dtype of each result."""
     shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in results]
     return list(jax.ffi.ffi_call(name, shapes, vmap_method="sequential")(*inputs))
 
@@ -178,59 +131,74 @@ def _capsule(address: int | None, destructor: int | None = None) -> object:
     return new(address, None, destructor)
 
 
+GATE = """
+define ptr @{name}(ptr %frame) {{
+  ; Counted before the gate is looked at: the end closes it and then waits until nobody is inside, so misses no thread.
+  atomicrmw add ptr inttoptr (i64 {num_inside} to ptr), i32 1 seq_cst
+  %closed = load atomic i32, ptr inttoptr (i64 {is_closed} to ptr) seq_cst, align 4
+  %is_open = icmp eq i32 %closed, 0
+  br i1 %is_open, label %inside, label %outside
+inside:
+  %result = call ptr inttoptr (i64 {entry} to ptr)(ptr %frame)
+  br label %leave
+outside:
+  ; frame->api->create_error(&_AT_THE_END)
+  %api_place = getelementptr i8, ptr %frame, i64 {api}
+  %api = load ptr, ptr %api_place
+  %create_place = getelementptr i8, ptr %api, i64 {create_error}
+  %create_error = load ptr, ptr %create_place
+  %error = call ptr %create_error(ptr inttoptr (i64 {at_the_end} to ptr))
+  br label %leave
+leave:
+  %returned = phi ptr [ %result, %inside ], [ %error, %outside ]
+  atomicrmw sub ptr inttoptr (i64 {num_inside} to ptr), i32 1 seq_cst
+  ret ptr %returned
+}}
+"""
+"""A function like `entry`, frame → error, that makes an error if the gate is closed."""
+
+
 def _gated(entry: Any) -> int:
-    """Return the address of a function like `entry`, frame → error, that makes an error if the gate is closed."""
-    module, name = ir.Module("gate"), llvm_code.unique("gate")
-    signature = ir.FunctionType(POINTER, [POINTER])
-    function = ir.Function(module, signature, name)
-    b = ir.IRBuilder(function.append_basic_block("come"))
-    inside, outside = function.append_basic_block("inside"), function.append_basic_block("outside")
-    (frame,) = function.args
-
-    def pointer(address: int) -> ir.Value:
-        return b.inttoptr(LONG(address), POINTER)
-
-    def field(structure: ir.Value, offset: int, type_: ir.Type) -> ir.Value:
-        return b.load(b.gep(structure, [LONG(offset)], source_etype=ir.IntType(8)), typ=type_)
-
-    def leave_with_result_of(address: ir.Value, argument: ir.Value) -> None:
-        result = b.call(b.inttoptr(address, signature.as_pointer()), [argument])
-        b.atomic_rmw("sub", num_inside, INT(1), "seq_cst")
-        b.ret(result)
-
-    num_inside, is_closed = (pointer(ctypes.addressof(number)) for number in (_num_inside, _is_closed))
-    # Counted before the gate is looked at: the end, which closes it and then waits for nobody inside, misses no thread.
-    b.atomic_rmw("add", num_inside, INT(1), "seq_cst")
-    b.cbranch(b.icmp_signed("==", b.load_atomic(is_closed, "seq_cst", 4, typ=INT), INT(0)), inside, outside)
-    b.position_at_end(inside)
-    leave_with_result_of(LONG(ctypes.cast(entry, _pointer).value or 0), frame)
-    b.position_at_end(outside)
-    # frame->api->create_error(&_AT_THE_END)
-    create_error = field(field(frame, _CallFrame.api.offset, POINTER), _Api.create_error.offset, LONG)
-    leave_with_result_of(create_error, pointer(ctypes.addressof(_AT_THE_END)))
-    return llvm_code.compile_module(module)[name]
+    """Return the address of `GATE` around a function."""
+    places = {"num_inside": _num_inside, "is_closed": _is_closed, "at_the_end": _AT_THE_END}
+    name = llvm_code.unique("gate")
+    code = GATE.format(
+        name=name,
+        entry=ctypes.cast(entry, _pointer).value,
+        api=_CallFrame.api.offset,
+        create_error=_Api.create_error.offset,
+        **{name: ctypes.addressof(own) for name, own in places.items()},
+    )
+    return llvm_code.compile_text(code, [name])[name]
 
 
 def _entry(handler: Handler) -> Callable[..., int | None]:
-    """Return the function that XLA calls; it returns None on success, else the address of an error.
+    """Return the function that XLA calls; it returns None on success, else the address of an error."""
 
-    No exception may pass through C: it would be lost, and the unfilled results would count as computed.
-    """
-
-    def enter(frame: Any) -> int | None:
-        interrupts: list[int] = []
+    def enter(pointer: Any) -> int | None:
+        frame, interrupts = pointer.contents, list[int]()
         dropped_last: list[object] = []
+        # No exception may pass through C: it would be lost, and the unfilled results would count as computed.
         try:
             with _interrupts_noted(interrupts):
-                _dispatch(frame.contents, handler)
+                extension = frame.extension
+                if extension and extension.contents.kind == METADATA_EXTENSION:
+                    version = extension.contents.metadata.contents.version
+                    version.major, version.minor = VERSION
+                elif frame.stage == EXECUTE_STAGE:
+                    handler(_arrays(frame.arguments), _arrays(frame.results))
             if interrupts:
                 dropped_last.append(_interrupt_once_dropped())
         except BaseException as error:
             if interrupts or isinstance(error, KeyboardInterrupt):
                 dropped_last.append(_interrupt_once_dropped())
-            failure = _failure(frame.contents, error)
-            error.with_traceback(None)  # a traceback would keep this function's variables alive
-            return failure
+            what = "".join(traceback.format_exception_only(error))
+            where = "".join(traceback.format_tb(error.__traceback__)[1:])
+            message = f"{what}raised, most recent call last, at\n{where}".encode(errors="replace")
+            error.with_traceback(None)  # A traceback would keep this function's variables alive.
+            arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, INTERNAL_ERROR)
+            address: int = frame.api.contents.create_error(ctypes.byref(arguments))
+            return address
         return None
 
     return enter
@@ -259,36 +227,16 @@ def _interrupt_once_dropped() -> object:
     return _capsule(interrupt, interrupt)
 
 
-def _dispatch(frame: _CallFrame, handler: Handler) -> None:
-    """Answer XLA's question for metadata, or execute the handler."""
-    extension = frame.extension
-    if extension and extension.contents.kind == METADATA_EXTENSION:
-        version = extension.contents.metadata.contents.version
-        version.major, version.minor = VERSION
-    elif frame.stage == EXECUTE_STAGE:
-        handler(_arrays(frame.arguments), _arrays(frame.results))
-
-
-def _failure(frame: _CallFrame, error: BaseException) -> int:
-    """Make XLA's error, with the exception and its traceback; return its address."""
-    what = "".join(traceback.format_exception_only(error))
-    where = "".join(traceback.format_tb(error.__traceback__)[2:])
-    message = f"{what}raised, most recent call last, at\n{where}".encode(errors="replace")
-    arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, INTERNAL_ERROR)
-    return frame.api.contents.create_error(ctypes.byref(arguments))
-
-
-def _arrays(buffers: _Buffers) -> list[np.ndarray]:
-    return [_array(buffers.buffers[index].contents) for index in range(buffers.num)]
-
-
-def _array(buffer: _Buffer) -> np.ndarray:
-    shape, dtype = tuple(buffer.dims[: buffer.rank]), np.dtype(DTYPES[buffer.dtype])
-    num_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
-    if num_bytes == 0:
-        return np.empty(shape, dtype)
-    memory = (ctypes.c_ubyte * num_bytes).from_address(buffer.data)
-    return np.frombuffer(memoryview(memory), dtype).reshape(shape)
+def _arrays(buffers: Any) -> list[np.ndarray]:
+    arrays = []
+    for index in range(buffers.num):
+        buffer = buffers.buffers[index].contents
+        shape, dtype = tuple(buffer.dims[: buffer.rank]), np.dtype(DTYPES[buffer.dtype])
+        num_bytes = math.prod(shape) * dtype.itemsize
+        # Buffers without numbers may have no address.
+        memory = (ctypes.c_ubyte * num_bytes).from_address(buffer.data) if num_bytes else bytearray()
+        arrays.append(np.frombuffer(memory, dtype).reshape(shape))
+    return arrays
 
 
 def even_spans(num: int, least_items: int) -> list[Span]:
@@ -316,12 +264,9 @@ def _pool(size: int) -> concurrent.futures.ThreadPoolExecutor:
     return concurrent.futures.ThreadPoolExecutor(size, thread_name_prefix="a2tg")
 
 
-def _empty() -> None:
-    _num_inside.value = 0
-
-
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_empty)  # the child has none of the parent's threads
+    # The child has none of the parent's threads.
+    os.register_at_fork(after_in_child=lambda: setattr(_num_inside, "value", 0))
 
 
 @atexit.register
@@ -329,20 +274,15 @@ def _close() -> None:
     """Close the gate, and wait until no thread is inside and none waits for arrays."""
     if not _entries:
         return
-    # The gate is used as long as the process lives, so that its parts must outlive Python's shutdown.
+    # Threads use the gate as long as the process lives: its parts must outlive Python's shutdown.
     for kept in (_num_inside, _is_closed, llvm_code.engine()):
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))
     _is_closed.value = 1
     while _num_inside.value:
         time.sleep(1e-3)
     if threading.active_count() > 1:
-        _wait_for_arrays()
-
-
-def _wait_for_arrays() -> None:
-    """Wait until all arrays on the CPU are computed or have failed, and other threads have had time to see it."""
-    with contextlib.suppress(RuntimeError):  # no CPU among JAX's platforms
-        for array in jax.live_arrays("cpu"):
-            with contextlib.suppress(RuntimeError):
-                array.block_until_ready()
-    time.sleep(SECONDS_TO_RETURN)
+        with contextlib.suppress(RuntimeError):  # No CPU among JAX's platforms.
+            for array in jax.live_arrays("cpu"):
+                with contextlib.suppress(RuntimeError):
+                    array.block_until_ready()
+        time.sleep(SECONDS_TO_RETURN)

@@ -32,11 +32,16 @@ PLACE = ("tiles", "splats", "cursors", "ids")
 NUM_NUMBERS = len(Outline._fields)
 
 
+def _outline_of(dtype: str) -> Outline:
+    """Return an example of an outline for `trace`; its last field is the flag `is_clipped`."""
+    return Outline._make([example(dtype)] * (NUM_NUMBERS - 1) + [example(jnp.bool_)])
+
+
 def _write_bound(module: ir.Module, name: str, dtype: str, tile_size: int, near_plane: float) -> None:
     w = Writer(module, name, BOUND, ("first", "last", "width", "height"), dtype)
     b, given, scalars = w.b, w.arguments, Lanes(w.b, 1)
-    number, integer = example(dtype), example(jnp.int32)
-    M, outline = ((number,) * 3,) * 3, Outline._make([number] * (NUM_NUMBERS - 1) + [example(jnp.bool_)])
+    number, integer, outline = example(dtype), example(jnp.int32), _outline_of(dtype)
+    M = ((number,) * 3,) * 3
 
     def rectangle(bounds: ScreenBounds, width: int, height: int) -> Rectangles:
         return tile_rectangles(bounds, TileGrid(width, height, tile_size))
@@ -71,8 +76,7 @@ def _write_bound(module: ir.Module, name: str, dtype: str, tile_size: int, near_
 def _write_find(module: ir.Module, name: str, dtype: str, tile_size: int) -> None:
     w = Writer(module, name, FIND, ("num_splats", "columns"), dtype)
     b, given, number = w.b, w.arguments, example(dtype)
-    outline = Outline._make([number] * (NUM_NUMBERS - 1) + [example(jnp.bool_)])
-    touches, _ = trace(functools.partial(outline_touches, tile_size=tile_size), outline, number, number)
+    touches, _ = trace(functools.partial(outline_touches, tile_size=tile_size), _outline_of(dtype), number, number)
     num_found = w.variable(LONG)
     b.store(LONG(0), num_found)
     with w.loop(LONG(0), w.long(given["num_splats"])) as (rank, _):
@@ -114,8 +118,6 @@ def _write_place(module: ir.Module, name: str) -> None:
 
 
 class ListFunctions(NamedTuple):
-    """Compiled functions `bound`, `find` and `place`."""
-
     bound: CompiledFunction
     find: CompiledFunction
     place: CompiledFunction

@@ -1,4 +1,4 @@
-"""LLVM code: arithmetic on vectors of lanes, functions with memory and loops, and modules compiled for this processor.
+"""LLVM code: functions with memory and loops, and modules compiled for this processor.
 
 With A2TG_DUMP=folder in the environment, compiled functions leave their code in that folder.
 """
@@ -12,7 +12,6 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import llvmlite.binding as llvm
 import numpy as np
@@ -31,160 +30,12 @@ _LOCK = threading.Lock()
 
 
 def scalar_type(dtype: DTypeLike) -> ir.Type:
-    """Return the LLVM type of a scalar of a numpy dtype.
-
-    Raises:
-      Untranslatable: for anything but bool, int32, int64, float32 and float64.
-    """
+    """Return the LLVM type of a scalar of a numpy dtype; Untranslatable if there is none."""
     types = {"bool": BOOL, "int32": INT, "int64": LONG, "float32": ir.FloatType(), "float64": ir.DoubleType()}
     name = np.dtype(dtype).name
     if name not in types:
         raise Untranslatable(f"native loops compute with {', '.join(types)}; a value is {name}")
     return types[name]
-
-
-def scalar_of(type_: ir.Type) -> ir.Type:
-    """Return the type of one lane."""
-    return type_.element if isinstance(type_, ir.VectorType) else type_
-
-
-def is_float(type_: ir.Type) -> bool:
-    return isinstance(scalar_of(type_), (ir.FloatType, ir.DoubleType))
-
-
-def num_bits(type_: ir.Type) -> int:
-    """Return the bits of one lane's type."""
-    scalar = scalar_of(type_)
-    return {ir.FloatType: 32, ir.DoubleType: 64}.get(type(scalar)) or scalar.width
-
-
-def suffix(type_: ir.Type) -> str:
-    """Return the spelling of a type in the names of intrinsics."""
-    one = f"{'f' if is_float(type_) else 'i'}{num_bits(type_)}"
-    return f"v{type_.count}{one}" if isinstance(type_, ir.VectorType) else one
-
-
-class Vectors:
-    """Operations at a builder's position on vectors of `width` lanes; `width` 1 means plain scalars."""
-
-    def __init__(self, builder: ir.IRBuilder, width: int):
-        self.builder, self.width = builder, width
-
-    def vector(self, scalar: ir.Type) -> ir.Type:
-        """Return the type of one value per lane."""
-        return scalar if self.width == 1 else ir.VectorType(scalar, self.width)
-
-    def constant(self, value: Any, scalar: ir.Type) -> ir.Constant:
-        """Return the same number in every lane."""
-        value = float(value) if is_float(scalar) else int(value)
-        return ir.Constant(self.vector(scalar), value if self.width == 1 else [value] * self.width)
-
-    def broadcast(self, value: ir.Value) -> ir.Value:
-        """Copy a scalar to every lane."""
-        if self.width == 1:
-            return value
-        # LLVM's idiom: insert into the first lane, then shuffle it to all; it becomes one broadcast.
-        undefined = ir.Constant(self.vector(value.type), ir.Undefined)
-        first = self.builder.insert_element(undefined, value, INT(0))
-        return self.builder.shuffle_vector(
-            first, undefined, ir.Constant(ir.VectorType(INT, self.width), [0] * self.width)
-        )
-
-    def intrinsic(self, name: str, operands: Sequence[ir.Value]) -> ir.Value:
-        """Call llvm.<name> on operands of one type; the result has that type."""
-        flags = FLAGS if is_float(operands[0].type) else ()
-        type_ = operands[0].type
-        return self.call(f"llvm.{name}.{suffix(type_)}", type_, operands, flags)
-
-    def libm(self, name: str, operands: Sequence[ir.Value]) -> ir.Value:
-        """Call a function of the C library on floats; its error is about one unit in the last place."""
-        # LLVM calls it lane by lane. It needs the address, because on Windows it does not find all functions itself.
-        _add_libm_symbol(name if num_bits(operands[0].type) == 64 else f"{name}f")
-        return self.intrinsic(name, operands)
-
-    def call(self, name: str, type_: ir.Type, operands: Sequence[ir.Value], flags: Sequence[str] = ()) -> ir.Value:
-        """Call a function of the module that returns a value of a type; declare it if needed."""
-        module = self.builder.module
-        function_type = ir.FunctionType(type_, [operand.type for operand in operands])
-        function = module.globals.get(name) or ir.Function(module, function_type, name)
-        return self.builder.call(function, operands, fastmath=flags)
-
-    def sum(self, value: ir.Value) -> ir.Value:
-        """Sum over lanes, in an order of LLVM's choice."""
-        if self.width == 1:
-            return value
-        scalar = value.type.element
-        operands, flags = [ir.Constant(scalar, 0.0), value], ("reassoc", "nsz", "contract")
-        return self.call(f"llvm.vector.reduce.fadd.{suffix(value.type)}", scalar, operands, flags)
-
-    def fold(self, value: ir.Value, combine: Callable[[ir.Value, ir.Value], ir.Value], to: int = 1) -> ir.Value:
-        """Combine the halves of a vector until `to` lanes are left; one lane is a scalar."""
-        b, width = self.builder, self.width
-        while width > to:
-            width //= 2
-            masks = (ir.Constant(ir.VectorType(INT, width), list(range(first, first + width))) for first in (0, width))
-            value = combine(*(b.shuffle_vector(value, value, mask) for mask in masks))
-        return b.extract_element(value, INT(0)) if isinstance(value.type, ir.VectorType) and to == 1 else value
-
-    def any(self, mask: ir.Value) -> ir.Value:
-        """Return whether a lane of a mask is set."""
-        if self.width == 1:
-            return mask
-        # As one integer of L bits: a single test of a register, where a fold would take log L steps.
-        bits = self.builder.bitcast(mask, ir.IntType(self.width))
-        return self.builder.icmp_unsigned("!=", bits, ir.IntType(self.width)(0))
-
-    def larger(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """Return the larger float, in one instruction; y if either is NaN or both are zeros."""
-        return self.builder.select(self.builder.fcmp_ordered(">", x, y), x, y)
-
-    def smaller(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """Return the smaller float, in one instruction; y if either is NaN or both are zeros."""
-        return self.builder.select(self.builder.fcmp_ordered("<", x, y), x, y)
-
-    def maximum(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """Return IEEE 754's maximum of floats: NaN if either is, and +0 is larger than −0."""
-        if _orders_by_compare(y, -1.0):
-            return self.larger(y, x)
-        if _orders_by_compare(x, -1.0):
-            return self.larger(x, y)
-        # Against +0, a comparison takes −0 as equal: +0 + −0 = +0 corrects that, and adds nothing to others.
-        for zero, other in ((x, y), (y, x)):
-            if _orders_by_compare(zero, 1.0):
-                return self.builder.fadd(self.larger(zero, other), zero)
-        # Two orders that agree are both right. Otherwise there is a NaN, or zeros of both signs: the union of the bits,
-        # with the signs intersected, is the result.
-        b, sign = self.builder, self._sign_bits(x.type)
-        one, other = (b.xor(self._as_bits(self.larger(*pair)), sign) for pair in ((x, y), (y, x)))
-        return b.bitcast(b.xor(b.or_(one, other), sign), x.type)
-
-    def minimum(self, x: ir.Value, y: ir.Value) -> ir.Value:
-        """Return IEEE 754's minimum of floats: NaN if either is, and −0 is smaller than +0."""
-        if _orders_by_compare(y, 1.0):
-            return self.smaller(y, x)
-        if _orders_by_compare(x, 1.0):
-            return self.smaller(x, y)
-        # As in `maximum`, but the union of the signs is the right one: −0 is the smaller zero.
-        one, other = (self._as_bits(self.smaller(*pair)) for pair in ((x, y), (y, x)))
-        return self.builder.bitcast(self.builder.or_(one, other), x.type)
-
-    def _as_bits(self, x: ir.Value) -> ir.Value:
-        return self.builder.bitcast(x, self.vector(ir.IntType(num_bits(x.type))))
-
-    def _sign_bits(self, type_: ir.Type) -> ir.Constant:
-        width = num_bits(type_)
-        return self.constant(1 << (width - 1), ir.IntType(width))
-
-
-def _orders_by_compare(value: ir.Value, sign_of_zero: float) -> bool:
-    """Return whether one comparison orders this constant and any number: it is not NaN, and a zero only of the
-    given sign."""
-    if not isinstance(value, ir.Constant):
-        return False
-    number = value.constant[0] if isinstance(value.type, ir.VectorType) else value.constant
-    if isinstance(number, ir.Constant):
-        number = number.constant
-    return bool(number == number and (number != 0 or np.copysign(1.0, number) == sign_of_zero))
 
 
 class Writer:
@@ -209,7 +60,6 @@ class Writer:
         return room
 
     def at(self, base: ir.Value, index: ir.Value, type_: ir.Type) -> ir.Value:
-        """Return the address of entry `index` of an array."""
         return self.b.gep(base, [index], source_etype=type_)
 
     def load(self, base: ir.Value, index: ir.Value | int, type_: ir.Type) -> ir.Value:
@@ -271,7 +121,7 @@ def engine() -> llvm.ExecutionEngine:
 
 
 @functools.cache
-def _add_libm_symbol(name: str) -> None:
+def add_libm_symbol(name: str) -> None:
     """Give compiled code the address of a function of the C library."""
     library = ctypes.CDLL("ucrtbase" if os.name == "nt" else ctypes.util.find_library("m"))
     llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
@@ -287,7 +137,6 @@ def vector_bytes() -> int:
 
 
 def num_lanes(dtype: DTypeLike) -> int:
-    """Return the number L of numbers in a vector."""
     return vector_bytes() // np.dtype(dtype).itemsize
 
 
@@ -299,17 +148,15 @@ def unique(name: str) -> str:
     return f"{name}_{next(_numbers)}"
 
 
-def compile_module(module: ir.Module) -> dict[str, int]:
-    """Optimise and compile a module; return the addresses of its functions, valid for the life of the process."""
+def compile_text(code: str, names: Sequence[str]) -> dict[str, int]:
+    """Optimise and compile LLVM assembly; return the addresses of functions, valid as long as the process lives."""
     with _LOCK:
-        module.triple = llvm.get_default_triple()
-        module.data_layout = str(_machine().target_data)
-        names = [function.name for function in module.functions if not function.is_declaration]
-        parsed = llvm.parse_assembly(str(module))
+        parsed = llvm.parse_assembly(code)
+        parsed.triple, parsed.data_layout = llvm.get_default_triple(), str(_machine().target_data)
         parsed.verify()
         dump(names[0], "ll", lambda: str(parsed))
         options = llvm.create_pipeline_tuning_options(speed_level=3)
-        # Code is in vectors already. Vectorising straight-line code once more finds nothing and takes its time.
+        # Code is in vectors already. Vectorising straight-line code once more finds nothing, and takes time.
         options.slp_vectorization = False
         builder = llvm.create_pass_builder(_machine(), options)
         builder.getModulePassManager().run(parsed, builder)
@@ -323,15 +170,13 @@ def compile_module(module: ir.Module) -> dict[str, int]:
 def compiled(module: ir.Module, signatures: dict[str, tuple[int, int]]) -> list[CompiledFunction]:
     """Compile a module; return its functions void(pointer…, int32…) as Python callables, which release the GIL.
 
-    Args:
-      module: the module.
-      signatures: number of pointers and of integers of each function, by name.
+    The signatures are the number of pointers and of integers of each function, by name.
     """
-    addresses = compile_module(module)
-    types = ([ctypes.c_void_p] * pointers + [ctypes.c_int32] * integers for pointers, integers in signatures.values())
-    return [
-        ctypes.CFUNCTYPE(None, *arguments)(addresses[name]) for name, arguments in zip(signatures, types, strict=True)
-    ]
+    addresses, found = compile_text(str(module), list(signatures)), list[CompiledFunction]()
+    for name, (pointers, integers) in signatures.items():
+        types = [ctypes.c_void_p] * pointers + [ctypes.c_int32] * integers
+        found.append(ctypes.CFUNCTYPE(None, *types)(addresses[name]))
+    return found
 
 
 def dump(name: str, kind: str, make_text: Callable[[], str]) -> None:

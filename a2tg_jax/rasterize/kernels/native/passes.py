@@ -22,7 +22,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import DTypeLike
 from llvmlite import ir
 
 from a2tg_jax.rasterize.kernels.jaxprs import CUTOFF_SLACK, PixelFunctions
@@ -30,7 +29,7 @@ from a2tg_jax.rasterize.kernels.native import llvm_code
 from a2tg_jax.rasterize.kernels.native.lanes import Lanes
 from a2tg_jax.rasterize.kernels.native.llvm_code import BOOL, INT, LONG, CompiledFunction
 from a2tg_jax.rasterize.kernels.native.texture_lookups import NativeTexture, Place, TexelWriter
-from a2tg_jax.rasterize.splats import KernelSpec
+from a2tg_jax.rasterize.splats import PassSettings
 from a2tg_jax.rasterize.tile_pixels import TilePixels
 
 INTEGERS = ("first", "last", "columns", "width", "height")
@@ -56,83 +55,52 @@ def pixel_order(tile_size: int, lanes: int) -> np.ndarray:
     return np.moveaxis(blocks, 2, 1).reshape(-1)
 
 
-def packed_pixels(spec: KernelSpec, pixels: TilePixels | None, dtype: DTypeLike) -> Array:
+def packed_pixels(settings: PassSettings, pixels: TilePixels | None) -> Array:
     """Pack the pixels of each tile as a row: its numbers, then x, y and whether they are seen, in the order of vectors.
 
     All four parts fill whole vectors. Without rays, the result is empty.
     """
     if pixels is None:
-        return jnp.zeros((1, 0), dtype)
-    lanes = llvm_code.num_lanes(spec.dtype)
-    order = pixel_order(spec.tile_size, lanes)
+        return jnp.zeros((1, 0), settings.dtype)
+    lanes = llvm_code.num_lanes(settings.dtype)
+    order = pixel_order(settings.grid.tile_size, lanes)
     numbers = jnp.concatenate([pixels.centers, pixels.frames.reshape(-1, 4)], axis=1)
     x, y = (pixels.offsets[:, k, order] for k in range(2))
-    parts = numbers, x, y, pixels.is_seen[:, order].astype(dtype)
+    parts = numbers, x, y, pixels.is_seen[:, order].astype(settings.dtype)
     return jnp.concatenate([jnp.pad(part, ((0, 0), (0, -part.shape[1] % lanes))) for part in parts], axis=1)
 
 
 class _LoadedSplat(NamedTuple):
-    """Splat prepared for the pixels of a tile."""
-
-    numbers: list[ir.Value]
-    """Numbers as in memory, without the cutoff."""
-    planes: list[ir.Value]
-    """`rasterize.pixel.Planes`, the same in every lane."""
-    spread: list[ir.Value]
-    """`numbers` in every lane."""
-    texture: NativeTexture | None
-    """Its texture, if the appearance has textures."""
-    spread_region: list[ir.Value]
-    """`TextureRegion` in every lane."""
-    limit: ir.Value
-    """Squared distance within which a pixel is composited, in every lane."""
-
-
-class _Rows(NamedTuple):
-    """Addresses to which the cotangents of a splat are added."""
-
-    splat: ir.Value
-    """Row of its numbers."""
-    probe: ir.Value
-    """Row of the statistic."""
-    texture: NativeTexture | None
-    """Cotangents of its texels, if the appearance has textures."""
-
-
-TileValues = list[ir.Value]
-"""Numbers of a tile (`rasterize.pixel.TileNumbers`)."""
+    numbers: list[ir.Value]  # numbers as in memory, without the cutoff
+    planes: list[ir.Value]  # `rasterize.pixel.Planes`, the same in every lane
+    spread: list[ir.Value]  # `numbers` in every lane
+    texture: NativeTexture | None  # its texture, if the appearance has textures
+    spread_region: list[ir.Value]  # `TextureRegion` in every lane
+    limit: ir.Value  # squared distance within which a pixel is composited, in every lane
 
 
 class _Vector(NamedTuple):
-    """Vector of a tile's pixels."""
-
-    k: ir.Value
-    """Its number in the tile."""
-    x: ir.Value
-    """Horizontal coordinates from the tile's centre."""
-    y: ir.Value
-    """Vertical coordinates."""
-    place: Place | None
-    """Positions in the splat's texture, if it has one."""
-    is_live: ir.Value
-    """Pixels that have not stopped."""
+    k: ir.Value  # its number in the tile
+    x: ir.Value  # horizontal coordinates from the tile's centre
+    y: ir.Value  # vertical coordinates
+    place: Place | None  # positions in the splat's texture, if it has one
+    is_live: ir.Value  # pixels that have not stopped
 
 
 class _Pass(TexelWriter):
-    """Base of both passes."""
+    """Base of both passes. Generators write a loop, or a branch, which the body of the caller's `for` fills."""
 
     def __init__(self, functions: PixelFunctions, module: ir.Module, name: str, buffers: Sequence[str]):
-        spec = functions.spec
-        super().__init__(module, name, buffers, INTEGERS, spec.dtype)
-        self.spec, self.functions, self.num_columns = spec, functions, spec.num_columns
-        self.empty = spec.static.functions.empty
-        self.lanes, self.scalars = Lanes(self.b, llvm_code.num_lanes(spec.dtype)), Lanes(self.b, 1)
-        self.num_vectors = -(-(spec.tile_size**2) // self.lanes.width)
-        self.reals = self.lanes.vector(self.real)
-        self.integers = self.lanes.vector(INT)
-        order = pixel_order(spec.tile_size, self.lanes.width)
-        y, x = np.stack(np.divmod(order, spec.tile_size)) - (spec.tile_size - 1) / 2
-        # Lanes past the last pixel lie outside every image.
+        settings = functions.settings
+        super().__init__(module, name, buffers, INTEGERS, settings.dtype)
+        self.settings, self.functions, self.num_columns = settings, functions, settings.num_columns
+        self.empty, self.tile_size = settings.static.functions.empty, settings.grid.tile_size
+        self.lanes, self.scalars = Lanes(self.b, llvm_code.num_lanes(settings.dtype)), Lanes(self.b, 1)
+        self.num_vectors = -(-settings.num_pixels // self.lanes.width)
+        self.reals, self.integers = self.lanes.vector(self.real), self.lanes.vector(INT)
+        order = pixel_order(self.tile_size, self.lanes.width)
+        y, x = np.stack(np.divmod(order, self.tile_size)) - (self.tile_size - 1) / 2
+        # Lanes past the last pixel are outside every image.
         past = np.full(-len(order) % self.lanes.width, 1e9)
         self.transmittance = self.variable(self.reals, self.num_vectors)
         self.live = self.variable(self.integers, self.num_vectors)
@@ -151,25 +119,23 @@ class _Pass(TexelWriter):
         table.type = ir.PointerType()
         return table
 
-    # Generators write a loop, or a branch, which the body of the caller's `for` fills.
-
-    def tiles(self) -> Iterator[tuple[ir.Value, TileValues]]:
-        """Write a loop over the tiles; yield each one's index and numbers. Then end the function."""
-        given = self.arguments
+    def tiles(self) -> Iterator[tuple[ir.Value, list[ir.Value]]]:
+        """Write a loop over the tiles; yield each one's index and `rasterize.pixel.TileNumbers`. Then end the
+        function."""
+        b, given, size = self.b, self.arguments, self.tile_size
         with self.loop(self.long(given["first"]), self.long(given["last"])) as (tile, _):
-            yield tile, self._tile_with_rays(tile) if self.spec.has_rays else self._tile_center(tile)
-        self.b.ret_void()
+            if self.settings.has_rays:
+                yield tile, self._tile_with_rays(tile)
+            else:
+                columns = self.long(given["columns"])
+                place = b.srem(tile, columns), b.sdiv(tile, columns)
+                scaled = (b.fmul(b.sitofp(at, self.real), self.real(size)) for at in place)
+                yield tile, [b.fadd(corner, self.real(size / 2)) for corner in scaled]
+        b.ret_void()
 
-    def _tile_center(self, tile: ir.Value) -> TileValues:
-        """Return the centre of a tile of a pinhole camera."""
-        b, size = self.b, self.spec.tile_size
-        columns = self.long(self.arguments["columns"])
-        place = b.srem(tile, columns), b.sdiv(tile, columns)
-        return [b.fadd(b.fmul(b.sitofp(at, self.real), self.real(size)), self.real(size / 2)) for at in place]
-
-    def _tile_with_rays(self, tile: ir.Value) -> TileValues:
+    def _tile_with_rays(self, tile: ir.Value) -> list[ir.Value]:
         """Take the pixels of a tile from the buffer (`packed_pixels`); return its numbers."""
-        width, num = self.lanes.width, self.spec.num_tile_numbers
+        width, num = self.lanes.width, self.functions.num_tile_numbers
         # Each part fills whole vectors, as `packed_pixels` has padded it.
         header, part = -(-num // width) * width, self.num_vectors * width
         base = self.at(self.arguments["pixels"], self.times(tile, header + 3 * part), self.real)
@@ -189,19 +155,18 @@ class _Pass(TexelWriter):
             b.position_at_end(going_on)
 
     def all_vectors(self) -> contextlib.AbstractContextManager[tuple[ir.Value, ir.Block]]:
-        """Write a loop over the vectors of a tile."""
         return self.loop(LONG(0), LONG(self.num_vectors))
 
     def pixel(self, k: ir.Value, channel: int) -> ir.Value:
         """Return the index of a tile's lane k among its numbers [channels, P]."""
-        return self.b.add(self.long(self.load(self.order, k, INT)), LONG(channel * self.spec.tile_size**2))
+        return self.b.add(self.long(self.load(self.order, k, INT)), LONG(channel * self.settings.num_pixels))
 
-    def begin_tile(self, tile: TileValues) -> None:
-        """Set the transmittance to 1, and the pixels live that lie inside the image and have a ray."""
+    def begin_tile(self, tile: list[ir.Value]) -> None:
+        """Set the transmittance to 1, and the pixels live that are inside the image and have a ray."""
         b, lanes = self.b, self.lanes
         with self.all_vectors() as (k, _):
             self.store(lanes.constant(1.0, self.real), self.transmittance, k)
-            if self.spec.has_rays:
+            if self.settings.has_rays:
                 seen = self.load(self.is_seen, k, self.reals)
                 is_live = b.fcmp_ordered(">", seen, lanes.constant(0.5, self.real))
             else:
@@ -213,9 +178,9 @@ class _Pass(TexelWriter):
                 is_live = b.and_(*inside)
             self.store(b.zext(is_live, self.integers), self.live, k)
 
-    def load_splat(self, id_: ir.Value, tile: TileValues) -> _LoadedSplat:
+    def load_splat(self, id_: ir.Value, tile: list[ir.Value]) -> _LoadedSplat:
         """Load a splat of the list and prepare it for a tile."""
-        num_floats, given = self.spec.num_floats, self.arguments
+        num_floats, given = self.settings.num_floats, self.arguments
         row = self.at(given["splats"], self.times(id_, num_floats), self.real)
         *numbers, cutoff = (self.load(row, k, self.real) for k in range(num_floats))
         planes = self.scalars.emit(self.functions.prepare, [*numbers[:9], *tile])
@@ -243,41 +208,41 @@ class _Pass(TexelWriter):
             b.store(b.or_(now, b.load(self.any_live, typ=self.integers)), self.any_live)
 
     def spread(self, numbers: Sequence[ir.Value]) -> list[ir.Value]:
-        """Copy numbers to every lane."""
         return [self.lanes.broadcast(number) for number in numbers]
+
+    def store_state(self, k: ir.Value, transmittance: ir.Value, is_live: ir.Value) -> None:
+        self.store(transmittance, self.transmittance, k)
+        self.store(self.b.zext(is_live, self.integers), self.live, k)
 
 
 class _Forward(_Pass):
     """Pass that computes channels and transmittance of the tiles."""
 
     def write(self) -> None:
-        """Write the function."""
-        channels = [self.variable(self.reals, self.num_vectors) for _ in range(self.spec.num_channels)]
-        for tile, tile_values in self.tiles():
-            self.begin_tile(tile_values)
+        channels = [self.variable(self.reals, self.num_vectors) for _ in range(self.settings.num_channels)]
+        for tile, tile_numbers in self.tiles():
+            self.begin_tile(tile_numbers)
             with self.all_vectors() as (k, _):
                 for channel in channels:
                     self.store(self.lanes.constant(0.0, self.real), channel, k)
             for id_, _ in self.splats(tile):
-                splat = self.load_splat(id_, tile_values)
+                splat = self.load_splat(id_, tile_numbers)
                 for vector in self.reached_vectors(splat):
                     self.composite(splat, vector, channels)
-            arrays, num_pixels = [*channels, self.transmittance], self.spec.tile_size**2
+            arrays, num_pixels = [*channels, self.transmittance], self.settings.num_pixels
             base = self.at(self.arguments["result"], self.times(tile, num_pixels * len(arrays)), self.real)
             for index, array in enumerate(arrays):
                 with self.loop(LONG(0), LONG(num_pixels)) as (k, _):
                     self.store(self.load(array, k, self.real), base, self.pixel(k, index))
 
     def composite(self, splat: _LoadedSplat, vector: _Vector, channels: Sequence[ir.Value]) -> None:
-        """Add a splat to a vector of pixels."""
         k, place = vector.k, vector.place
         values = self.sample(splat.texture, place, has_slopes=False) if splat.texture and place else []
         before = [self.load(channel, k, self.reals) for channel in channels]
         state = [self.load(self.transmittance, k, self.reals), vector.is_live, *before]
         at_pixel = [*splat.planes, *splat.spread, *values, vector.x, vector.y, *state]
         after, still_live, *totals = self.lanes.emit(self.functions.forward, at_pixel)
-        self.store(after, self.transmittance, k)
-        self.store(self.b.zext(still_live, self.integers), self.live, k)
+        self.store_state(k, after, still_live)
         for total, channel in zip(totals, channels, strict=True):
             self.store(total, channel, k)
 
@@ -286,38 +251,36 @@ class _Backward(_Pass):
     """Pass that computes cotangents of the splats and of the texels, and the statistic."""
 
     def write(self) -> None:
-        """Write the function."""
-        b, spec = self.b, self.spec
-        num_arrays = 1 + spec.num_channels
+        b, settings = self.b, self.settings
+        num_arrays = 1 + settings.num_channels
         self.suffix_sum, *self.g = (self.variable(self.reals, self.num_vectors) for _ in range(num_arrays))
         self.sums = self.variable(self.reals, self.num_sums)
         for k in range(self.num_sums):
             self.store(self.lanes.constant(0.0, self.real), self.sums, k)
         self.any_contributes = self.variable(BOOL)
-        for tile, tile_values in self.tiles():
-            self.begin_tile(tile_values)
+        for tile, tile_numbers in self.tiles():
+            self.begin_tile(tile_numbers)
             self.read_tile(tile, [self.suffix_sum], self.arguments["suffix_sum"])
             self.read_tile(tile, self.g, self.arguments["g"])
             for id_, position in self.splats(tile):
-                splat = self.load_splat(id_, tile_values)
+                splat = self.load_splat(id_, tile_numbers)
                 jacobian = [self.load(self.arguments["jacobian"], k, self.real) for k in range(9)]
-                same_everywhere = self.spread([*tile_values, *jacobian])
-                rows = self.rows_of(id_, position, splat.texture)
+                same_everywhere = self.spread([*tile_numbers, *jacobian])
+                *rows, d_texture = self.rows_of(id_, position, splat.texture)
                 b.store(BOOL(0), self.any_contributes)
                 # Planes, all numbers but the homography, three of the statistic and the number of pixels.
-                num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if spec.statistic else 0)
+                num_sums = self.functions.num_planes + (len(splat.numbers) - 9) + (4 if settings.statistic else 0)
                 totals = self.zeros(num_sums)
                 for vector in self.reached_vectors(splat):
-                    self.pull_back(splat, vector, same_everywhere, totals, rows.texture)
+                    self.pull_back(splat, vector, same_everywhere, totals, d_texture)
                 # Sums over lanes take as long as a vector of pixels: once per splat and tile, and only if needed.
                 with b.if_then(b.load(self.any_contributes, typ=BOOL)):
-                    self.add_totals(rows, splat.numbers, tile_values, totals)
-                    if rows.texture:
-                        self.finish_texels(rows.texture)
+                    self.add_totals(rows, splat.numbers, tile_numbers, totals)
+                    if d_texture:
+                        self.finish_texels(d_texture)
 
     def read_tile(self, tile: ir.Value, arrays: Sequence[ir.Value], source: ir.Value) -> None:
-        """Load the numbers of a tile from a buffer."""
-        num_pixels = self.spec.tile_size**2
+        num_pixels = self.settings.num_pixels
         base = self.at(source, self.times(tile, num_pixels * len(arrays)), self.real)
         for index, array in enumerate(arrays):
             # Lanes past the last pixel are never live, but are computed: they must not hold NaN from another tile.
@@ -330,23 +293,19 @@ class _Backward(_Pass):
         self, splat: _LoadedSplat, vector: _Vector, same_everywhere: Sequence[ir.Value], totals: Sequence[ir.Value],
         d_texture: NativeTexture | None,
     ) -> None:  # fmt: skip
-        """Add the cotangents of a splat at a vector of pixels to the totals and to its texels'."""
+        """Add the cotangents of a splat at a vector of pixels to the totals, and its texels' to theirs."""
         b, lanes, k, place = self.b, self.lanes, vector.k, vector.place
         sample = self.sample(splat.texture, place, has_slopes=True) if splat.texture and place else []
-        state = [
-            self.load(self.transmittance, k, self.reals),
-            vector.is_live,
-            self.load(self.suffix_sum, k, self.reals),
-        ]
-        cotangents = [self.load(channel, k, self.reals) for channel in self.g]
+        transmittance, suffix_sum, *cotangents = (
+            self.load(array, k, self.reals) for array in (self.transmittance, self.suffix_sum, *self.g)
+        )
         at_pixel = [*splat.planes, *splat.spread, *splat.spread_region, *sample, vector.x, vector.y]
-        at_pixel += [*state, *cotangents, *same_everywhere]
+        at_pixel += [transmittance, vector.is_live, suffix_sum, *cotangents, *same_everywhere]
         after, still_live, left, contributes, *rest = lanes.emit(self.functions.backward, at_pixel)
-        self.store(after, self.transmittance, k)
-        self.store(b.zext(still_live, self.integers), self.live, k)
+        self.store_state(k, after, still_live)
         self.store(left, self.suffix_sum, k)
         d_values, sums = rest[: self.num_columns], rest[self.num_columns :]
-        if self.spec.statistic:
+        if self.settings.statistic:
             sums.append(lanes.constant(1.0, self.real))
         # Selected, not multiplied: the cotangents of a pixel that shows nothing may not be finite.
         chosen = functools.partial(b.select, contributes, rhs=lanes.constant(0.0, self.real))
@@ -357,8 +316,11 @@ class _Backward(_Pass):
             if d_texture and place:
                 self.add_to_texels(d_texture, place, [chosen(value) for value in d_values])
 
-    def rows_of(self, id_: ir.Value, position: ir.Value, texture: NativeTexture | None) -> _Rows:
-        """Return the addresses to which the cotangents of one pair are added."""
+    def rows_of(
+        self, id_: ir.Value, position: ir.Value, texture: NativeTexture | None
+    ) -> tuple[ir.Value, ir.Value, NativeTexture | None]:
+        """Return the addresses to which a pair adds the cotangents of its splat's numbers, the statistic, and the
+        cotangents of its texels, if the appearance has textures."""
         b, arguments = self.b, self.arguments
         place = self.long(self.load(arguments["places"], position, INT))
         is_own = b.icmp_signed("<", place, LONG(0))
@@ -373,38 +335,34 @@ class _Backward(_Pass):
             more_first = self.long(self.load(arguments["more_first"], b.select(is_own, LONG(0), place), INT))
             texture = self.texture(texels, b.select(is_own, own_first, more_first), texture.height, texture.width)
         at_row = functools.partial(self.at, type_=self.real)
-        return _Rows(at_row(splats, self.times(row, self.spec.num_floats)), at_row(probe, self.times(row, 4)), texture)
+        floats = self.settings.num_floats
+        return at_row(splats, self.times(row, floats)), at_row(probe, self.times(row, 4)), texture
 
     def add_totals(
-        self, rows: _Rows, numbers: Sequence[ir.Value], tile: TileValues, totals: Sequence[ir.Value]
+        self, rows: Sequence[ir.Value], numbers: Sequence[ir.Value], tile: list[ir.Value], totals: Sequence[ir.Value]
     ) -> None:
         """Sum over lanes, carry the planes' cotangents to the homography, and add all to the splat's rows."""
-        spec, functions = self.spec, self.functions
+        functions = self.functions
         sums = [self.lanes.sum(self.b.load(total, typ=self.reals)) for total in totals]
         d_planes, others = sums[: functions.num_planes], sums[functions.num_planes :]
         # All pixels of a tile share the planes: their cotangents are summed first, and pulled back to M once.
         d_M = self.scalars.emit(functions.prepare_vjp, [*numbers[:9], *tile, *d_planes])
         num_others = len(numbers) - 9
-        addends = [(rows.splat, [*d_M, *others[:num_others]])]
-        if spec.statistic:
-            addends.append((rows.probe, others[num_others:]))
-        for row, values in addends:
+        # The statistic, if any, is behind the numbers of the splat.
+        for row, values in zip(rows, ([*d_M, *others[:num_others]], others[num_others:]), strict=True):
             for k, value in enumerate(values):
                 self.store(self.b.fadd(self.load(row, k, self.real), value), row, k)
 
 
 class Passes(NamedTuple):
-    """Compiled forward and backward pass."""
-
     forward: CompiledFunction
     backward: CompiledFunction
 
 
 @functools.cache
-def compiled_passes(spec: KernelSpec) -> Passes:
-    """Return the passes of a spec, compiled at the first call."""
-    functions = PixelFunctions(spec)
-    module = ir.Module("passes")
+def compiled_passes(kernel: PassSettings) -> Passes:
+    """Return the passes of a kernel, compiled at the first call."""
+    functions, module = PixelFunctions(kernel), ir.Module("passes")
     forward, backward = (llvm_code.unique(name) for name in ("forward", "backward"))
     _Forward(functions, module, forward, FORWARD).write()
     _Backward(functions, module, backward, BACKWARD).write()

@@ -13,8 +13,8 @@ d_product three of these; share [1] the weight of each score; rows: workspace fo
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -41,79 +41,52 @@ def least_width(dtype: DTypeLike, num_taps: int) -> int:
     return llvm_code.num_lanes(dtype) + num_taps - 1
 
 
-def mean_score(score: Score, x: Array, y: Array) -> Array:
-    """Return the average over all windows of images [C, H, W], float32 or float64, at least `least_width` wide."""
-    return _score(score, x, y)[0]
-
-
 def value_and_slopes(score: Score, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return the average, and its derivatives by x and y."""
-    value, (d_x_mean, d_y_mean, *d_products) = _score(score, x, y)
-    share = jnp.full(1, 1 / _num_windows(score, x), x.dtype)
-    name = _registered(score, str(x.dtype), "pull_back", _pull_back_handler)
-    # x² + y² and x·y are symmetric: the derivative by y is the one by x with the images and their means exchanged.
-    inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
-    d_x, d_y = (ffi.call(name, [(x.shape, x.dtype)], *given)[0] for given in inputs)
-    return value, d_x, d_y
-
-
-def _score(score: Score, x: Array, y: Array) -> tuple[Array, Array]:
-    """Return the average, and its derivatives by the means, `d_means`."""
+    """Return the average over all windows of images [C, H, W], float32 or float64, at least `least_width` wide; and its
+    derivatives by x and y."""
     count, height, width = x.shape
     margin = len(score.taps) - 1
     down, across = height - margin, width - margin
     shapes = (count * down,), (4, count, down + 2 * margin, across)
-    name = _registered(score, str(x.dtype), "score", _score_handler)
-    sums, d_means = ffi.call(name, [(shape, x.dtype) for shape in shapes], x, y)
-    return jnp.sum(sums) / _num_windows(score, x), d_means
+    name = _registered(score, str(x.dtype), "score")
+    sums, (d_x_mean, d_y_mean, *d_products) = ffi.call(name, [(shape, x.dtype) for shape in shapes], x, y)
+    num_windows = count * down * across
+    share = jnp.full(1, 1 / num_windows, x.dtype)
+    name = _registered(score, str(x.dtype), "pull_back")
+    # x² + y² and x·y are symmetric: the derivative by y is the one by x with the images and their means exchanged.
+    inputs = (x, y, d_x_mean, *d_products, share), (y, x, d_y_mean, *d_products, share)
+    d_x, d_y = (ffi.call(name, [(x.shape, x.dtype)], *given)[0] for given in inputs)
+    return jnp.sum(sums) / num_windows, d_x, d_y
 
 
-def _num_windows(score: Score, x: Array) -> int:
-    count, height, width = x.shape
-    margin = len(score.taps) - 1
-    return count * (height - margin) * (width - margin)
-
-
-def _registered(score: Score, dtype: str, which: Literal["score", "pull_back"], handler: Callable[..., None]) -> str:
-    """Return the name under which XLA knows a function of a score."""
+def _registered(score: Score, dtype: str, which: Literal["score", "pull_back"]) -> str:
     function = getattr(score.function, "__qualname__", type(score.function).__name__)
+    margin = len(score.taps) - 1
 
     def make_handler() -> ffi.Handler:
-        return functools.partial(handler, getattr(_window_functions(score, dtype), which), len(score.taps) - 1)
+        run = _compiled(score, dtype)[which]
+
+        def handler(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+            count, height, width = arguments[0].shape
+            if which == "score":
+                num_rows = len(results[0])
+                # `pull_back` reads T rows of windows for each row of pixels, also at the edges.
+                results[1][:, :, :margin], results[1][:, :, -margin:] = 0, 0
+            else:
+                num_rows = count * height
+
+            def part(first: int, last: int, _: int) -> None:
+                # Four means of a row; or three rows of windows, between margins that stay zero.
+                rows = np.zeros(4 * width if which == "score" else 3 * (width + margin), dtype)
+                pointers = (array.ctypes.data for array in (*arguments, *results, rows))
+                run(*pointers, first, last, count, height, width)
+
+            least_rows = max(1, num_rows * LEAST_PIXELS // arguments[0].size)
+            ffi.run_spans(part, ffi.even_spans(num_rows, least_rows))
+
+        return handler
 
     return ffi.registered(f"{which} {dtype} {function} {score.taps}", (which, dtype, score), make_handler)
-
-
-def _score_handler(run: CompiledFunction, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
-    sums, d_means = results
-    count, height, width = arguments[0].shape
-    # `pull_back` reads T rows of windows for each row of pixels, also at the edges.
-    d_means[:, :, :margin], d_means[:, :, -margin:] = 0, 0
-
-    def part(first: int, last: int, _: int) -> None:
-        rows = np.empty(4 * width, sums.dtype)
-        run(*(array.ctypes.data for array in (*arguments, *results, rows)), first, last, count, height, width)
-
-    _in_spans(part, len(sums), arguments[0].size)
-
-
-def _pull_back_handler(
-    run: CompiledFunction, margin: int, arguments: list[np.ndarray], results: list[np.ndarray]
-) -> None:
-    (d_x,) = results
-    count, height, width = d_x.shape
-
-    def part(first: int, last: int, _: int) -> None:
-        # A row of windows lies between margins, which stay zero.
-        rows = np.zeros(3 * (width + margin), d_x.dtype)
-        run(*(array.ctypes.data for array in (*arguments, d_x, rows)), first, last, count, height, width)
-
-    _in_spans(part, count * height, d_x.size)
-
-
-def _in_spans(part: Callable[[int, int, int], None], num_rows: int, num_pixels: int) -> None:
-    """Call part(first, last, _) for all rows, on as many threads as the pixels are worth."""
-    ffi.run_spans(part, ffi.even_spans(num_rows, max(1, num_rows * LEAST_PIXELS // num_pixels)))
 
 
 class _ImageRows(Writer):
@@ -128,7 +101,6 @@ class _ImageRows(Writer):
         self.down, self.across = (self.b.sub(size, LONG(self.margin)) for size in (self.height, self.width))
 
     def loop_over_rows(self) -> contextlib.AbstractContextManager[tuple[ir.Value, ir.Block]]:
-        """Write a loop over the rows first..last − 1."""
         return self.loop(self.long(self.arguments["first"]), self.long(self.arguments["last"]))
 
     @contextlib.contextmanager
@@ -146,27 +118,23 @@ class _ImageRows(Writer):
             yield start, b.sub(place, start)
 
     def row(self, name: str, index: ir.Value, length: ir.Value) -> ir.Value:
-        """Return the address of a row of an array."""
         return self.at(self.arguments[name], self.b.mul(index, length), self.real)
 
-    def vector(self, base: ir.Value, index: ir.Value) -> ir.Value:
-        """Load L numbers of an array, from an index on."""
-        return self.load(self.at(base, index, self.real), 0, self.reals)
-
     def weighed(self, numbers: Sequence[ir.Value], taps: Sequence[float]) -> ir.Value:
-        """Return Σ taps·numbers."""
         weights = [self.lanes.constant(tap, self.real) for tap in taps]
         return functools.reduce(self.sum, map(self.product, numbers, weights))
 
-    def along(self, base: ir.Value, start: ir.Value, stride: ir.Value) -> list[ir.Value]:
-        """Load the numbers under a window's taps, from `start` on."""
-        places = [self.b.add(start, self.times(stride, i)) for i in range(self.margin + 1)]
-        return [self.vector(base, place) for place in places]
+    def along(self, base: ir.Value, start: ir.Value, stride: ir.Value, num: int | None = None) -> list[ir.Value]:
+        """Load the vectors of numbers under a window's taps, or under `num` of them, from `start` on."""
+        num = self.margin + 1 if num is None else num
+        places = [self.b.add(start, self.times(stride, i)) for i in range(num)]
+        return [self.load(self.at(base, place, self.real), 0, self.reals) for place in places]
+
+    def put(self, vector: ir.Value, base: ir.Value, start: ir.Value) -> None:
+        self.store(vector, self.at(base, start, self.real), 0)
 
 
 class _ScoreRows(_ImageRows):
-    """Writer of `score`."""
-
     def write(self, dtype: str) -> None:
         b = self.b
         with_slopes, _ = trace(jax.value_and_grad(self.score.function, argnums=(0, 1, 2, 3)), *[example(dtype)] * 4)
@@ -185,10 +153,9 @@ class _ScoreRows(_ImageRows):
                 is_new = b.icmp_signed(">=", lane, self.lanes.broadcast(b.trunc(num_done, INT)))
                 b.store(self.sum(b.load(total, typ=self.reals), b.select(is_new, value, zero)), total)
                 for k, slope in enumerate(slopes):
-                    row = b.add(
-                        b.mul(b.add(self.times(self.channels, k), channel), padded), b.add(y, LONG(self.margin))
-                    )
-                    self.store(slope, self.at(self.row("d_means", row, self.across), start, self.real), 0)
+                    row = b.mul(b.add(self.times(self.channels, k), channel), padded)
+                    row = b.add(row, b.add(y, LONG(self.margin)))
+                    self.put(slope, self.row("d_means", row, self.across), start)
             self.store(self.lanes.sum(b.load(total, typ=self.reals)), self.arguments["sums"], index)
         b.ret_void()
 
@@ -199,50 +166,37 @@ class _ScoreRows(_ImageRows):
             squares = [self.sum(self.product(p, p), self.product(q, q)) for p, q in zip(xs, ys, strict=True)]
             products = list(map(self.product, xs, ys))
             for mean, numbers in zip(means, (xs, ys, squares, products), strict=True):
-                self.store(self.weighed(numbers, self.score.taps), self.at(mean, start, self.real), 0)
+                self.put(self.weighed(numbers, self.score.taps), mean, start)
 
 
 class _PullBackRows(_ImageRows):
-    """Writer of `pull_back`."""
-
     def write(self) -> None:
         b, taps = self.b, self.score.taps[::-1]
         length = b.add(self.width, LONG(self.margin))
         rows = [self.row("rows", LONG(k), length) for k in range(3)]
-        two, share = (
-            self.lanes.broadcast(number)
-            for number in (self.real(2.0), self.load(self.arguments["share"], 0, self.real))
-        )
+        two, share = map(self.lanes.broadcast, (self.real(2.0), self.load(self.arguments["share"], 0, self.real)))
         with self.loop_over_rows() as (index, _):
             channel, y = b.sdiv(index, self.height), b.srem(index, self.height)
             first = b.add(b.mul(channel, b.add(self.height, LONG(self.margin))), y)
             with self.vectors(self.across) as (start, _):
                 for name, row in zip(PULL_BACK[2:5], rows, strict=True):
                     column = self.along(self.row(name, first, self.across), start, self.across)
-                    self.store(self.weighed(column, taps), self.at(row, b.add(start, LONG(self.margin)), self.real), 0)
+                    self.put(self.weighed(column, taps), row, b.add(start, LONG(self.margin)))
             with self.vectors(self.width) as (start, _):
                 d_mean, d_squares, d_product = (self.weighed(self.along(row, start, LONG(1)), taps) for row in rows)
-                x, y = (self.vector(self.row(name, index, self.width), start) for name in "xy")
+                x, y = (self.along(self.row(name, index, self.width), start, LONG(1), num=1)[0] for name in "xy")
                 # d(x² + y²)/dx = 2x and d(x·y)/dx = y.
                 by_x = self.sum(self.product(self.product(two, x), d_squares), self.product(y, d_product))
-                d_x = self.product(share, self.sum(d_mean, by_x))
-                self.store(d_x, self.at(self.row("d_x", index, self.width), start, self.real), 0)
+                self.put(self.product(share, self.sum(d_mean, by_x)), self.row("d_x", index, self.width), start)
         b.ret_void()
 
 
-class _WindowFunctions(NamedTuple):
-    """Compiled functions `score` and `pull_back`."""
-
-    score: CompiledFunction
-    pull_back: CompiledFunction
-
-
 @functools.cache
-def _window_functions(score: Score, dtype: str) -> _WindowFunctions:
-    """Return the functions of a score, compiled at the first call."""
+def _compiled(score: Score, dtype: str) -> dict[str, CompiledFunction]:
+    """Return the functions `score` and `pull_back`, compiled at the first call."""
     module = ir.Module("windows")
     forward, backward = (llvm_code.unique(name) for name in ("score", "pull_back"))
     _ScoreRows(module, forward, SCORE, score, dtype).write(dtype)
     _PullBackRows(module, backward, PULL_BACK, score, dtype).write()
     signatures = {forward: (len(SCORE), len(INTEGERS)), backward: (len(PULL_BACK), len(INTEGERS))}
-    return _WindowFunctions(*llvm_code.compiled(module, signatures))
+    return dict(zip(("score", "pull_back"), llvm_code.compiled(module, signatures), strict=True))

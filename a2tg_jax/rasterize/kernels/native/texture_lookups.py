@@ -24,54 +24,43 @@ SMALL_HEIGHT = max(SMALL_WIDTHS)
 class NativeTexture(NamedTuple):
     """Place of a splat's texture among all texels, or of its cotangents among theirs."""
 
-    first: ir.Value
-    """Address of its first texel."""
-    height: ir.Value
-    """Height in texels, a 64-bit integer."""
-    width: ir.Value
-    """Width in texels, a 64-bit integer."""
+    first: ir.Value  # address of its first texel
+    height: ir.Value  # height in texels, a 64-bit integer
+    width: ir.Value  # width in texels, a 64-bit integer
 
 
 class Place(NamedTuple):
     """Positions of L lanes in a texture."""
 
-    x: ir.Value
-    """Horizontal coordinates in texels."""
-    y: ir.Value
-    """Vertical coordinates in texels."""
-    is_reached: ir.Value
-    """Mask of the lanes whose pixel the splat may reach; at least one is set."""
+    x: ir.Value  # horizontal coordinates in texels
+    y: ir.Value  # vertical coordinates in texels
+    is_reached: ir.Value  # mask of the lanes whose pixel the splat may reach; at least one is set
 
 
 class Line(NamedTuple):
-    """Row or column of texels."""
-
-    index: ir.Value
-    """Number of the row or column."""
-    weight: ir.Value
-    """Weight max(0, 1 − |distance|) in each lane."""
-    slope: ir.Value | None
-    """Derivative of the weight within the cell; None if it is zero or not requested."""
+    index: ir.Value  # number of the row or column
+    weight: ir.Value  # weight max(0, 1 − |distance|) in each lane
+    slope: ir.Value | None  # derivative of the weight within the cell; None if it is zero or not requested
 
 
 class TexelWriter(Writer):
     """Writer of a function that reads textures in texels [T, C], or adds to their cotangents."""
 
-    lanes: Lanes
-    """Operations on vectors of L pixels."""
-    reals: ir.Type
-    """Type of a vector of L floats."""
-    num_columns: int
-    """Number C of numbers per texel."""
-    empty: Sequence[float]
-    """C values of a splat without a texture; empty if all splats have one."""
-    sums: ir.Value
-    """Cotangents of a small texture's texels in each lane, `num_sums` vectors; zero before a splat."""
+    lanes: Lanes  # operations on vectors of L pixels
+    reals: ir.Type  # type of a vector of L floats
+    num_columns: int  # number C of numbers per texel
+    empty: Sequence[float]  # C values of a splat without a texture; empty if all splats have one
+    sums: ir.Value  # cotangents of a small texture's texels in each lane, `num_sums` vectors; zero before a splat
 
     @property
     def num_sums(self) -> int:
         """Number of vectors in `sums`: C for every texel of the largest small texture."""
         return SMALL_HEIGHT * max(SMALL_WIDTHS) * self.num_columns
+
+    @property
+    def small_widths(self) -> tuple[int, ...]:
+        """Widths of small textures, with `EMPTY` if there may be textures without texels."""
+        return (EMPTY, *SMALL_WIDTHS) if self.empty else SMALL_WIDTHS
 
     def texture(self, texels: ir.Value, first: ir.Value, height: ir.Value, width: ir.Value) -> NativeTexture:
         """Return the texture that begins with texel `first`."""
@@ -139,11 +128,6 @@ class TexelWriter(Writer):
         is_low = b.icmp_signed("<=", texture.height, LONG(SMALL_HEIGHT))
         return b.select(b.and_(is_low, functools.reduce(b.or_, is_width)), texture.width, LONG(-1))
 
-    @property
-    def small_widths(self) -> tuple[int, ...]:
-        """Widths of small textures, with `EMPTY` if there may be textures without texels."""
-        return (EMPTY, *SMALL_WIDTHS) if self.empty else SMALL_WIDTHS
-
     def cases(self, texture: NativeTexture) -> Iterator[int | None]:
         """Write branches, which the caller fills: one per width of a small texture, and one (None) for large ones."""
         b = self.b
@@ -182,12 +166,8 @@ class TexelWriter(Writer):
     def seen(
         self, places: ir.Value, is_reached: ir.Value, size: ir.Value
     ) -> tuple[tuple[ir.Value, ir.Value], ir.Value]:
-        """Find the texels along an axis that the reached lanes see.
-
-        Returns:
-          The first texel and the end, which is excluded; and the places, those of other lanes moved between the
-          reached ones.
-        """
+        """Return the first texel along an axis that the reached lanes see, and the end, which is excluded; and all
+        lanes' places, moved between the reached ones."""
         b, number = self.b, functools.partial(self.lanes.constant, scalar=self.real)
         # An axis without texels has an empty range, not one that begins before the first texel.
         last = b.select(b.icmp_signed(">", size, LONG(0)), b.sub(size, LONG(1)), LONG(0))
@@ -201,10 +181,8 @@ class TexelWriter(Writer):
         end = b.add(b.fptosi(largest, LONG), LONG(2))
         end = b.select(b.icmp_signed("<", end, size), end, size)
         # Other lanes are composited too. They show nothing, as the cutoff says, if their values are averages of texels.
-        moved = self.lanes.smaller(
-            self.lanes.larger(places, self.lanes.broadcast(least)), self.lanes.broadcast(largest)
-        )
-        return (b.fptosi(least, LONG), end), moved
+        places = self.lanes.larger(places, self.lanes.broadcast(least))
+        return (b.fptosi(least, LONG), end), self.lanes.smaller(places, self.lanes.broadcast(largest))
 
     def line(self, index: ir.Value, places: ir.Value, size: ir.Value, has_slope: bool) -> Line:
         """Return one of `size` rows or columns, seen from `places`."""
@@ -222,7 +200,6 @@ class TexelWriter(Writer):
         return Line(index, weight, b.select(b.and_(*is_in_cell), slope, number(0.0)))
 
     def texel(self, texture: NativeTexture, column: Line, row: Line) -> ir.Value:
-        """Return the address of a texel."""
         return self.entry(texture, self.b.add(self.b.mul(row.index, texture.width), column.index))
 
     def entry(self, texture: NativeTexture, index: ir.Value) -> ir.Value:
@@ -258,11 +235,10 @@ class TexelWriter(Writer):
         return rooms
 
     def loads(self, rooms: Sequence[ir.Value]) -> list[ir.Value]:
-        """Load variables of one vector each."""
         return [self.b.load(room, typ=self.reals) for room in rooms]
 
     def transpose_quarters(self, vectors: Sequence[ir.Value]) -> list[ir.Value]:
-        """Transpose every four lanes of four vectors as a 4×4 matrix."""
+        """Transpose every four lanes of four vectors as a 4×4 matrix: in pairs, then in pairs of pairs."""
         low01, low23 = (self.shuffle(vectors[k], vectors[k + 1], (0, "0", 1, "1")) for k in (0, 2))
         high01, high23 = (self.shuffle(vectors[k], vectors[k + 1], (2, "2", 3, "3")) for k in (0, 2))
         first, second = (0, 1, "0", "1"), (2, 3, "2", "3")
@@ -272,9 +248,6 @@ class TexelWriter(Writer):
     def shuffle(self, x: ir.Value, y: ir.Value, pattern: Sequence[int | str]) -> ir.Value:
         """Apply a pattern to every four lanes; numbers are lanes of x, strings are lanes of y."""
         width = self.lanes.width
-        mask = [
-            quarter + (width + int(lane) if isinstance(lane, str) else lane)
-            for quarter in range(0, width, 4)
-            for lane in pattern
-        ]
+        lanes = [width + int(lane) if isinstance(lane, str) else lane for lane in pattern]
+        mask = [quarter + lane for quarter in range(0, width, 4) for lane in lanes]
         return self.b.shuffle_vector(x, y, ir.Constant(ir.VectorType(INT, width), mask))
