@@ -102,7 +102,7 @@ class Renderer:
           model: a model, or Gaussians of which all rows exist.
           appearance: appearance of Gaussians; None is plain 2DGS. A model has its own.
           cameras: one or more for which the first capacities are planned; others may follow.
-          capacities: initial capacities, such as those of the renderer of a similar model.
+          capacities: initial capacities, such as `capacities` of the renderer of a similar model.
           background: [3] colour; None is the model's own, or black.
           settings: static options; the renderer finds the capacity.
           has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.

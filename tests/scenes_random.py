@@ -95,7 +95,7 @@ def needle(rng: np.random.Generator) -> Splat:
 
 
 def opaque(rng: np.random.Generator) -> Splat:
-    """A large splat that almost hides what lies behind it: a few of them end a pixel."""
+    """A large splat that almost hides what is behind it: a few of them end a pixel."""
     mean, quat, log_scales, _ = ordinary(rng)
     return mean, quat, log_scales + 1, rng.uniform(4, 8)
 
@@ -264,6 +264,12 @@ def as_settings(rules: Rules = DEFAULT_RULES, **changes: Any) -> RenderSettings:
     options = {name: getattr(rules, name) for name in ("uv", "outside", "rgb", "alpha", "max_alpha")}
     texture = dataclasses.replace(plain.texture, **options)
     return dataclasses.replace(plain, near_plane=rules.near, sh_degree=rules.sh_degree, texture=texture, **changes)
+
+
+def assert_all_close(found: Any, wanted: Any, rtol: float, atol: float) -> None:
+    """Leaves agree; `atol` is in units of the largest entry of each."""
+    for one, other in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
+        np.testing.assert_allclose(other, one, rtol=rtol, atol=atol * float(abs(np.asarray(one)).max(initial=0)))
 
 
 @functools.cache

@@ -140,12 +140,12 @@ def test_poses_of_another_convention_are_named(given, advice, has_points):
 
 
 def test_cameras_that_look_outwards_are_fine(given):
-    """On a circle, as those of a room; without points."""
+    """On a circle, as in a room; without points."""
     outwards = [a2tg.look_at([x, y, 0], [2 * x, 2 * y, 0], width=40, height=30).viewmat
                 for x, y in zip(np.cos(range(6)), np.sin(range(6)), strict=True)]  # fmt: skip
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as warned:
         a2tg.scene_from_arrays(given["images"], outwards, given["Ks"])
-    assert len(told) == 1 and "has no sparse points" in str(told[0].message)
+    assert len(warned) == 1 and "has no sparse points" in str(warned[0].message)
 
 
 @pytest.mark.parametrize(

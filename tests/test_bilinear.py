@@ -13,7 +13,7 @@ FIRST = 7
 
 
 def sample(texels: np.ndarray, x, y):
-    """The sample of one channel of an image [h, w] that lies in a table of others."""
+    """The sample of one channel of an image [h, w] within a table of others."""
     height, width = texels.shape
     table = jnp.concatenate([jnp.full(FIRST, 1e6), jnp.asarray(texels).reshape(-1), jnp.full(50, 1e6)])
     found = corners_of(

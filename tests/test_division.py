@@ -50,13 +50,13 @@ def together(monkeypatch):
     monkeypatch.setattr(load, "among_processes", lambda: own.division)
 
     def call(*functions, seconds=60):
-        barrier, told, found = threading.Barrier(len(functions), timeout=seconds), {}, {}
+        barrier, gathered, found = threading.Barrier(len(functions), timeout=seconds), {}, {}
 
         def run(index, function):
             def gather(data):
-                told[index] = data
+                gathered[index] = data
                 barrier.wait()
-                parts = [told[number] for number in range(len(functions))]
+                parts = [gathered[number] for number in range(len(functions))]
                 barrier.wait()
                 return parts
 
@@ -154,8 +154,8 @@ def test_every_process_is_told_of_a_photograph_that_one_cannot_read(tmp_path, to
     folders = copies(write_scene(tmp_path / "scene"), 2)
     broken = share(folders[index], index)[1]
     broken.write_bytes(broken.read_bytes()[:-60])
-    told = error_of_all(together(*loading(folders, room=0), seconds=20))
-    assert told.startswith(f"{broken}: cannot be read as an image")
+    message = error_of_all(together(*loading(folders, room=0), seconds=20))
+    assert message.startswith(f"{broken}: cannot be read as an image")
 
 
 @pytest.mark.parametrize("room", [0, None])
@@ -163,8 +163,8 @@ def test_a_photograph_of_another_size_than_elsewhere_is_told_to_all(tmp_path, to
     """The size is compared after the common reading. The other process waits at the end."""
     folders = copies(write_scene(tmp_path / "scene", alpha=True), 2)
     Image.fromarray(np.zeros((64, 80, 4), np.uint8)).save(share(folders[1], 0)[0])
-    told = error_of_all(together(*loading(folders, room=room), seconds=20))
-    assert "is 80x64, but 40x32 where another process reads it" in told
+    message = error_of_all(together(*loading(folders, room=room), seconds=20))
+    assert "is 80x64, but 40x32 where another process reads it" in message
 
 
 @pytest.mark.parametrize("index", [0, 1])
@@ -172,11 +172,11 @@ def test_a_file_missing_in_one_copy_is_told_to_all(tmp_path, together, index):
     folders = copies(write_scene(tmp_path / "scene"), 2)
     missing = share(folders[index], 0)[1]
     missing.unlink()
-    told = error_of_all(together(*loading(folders), seconds=20), FileNotFoundError)
-    assert told.startswith(f"{missing}: no such image")
+    message = error_of_all(together(*loading(folders), seconds=20), FileNotFoundError)
+    assert message.startswith(f"{missing}: no such image")
     (folders[index] / "transforms.json").unlink()
-    told = error_of_all(together(*loading(folders), seconds=20), FileNotFoundError)
-    assert told.startswith(f"{folders[index]}: has no sparse model")
+    message = error_of_all(together(*loading(folders), seconds=20), FileNotFoundError)
+    assert message.startswith(f"{folders[index]}: has no sparse model")
 
 
 def divided(folder, together, decoded, num, **options):
@@ -229,15 +229,15 @@ def test_processes_must_have_the_same_photographs(tmp_path, together):
     (folders[1] / "images_2").mkdir()
     for name in (folders[1] / "images").iterdir():
         Image.open(name).resize((20, 16)).save(folders[1] / "images_2" / name.name)
-    told = error_of_all(together(*loading(folders, downscale=2), seconds=20))
+    message = error_of_all(together(*loading(folders, downscale=2), seconds=20))
     first = share(folders[1], 0)[0].relative_to(folders[1])
     names = rf"{first} downscaled by 1, not {first} downscaled by 2; give all processes .* such as images_2"
-    assert re.fullmatch(f"process 1 has other photographs than process 0: {names}", told)
+    assert re.fullmatch(f"process 1 has other photographs than process 0: {names}", message)
     meta = json.loads((folders[2] / "transforms.json").read_text())
     last = meta["frames"].pop()["file_path"]
     (folders[2] / "transforms.json").write_text(json.dumps(meta))
-    told = error_of_all(together(*loading(folders), seconds=20))
-    assert told.startswith(f"process 2 has other photographs than process 0: none, not {last} downscaled by 1; ")
+    message = error_of_all(together(*loading(folders), seconds=20))
+    assert message.startswith(f"process 2 has other photographs than process 0: none, not {last} downscaled by 1; ")
 
 
 def test_processes_must_have_the_same_options(tmp_path, together):
@@ -246,8 +246,8 @@ def test_processes_must_have_the_same_options(tmp_path, together):
     for option, values in options.items():
         calls = [functools.partial(load_scene, folder, is_divided=True, **{option: value}) for value in values]
         difference = f"{option}={values[1]}, not {option}={values[0]}; "
-        told = error_of_all(together(*calls, seconds=20))
-        assert told.startswith(f"process 1 has other options of the scene than process 0: {difference}")
+        message = error_of_all(together(*calls, seconds=20))
+        assert message.startswith(f"process 1 has other options of the scene than process 0: {difference}")
 
 
 def test_processes_of_a_run_must_have_the_same_options(tmp_path, together):
@@ -258,8 +258,8 @@ def test_processes_of_a_run_must_have_the_same_options(tmp_path, together):
         (folder, {"alpha": "mask"}, "alpha=mask, not alpha=transparency"),
     ):
         sources = SceneSource(folder), SceneSource(path, **changes)
-        told = error_of_all(together(*(functools.partial(one.load, is_divided=True) for one in sources), seconds=20))
-        assert told.startswith(f"process 1 has other options of the scene than process 0: {difference}; ")
+        message = error_of_all(together(*(functools.partial(one.load, is_divided=True) for one in sources), seconds=20))
+        assert message.startswith(f"process 1 has other options of the scene than process 0: {difference}; ")
 
 
 def test_processes_at_different_steps_end(together):
@@ -267,8 +267,8 @@ def test_processes_at_different_steps_end(together):
         with sharing_errors(load.among_processes()):
             load.among_processes().exchange(step)
 
-    told = error_of_all(together(*(functools.partial(at, step) for step in ("masks", "photographs")), seconds=20))
-    assert told.startswith("process 1 has other steps of loading than process 0: photographs, not masks; ")
+    message = error_of_all(together(*(functools.partial(at, step) for step in ("masks", "photographs")), seconds=20))
+    assert message.startswith("process 1 has other steps of loading than process 0: photographs, not masks; ")
 
 
 def test_an_error_of_the_connection_is_not_told(together):

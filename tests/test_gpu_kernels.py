@@ -10,7 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from scenes_random import as_camera, as_gaussians, as_settings, as_textures, draw_scene, quick_then_long
+from scenes_random import (
+    as_camera,
+    as_gaussians,
+    as_settings,
+    as_textures,
+    assert_all_close,
+    draw_scene,
+    quick_then_long,
+)
 
 from a2tg_jax import RenderSettings, render_image
 from a2tg_jax.appearance import Appearance, StaticShading, Texture
@@ -88,11 +96,6 @@ def test_xla_takes_them():
         assert f"name = {name}" in call and "block_x = 256" in call and "grid_x = 6 " in call
 
 
-def assert_all_close(found, wanted, rtol, atol):
-    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
-        np.testing.assert_allclose(b, a, rtol=rtol, atol=atol * max(1.0, float(jnp.abs(a).max(initial=0))))
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("gpu_kernels", "x64")
 @pytest.mark.parametrize(("num", "tile_size", "size"), [(300, 16, (33, 18)), (1, 5, (7, 9)), (90, 24, (24, 30))])
@@ -134,8 +137,7 @@ def test_gpu_kernels_are_those_of_xla(has_textures, statistic):
     inputs = gaussians, floats, jnp.zeros((gaussians.num, 4))
     wanted, found = (differentiate(*inputs, name) for name in ("xla", "cuda"))
     assert wanted[0][1].alpha.max() > 0.5 and wanted[1][2][:, 3].max() > 10
-    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
-        np.testing.assert_allclose(b, a, rtol=1e-4, atol=2e-5 * float(jnp.abs(a).max()))
+    assert_all_close(found, wanted, 1e-4, 2e-5)
 
 
 def test_every_primitive_of_native_loops_is_printed():

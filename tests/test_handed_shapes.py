@@ -46,7 +46,7 @@ def scene():
 
 
 def first_model(file, scene, system, tmp_path) -> Model:
-    """The model that the splats of a file give in place of the first stage."""
+    """The model that the splats of a file give instead of the first stage."""
     record = RunRecord(SceneSource("synthetic"), system.name, system, init=str(file))
     run, planned = create_run(tmp_path / "run"), record.plan.stages[0]
     write_first_stage(run, record, load_splats(file), scene)

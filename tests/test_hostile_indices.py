@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, quick_then_long
+from scenes_random import as_camera, as_gaussians, as_textures, assert_all_close, draw_scene, quick_then_long
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Appearance, Billboards, Texture
@@ -165,8 +165,7 @@ def test_regions_and_lists_of_any_integers(compositor):
     """Good ones lead to what XLA finds, and nearly so do stray regions."""
     _, _, _, regions, _, lists = view_of("native")
     run, by_xla = differentiated(compositor), differentiated("xla")
-    for own, other in zip(*(jax.tree.leaves(each(regions, lists)) for each in (run, by_xla)), strict=True):
-        np.testing.assert_allclose(own, other, rtol=1e-3, atol=1e-3 * float(jnp.abs(other).max(initial=0)))
+    assert_all_close(run(regions, lists), by_xla(regions, lists), 1e-3, 1e-3)
     for seed in range(8):
         rng = np.random.default_rng(seed)
         stray = TextureRegion(*(stray_numbers(rng, np.asarray(numbers)) for numbers in regions))

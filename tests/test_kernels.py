@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, quick_then_long
+from scenes_random import as_camera, as_gaussians, as_textures, assert_all_close, draw_scene, quick_then_long
 
 from a2tg_jax import RenderSettings, render_appearance, render_image
 from a2tg_jax.appearance import Appearance, Exponents, StaticShading, Texture, TextureOptions, gaussian_cutoff
@@ -49,14 +49,8 @@ def test_lists_are_those_of_xla(monkeypatch, dtype):
     assert full.overflow and full.starts[-1] == 0
 
 
-def assert_all_close(found, wanted, rtol, atol):
-    """Leaves agree; `atol` is in units of the largest entry of each."""
-    for a, b in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
-        np.testing.assert_allclose(b, a, rtol=rtol, atol=atol * float(jnp.abs(a).max()))
-
-
 def test_threads_share_the_work_and_nothing_else(monkeypatch):
-    """Images are bit for bit those of one thread; gradients, summed by thread, are equal to rounding."""
+    """Images are bit for bit the same as with one thread; gradients, summed by thread, are equal to rounding."""
     scene = draw_scene(3, num=60)
     gaussians, camera = as_gaussians(scene, "float32"), as_camera(scene, "float32")
     textures, settings = as_textures(scene, "float32"), RenderSettings(capacity=8192)

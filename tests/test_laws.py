@@ -51,7 +51,7 @@ def rotation_of(seed: int) -> Float:
 
 
 def rotate_sh(sh: Float, rotation: Float) -> Float:
-    """Coefficients [N, 16, 3] whose colour seen along Q·d is that of the given ones along d, by least squares."""
+    """Coefficients [N, 16, 3] whose colour seen along Q·d equals the given ones' along d, by least squares."""
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     before = np.array([oracle.sh_basis(direction) for direction in directions])

@@ -81,9 +81,9 @@ def farthest(found: np.ndarray, true: np.ndarray) -> float:
 
 def test_a_ply_of_map_coordinates_is_exact_with_the_offset_that_it_names(tmp_path):
     model, true = map_scene()
-    with pytest.warns(UserWarning, match=r"a\.ply: positions are relative to \(43123\d, 541122\d, 31\d\)") as told:
+    with pytest.warns(UserWarning, match=r"a\.ply: positions are relative to \(43123\d, 541122\d, 31\d\)") as warned:
         a2tg.save_ply(tmp_path / "a.ply", model)
-    assert len(told) == 1
+    assert len(warned) == 1
     assert np.abs(positions_of_ply(tmp_path / "a.ply") - true).max() < 1e-6
     _, rows = ply_parts((tmp_path / "a.ply").read_bytes())
     with pytest.warns(UserWarning, match="positions are relative to"):
@@ -165,7 +165,7 @@ def test_an_offset_that_is_no_number_is_refused_and_other_comments_are_ignored(t
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog", ".spz", ".splat", ".ksplat"])
 def test_scenes_near_the_origin_have_no_offset(tmp_path, suffix):
-    """Also those of a local grid a few hundred metres away, which float32 holds."""
+    """Also in a local grid a few hundred metres away, which float32 holds."""
     if suffix != ".ply":
         pytest.importorskip("gaussforge")
     for middle in (np.zeros(3), np.array([3.0, -2.0, 1.0]), np.array([300.0, 200.0, 50.0])):
@@ -207,7 +207,7 @@ def in_map(positions: np.ndarray, kept: dict) -> np.ndarray:
 
 
 def test_gltf_and_usd_lead_back_to_the_map(tmp_path):
-    """Their positions are those of the model; the origin beside them has the transform in float64."""
+    """Their positions are the model's; the origin beside them has the transform in float64."""
     model, true = map_scene()
     a2tg.save_gltf(tmp_path / "a.glb", model)
     glb = (tmp_path / "a.glb").read_bytes()
@@ -314,8 +314,8 @@ def test_models_with_different_offsets_are_joined_with_a_warning_whose_advice_wo
     for name, (model, _) in zip("ab", scenes, strict=True):
         a2tg.save_ply(tmp_path / f"{name}.ply", model, float64=True)
     models = [a2tg.load_splats(tmp_path / f"{name}.ply") for name in "ab"]
-    with pytest.warns(UserWarning, match=r"models\[1\] is relative to another offset") as told:
+    with pytest.warns(UserWarning, match=r"models\[1\] is relative to another offset") as warned:
         a2tg.concatenate(models)
-    move = eval(str(told[0].message).partition("transform it by ")[2], {"models": models})
+    move = eval(str(warned[0].message).partition("transform it by ")[2], {"models": models})
     joined = a2tg.concatenate([models[0], models[1].transform(move)])
     assert np.abs(in_original_world(joined) - np.concatenate([true for _, true in scenes])).max() < 1e-5

@@ -112,7 +112,7 @@ def test_spherical_harmonics_are_orthonormal():
 
 
 def test_statistic_against_differences():
-    """ε = 1e-6 in float64, moving ρ alone: order, colour, lookup and decisions stay those of the unmoved splat."""
+    """ε = 1e-6 in float64, moving ρ alone: order, colour, lookup and decisions stay as they were."""
     scene = draw_scene(3, num=20, width=9, height=7)
     cotangent = np.random.default_rng(0).normal(size=(7, 9, 3))
     base = splat_layers(scene)

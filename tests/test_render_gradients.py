@@ -18,6 +18,7 @@ from scenes_random import (
     as_gaussians,
     as_settings,
     as_textures,
+    assert_all_close,
     draw_scene,
     draw_smooth_scene,
     quick_then_long,
@@ -100,7 +101,7 @@ def package_gradient(scene: Scene, dtype: str, settings: RenderSettings) -> tupl
 def oracle_loss(scene: Scene, rules: Rules, name: str, texels: list[Float] | None = None) -> Callable[[Float], float]:
     """The same weighted sum of the oracle's outputs, as a function of one field of the scene.
 
-    `texels` replace the lookups where given. Only the layers of splats whose own values changed are made anew.
+    `texels` replace the lookups where given. Only the layers of splats whose own values changed are computed again.
     """
     weights, base = draw_weights(scene), getattr(scene, name)
     layers = oracle.splat_layers(scene, rules, texels)
@@ -163,12 +164,6 @@ def assert_leaves_match(gradient: Inputs, scene: Scene, rules: Rules, texels: li
             return loss([*scene.textures[:i], texture, *scene.textures[i + 1 :]])
 
         assert_gradients_close(found, differences(scene.textures[i], loss_of_one), f"texture {i}")
-
-
-def assert_all_close(found, wanted, rtol: float, atol: float):
-    """Leaves agree; `atol` is in units of the largest entry of each."""
-    for one, other in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
-        np.testing.assert_allclose(other, one, rtol=rtol, atol=atol * abs(np.asarray(one)).max())
 
 
 @pytest.mark.usefixtures("x64")

@@ -11,7 +11,7 @@ NUM, NUM_TILES, COLUMNS = 300, 40, 4
 
 
 def draw_lists(rng):
-    """ids [pairs] and starts [tiles + 1]; a splat lies in a few tiles that follow each other."""
+    """ids [pairs] and starts [tiles + 1]; a splat is in a few tiles that follow each other."""
     first = rng.integers(0, NUM_TILES, NUM)
     tiles = [np.flatnonzero((first <= t) & (t < first + rng.integers(1, 6, NUM))) for t in range(NUM_TILES)]
     starts = np.cumsum([0, *map(len, tiles)]).astype(np.int32)
@@ -22,7 +22,7 @@ def draw_images(rng, is_shared: bool):
     """[N, 3] and the length of the table."""
     sizes = rng.integers(1, 4, (NUM, 2))
     ends = np.cumsum(sizes.prod(1))
-    order = rng.permutation(NUM)  # images need not lie in the order of their splats
+    order = rng.permutation(NUM)  # images need not be in the order of their splats
     first = np.empty(NUM, np.int64)
     first[order] = np.cumsum(sizes[order].prod(1)) - sizes[order].prod(1)
     first = first // 2 if is_shared else first
@@ -71,7 +71,7 @@ def test_sums_are_those_of_full_copies(borders, has_probe, is_shared):
 
 
 def test_a_part_has_room_for_what_it_shares_only():
-    """1,000 splats in a tile of their own each, but for 3 that lie in two, on both sides of a border."""
+    """1,000 splats, each in its own tile, but 3 of them in two, on both sides of a border."""
     num = 1_000
     ids = np.concatenate([np.arange(500), [7, 8, 9], np.arange(500, num)]).astype(np.int32)
     starts = np.concatenate([np.arange(500), np.arange(503, num + 4)]).astype(np.int32)

@@ -106,7 +106,7 @@ def list_tiles(
 
 def _lists_on(platform: str, settings: PassSettings, capacity: int) -> Any:
     def lists(M: Array, cutoff: Array, height: Array | None) -> tuple[Array, ...]:
-        # CUDA kernels have no lists of their own.
+        # `cuda` has no function of this name.
         tile_lists = getattr(_kernels(settings, platform), "tile_lists", tiles.tile_lists)
         return tuple(tile_lists(M, cutoff, settings.near_plane, settings.grid, capacity, height=height)[:4])
 

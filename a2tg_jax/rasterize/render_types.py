@@ -29,7 +29,7 @@ class RenderSettings:
     sh_degree: int = 3
     """Highest degree of spherical harmonics used, 0 to 3."""
     texture: TextureOptions = dataclasses.field(default_factory=TextureOptions)
-    """Texture options for Gaussians and textures given apart (`render_image`, `plan_render`, `evaluate`).
+    """Texture options for Gaussians and textures given without a model (`render_image`, `plan_render`, `evaluate`).
 
     A `Model` and an appearance have their own options; this field is then not used."""
     capacity: int | None = None

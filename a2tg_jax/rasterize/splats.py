@@ -192,7 +192,7 @@ def pack_inputs(settings: PassSettings, inputs: PassInputs) -> tuple[Array, ...]
 
     Kernels follow these indices without checking them. Ids and starts are clamped here, and regions by the compositor
     (`bilinear.within_texels`), so that no list and no region, whatever it holds, makes them read or write elsewhere.
-    Rays of pixels are packed apart (`native.composite`).
+    Rays of pixels are packed by `native.composite`.
     """
     splats, texels, regions, cutoff, lists = inputs
     dtype, num, capacity = splats.M.dtype, splats.M.shape[0], lists.ids.shape[0]
@@ -214,7 +214,7 @@ def pack_splats(splats: Splats, has_geometry: bool, *more: Array) -> Array:
 
 
 def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
-    """Unpack cotangents [N, S] as those of splats."""
+    """Unpack cotangents [N, S] as cotangents of splats."""
     normal = 10 + like.colors.shape[1]
     first = normal + 3 * has_geometry
     return Splats(
@@ -229,7 +229,7 @@ def unpack_splats(packed: Array, like: Splats, has_geometry: bool) -> Splats:
 def unpack_gradients(
     settings: PassSettings, found: Sequence[Array], inputs: PassInputs, probe: Array
 ) -> tuple[Splats, Array, Array]:
-    """Unpack a kernel's gradients, of `PassSettings.gradient_shapes`, as those of splats, texels and probe."""
+    """Unpack a kernel's gradients, of `PassSettings.gradient_shapes`, as gradients of splats, texels and probe."""
     packed, d_texels, d_probe = found
     d_splats = unpack_splats(packed, inputs.splats, settings.has_geometry)
     d_probe = d_probe.astype(probe.dtype) if settings.statistic else jnp.zeros_like(probe)

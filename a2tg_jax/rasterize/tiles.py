@@ -44,7 +44,7 @@ class TileLists(NamedTuple):
     num_pairs: Array  # number of pairs before the outline test, as a float; the capacity must hold it
     overflow: Array  # whether the pairs did not fit; the lists are then empty
     pixels: TilePixels | None = None  # pixels of the tiles, if the camera has a ray for each pixel
-    height: Array | None = None  # int32 rows of pixels that are shown; None: those of the grid
+    height: Array | None = None  # int32 rows of pixels that are shown; None: all of the grid
 
     def height_in(self, grid: TileGrid) -> Any:
         """Return the rows of pixels that are shown of a grid."""
@@ -107,7 +107,7 @@ def _touches(outline: Outline, box_from: Callable[[Array, Array], tuple[Array, A
     """Return whether an outline reaches a box, given its left, right, top and bottom edge from an origin."""
     left, right, top, bottom = box_from(outline.ellipse_x, outline.ellipse_y)
     xx, xy, yy = outline.xx, outline.xy, outline.yy
-    # The nearest point of the box in the ellipse's metric lies on one of the two sides that face the centre.
+    # The nearest point of the box in the ellipse's metric is on one of the two sides that face the centre.
     x_side, y_side = jnp.clip(0.0, left, right), jnp.clip(0.0, top, bottom)
     y_on_side = jnp.clip(xy / xx * x_side, top, bottom)
     x_on_side = jnp.clip(xy / yy * y_side, left, right)

@@ -46,7 +46,7 @@ def _failure() -> str | None:
     driver = Path("/proc/driver/nvidia/version")
     version = driver.read_text(encoding="utf-8") if driver.is_file() else cuda_of_driver()
     key = version, device.device_kind, jax.__version__, jaxlib_version, source(_inputs()[0].kernel, "cuda")
-    # An empty file stands for kernels that agree.
+    # An empty file means that the kernels agree.
     file = cache_folder() / f"cuda-kernels-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.txt"
     with contextlib.suppress(OSError):
         return file.read_text(encoding="utf-8") or None

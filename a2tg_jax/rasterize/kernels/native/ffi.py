@@ -98,7 +98,7 @@ def refusal() -> str | None:
     if found is None or (found[0] == VERSION[0] and found >= VERSION):
         return None
     own, other = (".".join(map(str, version)) for version in (VERSION, found))
-    return f"native loops speak version {own} of XLA's foreign function interface, and this jaxlib {other}"
+    return f"native loops use version {own} of XLA's foreign function interface, and this jaxlib {other}"
 
 
 def registered(description: str, key: Hashable, make_handler: Callable[[], Handler]) -> str:

@@ -1,7 +1,7 @@
 """Texture lookups in vector code without gathers: reads of the splats' textures, and sums of their cotangents.
 
 Every texel that a vector of L neighbouring pixels may see is loaded once for all lanes, and each lane weighs it by its
-distance. The sum is that of the four corners in `core.bilinear`. Textures of up to 4×4 texels are visited whole, with
+distance. The sum is the one over four corners in `core.bilinear`. Textures of up to 4×4 texels are visited whole, with
 code unrolled along a row; in larger ones, the texels between the least and the largest coordinate of the lanes are.
 """
 
