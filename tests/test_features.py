@@ -96,7 +96,7 @@ def test_gpu_kernels_show_features():
 
 
 def test_features_of_a_model():
-    """Behind the rows that exist there may be others; the model's background is a colour, so the background of features is 0."""
+    """Of the rows that exist; the model's background is a colour, so the background of features is 0."""
     gaussians, camera = as_gaussians(SCENE, "float32"), as_camera(SCENE, "float32")
     features = jnp.asarray(some_features(8, 4), jnp.float32)
     model = Model(gaussians, num_live=jnp.int32(5))

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 PRIOR = 1e-6
-"""Weight of the unit matrix, per pixel, where a tile's pixels do not determine its frame: a single row or column of them."""
+"""Weight of the unit matrix, per pixel, where a tile's pixels do not determine its frame: one row or column of them."""
 
 
 class TilePixels(NamedTuple):

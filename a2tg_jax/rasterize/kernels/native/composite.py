@@ -243,7 +243,7 @@ def _list_handler(functions: ListFunctions, arguments: list[np.ndarray], results
         return
     visible = np.flatnonzero(rectangles[:, 3])
     order = visible[_depth_order(M[visible, 2, 2])].astype(np.int32)
-    # A counting sort. Each thread lists the pairs of a range of splats, and places them behind the pairs of nearer ranges.
+    # A counting sort. Each thread lists the pairs of a range of splats, and places them behind pairs of nearer splats.
     begins = np.concatenate([[0], np.cumsum(rectangles[order, 3], dtype=np.int64)])
     spans = _parts(begins)
     counts = np.zeros((len(spans), len(starts) - 1), np.int32)
