@@ -77,22 +77,31 @@ def test_initial_colours_lie_inside():
     np.testing.assert_allclose(sh[:, 0] * SH_C0 + 0.5, [[0.05, 0.5, 1.0], [0.05, 0.9, 0.3]], atol=1e-6)
 
 
-def test_points_of_one_colour_have_none_and_a_missing_channel_is_learned():
-    scene = a2tg.synthetic_scene(width=32, height=24, num_views=4, num_points=50)
-    with_colors = lambda colors: dataclasses.replace(scene, colors=np.asarray(colors, np.float32))  # noqa: E731
+SCENE = a2tg.synthetic_scene(width=32, height=24, num_views=4, num_points=50)
+
+
+def with_colors(colors):
+    return dataclasses.replace(SCENE, colors=np.asarray(colors, np.float32))
+
+
+def test_points_of_one_colour_have_none_and_others_keep_theirs():
     for color in ((0, 0, 0), (1, 1, 1), (0.2, 0, 0)):
         with pytest.warns(UserWarning, match=r"all 50 points of synthetic have one colour \(.*\): taken as points"):
             np.testing.assert_array_equal(start_colors(with_colors(np.full((50, 3), color))), 0.5)
     nearly_black = np.zeros((50, 3))
     nearly_black[3] = 0.1
-    no_red = scene.colors * np.asarray([0, 1, 1], np.float32)
-    for kept in (np.full((50, 3), 0.502), nearly_black, no_red):
+    for kept in (np.full((50, 3), 0.502), nearly_black):
         np.testing.assert_array_equal(start_colors(with_colors(kept)), np.asarray(kept, np.float32))
-    system = a2tg.Gaussians2d.preset("smoke", stage1_iterations=150, densify=None)
-    model = a2tg.fit(with_colors(no_red), system, progress=False).model
-    found, wanted = (np.asarray(image)[..., 0] for image in (
-        model.render(scene.train[0].camera).color, a2tg.view_image(scene.train[0])))  # fmt: skip
-    assert abs(np.clip(found, 0, 1).mean() - wanted.mean()) < 0.15 * wanted.mean()
+
+
+@pytest.mark.long
+def test_a_channel_that_is_zero_in_all_points_is_learned():
+    system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=600)
+    model = a2tg.fit(with_colors(SCENE.colors * np.asarray([0, 1, 1])), system, progress=False).model
+    view = SCENE.train[0]
+    found, wanted = (np.clip(image[..., 0], 0, 1).mean() for image in (
+        model.render(view.camera).color, a2tg.view_image(view)))  # fmt: skip
+    assert abs(found - wanted) < 0.15 * wanted
 
 
 def with_texels(texels, options):
