@@ -21,23 +21,14 @@ from scenes_random import (
     to_world,
 )
 
-from a2tg_jax import (
-    Camera,
-    RenderOutput,
-    RenderSettings,
-    allocate_textures,
-    init_from_points,
-    plan_render,
-    render_image,
-    texture_arrays,
-)
+import a2tg_jax as a2tg
 
 FIELDS = ("color", "alpha", "depth", "normal")
 rendered = functools.partial(render_scene, dtype="float64")
 x64 = pytest.mark.usefixtures("x64")
 
 
-def assert_same(one: RenderOutput, other: RenderOutput, tolerance: float = 1e-12):
+def assert_same(one: a2tg.RenderOutput, other: a2tg.RenderOutput, tolerance: float = 1e-12):
     for name in FIELDS:
         np.testing.assert_allclose(
             getattr(one, name), getattr(other, name), rtol=tolerance, atol=tolerance, err_msg=name
@@ -63,8 +54,8 @@ def rotate_sh(sh: Float, rotation: Float) -> Float:
 def test_textures_that_change_nothing():
     """Initial ones are none, a constant one of any size is its one texel, and colour is affine in RGB texels."""
     scene, rng = draw_scene(1), np.random.default_rng(0)
-    textures = allocate_textures(np.array([texture.shape[:2] for texture in scene.textures]))
-    neutral = [np.asarray(texture) for texture in texture_arrays(textures)]
+    textures = a2tg.allocate_textures(np.array([texture.shape[:2] for texture in scene.textures]))
+    neutral = [np.asarray(texture) for texture in a2tg.texture_arrays(textures)]
     assert_same(rendered(scene._replace(textures=neutral)), rendered(scene._replace(textures=None)))
     single = [texture[:1, :1] for texture in scene.textures]
     constant = [np.broadcast_to(one, texture.shape) for one, texture in zip(single, scene.textures, strict=True)]
@@ -139,14 +130,14 @@ def test_the_same_shapes_are_traced_once():
     """Other values are not traced again, nor are textures of the same sizes in another order: the buckets are alike."""
     scene = draw_scene(0)
     gaussians, camera, textures = inputs_of(scene)
-    settings = plan_render(gaussians, [camera], textures)
+    settings = a2tg.plan_render(gaussians, [camera], textures)
     num_traces = 0
 
     @jax.jit
     def draw(gaussians, camera, textures):
         nonlocal num_traces
         num_traces += 1
-        return render_image(gaussians, camera, textures, settings=settings)
+        return a2tg.render_image(gaussians, camera, textures, settings=settings)
 
     for shift, textures in [(0.0, scene.textures), (0.01, scene.textures), (0.02, scene.textures[::-1])]:
         moved = dataclasses.replace(gaussians, means=gaussians.means + shift)
@@ -159,13 +150,13 @@ def test_a_missing_capacity_says_what_to_do(transform):
     gaussians, camera, _ = inputs_of(draw_scene(0))
 
     def draw(means):
-        return render_image(dataclasses.replace(gaussians, means=means), camera).color
+        return a2tg.render_image(dataclasses.replace(gaussians, means=means), camera).color
 
     with pytest.raises(ValueError, match="plan_render"):
         transform(draw)(gaussians.means)
 
 
-def draw_with(settings: RenderSettings, scene: Scene) -> RenderOutput:
+def draw_with(settings: a2tg.RenderSettings, scene: Scene) -> a2tg.RenderOutput:
     """The float32 image under given settings, capacity included, under jit."""
     return jitted_renderer(settings)(*inputs_of(scene), jnp.asarray(scene.background, jnp.float32))
 
@@ -180,7 +171,7 @@ def test_too_small_a_capacity_is_flagged_and_a_plan_holds_for_all_its_cameras():
             assert_same(output, render_scene(scene, "float32"), 1e-6)
     views = [scene._replace(viewmat=other.viewmat, K=other.K) for other in map(draw_scene, (0, 1, 2))]
     gaussians, _, textures = inputs_of(scene)
-    settings = plan_render(gaussians, [as_camera(view, "float32") for view in views], textures)
+    settings = a2tg.plan_render(gaussians, [as_camera(view, "float32") for view in views], textures)
     assert not any(draw_with(settings, view).overflow for view in views)
 
 
@@ -193,12 +184,12 @@ def test_cameras_can_be_batched():
         viewmat[:3, 3] += offset
         views.append(scene._replace(viewmat=viewmat))
     cameras = [as_camera(view, "float32") for view in views]
-    settings = plan_render(gaussians, cameras, textures)
+    settings = a2tg.plan_render(gaussians, cameras, textures)
     background = jnp.asarray(scene.background, jnp.float32)
 
     def draw(viewmat):
-        view = Camera(viewmat, camera.K, camera.width, camera.height)
-        return render_image(gaussians, view, textures, background=background, settings=settings)
+        view = a2tg.Camera(viewmat, camera.K, camera.width, camera.height)
+        return a2tg.render_image(gaussians, view, textures, background=background, settings=settings)
 
     batched = jax.jit(jax.vmap(draw))(jnp.stack([view.viewmat for view in cameras]))
     for i, view in enumerate(views):
@@ -207,12 +198,12 @@ def test_cameras_can_be_batched():
 
 @pytest.mark.parametrize("has_textures", [False, True])
 def test_no_gaussians_show_the_background(has_textures):
-    nothing = init_from_points([[0, 0, 1], [0, 0, 2]], np.zeros((2, 3)))[:0]
-    textures = allocate_textures(np.zeros((0, 2), np.int64)) if has_textures else None
-    camera = Camera(jnp.eye(4), jnp.asarray([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 17, 13)
+    nothing = a2tg.init_from_points([[0, 0, 1], [0, 0, 2]], np.zeros((2, 3)))[:0]
+    textures = a2tg.allocate_textures(np.zeros((0, 2), np.int64)) if has_textures else None
+    camera = a2tg.Camera(jnp.eye(4), jnp.asarray([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 17, 13)
 
     def draw(gaussians):
-        return render_image(gaussians, camera, textures, background=(0.1, 0.2, 0.3))
+        return a2tg.render_image(gaussians, camera, textures, background=(0.1, 0.2, 0.3))
 
     output = draw(nothing)
     np.testing.assert_array_equal(output.color, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (13, 17, 3)))

@@ -24,18 +24,7 @@ from scenes_random import (
     quick_then_long,
 )
 
-from a2tg_jax import (
-    Camera,
-    Gaussians,
-    RenderSettings,
-    Textures,
-    combine,
-    partition,
-    plan_render,
-    render_image,
-    texture_arrays,
-    textures_from_arrays,
-)
+import a2tg_jax as a2tg
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.render import appearance_of
 
@@ -54,8 +43,8 @@ long = pytest.mark.long
 class Inputs(NamedTuple):
     """Everything that the image can be differentiated by."""
 
-    gaussians: Gaussians
-    textures: Textures | None
+    gaussians: a2tg.Gaussians
+    textures: a2tg.Textures | None
     viewmat: jax.Array
     K: jax.Array
     background: jax.Array
@@ -65,7 +54,7 @@ def as_inputs(scene: Scene, dtype: str) -> tuple[Inputs, Inputs]:
     """The scene's differentiable inputs, and the places of its textures."""
     camera, background = as_camera(scene, dtype), jnp.asarray(scene.background, dtype)
     inputs = as_gaussians(scene, dtype), as_textures(scene, dtype), camera.viewmat, camera.K, background
-    return partition(Inputs(*inputs))
+    return a2tg.partition(Inputs(*inputs))
 
 
 def draw_weights(scene: Scene) -> dict[str, Float]:
@@ -75,27 +64,29 @@ def draw_weights(scene: Scene) -> dict[str, Float]:
 
 
 def weighted_sum(inputs: Inputs, weights, size: tuple[int, int], settings) -> jax.Array:
-    camera = Camera(inputs.viewmat, inputs.K, *size)
-    output = render_image(inputs.gaussians, camera, inputs.textures, background=inputs.background, settings=settings)
+    camera = a2tg.Camera(inputs.viewmat, inputs.K, *size)
+    output = a2tg.render_image(
+        inputs.gaussians, camera, inputs.textures, background=inputs.background, settings=settings
+    )
     return sum(jnp.sum(getattr(output, name) * weight) for name, weight in weights.items())
 
 
 @functools.cache
-def jitted_gradient(settings: RenderSettings) -> Callable[..., Any]:
+def jitted_gradient(settings: a2tg.RenderSettings) -> Callable[..., Any]:
     """The loss and its gradient as a function of (inputs, places, weights) and the static image size."""
 
     def loss(inputs: Inputs, places: Inputs, weights: dict[str, jax.Array], size: tuple[int, int]):
-        return weighted_sum(combine(inputs, places), weights, size, settings)
+        return weighted_sum(a2tg.combine(inputs, places), weights, size, settings)
 
     return jax.jit(jax.value_and_grad(loss), static_argnums=3)
 
 
-def package_gradient(scene: Scene, dtype: str, settings: RenderSettings) -> tuple[jax.Array, Inputs]:
+def package_gradient(scene: Scene, dtype: str, settings: a2tg.RenderSettings) -> tuple[jax.Array, Inputs]:
     inputs, places = as_inputs(scene, dtype)
     weights = {name: jnp.asarray(weight, dtype) for name, weight in draw_weights(scene).items()}
     settings = dataclasses.replace(settings, capacity=CAPACITY)
     loss, gradient = jitted_gradient(settings)(inputs, places, weights, (scene.width, scene.height))
-    return loss, combine(gradient, places)
+    return loss, a2tg.combine(gradient, places)
 
 
 def oracle_loss(scene: Scene, rules: Rules, name: str, texels: list[Float] | None = None) -> Callable[[Float], float]:
@@ -158,7 +149,7 @@ def assert_leaves_match(gradient: Inputs, scene: Scene, rules: Rules, texels: li
     if gradient.textures is None:
         return
     loss = oracle_loss(scene, rules, "textures")
-    for i, found in enumerate(texture_arrays(gradient.textures)):
+    for i, found in enumerate(a2tg.texture_arrays(gradient.textures)):
 
         def loss_of_one(texture: Float, i: int = i) -> float:
             return loss([*scene.textures[:i], texture, *scene.textures[i + 1 :]])
@@ -172,7 +163,7 @@ def assert_leaves_match(gradient: Inputs, scene: Scene, rules: Rules, texels: li
 )
 def test_every_leaf_against_differences(seed, compositor):
     scene = smooth_scene(seed, DEFAULT_RULES)
-    _, gradient = package_gradient(scene, "float64", RenderSettings(compositor=compositor))
+    _, gradient = package_gradient(scene, "float64", a2tg.RenderSettings(compositor=compositor))
     assert_leaves_match(gradient, scene, DEFAULT_RULES)
 
 
@@ -182,10 +173,10 @@ def test_official_gradients_stop_at_the_lookup_and_textures_may_be_missing():
     """The official preset has the gradient with what the lookups gave held fixed."""
     scene = smooth_scene(SMOOTH_SEEDS[0], OFFICIAL)
     texels = [layer.texel for layer in oracle.splat_layers(scene, OFFICIAL)]
-    _, gradient = package_gradient(scene, "float64", RenderSettings.official())
+    _, gradient = package_gradient(scene, "float64", a2tg.RenderSettings.official())
     assert_leaves_match(gradient, scene, OFFICIAL, texels)
     plain = smooth_scene(SMOOTH_SEEDS[0], DEFAULT_RULES)._replace(textures=None)
-    _, gradient = package_gradient(plain, "float64", RenderSettings())
+    _, gradient = package_gradient(plain, "float64", a2tg.RenderSettings())
     assert_leaves_match(gradient, plain, DEFAULT_RULES)
 
 
@@ -198,24 +189,26 @@ def test_gradients_do_not_depend_on_tiles_or_on_how_they_are_called():
     np.testing.assert_array_equal(expected.viewmat[3], 0)
     for settings in (as_settings(), as_settings(compositor="xla"), as_settings(compositor="xla", tile_batch=0)):
         assert_all_close(package_gradient(scene, "float64", settings)[1], expected, 1e-9, 1e-9)
-    repacked = textures_from_arrays(texture_arrays(expected.textures))
+    repacked = a2tg.textures_from_arrays(a2tg.texture_arrays(expected.textures))
     for bucket, without_padding in zip(expected.textures.buckets, repacked.buckets, strict=True):
         np.testing.assert_allclose(np.sum(abs(bucket[..., :3])), np.sum(abs(without_padding[..., :3])))
 
     inputs, places = as_inputs(scene, "float64")
     weights = {name: jnp.asarray(weight) for name, weight in draw_weights(scene).items()}
     size = scene.width, scene.height
-    eager = jax.grad(lambda inputs: weighted_sum(combine(inputs, places), weights, size, RenderSettings()))(inputs)
-    planned = plan_render(inputs.gaussians, [as_camera(scene, "float64")], as_textures(scene, "float64"))
+    eager = jax.grad(lambda inputs: weighted_sum(a2tg.combine(inputs, places), weights, size, a2tg.RenderSettings()))(
+        inputs
+    )
+    planned = a2tg.plan_render(inputs.gaussians, [as_camera(scene, "float64")], as_textures(scene, "float64"))
     assert_all_close(jitted_gradient(planned)(inputs, places, weights, size)[1], eager, 1e-9, 1e-9)
 
 
 @pytest.mark.usefixtures("x64")
 def test_float32_gradients_are_those_of_float64():
     """To 1e-3 of the largest entry: float32 carries about 1e-7 through a few thousand sums and divisions."""
-    scene, settings = smooth_scene(SMOOTH_SEEDS[1], DEFAULT_RULES), RenderSettings(compositor="native")
+    scene, settings = smooth_scene(SMOOTH_SEEDS[1], DEFAULT_RULES), a2tg.RenderSettings(compositor="native")
     (_, exact), (_, rounded) = (package_gradient(scene, dtype, settings) for dtype in ("float64", "float32"))
-    (exact, _), (rounded, _) = partition(exact), partition(rounded)
+    (exact, _), (rounded, _) = a2tg.partition(exact), a2tg.partition(rounded)
     assert {leaf.dtype for leaf in jax.tree.leaves(rounded)} == {jnp.dtype("float32")}
     assert_all_close(rounded, exact, 0, 1e-3)
 
@@ -238,7 +231,9 @@ def degenerate_scene() -> Scene:
 
 
 @pytest.mark.parametrize(
-    "settings", [RenderSettings(), pytest.param(RenderSettings.official(), marks=long)], ids=["default", "official"]
+    "settings",
+    [a2tg.RenderSettings(), pytest.param(a2tg.RenderSettings.official(), marks=long)],
+    ids=["default", "official"],
 )
 def test_values_and_gradients_are_finite(settings):
     for scene in (draw_scene(8), degenerate_scene()):
@@ -249,12 +244,12 @@ def test_values_and_gradients_are_finite(settings):
 
 
 @functools.cache
-def jitted_statistic(settings: RenderSettings, which: str, size: tuple[int, int]) -> Callable[..., Any]:
-    """Gradient at the probe [N, 4] as a function of Gaussians, camera, appearance, background and the colour's
+def jitted_statistic(settings: a2tg.RenderSettings, which: str, size: tuple[int, int]) -> Callable[..., Any]:
+    """Gradient at the probe [N, 4] as a function of a2tg.Gaussians, camera, appearance, background and the colour's
     cotangent: the statistic, and the number of pixels composited."""
 
     def loss(probe, gaussians, viewmat, K, appearance, background, cotangent):
-        given = gaussians, Camera(viewmat, K, *size), appearance, background, settings
+        given = gaussians, a2tg.Camera(viewmat, K, *size), appearance, background, settings
         output, _ = render_traced(*given, has_geometry=False, probe=probe, statistic=which)
         return jnp.sum(output.color * cotangent)
 
@@ -266,7 +261,7 @@ OTHERS = {
     "xla, all tiles at once": (
         DEFAULT_RULES, as_settings(compositor="xla", tile_size=16, tile_batch=0), [(9, "position")]
     ),
-    "official": (OFFICIAL, RenderSettings.official(), [(4, "position"), (9, "position")]),
+    "official": (OFFICIAL, a2tg.RenderSettings.official(), [(4, "position"), (9, "position")]),
 }  # fmt: skip
 NATIVE = DEFAULT_RULES, as_settings(), [(4, "position"), (9, "position"), (4, "screen"), (4, "center")]
 
@@ -281,7 +276,7 @@ def test_statistics_are_the_closed_forms_of_the_oracle(rules, settings, cases):
     for seed, which in cases:
         scene = draw_scene(seed)
         cotangent = np.random.default_rng(seed).normal(size=(scene.height, scene.width, 3))
-        inputs = Inputs(*(combine(*as_inputs(scene, "float64"))))
+        inputs = Inputs(*(a2tg.combine(*as_inputs(scene, "float64"))))
         gradient = jitted_statistic(settings, which, (scene.width, scene.height))
         appearance = appearance_of(inputs.gaussians, inputs.textures, settings)
         given = inputs.gaussians, inputs.viewmat, inputs.K, appearance, inputs.background, jnp.asarray(cotangent)

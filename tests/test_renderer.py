@@ -8,18 +8,7 @@ import numpy as np
 import pytest
 from scenes_random import as_camera, as_gaussians, draw_scene
 
-from a2tg_jax import (
-    Appearance,
-    Model,
-    Origin,
-    Renderer,
-    RenderSettings,
-    Texture,
-    evaluate,
-    plan_render,
-    render_image,
-    textures_from_arrays,
-)
+import a2tg_jax as a2tg
 from a2tg_jax.core.cameras import Camera, crop_camera, resize_camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.pytree import num_compiled
@@ -43,22 +32,26 @@ def flight(num: int, size: tuple[int, int] = (48, 32)) -> list[Camera]:
 
 def test_a_flight_of_200_views_compiles_three_times_at_most():
     gaussians = cloud(2000)
-    renderer, before = Renderer(gaussians, has_geometry=False), num_compiled(jitted_render())
-    pairs = [plan_render(gaussians, camera).capacity for camera in flight(20)]
+    renderer, before = a2tg.Renderer(gaussians, has_geometry=False), num_compiled(jitted_render())
+    pairs = [a2tg.plan_render(gaussians, camera).capacity for camera in flight(20)]
     assert max(pairs) > 4 * pairs[0], "the flight is to need more room on its way"
     frames = [(camera, renderer(camera)) for camera in flight(200)]
     assert not any(output.overflow for _, output in frames)
     assert 2 <= num_compiled(jitted_render()) - before <= 3
     for camera, output in frames[39::40]:
-        np.testing.assert_array_equal(output.color, render_image(gaussians, camera).color)
+        np.testing.assert_array_equal(output.color, a2tg.render_image(gaussians, camera).color)
 
 
 @pytest.mark.parametrize("are_given", [True, False])
 def test_cameras_that_are_known_compile_once(are_given):
     """They are given, or the model was trained with them."""
     gaussians, cameras = cloud(2100 if are_given else 2200), flight(10, (40, 24))
-    model = Model(gaussians) if are_given else Model(gaussians, origin=Origin.of_cameras(flight(10, (20, 12))))
-    renderer = Renderer(model, cameras=cameras if are_given else (), has_geometry=False)
+    model = (
+        a2tg.Model(gaussians)
+        if are_given
+        else a2tg.Model(gaussians, origin=a2tg.Origin.of_cameras(flight(10, (20, 12))))
+    )
+    renderer = a2tg.Renderer(model, cameras=cameras if are_given else (), has_geometry=False)
     before = num_compiled(jitted_render())
     for camera in cameras:
         renderer(camera)
@@ -70,7 +63,7 @@ def test_several_sizes_and_models_of_one_shape():
     before = num_compiled(jitted_render())
     for shift in (0.0, 0.1):
         gaussians = dataclasses.replace(cloud(), means=cloud().means + shift)
-        renderer = Renderer(gaussians, cameras=cameras, has_geometry=False)
+        renderer = a2tg.Renderer(gaussians, cameras=cameras, has_geometry=False)
         for camera in cameras:
             assert renderer(camera).color.shape == (camera.height, camera.width, 3)
         assert set(renderer.capacities) == {(24, 16), (16, 24)}
@@ -80,34 +73,34 @@ def test_several_sizes_and_models_of_one_shape():
 def test_a_model_with_all_that_belongs_to_it():
     scene = draw_scene(4)
     camera = as_camera(scene, "float32")
-    textures = textures_from_arrays([np.asarray(texture, np.float32) for texture in scene.textures])
+    textures = a2tg.textures_from_arrays([np.asarray(texture, np.float32) for texture in scene.textures])
     background = tuple(scene.background.tolist())
-    model = Model(
+    model = a2tg.Model(
         as_gaussians(scene, "float32"),
-        Appearance(texture=Texture(textures)),
+        a2tg.Appearance(texture=a2tg.Texture(textures)),
         jnp.asarray(45),
         background=background,
-        origin=Origin.of_cameras([camera]),
+        origin=a2tg.Origin.of_cameras([camera]),
     )
-    found, expected = Renderer(model)(camera), model.live.render(camera)
+    found, expected = a2tg.Renderer(model)(camera), model.live.render(camera)
     for image, wanted in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
         np.testing.assert_array_equal(image, wanted)
     assert expected.depth.max() > 0
 
 
 def test_what_a_renderer_refuses():
-    camera, textures = flight(1)[0], textures_from_arrays(np.ones((300, 1, 1, 4)))
+    camera, textures = flight(1)[0], a2tg.textures_from_arrays(np.ones((300, 1, 1, 4)))
     for call, words in (
-        (lambda: Renderer(Model(cloud()), Appearance()), "appearance: a model has its own"),
-        (lambda: Renderer(cloud(), background=(0, 0, 0, 1)), r"background must be \[3\]; got \[4\]"),
+        (lambda: a2tg.Renderer(a2tg.Model(cloud()), a2tg.Appearance()), "appearance: a model has its own"),
+        (lambda: a2tg.Renderer(cloud(), background=(0, 0, 0, 1)), r"background must be \[3\]; got \[4\]"),
         (
-            lambda: Renderer(cloud())(dataclasses.replace(camera, K=jnp.eye(4))),
+            lambda: a2tg.Renderer(cloud())(dataclasses.replace(camera, K=jnp.eye(4))),
             r"camera\.K must be \[3, 3\]; got \[4, 4\]",
         ),
-        (lambda: plan_render(cloud(), camera, head_room=0.5), "head_room must be at least 1"),
-        (lambda: plan_render(cloud(), []), "cameras must be one camera at least"),
+        (lambda: a2tg.plan_render(cloud(), camera, head_room=0.5), "head_room must be at least 1"),
+        (lambda: a2tg.plan_render(cloud(), []), "cameras must be one camera at least"),
         (
-            lambda: plan_render(cloud(), camera, textures, appearance=Appearance()),
+            lambda: a2tg.plan_render(cloud(), camera, textures, appearance=a2tg.Appearance()),
             "an appearance or textures, not both",
         ),
     ):
@@ -117,25 +110,25 @@ def test_what_a_renderer_refuses():
 
 def test_gaussians_alone_are_as_opaque_as_the_settings_let_them_be():
     """As `render_image` has it: 0.999 in the authors' conventions, else 0.99."""
-    camera, settings = flight(9)[1], RenderSettings.official()
+    camera, settings = flight(9)[1], a2tg.RenderSettings.official()
     gaussians = dataclasses.replace(cloud(), logit_opacities=jnp.full(300, 9.0))
-    expected = render_image(gaussians, camera, settings=settings)
+    expected = a2tg.render_image(gaussians, camera, settings=settings)
     assert 1 - expected.alpha.max() < 2e-3
-    np.testing.assert_array_equal(Renderer(gaussians, settings=settings)(camera).alpha, expected.alpha)
+    np.testing.assert_array_equal(a2tg.Renderer(gaussians, settings=settings)(camera).alpha, expected.alpha)
     image = np.zeros((camera.height, camera.width, 3), np.uint8)
-    found = evaluate([View("view", camera, image)], gaussians, settings=settings, num_renders=1)
+    found = a2tg.evaluate([View("view", camera, image)], gaussians, settings=settings, num_renders=1)
     wanted = np.rint(255 * np.clip(np.asarray(expected.color), 0, 1))
     assert np.abs(found.renders[0].astype(int) - wanted).max() <= 1
-    opaque = render_image(gaussians, camera).color
+    opaque = a2tg.render_image(gaussians, camera).color
     assert np.abs(np.rint(255 * np.clip(np.asarray(opaque), 0, 1)) - wanted).max() > 1
 
 
 def test_plan_with_an_appearance_and_head_room():
     camera = flight(3)[1]
-    appearance = Appearance()
-    assert plan_render(cloud(), camera, appearance=appearance) == plan_render(cloud(), camera)
-    roomy = plan_render(cloud(3000), camera, appearance=appearance, head_room=10)
-    assert roomy.capacity > 4 * plan_render(cloud(3000), camera, appearance=appearance).capacity
+    appearance = a2tg.Appearance()
+    assert a2tg.plan_render(cloud(), camera, appearance=appearance) == a2tg.plan_render(cloud(), camera)
+    roomy = a2tg.plan_render(cloud(3000), camera, appearance=appearance, head_room=10)
+    assert roomy.capacity > 4 * a2tg.plan_render(cloud(3000), camera, appearance=appearance).capacity
 
 
 def test_a_cropped_view_keeps_its_centre_and_proportions():
