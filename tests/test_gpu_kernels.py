@@ -120,7 +120,7 @@ def test_long_lists_and_odd_tiles(num, tile_size, size):
 @pytest.mark.usefixtures("gpu_kernels")
 @pytest.mark.parametrize(
     ("has_textures", "statistic"),
-    quick_then_long([(True, "position")], [(False, "position"), (False, "screen"), (False, "center")]),
+    quick_then_long([(False, "position")], [(True, "position"), (False, "screen"), (False, "center")]),
 )
 def test_gpu_kernels_are_those_of_xla(has_textures, statistic):
     """Interpreted, on a small scene: the image, the gradient, and a statistic."""

@@ -9,7 +9,7 @@ import numpy as np
 import oracle
 import pytest
 from oracle import DEFAULT_RULES
-from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_scene, quick_then_long
+from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_scene
 
 import a2tg_jax as a2tg
 from a2tg_jax import Appearance, Model, RenderSettings, Texture, view_gradients
@@ -44,9 +44,8 @@ def test_gradients_are_those_of_the_image_and_the_statistic_is_the_oracles():
     assert 0 < is_seen.sum() < len(is_seen)
 
 
-@pytest.mark.parametrize(
-    "event", quick_then_long([a2tg.Upscale()], [a2tg.CloneSplitPrune(), a2tg.Upscale(gradient="screen")])
-)
+@pytest.mark.long
+@pytest.mark.parametrize("event", [a2tg.Upscale(), a2tg.CloneSplitPrune(), a2tg.Upscale(gradient="screen")])
 def test_norms_are_those_that_events_average(event):
     """Also where the statistic is by the position on the screen, whose thresholds are in units of half an image."""
     scene = draw_scene(4)

@@ -114,6 +114,7 @@ def test_an_eager_render_refuses_it_by_name(changes, message):
         a2tg.render_image(GAUSSIANS, CAMERA, dataclasses.replace(TEXTURES, **moved))
 
 
+@pytest.mark.long
 def test_pictures_with_rows_out_of_range():
     """Refused eagerly, the nearest picture under jit, as with textures."""
     pictures = textures_of([(4, 4)] * NUM)

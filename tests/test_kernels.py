@@ -26,7 +26,7 @@ long = pytest.mark.long
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", quick_then_long(["float32"], ["float64"]))
 def test_lists_are_those_of_xla(monkeypatch, dtype):
     monkeypatch.setattr(native, "SPLATS_PER_THREAD", 100)
     monkeypatch.setattr(native, "PAIRS_PER_THREAD", 100)

@@ -231,6 +231,7 @@ def test_gradient_of_a_gradient():
     assert_differences(found, ahead, behind, step)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("x64")
 def test_autodiff_has_the_gradient_of_the_other_compositors():
     """On a scene with opaque, edge-on and invisible splats, in tiles with several blocks."""
