@@ -131,6 +131,51 @@ class Lanes:
         """Return the smaller float, in one instruction; y if either is NaN or both are zeros."""
         return self.builder.select(self.builder.fcmp_ordered("<", x, y), x, y)
 
+    def maximum(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        """Return IEEE 754's maximum of floats: NaN if either is, and +0 is larger than −0."""
+        # LLVM's own llvm.maximum made whole steps 7 % slower with AVX-512.
+        if _orders_by_compare(y, -1.0):
+            return self.larger(y, x)
+        if _orders_by_compare(x, -1.0):
+            return self.larger(x, y)
+        # Against +0, a comparison takes −0 as equal: +0 + −0 = +0 corrects that, and adds nothing to others.
+        for zero, other in ((x, y), (y, x)):
+            if _orders_by_compare(zero, 1.0):
+                return self.builder.fadd(self.larger(zero, other), zero)
+        # Two orders that agree are both right. Otherwise there is a NaN, or zeros of both signs: the union of the bits,
+        # with the signs intersected, is the result.
+        b, sign = self.builder, self._sign_bits(x.type)
+        one, other = (b.xor(self._as_bits(self.larger(*pair)), sign) for pair in ((x, y), (y, x)))
+        return b.bitcast(b.xor(b.or_(one, other), sign), x.type)
+
+    def minimum(self, x: ir.Value, y: ir.Value) -> ir.Value:
+        """Return IEEE 754's minimum of floats: NaN if either is, and −0 is smaller than +0."""
+        if _orders_by_compare(y, 1.0):
+            return self.smaller(y, x)
+        if _orders_by_compare(x, 1.0):
+            return self.smaller(x, y)
+        # As in `maximum`, but the union of the signs is the right one: −0 is the smaller zero.
+        one, other = (self._as_bits(self.smaller(*pair)) for pair in ((x, y), (y, x)))
+        return self.builder.bitcast(self.builder.or_(one, other), x.type)
+
+    def _as_bits(self, x: ir.Value) -> ir.Value:
+        return self.builder.bitcast(x, self.vector(ir.IntType(num_bits(x.type))))
+
+    def _sign_bits(self, type_: ir.Type) -> ir.Constant:
+        width = num_bits(type_)
+        return self.constant(1 << (width - 1), ir.IntType(width))
+
+
+def _orders_by_compare(value: ir.Value, sign_of_zero: float) -> bool:
+    """Return whether one comparison orders this constant and any number: it is not NaN, and a zero only of the
+    given sign."""
+    if not isinstance(value, ir.Constant):
+        return False
+    number = value.constant[0] if isinstance(value.type, ir.VectorType) else value.constant
+    if isinstance(number, ir.Constant):
+        number = number.constant
+    return bool(number == number and (number != 0 or np.copysign(1.0, number) == sign_of_zero))
+
 
 def _binary(for_floats: str, for_integers: str) -> Emitter:
     def emit(lanes: Lanes, operands: Operands, _: Equation) -> ir.Value:
@@ -156,8 +201,7 @@ def _comparison(symbol: str) -> Emitter:
 def _extreme(of_floats: str, symbol: str) -> Emitter:
     def emit(lanes: Lanes, operands: Operands, equation: Equation) -> ir.Value:
         if is_float(operands[0].type):
-            # IEEE 754's maximum and minimum: NaN if either is, and −0 is less than +0.
-            return lanes.intrinsic(of_floats, operands)
+            return getattr(lanes, of_floats)(*operands)
         return lanes.builder.select(_comparison(symbol)(lanes, operands, equation), *operands)
 
     return emit
