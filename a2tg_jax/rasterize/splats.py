@@ -171,7 +171,7 @@ def settings_of_pass(
                 f"an appearance gives regions.{field} [N] of N = {num} gaussians; {name} gave {given.shape}"
             )
     if not 0 < appearance.alpha_limit < 1:
-        raise ValueError(f"max_alpha of an appearance must be in (0, 1); {name} has {appearance.alpha_limit}")
+        raise ValueError(f"max_alpha of an appearance must be in (0, 1); in {name} it is {appearance.alpha_limit}")
     settings = PassSettings(
         static=StaticShading.of(appearance),
         num_own_numbers=splats.numbers.shape[1],
