@@ -13,7 +13,7 @@ def passes_in_its_own_process(request) -> bool:
         return False
     flags = {"XLA_FLAGS": UNOPTIMISED}
     name = f"{request.node.path}::{request.node.name}"
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", "--long", name]
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "--long", name]
     done = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
     return True
