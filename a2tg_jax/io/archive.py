@@ -29,16 +29,19 @@ def write_archive(
     *,
     format: str = FORMAT,
 ) -> None:
-    """Write an archive; an older file of that name is replaced once the new one is whole.
+    """Write an archive; an existing file is replaced once the new one is complete.
 
     Args:
-      path: the file, by custom *.npz.
+      path: the file, conventionally *.npz.
       header: JSON-able values; "format" and "version" are added.
-      arrays: named arrays of plain dtypes; the name "header" is taken.
+      arrays: named arrays of plain dtypes; the name "header" is reserved.
       format: what kind of archive this is; `read_archive` expects the same.
     """
+    # NaN is not JSON: strict parsers, browsers among them, reject it.
     text = json.dumps({**header, "format": format, "version": VERSION}, allow_nan=False)
+    # The header is bytes, not a NumPy string: `read_npz` accepts numbers only.
     entries = {HEADER: np.frombuffer(text.encode(), np.uint8), **{name: np.asarray(a) for name, a in arrays.items()}}
+    # To a path without .npz NumPy would append it, so that `replacing` would not find the file.
     with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **entries)  # type: ignore[arg-type]
 
@@ -50,6 +53,7 @@ def read_archive(
     is no such file. ValueError: it is not such an archive, is damaged, lacks one of the names, or is of another
     version."""
     path = Path(path)
+    # A run folder in the place of its model is a likely mistake.
     if is_folder(path):
         found = sorted(path.glob("models/*.npz"))
         raise ValueError(f"{path}: is a folder; name a file{f', such as {found[0]}' if found else ''}")

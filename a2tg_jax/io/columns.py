@@ -23,18 +23,20 @@ Precision = int | Literal["float32", "float16"]
 Choice = Literal["smallest", "lzma", "zstd", "webp", "deflate", "none"]
 """Name of a coder, or "smallest" for the one with fewest bytes. Browsers decode deflate and none."""
 CODERS = ("lzma", "zstd", "deflate", "none", "webp")
+# Codes of 16 bits fit two planes, and keys of three axes, 48 bits, an int64.
 MOST_BITS = 16
+# Readers return float32.
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 LEAST_OPACITY = 1e-7
 LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
 """Bounds of the bytes that a file may unpack to: a multiple of its own, and further ones."""
-ZSTD_LEVEL = 19
+ZSTD_LEVEL = 19  # Higher levels are zstd's "ultra", whose windows cost readers more memory.
 LZMA_FILTERS = [
     {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 20}
 ]
 """Filters for LZMA: one adaptive model without contexts, because planes are noise around few values."""
 WEBP_CHANNELS = 3
-LONGEST_WEBP_SIDE = 16_383
+LONGEST_WEBP_SIDE = 16_383  # 14 bits in WebP's header.
 
 
 # Coders of byte planes
@@ -47,6 +49,7 @@ def room_of(num_bytes: int) -> int:
 
 def encode(coder: str, planes: np.ndarray) -> bytes:
     """Code planes [C, n] of uint8; no planes give no bytes."""
+    # Some coders write a header for nothing, and WebP has no empty images.
     if not planes.size or coder == "none":
         return planes.tobytes()
     if coder == "lzma":
@@ -73,6 +76,7 @@ def decode(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
     """Return the planes [num_planes, length] of uint8 that `encode` was given. ValueError: the bytes are damaged, or
     hold more or less than that."""
     size = num_planes * length
+    # `encode` wrote no bytes for these.
     if size == 0:
         if data:
             raise ValueError("holds bytes where there should be none")
@@ -104,10 +108,12 @@ def _decoded(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarra
         return np.frombuffer(zstandard.ZstdDecompressor().decompress(data, allow_extra_data=False), np.uint8)
     num, height, width = _webp_shape(num_planes, length)
     with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+        # Before any pixel is decoded: the header alone decides how much Pillow allocates.
         if image.size != (width, num * height):
             raise ValueError(f"its image is of {image.size} pixels")
         pixels = np.asarray(image.convert("RGB"))
     planes = pixels.reshape(num, height * width, WEBP_CHANNELS).transpose(0, 2, 1).reshape(-1, height * width)
+    # The last image is padded to three channels, and each plane to a whole rectangle.
     return planes[:num_planes, :length]
 
 
@@ -130,16 +136,17 @@ class Ends(NamedTuple):
 def ends_of(values: np.ndarray, bits: int) -> Ends:
     """Return the smallest and the largest of all numbers; 0 and 0 without numbers.
 
-    Where 0 lies between them, they are moved apart, by a step together, so that a step lies on 0: most of what is added
-    to something else is about 0.
+    If 0 is between them, they are moved apart, by a step in total, so that 0 is a step: residuals are mostly near 0.
     """
     if not values.size:
         return Ends(0.0, 0.0)
     low, high = float(values.min()), float(values.max())
     if low < 0 < high and bits > 1:
+        # One step fewer leaves room for moving the ends, so that no number is cut.
         step = (high - low) / ((1 << bits) - 2)
         low = -math.ceil(-low / step) * step
         high = low + step * ((1 << bits) - 1)
+    # Ends are JSON in the header: short decimals, from which each reader gets the same float32.
     return Ends(_short(low), _short(high))
 
 
@@ -151,6 +158,7 @@ def _short(value: Any) -> float:
 def quantised(values: np.ndarray, ends: Ends, bits: int) -> np.ndarray:
     """Return the nearest of 2^bits even steps between the ends, as int64; all 0 if both ends are equal."""
     low, high = ends
+    # A group of equal numbers has no step to divide by.
     if high <= low:
         return np.zeros(values.shape, np.int64)
     steps = (1 << bits) - 1
@@ -167,7 +175,7 @@ def dequantised(codes: np.ndarray, ends: Ends, bits: int) -> np.ndarray:
 def with_green(codes: np.ndarray, bits: int, sign: int = 1) -> np.ndarray:
     """Return codes [3, n] as red + green, green, blue + green, modulo the range of their bytes; `sign` -1 undoes it.
 
-    Colours are kept as differences to green, which are about 0.
+    Colours are stored as differences from green, which are near 0.
     """
     red, green, blue = codes
     mask = (1 << 8 * num_bytes_of(bits)) - 1
@@ -176,17 +184,20 @@ def with_green(codes: np.ndarray, bits: int, sign: int = 1) -> np.ndarray:
 
 def opacities_of(logits: np.ndarray) -> np.ndarray:
     """Return the opacities of logits, float64."""
+    # Clipped so that exp cannot overflow; opacities of logits beyond ±80 are 0 or 1 for any purpose.
     return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
 
 
 def logits_of(opacities: np.ndarray) -> np.ndarray:
     """Return the finite logits of opacities, float64."""
+    # Bits may round an opacity to exactly 0 or 1, whose logit is infinite.
     inside = np.clip(opacities.astype(np.float64), LEAST_OPACITY, 1 - LEAST_OPACITY)
     return np.log(inside) - np.log1p(-inside)
 
 
 def with_w(xyz: np.ndarray) -> np.ndarray:
     """Return unit quaternions [n, 4] from their last three numbers [3, n]; w is not negative."""
+    # Rounding may push x² + y² + z² above 1.
     squares = np.minimum(np.sum(xyz**2, axis=0), 1.0)
     quats = np.concatenate([np.sqrt(1.0 - squares)[None], xyz]).T
     return quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
@@ -205,9 +216,11 @@ class AxisSteps(NamedTuple):
 
     @staticmethod
     def of(x: np.ndarray, bits: int) -> "AxisSteps":
-        """Return the steps of the numbers [n] of one axis; three quarters of them lie within the spread."""
+        """Return the steps of the numbers [n] of one axis; three quarters of them are within the spread."""
+        # Median and quartile: a few splats far in the background must not stretch the steps.
         centre = _short(np.median(x)) if x.size else 0.0
         spread = _short(np.quantile(np.abs(x - centre), 0.75)) if x.size else 0.0
+        # A spread of 0 (most positions equal) would divide by 0.
         steps = AxisSteps(centre, spread if spread > 0 else 1.0, 0.0, 0.0)
         low, high = ends_of(steps.contracted(x), bits)
         return steps._replace(low=low, high=high)
@@ -252,8 +265,10 @@ def num_bytes_of(bits: int) -> int:
 
 def to_byte_planes(values: np.ndarray) -> np.ndarray:
     """Return uint8 [C·itemsize, n]: the lowest bytes of numbers [C, n] of any type, column by column, then the next."""
+    # Little-endian whatever the machine: the lowest byte comes first in the file.
     values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     num_columns, length = values.shape
+    # High bytes of neighbours are alike, low ones are noise: apart, they compress better.
     by_byte = values.view(np.uint8).reshape(num_columns, length, values.dtype.itemsize)
     return by_byte.transpose(2, 0, 1).reshape(values.dtype.itemsize * num_columns, length)
 
@@ -266,7 +281,7 @@ def from_byte_planes(planes: np.ndarray, num_columns: int, dtype: np.dtype) -> n
 
 
 def to_planes(codes: np.ndarray, bits: int) -> np.ndarray:
-    """Return uint8 [C·bytes, n]: codes [C, n] as `to_byte_planes`, without the bytes that so few bits leave empty."""
+    """Return uint8 [C·bytes, n]: codes [C, n] as `to_byte_planes`, without the bytes that these bits leave empty."""
     codes = np.atleast_2d(codes).astype(np.int64)
     return to_byte_planes(codes)[: num_bytes_of(bits) * len(codes)]
 
@@ -307,6 +322,7 @@ class ColumnWriter:
         """Write uint8 [C, n]."""
         planes = np.ascontiguousarray(planes)
         num, height, width = _webp_shape(*planes.shape)
+        # WebP, the last of CODERS, cannot hold large planes.
         fitting = CODERS if max(num * height, width) <= LONGEST_WEBP_SIDE else CODERS[:-1]
         coded = {coder: encode(coder, planes) for coder in (fitting if self.coder == "smallest" else (self.coder,))}
         coder, piece = min(coded.items(), key=lambda pair: len(pair[1]))
@@ -330,8 +346,10 @@ class ColumnWriter:
             return
         ends = Ends(*self._known_ends[name]) if name in self._known_ends else ends_of(values, precision)
         self.ends[name] = list(ends)
+        # A constant needs no planes: the ends say it all.
         if ends.low == ends.high:
             self.planes(name, np.zeros((0, values.shape[1]), np.uint8))
+            # Readers count these numbers against the room, although they have no bytes.
             self.num_unpacked += values.size
             return
         codes = quantised(values, ends, precision)
@@ -362,6 +380,7 @@ class ColumnReader:
         self._parts: dict[str, list[tuple[str, bytes]]] = {}
         start = 0
         for name, coder, length in parts:
+            # Not isinstance: JSON's true is an int in Python.
             if type(length) is not int or not 0 <= length <= len(body) - start:
                 raise ValueError(f"its parts must have {len(body)} bytes in all; the part {name} has {length}")
             self._parts.setdefault(name, []).append((coder, body[start : start + length]))
@@ -371,6 +390,7 @@ class ColumnReader:
 
     def planes(self, name: str, num_planes: int, length: int) -> np.ndarray:
         """Read uint8 [num_planes, length]. ValueError: the part is missing or damaged, or there is no room left."""
+        # Before decoding: what a header claims decides what the decoder allocates.
         self._take_room(name, num_planes * length)
         if not self._parts.get(name):
             raise ValueError(f"the part {name} is missing")
@@ -428,8 +448,10 @@ class ColumnReader:
         """Read float32 [3, length]."""
         if not isinstance(precision, int):
             return self.numbers("means", 3, length, precision)
+        # Per axis centre, spread, low and high, as `ColumnWriter.means` wrote them.
         known = np.reshape(self._ends("means", 12), (3, 4)).tolist()
         planes = self.planes("means", num_bytes_of(3 * precision), length)
+        # sinh overflows for ends that a damaged file claims; `_finite` reports this.
         with np.errstate(over="ignore"):
             codes = from_morton(np.cumsum(from_planes(planes, 1)[0]), precision)
             axes = [AxisSteps(*own).values(axis, precision) for axis, own in zip(codes, known, strict=True)]
@@ -437,6 +459,7 @@ class ColumnReader:
 
     def _ends(self, name: str, count: int) -> list[float]:
         found = self._ends_by_name[name]
+        # Type, not isinstance: a bool must not pass as a number.
         is_right = isinstance(found, list) and len(found) == count and all(type(x) in (int, float) for x in found)
         if not is_right or not all(abs(x) <= LARGEST_FLOAT for x in found):
             raise ValueError(f"the ends of {name} must be {count} numbers; got {found}")

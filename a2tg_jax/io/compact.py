@@ -49,6 +49,7 @@ from a2tg_jax.io.validate import check_suffix, existing_bytes, reading
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.texture import MAX_SIDE
 
+# As in PNG: CR LF shows a transfer as text, 0x1A ends a listing on Windows.
 MAGIC = b"a2tgz\r\n\x1a"
 VERSION, OLD_VERSIONS = 3, (1, 2)
 """Version 1 and 2, without and with shapes of kernels, had one chunk, a header in zstd, and a table for each property
@@ -102,9 +103,11 @@ class CompactChoices:
         """Raise ValueError, naming the choice, if one is invalid."""
         for name in GROUPS:
             precision = getattr(self, name)
+            # Not isinstance: True would pass for one bit.
             is_bits = type(precision) is int and 1 <= precision <= MOST_BITS
             if not is_bits and precision not in ("float32", "float16"):
                 raise ValueError(f"choices.{name} must be 1 to {MOST_BITS} bits, float32 or float16; got {precision!r}")
+        # The round trip checks the coder against its Literal.
         config_from_dict(type(self), config_to_dict(self), "choices")
         return self
 
@@ -126,9 +129,9 @@ def save_compact(
     """Write a model's live rows, its appearance and its origin in few bytes.
 
     Args:
-      path: the file, by custom *.a2tgz; an older one is replaced once the new one is whole.
+      path: the file, conventionally *.a2tgz; an existing one is replaced once the new one is complete.
       model: of Gaussians with or without textures, exponents and bands.
-      choices: how finely its numbers are kept.
+      choices: precision of its numbers.
       grids: grids of the groups kept in bits, with which the model was tuned (`tune_compact`); None: those between the
         smallest and the largest of the model's own numbers.
 
@@ -180,13 +183,16 @@ def encode_model(
     # A page draws after a sixteenth of a small scene; chunks of a large one are short enough to draw after each.
     chunk = max(num, 1) if order is None else int(np.clip(-(-num // 16), LEAST_CHUNK, LARGEST_CHUNK))
     order = np.arange(num) if order is None else order
+    # Means kept as floats still need an order along the curve.
     bits = choices.means if isinstance(choices.means, int) else MOST_BITS
+    # With the grids of a tuned model: its numbers lie on these steps, and others would round them again.
     known = np.reshape((grids or {}).get("means", ()), (-1, 4)).tolist()
     axes = [AxisSteps(*own) for own in known] or [AxisSteps.of(x, bits) for x in rows.means.T]
     keys = morton(np.stack([axis.codes(x, bits) for axis, x in zip(axes, rows.means.T, strict=True)]), bits)
     # Within each chunk, rows follow the Z curve: neighbours in space have similar numbers, which code well.
     starts = range(0, max(num, 1), chunk)
     order = np.concatenate([part[np.argsort(keys[part], kind="stable")] for part in np.split(order, starts[1:])])
+    # With given grids no splat is turned: its numbers were tuned as they are.
     rows, keys = ordered(rows, order, turns=grids is None), keys[order]
     header: dict[str, Any] = {
         "num": num,
@@ -259,12 +265,14 @@ def _columns(rows: Rows, choices: CompactChoices) -> Iterator[tuple[str, np.ndar
 
 def half_turned(model: Model) -> Model:
     """Return the model that its file without rounding holds: its rows along a Z curve, and splats half-turned."""
+    # An uncoded float32 file does all that writing does except rounding.
     exact = CompactChoices(coder="none").keeping(dict.fromkeys(GROUPS, "float32"))
     return decode_model(encode_model(model, exact))
 
 
 def grids_of(model: Model, choices: CompactChoices) -> Grids:
     """Return the grids of a file of these choices, for each group kept in bits of which the model has numbers."""
+    # Ends do not depend on the coder, and none is the fastest.
     header, _ = unframed(encode_model(model, dataclasses.replace(choices, coder="none")))
     return {name: tuple(ends) for name, ends in header["ends"].items()}
 
@@ -291,6 +299,7 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
             arrays = {
                 name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()
             }
+            # numpy's bool is a byte in the file, and `origin_of` takes no integers for it.
             origin = origin_of(header["origin"], arrays | {"is_test": arrays["is_test"].astype(bool)})
         reader.end()
         return model_of(joined_rows(parts), header["base_degree"], appearance, origin, background_of(header))
@@ -306,6 +315,7 @@ def bytes_by_part(data: bytes) -> dict[str, int]:
 
 
 def framed(header: Mapping[str, object], body: bytes) -> bytes:
+    # Browsers read the header with JSON.parse, which rejects NaN.
     text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
     coded = zlib.compress(text, 9)
     rest = coded + body
@@ -320,6 +330,7 @@ def unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
     if version not in (*OLD_VERSIONS, VERSION):
         raise ValueError(f"is a compact scene of version {version}; this program reads versions 1 to {VERSION}")
     rest = data[HEAD.size :]
+    # Before anything is decoded, so that a damaged file fails in one place.
     if zlib.crc32(rest) != checksum:
         raise ValueError("is damaged or cut off")
     if num_coded > len(rest) or num_text > room_of(len(data)):
@@ -329,6 +340,7 @@ def unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
     if not isinstance(header, dict):
         raise ValueError("has no header")
     if version in OLD_VERSIONS:
+        # JSON objects keep their order, which was the order of the parts.
         header["parts"] = [(name, header["coders"][name], length) for name, length in header["lengths"].items()]
     return header, rest[num_coded:]
 
@@ -344,12 +356,14 @@ def _rows_of(
     log_scales = reader.numbers("log_scales", 2, num, choices.log_scales).T
     quats = with_w(reader.numbers("quats", 3, num, choices.quats))
     opacities = reader.numbers("opacities", 1, num, choices.opacities)[0]
+    # Splats of an appearance with bands may have any degree up to the highest, however low the base is.
     highest = MAX_DEGREE if appearance.bands is not None else base
     if not set(table) <= set(range(base, highest + 1)):
         raise ValueError(f"degrees must lie in {base}..{highest}; got {table}")
     degrees = np.asarray(table, np.int64)[reader.indices("degrees", num, len(table))]
     bands = []
     for degree in range(highest + 1):
+        # Band l has rows only for splats of degree l or more.
         count = int(np.count_nonzero(degrees >= degree))
         name = f"sh_{degree}"
         columns = reader.numbers(name, 3, (2 * degree + 1) * count, choices.of_part(name), is_color=True)

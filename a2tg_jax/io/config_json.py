@@ -11,7 +11,7 @@ from a2tg_jax.core.checks import check_kind
 from a2tg_jax.host.text import did_you_mean, shortened
 
 ConfigT = TypeVar("ConfigT")
-LARGEST_INTEGER = 2**64
+LARGEST_INTEGER = 2**64  # JSON's integers have no bound in Python; NumPy and JAX take 64 bits.
 NONE = "None"
 """Text for None in formats that lack it, such as TOML."""
 
@@ -38,11 +38,13 @@ def config_from_dict(
     """
     if not isinstance(data, Mapping):
         raise ValueError(f"{where} must hold the fields of {kind.__name__}; got {shortened(repr(data))}")
+    # Annotations may be strings (PEP 563): `field.type` would not do.
     hints, values = typing.get_type_hints(kind), dict(given or {})
     fields = {field.name: field for field in dataclasses.fields(kind) if field.name not in values}  # type: ignore[arg-type]
     within = f"{where} " if where.endswith(":") else f"{where}."
     for name in data:
         if name not in fields:
+            # Dotted names are the command line's; files nest tables.
             group, _, option = name.partition(".")
             instead = did_you_mean(name, fields) or f"; it has {', '.join(fields)}"
             instead = f"; say {group}={{{option!r}: …}}" if option and group in fields else instead
@@ -77,6 +79,7 @@ def check_config(config: Any, prefix: str = "") -> None:
             given = ", ".join(f"{key}={item!r}" for key, item in value.items()) if isinstance(value, Mapping) else "…"
             check_kind(name, value, hint, f"say {hint.__name__}({shortened(given)})")
             check_config(value, f"{name}.")
+        # The round trip through JSON's types is the check; its result is not needed.
         elif _is_plain(hint):
             _from_json(hint, _to_json(value), name)
 
@@ -115,6 +118,7 @@ def _to_json(value: Any) -> Any:
         return {name: _to_json(item) for name, item in value.items()}
     if isinstance(value, tuple):
         return [_to_json(item) for item in value]
+    # NumPy's scalars and arrays are no JSON.
     return value.tolist() if hasattr(value, "tolist") else value
 
 
@@ -123,6 +127,7 @@ def _from_json(hint: object, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return config_from_dict(typing.cast(type, hint), value, where)
     alternatives = typing.get_args(hint)
+    # Where a field may hold text, "None" is text.
     if value == NONE and type(None) in alternatives and str not in alternatives:
         return None
     try:
@@ -132,8 +137,8 @@ def _from_json(hint: object, value: Any, where: str) -> Any:
 
 
 def _as(hint: Any, value: object) -> Any:
-    """Return a JSON value as a plain type; an integer is a good float, a truth value is not a number. TypeError: it is
-    of another type."""
+    """Return a JSON value as a plain type; an integer may be a float, a bool is no number. TypeError: its type is
+    another."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         for alternative in inner:
@@ -146,6 +151,7 @@ def _as(hint: Any, value: object) -> Any:
         hints = inner[:1] * len(value) if inner[-1] is ... else inner
         if len(hints) == len(value):
             return tuple(map(_as, hints, value))
+    # bool is a subclass of int: without this branch, true would pass for 1.
     elif isinstance(value, bool):
         if hint is bool:
             return value

@@ -1,4 +1,4 @@
-"""Formats of files of splats: by suffix how each is read and written, and what it keeps."""
+"""File formats of splats: how each is read and written, by suffix, and what it keeps."""
 
 import dataclasses
 import os
@@ -45,7 +45,7 @@ class FileFormat:
     is_exact: bool = True
     """Whether numbers come back unrounded."""
     has_extension: bool = False
-    """Whether other programs read the file, too, but only its plain splats."""
+    """Whether other programs also read the file, but only its plain splats."""
     import_library: Callable[[Path], object] | None = None
     """Import of the optional library that writing needs; raises ValueError, with what to install, without it."""
 
@@ -69,6 +69,7 @@ _CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, None)
 FORMATS = {
     ".npz": FileFormat("model", load_model, save_model, True, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
+    # Our own reader: reading needs no optional library.
     ".compressed.ply": dataclasses.replace(_by_gaussforge("compressed PLY"), load=load_ply_model),
     ".ply": FileFormat("PLY", load_ply_model, save_ply),
     ".spz": _by_gaussforge("SPZ"),
@@ -79,11 +80,12 @@ FORMATS = {
     **dict.fromkeys((".usda", ".usdc", ".usdz", ".usd"), _USD),
     **dict.fromkeys((".pt", ".pth", ".ckpt"), _CHECKPOINT),
 }
-"""Formats by suffix. Of two that fit a name the first counts."""
+"""Formats by suffix. If two match a name, the first is used."""
 
 
 def format_of(path: str | os.PathLike[str]) -> FileFormat:
     """Return the format of a file by its suffix. ValueError: the suffix is unknown."""
+    # Not Path.suffix: .compressed.ply has two dots.
     name = Path(path).name.lower()
     for suffix, found in FORMATS.items():
         if name.endswith(suffix):
@@ -126,6 +128,7 @@ def save_splats(path: str | os.PathLike[str], model: Model) -> None:
 
 def files_written(path: Path) -> list[Path]:
     """Return the files that a model is written as: its own first, then the buffer of a *.gltf."""
+    # As `Builder.save` names its buffer.
     return [path, path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else [path]
 
 
@@ -158,6 +161,7 @@ def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
         lost += [found for found in [_bakeable(model)] if found]
         if not shown.is_portable and model.textures is None:
             lost.append(f"what {type(shown).__name__} shows besides Gaussians")
+    # With bands the degree of `sh` is only the one that all splats share.
     if (model.gaussians.sh_degree if shown.bands is None else 3) > into.highest_degree:
         lost.append(f"spherical harmonics above degree {into.highest_degree}")
     lost += cut_numbers(into.name, model)

@@ -63,12 +63,12 @@ def save_gltf(
     """Write a model's live rows as splats of glTF, with its appearance and its origin.
 
     Args:
-      path: the file. *.gltf has its numbers in a *.bin of the same name, any other name is one *.glb. Older ones are
-        replaced once the new ones are whole.
+      path: the file. *.gltf has its numbers in a *.bin of the same name, any other name is one *.glb. Existing ones are
+        replaced once the new ones are complete.
       model: of Gaussians with or without textures, exponents and bands.
-      textures: write textures, degrees and shapes of kernels, too, as the extension A2TG_splat_textures. False writes
+      textures: also write textures, degrees and shapes of kernels, as the extension A2TG_splat_textures. False writes
         plain splats of any model, as `save_ply` does.
-      texels: what keeps them, "float32" exactly or "uint8" in a quarter of the bytes.
+      texels: their type in the file, "float32" exactly or "uint8" in a quarter of the bytes.
 
     Raises:
       ValueError: if the model has no Gaussians, shows what the extension cannot hold, or has a number that is not
@@ -77,13 +77,16 @@ def save_gltf(
     if texels not in get_args(TexelKind):
         raise ValueError(f"texels must be {' or '.join(get_args(TexelKind))}; got {shortened(repr(texels))}")
     model = live_model(path, model, "save_gltf")
+    # glTF has no accessors of count 0.
     if not model.num:
         raise ValueError("model has no Gaussians; a glTF file has at least one")
     if textures:
         check_encodable(model.appearance, "a glTF file", "a *.ply, or textures=False here, holds their plain splats")
     builder, splats = Builder(), others.splats_of(model, keeps_shapes=textures)
     attributes = {
+        # glTF requires bounds of POSITION, and of no other attribute.
         MEANS: builder.add(splats.means, has_bounds=True),
+        # wxyz to glTF's xyzw.
         ROTATION: builder.add(splats.quats[:, [1, 2, 3, 0]]),
         SCALE: builder.add(splats.scales),
         OPACITY: builder.add(splats.opacities),
@@ -107,7 +110,9 @@ def save_gltf(
     if model.origin is not None:
         kept["origin"] = others.origin_to_json(model.origin)
     matrix = others.matrix_of(others.upright(model.origin, "y"))
+    # glTF's matrices are column by column: transposed, then row by row.
     node = {"name": "splats", "mesh": 0, "matrix": matrix.T.ravel().tolist()}
+    # Mode 0: points, which programs without the extension show.
     primitive = {"attributes": attributes, "mode": 0, "extensions": {SPLATS: described}, "extras": {OWN: kept}}
     whole = {
         "asset": {"version": "2.0", "generator": "a2tg-jax"},
@@ -203,6 +208,7 @@ def _splats(document: Document, attributes: Mapping[str, object]) -> others.Elli
             raise ValueError(f"its splats lack {name}")
         return document.numbers(attributes[name], kind, name)
 
+    # xyzw to wxyz.
     means, quats = numbers(MEANS, "VEC3"), numbers(ROTATION, "VEC4")[:, [3, 0, 1, 2]]
     scales, opacities = numbers(SCALE, "VEC3"), numbers(OPACITY, "SCALAR")[:, 0]
     tried = range(others.HIGHEST_DEGREE + 2)  # One more than is read, for the warning.
@@ -250,7 +256,9 @@ def _shown(document: Document, described: Mapping[str, Any], splats: others.Elli
         if len(log_exponents) != num:
             raise ValueError(f"{EXTENSION}.shapes must be {num} numbers; got {len(log_exponents)}")
         shapes = shapes_of(log_exponents)
+    # Rows are not left out: the tables of the extension are by row.
     gaussians = others.gaussians_of(splats, document.path, is_flat=has_textures or has_shapes, keeps_all=True)
+    # `Bands` keeps tables up to the highest degree, empty ones included.
     sh = splats.sh if not has_degrees else np.pad(splats.sh, ((0, 0), (0, NUM_BASES[-1] - highest), (0, 0)))
     counts = [count for count in NUM_BASES if count <= sh.shape[1]]
     bands = [sh[degrees >= degree, count - 2 * degree - 1 : count] for degree, count in enumerate(counts)]
@@ -289,6 +297,7 @@ def _kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_described
     if "appearance" not in kept:
         return shown
     appearance = appearance_from_dict(kept["appearance"])
+    # Extras may be out of date if another program has edited the extension: then this decides.
     own, there = appearance.texture_options, shown.texture_options
     is_same = all((getattr(appearance, part) is None) == (getattr(shown, part) is None) for part in PARTS)
     if is_described:

@@ -24,14 +24,14 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.io.validate import existing_bytes
 
 MAGIC, VERSION = b"glTF", 2
-JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942  # "JSON" and "BIN\0", little-endian.
 HEAD, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
-MOST_GLB_BYTES = 2**32 - 1
-ARRAY_BUFFER = 34962
+MOST_GLB_BYTES = 2**32 - 1  # The header has the length as uint32.
+ARRAY_BUFFER = 34962  # OpenGL's number for vertex data.
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """Types of numbers, by their code."""
 SIDES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-MOST_STRIDE = 252
+MOST_STRIDE = 252  # glTF 2.0, bufferView.byteStride.
 LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
 """Bounds of the bytes of numbers, as float32, in a file: a multiple of its own bytes, and further bytes."""
 LONGEST_NAME = 255
@@ -69,6 +69,7 @@ class Builder:
             accessor["normalized"] = True
         if has_bounds:
             accessor |= {"min": columns.min(axis=0).tolist(), "max": columns.max(axis=0).tolist()}
+        # glTF is little-endian.
         data = np.ascontiguousarray(columns, np.dtype(COMPONENTS[code])).tobytes()
         self.add_bytes(data, **({"target": ARRAY_BUFFER} if is_attribute else {}))
         self.accessors.append(accessor)
@@ -77,6 +78,7 @@ class Builder:
     def add_bytes(self, data: bytes, **options: object) -> int:
         """Add bytes, such as an image, and return the index of their buffer view, which has these options."""
         self._views.append({"buffer": 0, "byteOffset": self._num_bytes, "byteLength": len(data), **options})
+        # glTF aligns accessors to their component size, at most 4 bytes.
         self._pieces.append(data + bytes(-len(data) % 4))
         self._num_bytes += len(self._pieces[-1])
         return len(self._views) - 1
@@ -94,12 +96,14 @@ class Builder:
         if path.suffix.lower() == ".gltf":
             binary = path.with_suffix(".bin")
             buffer["uri"] = urllib.parse.quote(binary.name)
+            # The buffer first: a *.gltf never names one that is not there yet.
             with replacing(binary) as temporary, open(temporary, "wb") as file:
                 file.writelines(self._pieces)
             with replacing(path) as temporary:
                 temporary.write_text(json.dumps(whole, allow_nan=False, indent=1), encoding="utf-8")
             return
         text = json.dumps(whole, allow_nan=False, separators=(",", ":")).encode()
+        # Chunks of a GLB are aligned to 4 bytes; JSON is padded with spaces.
         text += b" " * (-len(text) % 4)
         total = HEAD.size + CHUNK.size + len(text) + CHUNK.size + self._num_bytes
         if total > MOST_GLB_BYTES:
@@ -154,6 +158,7 @@ class Document:
         data = self._buffer(view.get("buffer"), what)
         start, length = _count(view, "byteOffset", what, 0), _count(view, "byteLength", what)
         stride, count = _count(view, "byteStride", what, size), _count(accessor, "count", what)
+        # Python's integers do not overflow, so sums of claimed numbers are safe to compare.
         if start + length > len(data):
             raise ValueError(f"{what} reaches beyond its buffer of {len(data)} bytes")
         if stride < size or stride > max(size, MOST_STRIDE):
@@ -168,6 +173,7 @@ class Document:
         rows = np.ndarray((count, columns), dtype, data, first if count else 0, (stride, dtype.itemsize))
         values = rows.astype(np.float32)
         if accessor.get("normalized") is True and dtype.kind != "f":
+            # glTF: max(c / 127, −1) for signed bytes, since −128 would be below −1.
             values = np.maximum(values / np.float32(np.iinfo(dtype).max), np.float32(-1.0))
         return values
 
@@ -177,6 +183,7 @@ class Document:
         length = _count(described, "byteLength", what)
         if index not in self._buffers:
             uri = described.get("uri")
+            # Only the first buffer may be the GLB's binary chunk.
             if uri is None and (index != 0 or self._binary is None):
                 raise ValueError(f"has no bytes for buffers[{index}]")
             self._buffers[index] = self._read(uri) if uri is not None else self._binary or b""
@@ -237,11 +244,13 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
         raise ValueError(f"is cut off: it has {len(data)} bytes where {total} are announced")
     chunks: dict[int, bytes] = {}
     place = HEAD.size
+    # glTF has the two known chunks first; extensions may append others.
     while place + CHUNK.size <= total and len(chunks) < 2:
         length, kind = CHUNK.unpack_from(data, place)
         place += CHUNK.size
         if place + length > total:
             raise ValueError("is damaged: a chunk is longer than the file")
+        # The first of a kind counts.
         chunks.setdefault(kind, data[place : place + length])
         place += length
     if JSON_CHUNK not in chunks:
@@ -252,6 +261,7 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
 def _count(described: Mapping[str, object], name: str, what: str, default: int | None = None) -> int:
     """Return a field that is a whole number, not negative."""
     value = described.get(name, default)
+    # Not isinstance, for true is an int; 2^53 is where JSON's numbers stop being exact.
     if type(value) is not int or not 0 <= value < 1 << 53:
         raise ValueError(f"{what}: {name} must be a whole number; got {shortened(value)}")
     return value
@@ -273,15 +283,18 @@ def mesh_nodes(document: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]
     else:
         nodes = document.json.get("nodes", [])
         children = {child for node in nodes for child in _indices(node, "children")}
+        # Without a scene, a node is a root if no other has it as a child.
         roots = [index for index in range(len(nodes)) if index not in children]
     seen: set[int] = set()
     waiting = [(index, np.eye(4)) for index in reversed(roots)]
     while waiting:  # No recursion: a file may nest nodes deeper than Python calls functions.
         index, parent = waiting.pop()
         node = document.entry("nodes", index)
+        # Nodes are a forest in glTF; a cycle would never end.
         if index in seen:
             raise ValueError(f"its nodes[{index}] occurs twice")
         seen.add(index)
+        # Chains of large scales overflow; `similarity_of` rejects what is not finite.
         with np.errstate(over="ignore", invalid="ignore"):
             matrix = parent @ _local_matrix(node)
         if "mesh" in node:
@@ -307,6 +320,7 @@ def _local_matrix(node: Mapping[str, Any]) -> np.ndarray:
         return np.asarray(values, np.float64)
 
     if "matrix" in node:
+        # Column by column in the file.
         return vector("matrix", [0.0] * 16).reshape(4, 4).T
     rotation = vector("rotation", [0.0, 0.0, 0.0, 1.0])
     matrix = np.eye(4)

@@ -44,9 +44,9 @@ def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, 
     """Write a model's live rows, its appearance and its origin.
 
     Args:
-      path: the file, by custom *.npz; an older one is replaced once the new one is whole.
+      path: the file, conventionally *.npz; an existing one is replaced once the new one is complete.
       model: any model.
-      header: JSON-able values to keep along; `read_archive_header` returns them.
+      header: JSON-able values to store with it; `read_archive_header` returns them.
 
     Raises:
       ValueError: if the suffix is another format's, if `load_model` would refuse the model, as it does numbers that
@@ -95,6 +95,7 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
 def number_in_file(path: str | os.PathLike[str]) -> int:
     """Return the number of Gaussians in a file of `save_model`, without reading more than their means.
     FileNotFoundError: there is no such file. ValueError: it is not a model, is damaged, or is of another version."""
+    # SH are most of a model's bytes.
     means = read_archive(path, format=FORMAT, names=("means",))[1]["means"]
     check_shape(f"{os.fspath(path)}: means", means, ("N", 3))
     return len(means)
@@ -119,9 +120,11 @@ def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
         "parts": parts,
     }
     try:
+        # Tried now: otherwise a model is lost only when someone loads it.
         back = _appearance_of(kind, json.loads(json.dumps(described, allow_nan=False)))
     except (TypeError, ValueError) as error:
         raise ValueError(f"the options of {kind.__name__} cannot be kept in a file: {error}") from error
+    # JSON turns tuples into lists and keys into texts, which not every option survives.
     if back != template_of(appearance):
         raise ValueError(f"the options of {kind.__name__} do not survive JSON: {described['options']}")
     return described
@@ -154,6 +157,7 @@ def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[App
 
 def _options_of(node: Any) -> dict[str, Any]:
     """Return the static fields of an appearance, or of a part."""
+    # Static fields are options; the others are arrays, which the archive holds.
     names = [field.name for field in dataclasses.fields(node) if field.metadata.get("static")]
     return {name: value for name, value in config_to_dict(template_of(node)).items() if name in names}
 
@@ -210,6 +214,7 @@ def origin_of(data: Mapping[str, object], arrays: Mapping[str, Any]) -> Origin:
             raise ValueError(f"{ORIGIN}{name} must be {what}; got {array.dtype}")
         check_shape(ORIGIN + name, array, shape)
         found[name] = array.astype(dtype)
+    # In the order of `origin_shapes`.
     viewmats, Ks, sizes, is_test, scale, rotation, translation = found.values()
     learned = {name.removeprefix(CORRECTIONS): rows for name, rows in arrays.items() if name.startswith(CORRECTIONS)}
     world = Similarity(float(scale), rotation, translation)

@@ -73,6 +73,7 @@ def rows_of_model(model: Model) -> Rows:
     check_model(model)
     gaussians, shown = model.gaussians, arrays_of(model.appearance, model.gaussians.sh_degree)
     sh = np.asarray(gaussians.sh)
+    # NUM_BASES[l] = (l + 1)², and band l has 2l + 1 coefficients.
     bands = [sh[:, NUM_BASES[degree] - 2 * degree - 1 : NUM_BASES[degree]] for degree in range(gaussians.sh_degree + 1)]
     degrees = np.full(gaussians.num, gaussians.sh_degree)
     if model.appearance.bands is not None:
@@ -124,6 +125,7 @@ def joined_rows(parts: Sequence[Rows]) -> Rows:
 def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Return the old places of the texels of reordered and mirrored splats."""
     areas = sizes.prod(axis=1)
+    # Exclusive sums: where each texture begins in the old table.
     starts = (np.cumsum(areas) - areas)[order]
     areas = areas[order]
     # The place of each texel within its texture, then its row and column, which a half-turn reverses.
@@ -144,7 +146,9 @@ def nearest_half_turn(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
       The quaternions, float64, and [n] the axis about which each was turned: 0 is none, 1 to 3 are u, v and the normal.
     """
     quats = np.asarray(quats, np.float64)
+    # w of q·(axis k) is −q[k]: turning about the axis of the largest number makes it w.
     axis = np.argmax(np.abs(quats), axis=1)
+    # q and −q are one rotation: with w ≥ 0, w follows from x, y, z.
     return with_positive_w(np.einsum("nij,nj->ni", HALF_TURNS[axis], quats)), axis
 
 
@@ -183,5 +187,6 @@ def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origi
             arrays[f"band_{degree}"] = np.asarray(band, np.float32)
     shown = with_arrays(appearance, arrays, base_degree)
     model = Model(gaussians, shown, background=background, origin=origin)
+    # The tables of a file may disagree in ways that only the whole model shows.
     check_model(model)
     return model

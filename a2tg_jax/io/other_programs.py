@@ -1,4 +1,4 @@
-"""Models as files of other programs hold them: ellipsoids in a world with other axes, with numbers of limited range.
+"""Models as files of other programs hold them: ellipsoids in a world with other axes, and numbers of limited range.
 
 A model's own world has +z up, and lengths in which its cameras are 1 away. A file's world has the lengths of the
 original one, and the up axis of its format; the model keeps its place in it. Positions that a format would
@@ -29,6 +29,7 @@ Up = Literal["y", "z"]
 Kind = str
 """gaussforge's name of a format, such as "spz"; "ply" is every one with positions in float32."""
 UPRIGHT: Mapping[Up, np.ndarray] = {
+    # (x, y, z) → (x, z, −y): a quarter turn about x.
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
     "z": np.eye(3),
 }
@@ -37,7 +38,8 @@ UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
 LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-6
 HIGHEST_DEGREE = len(NUM_BASES) - 1
 THICKNESS = 1e-3
-"""Ratio of the third scale of a flat Gaussian in a file to its shorter one."""
+"""Ratio of a flat Gaussian's third scale in a file to its shorter one."""
+# Turns by 120° and −120° about (1, 1, 1), and none.
 AXES_TO_NORMAL = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]], np.float32)
 """Row k: the rotation (wxyz) of the axes among themselves that makes the k-th the third."""
 SAME_PLACE = 1e-5
@@ -92,6 +94,7 @@ def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False)
         if shown.shapes is not None and not keeps_shapes:
             gaussians = nearest_gaussians(gaussians, np.asarray(shown.shapes))
         if not shown.has_own_opacities:
+            # Logits must be finite.
             opacities = jnp.clip(shown.opacities(model.gaussians), LEAST_OPACITY, LARGEST_OPACITY)
             gaussians = dataclasses.replace(gaussians, logit_opacities=logit(opacities))
     check_gaussians(gaussians)
@@ -111,6 +114,7 @@ def world_gaussians(
     if offset.any():
         # The offset goes before means are rounded to float32.
         to_world = dataclasses.replace(to_world, translation=to_world.translation - offset)
+    # Without a move nothing is computed, so that nothing is rounded.
     moved = plain if transform is None and not offset.any() else transform_gaussians(plain, to_world)
     return WorldGaussians(moved, offset, means)
 
@@ -123,11 +127,13 @@ def splats_of(model: Model, *, keeps_shapes: bool = False) -> Ellipsoids:
     """
     gaussians = plain_gaussians(model, keeps_shapes=keeps_shapes)
     quats = np.asarray(gaussians.quats, np.float64)
+    # Other programs expect unit quaternions; here any length is allowed.
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     units = np.where(norms > 0, quats / np.maximum(norms, LEAST_SCALE), [1.0, 0.0, 0.0, 0.0])
     logits = np.clip(np.asarray(gaussians.logit_opacities, np.float64), -80, 80)
     log_scales = np.asarray(gaussians.log_scales, np.float64)
     scales = np.exp(np.concatenate([log_scales, third_log_scales(log_scales)], axis=1))
+    # Coefficients above every splat's degree are zeros.
     sh = gaussians.sh[:, : NUM_BASES[model.degrees.max(initial=0)]]
     numbers = (gaussians.means, units, scales, 1 / (1 + np.exp(-logits)), sh)
     return Ellipsoids(*(np.asarray(values, np.float32) for values in numbers))
@@ -140,6 +146,7 @@ def third_log_scales(log_scales: np.ndarray) -> np.ndarray:
 
 def linear_colors(colors: np.ndarray) -> np.ndarray:
     """Return linear colours of sRGB colours in [0, 1]."""
+    # IEC 61966-2-1.
     return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
 
 
@@ -154,6 +161,7 @@ def gaussians_of(
     Else the thinnest axis becomes the normal. Splats with numbers that are not finite are left out with a warning,
     unless `keeps_all`.
     """
+    # A textured file has tables by row: none can be left out.
     if not keeps_all:
         kept = whole_rows(os.fspath(path), splats.scales, splats.means, splats.quats, splats.opacities, splats.sh)
         splats = Ellipsoids(*(values[kept] for values in splats))
@@ -171,7 +179,7 @@ def gaussians_of(
 def whole_rows(name: str, scales: np.ndarray, *columns: np.ndarray) -> np.ndarray:
     """Return which rows [N] have finite numbers only. The others are counted in a warning that names the file.
 
-    If no row is finite, all are returned, for the checks of a model to refuse. Of three scales, or their logarithms,
+    If no row is finite, all are returned, and the checks of a model fail. Of three scales, or their logarithms,
     the smallest may be −inf: `flattened` drops it.
     """
     seen = np.sort(scales, axis=1)[:, -2:]  # NaN is sorted to the end.
@@ -212,8 +220,10 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
         if third.min() == third.max() <= others.min() and third[0] < np.median(others) + np.log(0.1):
             return quats, others
     thinnest = 2 - np.argmin(log_scales[:, ::-1], axis=1)  # The last of equal ones.
+    # Cyclic order keeps u × v = normal, so that the rotation needs no reflection.
     kept = np.take_along_axis(log_scales, (thinnest[:, None] + np.array([[1, 2]])) % 3, axis=1)
     dropped = np.take_along_axis(log_scales, thinnest[:, None], axis=1)[:, 0]
+    # Files of `save_ply` have a third scale of 1 THICKNESS, which must not warn.
     num_thick = np.count_nonzero(dropped > kept.min(axis=1) + np.log(2 * THICKNESS))
     if num_thick:
         message = f"{name}: holds 3D Gaussians (scale_2), {num_thick} of them not flat; their thinnest axis is dropped"
@@ -257,6 +267,7 @@ def matrix_of(similarity: Similarity) -> np.ndarray:
 def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
     """Return the similarity that a matrix [4, 4] for columns is. ValueError, naming it `what`: it mirrors, shears, or
     scales axes differently."""
+    # Column norms of s·R are all s.
     scales = np.linalg.norm(matrix[:3, :3], axis=0)
     largest = float(scales.max())
     if not np.isfinite(matrix).all() or not 0 < largest < np.inf:
@@ -282,14 +293,17 @@ def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
     """
     origin, offset, models = None, None, list[Model]()
     for model, matrix in parts:
+        # A file may refer to one mesh from any number of nodes.
         if len(models) == MOST_PARTS:
             raise ValueError(f"holds more than {MOST_PARTS} sets of splats")
         origin = origin or model.origin
         world = similarity_of(matrix, "the transform of its splats")
         move = world.then(upright(origin, up).inverse())
+        # A file written here must come back with the same numbers: rounding in its matrix must not move it.
         if is_same := np.allclose(matrix_of(move), np.eye(4), rtol=0, atol=SAME_PLACE):
             move = UNMOVED
         check_similarity(move, "its transform")
+        # One offset for all parts, by the first: they must share a world.
         if offset is None:
             means, log_scales = np.asarray(model.gaussians.means, np.float64), np.asarray(model.gaussians.log_scales)
             offset = offset_for("ply", move.apply(means), log_scales + np.log(move.scale))
@@ -310,10 +324,10 @@ def origin_to_json(origin: Origin) -> dict[str, Any]:
 
 # Ranges and steps of numbers
 
-SPZ_STEP = 2.0**-12
+SPZ_STEP = 2.0**-12  # 24-bit fixed point with 12 fractional bits.
 SPZ_REACH = 2048 - SPZ_STEP
 """Largest coordinate of SPZ, which wraps those beyond."""
-SOG_LEVELS = 2**16 - 1
+SOG_LEVELS = 2**16 - 1  # Positions have 16 bits an axis.
 MOST_ROUNDING = 0.1
 """Largest rounding of a typical position by a format, in scales of its Gaussian, without a warning."""
 MOST_SINGLE_ROUNDING = 0.01
@@ -323,6 +337,7 @@ SLACK = 1e-3
 
 
 RANGES = {
+    # SPZ: bytes of 0.15·c + 0.5 for degree 0, and of (log-scale + 10)·16.
     "SPZ": (0.5 / 0.15, 1.0, -10.0, 255 / 16 - 10),
     "compressed PLY": (math.inf, 4.0, -math.inf, math.inf),
     ".splat": (0.5 / SH_C0, math.inf, -math.inf, math.inf),
@@ -351,11 +366,13 @@ def offset_for(kind: Kind, means: np.ndarray, log_scales: np.ndarray) -> np.ndar
         by_format = np.median(_rounding(kind, positions) / scales) / MOST_ROUNDING
         return float(max(np.median(single / scales) / MOST_SINGLE_ROUNDING, by_format))
 
-    with np.errstate(all="ignore"):  # Numbers that are not finite are refused later.
+    with np.errstate(all="ignore"):  # Numbers that are not finite fail the checks later.
+        # Whole numbers are exact in float64 and short in text; the median ignores floaters.
         offset: np.ndarray = np.rint(np.median(means, axis=0)) + 0.0  # Not -0.0.
         scales = np.exp(np.asarray(log_scales, np.float64).mean(axis=1))
         before, after = excess(means), excess(means - offset)
         is_outside = kind == "spz" and bool(np.abs(means).max() > SPZ_REACH)
+    # An offset must at least halve the rounding to be worth a moved origin.
     return offset if is_outside or (before > 1 and after < before / 2) else np.zeros(3)
 
 
@@ -424,6 +441,7 @@ def cut_numbers(name: str, model: Model) -> list[str]:
         return []
     gaussians = world_gaussians(model).gaussians
     (first, rest, low, high), sizes = RANGES[name], np.abs(np.asarray(gaussians.sh))
+    # It has no higher degrees to cut.
     if name == ".splat":
         sizes = sizes[:, :1]
     largest = np.where(np.arange(sizes.shape[1]) == 0, first, rest)[:, None] * (1 + SLACK)

@@ -12,6 +12,7 @@ from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 
 FORMAT, VERSION = "a2tg-jax path", 1
+# A file may come from a stranger: sides decide how much memory a frame takes.
 LARGEST_SIDE, MOST_VIEWS = 16384, 10_000
 
 

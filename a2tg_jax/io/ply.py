@@ -63,8 +63,8 @@ def save_ply(
     Args:
       path: the file; an older one is replaced once the new one is whole.
       gaussians: N Gaussians; or a model, of which the Gaussians that exist are written, without what they show;
-        they are as opaque as `Appearance.opacities` takes them to be (movable kernels and billboards have opacities of
-        their own). Kernels of other shapes become the nearest Gaussians.
+        their opacities are `Appearance.opacities`, for movable kernels and billboards have their own. Kernels of other
+        shapes become the nearest Gaussians.
       transform: `scene.transform`, which led from the original world to the world of the Gaussians; given, they are
         brought back to the original world first, SH included. None writes Gaussians as they are, and brings those of a
         model back to the original world of its origin, if it has one.
@@ -96,14 +96,17 @@ def encode_ply(
       offset: [3] what the means are relative to, for a comment.
       means: [N, 3] to write as float64 instead of the Gaussians' own.
     """
+    # A file that this program refuses to read must not be written.
     check_model(Model(gaussians))
     sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
+    # [N, K, 3] to channel by channel, as 3DGS writes f_rest.
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, 3 * (sh.shape[1] - 1))
     names = [name for name in ATTRIBUTES if name not in SH_REST[rest.shape[1] :]]
     if third is not None:
         names.insert(names.index(SCALES[-1]) + 1, THIRD_SCALE)
         log_scales = np.concatenate([log_scales, third], axis=1)
     columns = [
+        # Normals: the third column of each rotation.
         np.asarray(rotation_matrices(gaussians.quats)[:, :, 2]),
         sh[:, 0],
         rest,
@@ -116,6 +119,7 @@ def encode_ply(
     comments = f"comment {FLAT_MARK}\n{'' if offset is None else offset_comment(offset)}"
     header = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {gaussians.num}\n{properties}end_header\n"
     parts = (positions.astype(positions.dtype.newbyteorder("<")), np.concatenate(columns, 1).astype("<f4"))
+    # As bytes, since float64 positions and float32 columns share a row.
     rows = np.concatenate([np.ascontiguousarray(part).view(np.uint8) for part in parts], axis=1)
     return header.encode("ascii") + rows.tobytes()
 
@@ -168,10 +172,12 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     If the splats are not known to be flat, the header may say so.
     """
     ply = PlyFile(file, path)
+    # A packed file begins with its chunks.
     vertices = unpacked_vertices(ply) if [*ply.counts][:1] == ["chunk"] else _vertices(ply)
     is_flat |= any(" ".join(words).lower() == FLAT_MARK.lower() for words in ply.comments)
     has_third = THIRD_SCALE in (vertices.dtype.names or ()) and not is_flat
     log_scales = _columns(vertices, (*SCALES, THIRD_SCALE) if has_third else SCALES)
+    # float64 until the offset is subtracted: float32 would round map coordinates.
     means, quats = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1), _columns(vertices, QUATS)
     # Some programs write infinite logits for opacities 0 and 1.
     logits = vertices["opacity"]
@@ -180,7 +186,7 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     sh = _sh_of(vertices, path)
     means, quats, log_scales, logits, sh = others.flat_rows(str(path), means, quats, log_scales, logits, sh)
     inside = others.offset_for("ply", means, log_scales)  # Zeros where the file has float32.
-    with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
+    with np.errstate(over="ignore"):  # What is too large becomes infinite, which fails the checks.
         means = (means - inside).astype(np.float32)
     gaussians = Gaussians(*(jnp.asarray(rows) for rows in (means, quats, log_scales, logits, sh)))
     with reading(path):
@@ -210,12 +216,14 @@ def _sh_of(vertices: np.ndarray, path: Path) -> np.ndarray:
     """Return the spherical harmonics [N, K, 3] of a structured array of vertices."""
     found = {name for name in vertices.dtype.names or () if name.startswith("f_rest_")}
     rest = [f"f_rest_{i}" for i in range(len(found))]
+    # Gaps in the numbering would shift the channels.
     if len(rest) not in NUM_REST or found != set(rest):
         raise ValueError(f"{path}: has {len(rest)} attributes f_rest_*; SH of degree 0 to 4 have 0, 9, 24, 45 or 72")
     num_bases = NUM_BASES[others.degree_to_read(NUM_REST.index(len(rest)), str(path))]
     sh = np.zeros((len(vertices), num_bases, 3), np.float32)
     sh[:, 0] = _columns(vertices, SH_DEGREE0)
     if rest:
+        # Channel by channel: the degree to read is cut from each channel.
         per_channel = _columns(vertices, rest).reshape(len(vertices), 3, len(rest) // 3)
         sh[:, 1:] = per_channel[:, :, : num_bases - 1].transpose(0, 2, 1)
     return sh
@@ -223,7 +231,7 @@ def _sh_of(vertices: np.ndarray, path: Path) -> np.ndarray:
 
 def _columns(vertices: np.ndarray, wanted: Iterable[str]) -> np.ndarray:
     """Return attributes of vertices as columns, float32."""
-    with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused then.
+    with np.errstate(over="ignore"):  # What is too large becomes infinite, which fails the checks.
         return np.stack([vertices[name].astype(np.float32) for name in wanted], axis=-1)
 
 
@@ -255,6 +263,7 @@ def unpacked_vertices(ply: PlyFile) -> np.ndarray:
     if "sh" in names and (ply.counts["sh"] != num or set(ply.fields["sh"].values()) - {"u1"}):
         raise ValueError(f"{path}: sh must be uchar of each of the {num} vertices; got {ply.counts['sh']}")
     chunks, vertices, *rest = (ply.read(name) for name in names)
+    # The last chunk may be partially filled.
     chunks = np.repeat(chunks, CHUNK)[:num]
 
     def within(what: str, axes: str, shares: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -268,22 +277,27 @@ def unpacked_vertices(ply: PlyFile) -> np.ndarray:
     # The highest bits of a rotation hold the index of its largest number, which follows from the smaller.
     packed = vertices["packed_rotation"]
     smaller = np.stack(
+        # Numbers other than the largest of a unit quaternion are within ±1/√2.
         [(share - 0.5) * np.sqrt(2) for share in _unpacked(packed & np.uint32((1 << 30) - 1), (10,) * 3)]
     )
     largest, index = (
         np.sqrt(np.maximum(1 - np.sum(smaller**2, axis=0), 0.0)),
         (packed >> np.uint32(30)).astype(np.int64),
     )
+    # Number k is smaller[k] if the largest comes later, and smaller[k − 1] if it came before.
     before, after = np.stack([*smaller, smaller[2]]), np.stack([smaller[0], *smaller])
     columns |= {f"rot_{k}": np.where(index == k, largest, np.where(index > k, before[k], after[k])) for k in range(4)}
     *colors, opacity = _unpacked(vertices["packed_color"], (8,) * 4)
+    # Older files have colours in [0, 1] without bounds.
     if set(COLOR_BOUNDS) <= set(ply.fields["chunk"]):
         colors = within("", CHANNELS, colors)
     columns |= {f"f_dc_{k}": (color - 0.5) / SH_C0 for k, color in enumerate(colors)}
+    # Bytes 0 and 255 have no finite logit.
     opacity = np.clip(opacity, others.LEAST_OPACITY, 1 - others.LEAST_OPACITY)
     columns["opacity"] = np.log(opacity) - np.log1p(-opacity)
     for name in ply.fields["sh"] if rest else ():
         codes = rest[0][name].astype(np.float64)
+        # Centres of 256 bins, except at the ends, as SuperSplat decodes them.
         shares = np.where(codes == 0, 0.0, np.where(codes == 255, 1.0, (codes + 0.5) / 256))
         columns[name] = (shares - 0.5) * SH_RANGE
     found = np.empty(num, [(name, "<f4") for name in columns])

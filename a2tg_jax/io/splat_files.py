@@ -65,7 +65,9 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
     # In the order of a Z curve through the means.
     means = np.asarray(gaussians.means, np.float64)
     low, high = means.min(axis=0, initial=0.0), means.max(axis=0, initial=0.0)
+    # 1e-30: all means may be equal along an axis.
     codes = ((means - low) / np.maximum(high - low, 1e-30) * (2**CURVE_BITS - 1)).astype(np.int64)
+    # stable: equal codes keep their order, so that files repeat.
     gaussians = gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]
     third = others.third_log_scales(np.asarray(gaussians.log_scales)).min(axis=0, keepdims=True, initial=0.0)
     if kind == "compressed.ply":
@@ -132,6 +134,7 @@ def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
 def _marked(data: bytes, kind: str, offset: np.ndarray) -> bytes:
     """Return a file that says that its splats are flat, and what they are relative to, if its format can."""
     if kind == "compressed.ply":
+        # Comments of a PLY follow its format line.
         return data.replace(b" 1.0\n", f" 1.0\ncomment {FLAT_MARK}\n{offset_comment(offset)}".encode(), 1)
     if kind != "sog":
         return data
@@ -143,6 +146,7 @@ def _marked(data: bytes, kind: str, offset: np.ndarray) -> bytes:
                 header = {**json.loads(content), "model": SOG_FLAT}
                 header |= {OFFSET: offset.tolist()} if offset.any() else {}
                 content = json.dumps(header, separators=(",", ":")).encode()
+            # A fresh ZipInfo has a fixed date, so that files repeat.
             new.writestr(zipfile.ZipInfo(entry.filename), content)
     return marked.getvalue()
 
@@ -182,6 +186,7 @@ def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
     rows["colors"] = np.rint(255 * np.clip(colors, 0, 1))
     bands = [splats.sh[:, band**2 : (band + 1) ** 2] for band in range(1, degree + 1)]
     if bands:
+        # Degree by degree, and channel by channel within each.
         rows["rest"] = np.concatenate([band.transpose(0, 2, 1).reshape(len(rows), -1) for band in bands], axis=1)
     num = gaussians.num
     header = KSPLAT_HEADER.pack(*KSPLAT_VERSION, 1, 1, num, num, 0, 0.0, 0.0, 0.0, *DEFAULT_ENDS).ljust(
@@ -220,12 +225,14 @@ def _ksplat_splats(data: bytes) -> others.Ellipsoids:
     start = HEADER_BYTES + num_sections * SECTION_BYTES
     if start > len(data):
         raise ValueError(f"is cut off: {num_sections} sections were announced")
+    # 0 stands for the default in GaussianSplats3D.
     ends = (low or DEFAULT_ENDS[0], high or DEFAULT_ENDS[1])
     found = []
     for index in range(num_sections):
         section = KSPLAT_SECTION.unpack_from(data, HEADER_BYTES + index * SECTION_BYTES)
         splats, start = _ksplat_section(data, start, section, level, ends)
         found.append(splats)
+    # Sections may differ in degree: lower ones are padded with zeros.
     num_bases = max((splats.sh.shape[1] for splats in found), default=1)
     padded = [
         splats._replace(sh=np.pad(splats.sh, ((0, 0), (0, num_bases - splats.sh.shape[1]), (0, 0)))) for splats in found
@@ -249,6 +256,7 @@ def _ksplat_section(
         raise ValueError(f"is damaged: a section has bucket centres of {centre_bytes} bytes, not {BUCKET_BYTES}")
     dtype = _ksplat_rows(level, degree)
     first = start + 4 * num_partial + BUCKET_BYTES * num_buckets
+    # A section reserves room for its largest number of splats, not for those that it has.
     stop = first + most * dtype.itemsize
     if stop > len(data):
         raise ValueError(f"is cut off: a section ends at byte {stop:,} of {len(data):,}")
@@ -261,7 +269,9 @@ def _ksplat_section(
             raise ValueError(f"is damaged: the buckets of a section have fewer than its {num} splats")
         centres = np.frombuffer(data, "<f4", 3 * num_buckets, start + 4 * num_partial).reshape(-1, 3)
         reach = reach or DEFAULT_RANGE
+        # side right: splat i is in the first bucket that ends beyond i.
         bucket = np.searchsorted(bounds, np.arange(num), side="right")
+        # Codes 0 to 2·reach are −side/2 to side/2 around the bucket's centre.
         means = (means - reach) * (side / 2 / reach) + centres[bucket]
     rest = np.asarray(rows["rest"], np.float64)
     if level == 2:

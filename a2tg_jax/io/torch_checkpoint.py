@@ -45,6 +45,7 @@ GSPLAT = ("means", "quats", "scales", "opacities", "sh0", "shN")
 NERFSTUDIO = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 TUPLE_2DGS = {"means": 1, "sh0": 2, "shN": 3, "scales": 4, "quats": 5, "opacities": 6}
 """Places of the parameters in the tuple that 3DGS and 2DGS save."""
+# 3DGS has active_sh_degree at place 0, then the parameters, then statistics and the optimiser.
 TUPLE_LENGTH = 12
 COEFFICIENTS = (1, 4, 9, 16, 25)
 """Numbers of coefficients by degree of the spherical harmonics; gsplat trains degree 4, too."""
@@ -52,8 +53,8 @@ COEFFICIENTS = (1, 4, 9, 16, 25)
 
 def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a checkpoint of gsplat, Nerfstudio, 3DGS or 2DGS. Ellipsoids become flat, with a warning.
-    FileNotFoundError: there is no such file. ValueError: it is not such a checkpoint, is damaged, pickles anything else
-    than tensors, or a number is not finite."""
+    FileNotFoundError: there is no such file. ValueError: it is not such a checkpoint, is damaged, pickles anything but
+    tensors, or a number is not finite."""
     path = Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such checkpoint")
@@ -71,7 +72,7 @@ def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
 
 
 class _Refused(Exception):
-    """A pickle names something else than tensors."""
+    """A pickle refers to something other than tensors."""
 
 
 class _Storage(NamedTuple):
@@ -85,16 +86,18 @@ class _Storage(NamedTuple):
 class _Tensor:
     """A view into a storage."""
 
+    # Further arguments: requires_grad, hooks, metadata.
     def __init__(self, storage: _Storage, offset: int, size: Any, stride: Any, *rest: object):
         self.storage, self.offset, self.size, self.stride = storage, offset, tuple(size), tuple(stride)
 
 
 class _Ignored:
-    """A value of no use here, such as a NumPy scalar."""
+    """An unused value, such as a NumPy scalar."""
 
     def __init__(self, *arguments: Any):
         pass
 
+    # Pickles may set a state; it is dropped as well.
     __setstate__ = __init__
 
 
@@ -132,15 +135,17 @@ class _Unpickler(pickle.Unpickler):
         return functools.partial(KNOWN[full])  # What a pickle sets on it, it sets on no other.
 
     def persistent_load(self, pid: Any) -> _Storage:
+        # ("storage", type, key, device, number of elements).
         kind, dtype, key, _, num = pid
         if kind != "storage" or not isinstance(dtype, str) or not isinstance(num, int):
-            raise _Refused("refers to something else than a storage")
+            raise _Refused("refers to something other than a storage")
         return _Storage(dtype, str(key), num)
 
 
 def _unpickled(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
     """Return the arrays of a checkpoint's Gaussians by gsplat's names."""
     names = archive.namelist()
+    # The folder in the zip has the name of the file when it was saved.
     pickled = next((name for name in names if name.count("/") == 1 and name.endswith("/data.pkl")), None)
     if pickled is None or len(names) > MOST_ENTRIES:
         raise _Refused("is not a checkpoint of PyTorch: it has no data.pkl")
@@ -177,9 +182,11 @@ def _tensors_of(value: object) -> dict[str, _Tensor]:
                 raise _Refused(f"has dictionaries of more than {MOST_NODES:,} values")
             if isinstance(node, _Tensor):
                 own[name] = node
+        # Nerfstudio's names differ in the SH only.
         wanted = GSPLAT if any(name.endswith("sh0") for name in own) else NERFSTUDIO
         found = {name: own[key] for name, key in zip(GSPLAT, wanted, strict=True) if key in own}
     tensors = {name: tensor for name, tensor in found.items() if isinstance(tensor, _Tensor)}
+    # Degree 0 needs no shN.
     missing = [name for name in GSPLAT[:-1] if name not in tensors]
     if missing:
         raise _Refused(f"holds no Gaussians as gsplat, Nerfstudio, 3DGS or 2DGS save them: no {', '.join(missing)}")
@@ -203,6 +210,7 @@ def _array(tensor: _Tensor, archive: zipfile.ZipFile, folder: str) -> np.ndarray
     num = math.prod(size)
     dtype, entry = np.dtype(storage.dtype), archive.getinfo(f"{folder}data/{storage.key}")
     steps = [stride * (side - 1) for side, stride in zip(size, tensor.stride, strict=True)]
+    # PyTorch stores plainly; a compressed entry could unpack to far more than the file.
     if entry.compress_type != zipfile.ZIP_STORED:
         raise _Refused("has compressed storages")
     if entry.file_size != storage.num * dtype.itemsize:
@@ -212,6 +220,7 @@ def _array(tensor: _Tensor, archive: zipfile.ZipFile, folder: str) -> np.ndarray
     # The checks above keep every element that the strides reach within the storage.
     flat = np.frombuffer(archive.read(entry), dtype)
     strides = [stride * dtype.itemsize for stride in tensor.stride]
+    # A copy, for strides may overlap.
     return np.array(np.lib.stride_tricks.as_strided(flat[tensor.offset :], size, strides), np.float32)
 
 

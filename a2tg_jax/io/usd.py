@@ -43,6 +43,7 @@ def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = F
     """
     stage = _stage_of(live_model(path, model, "save_usd"), ellipsoids)
     path = Path(path)
+    # usd-core chooses the format by the suffix, which the temporary path lacks.
     with replacing(path) as temporary, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         suffix = path.suffix.lower() if path.suffix.lower() in (".usda", ".usdz") else ".usdc"
         layer = Path(folder, f"splats{'.usdc' if suffix == '.usdz' else suffix}")
@@ -57,9 +58,11 @@ def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = F
 def import_usd() -> Any:
     """Return the modules of usd-core. ValueError, with what to install, if it is missing or too old."""
     try:
+        # Subpackages must be imported to become attributes of pxr.
         import pxr
         from pxr import Gf, Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: F401 - as attributes of the package
 
+        # Particle fields came with 26.03.
         if not hasattr(UsdVol, SURFLET):
             raise ImportError("it is older than 26.03")
     except ImportError as error:
@@ -72,6 +75,7 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
     usd, splats = import_usd(), others.splats_of(model)
     stage = usd.Usd.Stage.CreateInMemory()
     usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.z)
+    # USD's default is centimetres.
     usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     world = usd.UsdGeom.Xform.Define(stage, "/World")
     stage.SetDefaultPrim(world.GetPrim())
@@ -83,6 +87,7 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
             getattr(usd.UsdVol, f"ParticleField{name}AttributeAPI").Apply(prim)
         getattr(usd.UsdVol, SURFLET).Apply(prim)
     matrix = others.matrix_of(others.upright(model.origin, "z"))
+    # USD's matrices are for row vectors.
     field.AddTransformOp().Set(usd.Gf.Matrix4d(*matrix.T.ravel().tolist()))
     volume, arrays = usd.UsdVol, usd.Vt
     harmonics = volume.ParticleFieldSphericalHarmonicsAttributeAPI(prim)
@@ -99,6 +104,7 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
         attribute.Set(array.FromNumpy(np.ascontiguousarray(values)))
     harmonics.CreateRadianceSphericalHarmonicsDegreeAttr(NUM_BASES.index(splats.sh.shape[1]))
     if model.num:
+        # Extents contain splats up to three standard deviations.
         reach = 3 * splats.scales.max(axis=1, keepdims=True)
         corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
         field.CreateExtentAttr(usd.Vt.Vec3fArray.FromNumpy(corners))
@@ -122,6 +128,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
     usd, path = import_usd(), Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such USD file")
+    # usd-core opens the path itself: this checks the size and the permission first.
     open_regular(path, MOST_ARRAY_BYTES).close()
     with reading(path):
         try:
@@ -132,7 +139,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
             return others.joined_parts(
                 ((_model_of(usd, prim, path), _world_of(usd, prim, unit)) for prim in fields), up
             )
-        except RuntimeError as error:  # Those of usd-core, of several lines.
+        except RuntimeError as error:  # usd-core's errors, which have several lines.
             raise ValueError(f"is no USD file, or is damaged ({shortened(str(error))})") from error
 
 
@@ -178,12 +185,14 @@ def _splats(usd: Any, prim: Any, path: Path) -> others.Ellipsoids:
         values = _numbers(usd, prim, name, len(default), num)
         return np.tile(np.asarray(default, np.float32), (num, 1)) if values is None else values
 
+    # Quatf arrays become xyzw in NumPy.
     quats = column("orientations", (0.0, 0.0, 0.0, 1.0))[:, [3, 0, 1, 2]]
     return others.Ellipsoids(means, quats, column("scales", (1.0, 1.0, 1.0)), column("opacities", (1.0,))[:, 0], sh)
 
 
 def _numbers(usd: Any, prim: Any, name: str, columns: int, wanted: int | None = None) -> np.ndarray | None:
     """Return the `wanted` first rows [n, columns] of an attribute, in floats or else in halves; None if it has none."""
+    # The schema's half attributes end in h; floats win if both are authored.
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
         values = attribute.Get(usd.Usd.TimeCode.EarliestTime()) if attribute else None
         if values is not None and len(values) >= (wanted or 0):

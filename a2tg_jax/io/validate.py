@@ -71,10 +71,12 @@ def reading(path: str | os.PathLike[str]) -> Iterator[None]:
         yield
     except KeyError as error:
         raise ValueError(f"{where}: lacks {shortened(str(error))}; it is damaged or of another version") from error
+    # What JSON of another shape than expected raises on access.
     except (TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"{where}: is damaged or of another version ({shortened(repr(error))})") from error
     except ValueError as error:
         reason = shortened(str(error), LONGEST_REASON)
+        # Inner readers may have named the file already.
         raise ValueError(reason if reason.startswith(where) else f"{where}: {reason}") from error
 
 
@@ -119,6 +121,7 @@ def check_finite(name: str, tree: object, *, is_signed: bool = True) -> None:
         values = np.asarray(leaf)
         if not np.issubdtype(values.dtype, np.floating):
             continue
+        # `values >= 0` is False for NaN.
         is_good = np.atleast_1d(np.isfinite(values) if is_signed else values >= 0)
         if not is_good.all():
             wanted, found = ("finite", "NaN or infinite") if is_signed else ("at least 0", "negative or NaN")

@@ -48,6 +48,7 @@ def encode_web_scene(
     model = model.live
     texture = model.appearance.texture
     if texture is not None and model.num:
+        # Baked into the texels, so that shaders need only one rule for textures.
         seen = dataclasses.replace(texture.options, rgb="signed", alpha="projected")
         texture = dataclasses.replace(texture, texels=texture.shown(), options=seen)
         model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=texture))
@@ -72,11 +73,13 @@ def encode_web_scene(
 def importance(model: Model) -> np.ndarray:
     """Return [N] opacity times the area that cameras see, on average; without cameras times the area itself."""
     gaussians, origin = model.gaussians, model.origin
+    # log s_u + log s_v.
     log_areas = np.asarray(gaussians.log_scales, np.float64).sum(axis=1)
     areas: np.ndarray = opacities_of(np.asarray(gaussians.logit_opacities)) * np.exp(log_areas)
     if origin is None or not len(origin.viewmats):
         return areas
     viewmats = origin.viewmats[:: -(-len(origin.viewmats) // MOST_CAMERAS)]  # Evenly chosen.
+    # −Rᵀ·t.
     centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
     means = np.asarray(gaussians.means)
     squares = np.stack([np.sum((means - center) ** 2, axis=1) for center in centers])
