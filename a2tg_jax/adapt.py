@@ -126,6 +126,7 @@ class Upscale(HostEvent):
             return max(num_bytes, self._budget_bytes)
         # Most who grow have grown before; how many pass a threshold is not known.
         share = self.fraction if self.select == "fraction" else USUAL_SHARE
+        # Each time doubles both sides at most.
         texels = min(4.0 ** len(self.iterations(num_iterations)), self.cap**2)
         return num_bytes + BYTES_PER_TEXEL * num * share * (texels - 1)
 
@@ -242,6 +243,7 @@ def next_sizes(
         is_thin_u, is_thin_v = is_thin_v, is_thin_u
     doubles = np.stack([~is_thin_u, ~is_thin_v], axis=1)
     present = np.maximum(sizes, 1)
+    # The maximum keeps sides that are above the cap already.
     return np.where(doubles, np.maximum(present, np.minimum(2 * present, cap)), present)
 
 

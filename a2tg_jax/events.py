@@ -46,6 +46,7 @@ class Times(NamedTuple):
 
     def num_left(self, iteration: Any) -> Any:
         """Return the number of its times from an iteration on."""
+        # The multiples of `every` up to the last time, without those before this iteration.
         return self.last // self.every - (iteration - 1) // self.every
 
     @property
@@ -293,6 +294,7 @@ def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | 
     is_kept = is_kept[:num]
     if (num_kept := int(is_kept.sum())) < LEAST_LEFT:
         raise ValueError(f"is_kept must keep at least {LEAST_LEFT} Gaussians; got {num_kept} of {num:,}")
+    # What is removed stays behind the others, where `num_live` leaves it out, so that no shape changes.
     rows[:num] = np.concatenate([np.flatnonzero(is_kept), np.flatnonzero(~is_kept)])
     moments = gather_moments(moments, rows)
     left = placed_like(np.asarray(num_kept, np.int32), model.gaussians.means)
@@ -342,6 +344,7 @@ def read_probe(found: Array, statistic: str, width: int, height: int) -> tuple[A
     """
     gradients = found[..., :3]
     if statistic != "position":
+        # Chain rule: ∂L/∂(x / (W/2)) = W/2·∂L/∂x.
         half = jnp.asarray([width / 2, height / 2, 1.0], found.dtype)
         gradients = gradients * half.reshape((1,) * (found.ndim - 1) + (3,))
     return gradients, found[..., 3] > 0

@@ -24,6 +24,7 @@ from a2tg_jax.core.table import bucket_capacity
 from a2tg_jax.events import NEVER, Change, EventInfo, Now, StepEvent, Times, clear_moments, gather_rows
 from a2tg_jax.model import Model
 
+# Constants of 3DGS-MCMC's program.
 NOISE_SCALE = 5e5
 NOISE_STEEPNESS = 100.0
 NOISE_TRANSPARENCY = 0.995

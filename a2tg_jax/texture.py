@@ -18,8 +18,8 @@ from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.table import Size, Table, check_table
 
 MAX_SIDE = 16
-BYTES_PER_TEXEL = 16
-NEUTRAL_TEXEL = (0.0, 0.0, 0.0, 1.0)
+BYTES_PER_TEXEL = 16  # 4 channels of float32
+NEUTRAL_TEXEL = (0.0, 0.0, 0.0, 1.0)  # adds no colour, and multiplies alpha by 1
 
 
 @pytree(repr=False)

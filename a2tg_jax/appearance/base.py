@@ -48,7 +48,7 @@ from a2tg_jax.texture import Textures
 
 T = TypeVar("T")
 
-MAX_ALPHA = 0.99
+MAX_ALPHA = 0.99  # as in 3DGS
 
 
 @pytree(kw_only=True)
@@ -114,6 +114,7 @@ class Appearance:
 
         By default, D = 3 of spherical harmonics up to `degree`, which may be traced.
         """
+        # Not `jnp.maximum`, which halves the gradient of colours at exactly 0.
         return at_least(color_sums(self, gaussians, camera, degree) + 0.5, 0.0)
 
     def atlas(self) -> tuple[Array, TextureRegion | None]:
@@ -297,6 +298,7 @@ def own_fields(appearance: Any) -> list[str]:
 
 def gaussian_cutoff(peak: Array) -> Array:
     """Return r² = 2·ln(255·peak), at which peak·exp(−r²/2) = 1/255; negative if the peak is not positive."""
+    # A peak of 0 has no logarithm; its bound must be finite and negative.
     return 2 * jnp.log(jnp.maximum(255 * peak, 1e-6))
 
 

@@ -29,7 +29,7 @@ from a2tg_jax.texture import MAX_SIDE, Textures, allocate_textures
 
 INITIAL_PEAK, INITIAL_SIGMA = 0.5, 0.3
 """Peak and σ, in units of u, of the initial alpha picture; it falls to an invisible 0.002 at the border."""
-LEAST_PEAK = 0.999 / 255
+LEAST_PEAK = 0.999 / 255  # rounding must not hide a picture that reaches 1/255
 
 
 @pytree
@@ -63,6 +63,7 @@ class Billboards(Appearance):
         return shown.reshape(-1, 4), TextureRegion(first, side, side)
 
     def peak_opacities(self, gaussians: Gaussians) -> Array:
+        # The picture's alpha is the whole opacity.
         return jnp.ones(gaussians.num, gaussians.means.dtype)
 
     def texel_position(self, region: TextureRegion, u: Array, v: Array) -> tuple[Array, Array]:
@@ -83,6 +84,7 @@ class Billboards(Appearance):
         """Return the circle around the picture, border included."""
         (bucket,) = self._bucket()
         peaks = jax.lax.stop_gradient(jnp.max(bucket[..., 3], axis=(1, 2)))[self._rows()]
+        # Pictures fade out over one texel beyond ±1; a corner is at ρ = u² + v².
         half_side = 1 + 2 / (self.side - 1)
         return jnp.where(opacities * peaks >= LEAST_PEAK, 2 * half_side * half_side, -1.0)
 

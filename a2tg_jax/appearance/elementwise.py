@@ -76,6 +76,7 @@ class StaticShading:
         has_curve, has_features = own.exponents is not None, own.features is not None
 
         def shade(numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array) -> tuple[Residual, Factor]:
+            # The curve is last (`numbers_in_view`). Features replace all colour, the residual as well.
             shaded = own.shade(numbers[:-CURVE] if has_curve else numbers, values, u, v)
             # `check_shading` names a result of another form.
             is_pair = isinstance(shaded, tuple | list) and len(shaded) == 2
@@ -111,6 +112,7 @@ class _LeftOut:
         )
 
     def __getattr__(self, name: str) -> Any:
+        # Python and JAX probe for special methods; only AttributeError says that there is none.
         if name.startswith("__"):
             raise AttributeError(name)
         self._refuse()

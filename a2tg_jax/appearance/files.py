@@ -70,6 +70,7 @@ def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degre
         changes["exponents"] = Exponents(jnp.asarray(shapes))
     if template.texture is not None:
         changes["texture"] = dataclasses.replace(template.texture, texels=_textures(arrays, "sizes", "texels"))
+    # Two rows are enough to learn the structure of a subclass's arrays and the shape of a row.
     example = allocate_appearance(template, jax.random.key(0), no_rows(2, 1))
     for field in own_fields(template):
 

@@ -54,6 +54,7 @@ class MovableKernels(Appearance):
 
     def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
         """Return [N, 28]: x, y, k, o and the colour of each kernel."""
+        # Not `jnp.maximum`, which halves the gradient at 0, where `project` puts kernels.
         sharpness = jnp.where(self.sharpness >= 0, self.sharpness, 0.0)
         columns = [self.centers, sharpness[..., None], self.kernel_opacities[..., None], self.colors]
         return jnp.concatenate(columns, axis=2).reshape(gaussians.num, -1)
@@ -80,6 +81,7 @@ class MovableKernels(Appearance):
         """Return colourless kernels around the mean. Together they are as opaque there as the Gaussian, up to 0.82."""
         num, dtype = gaussians.num, gaussians.means.dtype
         centers = jnp.asarray(INITIAL_CENTERS, dtype)
+        # The mean is at a squared distance of 2 from each initial centre.
         weight_at_mean = float(np.exp(-2 * INITIAL_SHARPNESS)) + LEAST_WEIGHT
         opacities = jnp.minimum(gaussians.opacities / weight_at_mean, LARGEST_INITIAL_OPACITY)
         return dataclasses.replace(

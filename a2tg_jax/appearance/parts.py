@@ -186,6 +186,7 @@ class Texture(Part):
             columns.append(jnp.pad(own, (0, most - len(own))))
         peaks = jnp.stack(columns)
         peaks = jax.lax.stop_gradient(peaks[textures.bucket, textures.row])
+        # Outside such a texture the factor is 1.
         return jnp.maximum(peaks, 1.0) if self.options.outside == "identity" else peaks
 
     # Element-wise, without the texels
@@ -314,6 +315,7 @@ class Coefficients(Table):
         bucket, row, num = on_host(places.bucket), on_host(places.row), places.bucket.shape[0]
         owners = []
         for index, blocks in enumerate(buckets):
+            # N is out of range, so that scatters drop padding.
             own = np.full(len(blocks), num, np.int32)
             own[row[bucket == index]] = np.flatnonzero(bucket == index)
             owners.append(placed_like(own, places.bucket))
@@ -359,10 +361,12 @@ class Bands(Part):
         for blocks, owners in zip(table.buckets, table.owners, strict=True):
             if not blocks.size:
                 continue
+            # Padding reads the last Gaussian here, and is dropped below.
             bases = sh_basis(normalize(means[jnp.minimum(owners, table.num - 1)] - center[None, :]))
             colors = jnp.zeros((len(blocks), 3), total.dtype)
             for band in range(base + 1, MAX_DEGREE + 1):
                 first, last = NUM_BASES[band - 1], NUM_BASES[band]
+                # Blocks have all bands up to a degree.
                 if blocks.shape[1] < last - NUM_BASES[base]:
                     break
                 basis = jnp.where(jnp.asarray(degree) >= band, bases[:, first:last], 0.0)
@@ -444,6 +448,7 @@ def _table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     kernels = np.asarray(falloff_of(curves, jnp.asarray(radii**2)[None]), np.float64)
     log_scales = np.linspace(LEAST_LOG_SCALE, MOST_LOG_SCALE, NUM_SCALES)
     squares = np.exp(2 * log_scales)
+    # ⟨f, g⟩ in units of π: ∫ f·g·2r dr in steps of radii[1].
     weighted = np.exp(-0.5 * radii**2 / squares[:, None]) * radii * (2 * radii[1])
     products = kernels @ weighted.T
     best = np.argmax(products**2 / squares, axis=1)

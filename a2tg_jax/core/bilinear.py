@@ -25,6 +25,7 @@ class TextureRegion(NamedTuple):
 
 def within_texels(regions: TextureRegion, num_texels: int) -> TextureRegion:
     """Return regions moved and cut so that all their texels are among `num_texels`; kernels do not check them."""
+    # Each limit uses those before it, so that first + height·width <= num_texels.
     height = jnp.where(regions.width > 0, jnp.clip(regions.height, 0, num_texels), 0)
     width = jnp.where(height > 0, jnp.clip(regions.width, 0, num_texels // jnp.maximum(height, 1)), 0)
     first = jnp.clip(regions.first, 0, num_texels - height * width)
@@ -62,12 +63,14 @@ def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
     # Clipped, so that no x or y reads outside the texture.
     left = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, right_most)
     top = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, bottom_most)
+    # Beyond the last texel the weight is 0, because x <= width − 1: any index inside will do.
     right, bottom = jnp.minimum(left + 1, right_most), jnp.minimum(top + 1, bottom_most)
     above, below = region.first + top * region.width, region.first + bottom * region.width
     exists = (region.width > 0).astype(x.dtype)
     # Without a texture all four weights are 0, and nothing is read into the sum.
     fx, fy = exists * (x - left.astype(x.dtype)), exists * (y - top.astype(y.dtype))
     gx, gy = exists - fx, exists - fy
+    # The slopes follow from ∂fx/∂x = 1 and ∂gx/∂x = −1.
     return (
         Corner(above + left, gx * gy, -gy, -gx),
         Corner(above + right, fx * gy, gy, -fx),

@@ -36,6 +36,7 @@ def megabytes_of(budget: float | str | None, name: str = "memory_budget") -> flo
     found = re.fullmatch(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([a-z]*)\s*", str(budget).lower())
     try:
         number, unit = found.groups() if found else ("", "")
+        # As floats, 33.3 kB would be 0.033299999999999996 MB, in messages as well.
         megabytes = float(decimal.Decimal(number) * decimal.Decimal(MEGABYTES[unit]))
     except (KeyError, decimal.InvalidOperation):
         raise ValueError(
@@ -80,6 +81,7 @@ def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray,
     budget = budget_bytes
     candidates = np.flatnonzero(can_grow & (statistic >= 0))
     gain = statistic[candidates].astype(np.float64) / cost[candidates]
+    # Stable: of equal gains the first Gaussian wins, on every machine.
     queue = candidates[np.argsort(-gain, kind="stable")]
     chosen = []
     # The rest of the budget only shrinks, so that a candidate that does not fit never will. Each round takes all up to
@@ -92,6 +94,7 @@ def within_budget(statistic: np.ndarray, can_grow: np.ndarray, cost: np.ndarray,
         queue = queue[num:]
         queue = queue[cost[queue] <= budget]
     mask = np.zeros(len(statistic), bool)
+    # The empty array keeps an integer dtype if nothing was chosen.
     mask[np.concatenate([np.zeros(0, np.int64), *chosen])] = True
     return mask
 

@@ -27,7 +27,7 @@ MIN_AXIS_SPREAD = 1e-3
 """Smallest eigenvalue of the mean of I - d·dᵀ (about the squared angle between axes) that fixes a point."""
 LEAST_FACING = 0.5
 """Smallest median cosine between optical axes and the directions to the subject."""
-LARGEST_ELEVATION = np.radians(80)
+LARGEST_ELEVATION = np.radians(80)  # a camera straight above has no level horizon (`looking`)
 FEWEST = 4
 """Smallest number of cameras whose right axes say more than their mean up."""
 LEAST_SPREAD = 0.025
@@ -44,6 +44,7 @@ TURN_WEIGHT = 0.5
 
 def nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return argmin_x Σ |(I - d·dᵀ)(x - c)|² for lines through `centers` along unit `axes`, or the mean centre."""
+    # Normal equations of the least squares: Σ P·x = Σ P·c with P = I − d·dᵀ.
     projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal_matrix = projections.mean(axis=0)
     if np.linalg.eigvalsh(normal_matrix)[0] < MIN_AXIS_SPREAD:
@@ -60,11 +61,13 @@ def vertical_of(viewmats: np.ndarray) -> np.ndarray:
     up: np.ndarray = -viewmats[:, 1, :3].mean(axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-12)
     rights = viewmats[:, 0, :3]
+    # `eigh` sorts eigenvalues in ascending order: the first vector is nearest to perpendicular to all rights.
     (least, middle, _), vectors = np.linalg.eigh(rights.T @ rights / len(rights))
     axis: np.ndarray = vectors[:, 0]
     is_open = middle < LEAST_SPREAD or least > LARGEST_RATIO * middle
     if len(viewmats) < FEWEST or is_open or abs(axis @ up) < LEAST_COSINE:
         return up
+    # An eigenvector has no sign of its own.
     return np.asarray(axis * np.sign(axis @ up))
 
 
@@ -148,6 +151,7 @@ def look_at(
     if not 0 < fov < 180:
         raise ValueError(f"fov must be between 0 and 180 degrees; got {fov}")
     viewmat, K = looking(center, forward, -up), intrinsics(width, height, np.radians(fov))
+    # `float` is JAX's default dtype, float64 under x64.
     camera = Camera(jnp.asarray(viewmat, float), jnp.asarray(K, float), width, height)
     check_camera(camera)
     return camera
@@ -174,6 +178,7 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     centers, forwards, downs = camera_centers(viewmats), viewmats[:, 2, :3], viewmats[:, 1, :3]
     # The tour begins at an end of the set, and always goes to the nearest camera that it has not visited.
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() or 1.0
+    # In radii of the capture, so that positions compare with directions.
     features = np.concatenate([centers / spread, TURN_WEIGHT * forwards], axis=1)
     tour = [int(np.linalg.norm(features - features.mean(axis=0), axis=1).argmax())]
     left = np.delete(np.arange(len(centers)), tour)
@@ -225,6 +230,7 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     ways = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     turns = (rotations[1:] * rotations[:-1].inv()).magnitude()
     steps = ways / max(ways.mean(), 1e-12) + turns / max(turns.mean(), 1e-12)
+    # Splines need increasing times, also where two views are equal.
     knots = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-3))])
     times = np.linspace(0.0, knots[-1], num_frames)
     places, turned = CubicSpline(knots, centers, bc_type="natural")(times), Slerp(knots, rotations)(times).as_matrix()

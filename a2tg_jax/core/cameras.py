@@ -179,7 +179,9 @@ def _resampled(values: Array, num: int, axis: int) -> Array:
     old = values.shape[axis]
     if old == 1 or num == old:
         return values if num == old else jnp.repeat(values, num, axis=axis)
+    # Centres are at +0.5 at both sizes; places count from the centre of the first old pixel.
     place = (np.arange(num) + 0.5) * (old / num) - 0.5
+    # Up to the last but one, so that the line through the last two continues beyond them.
     below = np.clip(np.floor(place), 0, old - 2).astype(np.int32)
     share = jnp.asarray(np.expand_dims(place - below, [k for k in range(values.ndim) if k != axis]), values.dtype)
     low, high = (jnp.take(values, rows, axis=axis) for rows in (below, below + 1))
@@ -209,6 +211,7 @@ def intrinsics(width: int, height: int, field_of_view: float) -> np.ndarray:
 def looking(center: np.ndarray, forward: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4] at `center`, with z along `forward` and y closest to `down`."""
     z = forward / np.linalg.norm(forward)
+    # A right-handed frame: x = y × z, y = z × x.
     x = np.cross(down, z)
     x /= np.linalg.norm(x)
     return viewmat_of_axes(np.stack([x, np.cross(z, x), z]), center)
@@ -232,6 +235,7 @@ def rotation_exp(rotvec: Array) -> Array:
     """Return R [3, 3] = I + (sin θ/θ)·W + ((1 − cos θ)/θ²)·W², exactly I for 0, with derivatives of any order there."""
     squared = jnp.sum(rotvec * rotvec)
     is_small = squared < SMALL
+    # `where` differentiates both branches: the one not taken must be finite too, or 0·∞ gives NaN.
     safe = jnp.where(is_small, 1.0, squared)
     angle = jnp.sqrt(safe)
     first = jnp.where(is_small, _series(squared, 1, 6, 120, 5040), jnp.sin(angle) / angle)
@@ -247,6 +251,7 @@ def rotation_exp(rotvec: Array) -> Array:
 def moved_viewmat(twist: Array, viewmat: Array) -> Array:
     """Return world to camera [4, 4] followed by a twist [6] in the camera's frame, about its centre."""
     rotation = rotation_exp(twist[:3])
+    # Sums of products, for the same reason as in `rotation_exp`.
     rows = jnp.sum(rotation[:, :, None] * viewmat[None, :3], axis=1)
     return viewmat.at[:3].set(rows.at[:, 3].add(twist[3:]))
 

@@ -54,7 +54,7 @@ def check_literal(name: str, value: object, literal: object) -> None:
 
 def check_int(name: str, value: Any, least: int, most: int | None = None, otherwise: str = "") -> None:
     """Raise ValueError unless a value is an int, of Python or numpy, in a range; the error adds what else may be."""
-    is_int = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    is_int = isinstance(value, int | np.integer) and not isinstance(value, bool)  # bool is an int
     if not is_int or value < least or (most is not None and value > most):
         limits = f"at least {least}" if most is None else f"{least} to {most}"
         raise ValueError(f"{name} must be an int, {limits}{otherwise}; got {value!r}")
@@ -83,7 +83,7 @@ def check_number(
     number = float(value)
     is_low_enough = (most is None or number <= most) and (below is None or number < below)
     is_high_enough = (least is None or number >= least) and (above is None or number > above)
-    if not (is_low_enough and is_high_enough and number == number):
+    if not (is_low_enough and is_high_enough and number == number):  # NaN is unequal to itself
         raise ValueError(f"{name} must be {wanted or 'a number'}; got {value!r}")
 
 
@@ -161,6 +161,7 @@ def check_shape(name: str, x: Any, wanted: Wanted) -> None:
     shape = np.shape(x)
     sizes: dict[int | str, int] = {}
     pairs = zip(shape, wanted, strict=False)
+    # A number stands for itself, a letter for the first size that it meets.
     fits = all(sizes.setdefault(side, side if isinstance(side, int) else own) == own for own, side in pairs)
     if len(shape) != len(wanted) or not fits:
         is_array = hasattr(x, "shape") or isinstance(x, numbers.Number | list | tuple)

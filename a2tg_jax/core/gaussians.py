@@ -55,11 +55,11 @@ def check_process() -> None:
 
 
 INITIAL_OPACITY = 0.1
-NO_ROW_LOG_SCALE = -10.0
+NO_ROW_LOG_SCALE = -10.0  # an opacity of 4.5e-5, far below 1/255
 """Log-scales and opacity logit of spare rows."""
 COLOR_SLACK = 1e-3
 """Rounding by which colours may leave [0, 1]."""
-SH_C0 = 0.28209479177387814
+SH_C0 = 0.28209479177387814  # 1/(2·√π), the value of the basis function of degree 0
 LEAST_INITIAL_COLOR = 0.05
 """Least initial colour. At and below 0 the renderer's max(colour, 0) has no gradient that would raise it."""
 
@@ -221,9 +221,12 @@ def init_from_points(
     if len(points) < 2:
         raise ValueError(f"at least two points are needed to choose scales; got {len(points)}")
     neighbours = min(3, len(points) - 1)
+    # The nearest point of each is the point itself.
     distances = cKDTree(points).query(points, k=neighbours + 1)[0][:, 1:]
+    # 1e-7 as in 3DGS's program: points that coincide would get a scale of 0.
     scales = np.sqrt(np.maximum(np.mean(distances**2, axis=1), 1e-7))
     count = len(points)
+    # A normalised 4D normal is uniform over rotations.
     quats = rng.normal(size=(count, 4))
     arrays = (
         points,
@@ -238,6 +241,7 @@ def init_from_points(
 def sh_of_colors(colors: np.ndarray, sh_degree: int) -> np.ndarray:
     """Return initial coefficients [N, K, 3] of colours [N, 3] in [0, 1], raised to `LEAST_INITIAL_COLOR` at least."""
     sh = np.zeros((len(colors), NUM_BASES[sh_degree], 3))
+    # Inverts the renderer's max(SH_C0·c + 0.5, 0).
     sh[:, 0] = (np.maximum(colors, LEAST_INITIAL_COLOR) - 0.5) / SH_C0
     return sh
 
@@ -255,10 +259,10 @@ def no_rows(num: int, num_coefficients: int, dtype: DTypeLike = jnp.float32) -> 
 
 # Coincident copies that together look like one Gaussian (3DGS-MCMC, Kheradmand et al., 2024, relocation)
 
-DEAD_OPACITY = 0.005
-MAX_SHARES = 51
-LARGEST_OPACITY = 1 - 2**-23
-QUADRATURE_END = 5.0
+DEAD_OPACITY = 0.005  # as in 3DGS-MCMC
+MAX_SHARES = 51  # the largest number of copies in 3DGS-MCMC's program
+LARGEST_OPACITY = 1 - 2**-23  # float32's ε below 1, so that its logit is finite
+QUADRATURE_END = 5.0  # beyond it, 51·∫ e^(−x²) dx is less than 1e-10
 QUADRATURE_STEPS = 32
 
 
@@ -304,5 +308,6 @@ def stacked_integral(opacities: Array, num_shares: Array) -> Array:
         return total + integrand(jnp.asarray(node, opacities.dtype) * spacing)
 
     # A loop over nodes, not an axis of nodes: the memory stays one value per row.
+    # The integrand is even: half of the line, where the node at 0 counts half, is doubled.
     half = jax.lax.fori_loop(1, QUADRATURE_STEPS + 1, add_node, 0.5 * integrand(0.0))
     return half * (2 * spacing / math.sqrt(math.pi))

@@ -19,7 +19,7 @@ FILTER_VARIANCE = 0.5
 """Variance in pixels² of the low-pass filter: ρ₂ = 2·|(x, y) − c|²."""
 NEAR_PLANE = 0.2
 """Default depth from which splats are drawn."""
-POLYGON_SIDES = 8
+POLYGON_SIDES = 8  # its corners are 8 % outside the disc, 1 / cos(π/8)
 BOUND_SLACK = 1e-2
 """Margin of every bound for rounding, in squared pixels."""
 Box = tuple[Array, Array, Array, Array]
@@ -100,12 +100,14 @@ def unclipped_bounds(M: Sequence[Sequence[Array]], cutoff: Array, near_plane: fl
     """
     last_u, last_v, depth = M[2]
     is_visible = (depth >= near_plane) & (cutoff > 0)
+    # Stand-ins for invisible splats, whose division might give infinities or NaN.
     depth = jnp.where(is_visible, depth, 1.0)
     r2 = jnp.where(is_visible, cutoff, 0.0)
     mean_x, mean_y = M[0][2] / depth, M[1][2] / depth
     x_u, x_v = M[0][0] - mean_x * last_u, M[0][1] - mean_x * last_v
     y_u, y_v = M[1][0] - mean_y * last_u, M[1][1] - mean_y * last_v
     spread2 = r2 * (last_u * last_u + last_v * last_v)
+    # The least depth on the disc is the mean's minus r·|(M₂₀, M₂₁)|.
     is_clipped = is_visible & (depth - jnp.sqrt(spread2) < near_plane)
 
     # The dual conic of the disc is C = M·diag(r², r², −1)·Mᵀ. After division by C₃₃ = spread2 − depth², its last column
@@ -116,6 +118,7 @@ def unclipped_bounds(M: Sequence[Sequence[Array]], cutoff: Array, near_plane: fl
     xx = (shift_x * shift_x + scale * (x_u * x_u + x_v * x_v)) * (1 + 1e-4) + BOUND_SLACK
     xy = (shift_x * shift_y + scale * (x_u * y_u + x_v * y_v)) * (1 + 1e-4)
     yy = (shift_y * shift_y + scale * (y_u * y_u + y_v * y_v)) * (1 + 1e-4) + BOUND_SLACK
+    # The low-pass filter, ρ = 2·|x − c|², reaches r/√2 pixels.
     half_x, half_y, radius = jnp.sqrt(xx), jnp.sqrt(yy), jnp.sqrt(r2 / 2 + BOUND_SLACK)
     return ScreenBounds(
         left=jnp.where(is_visible, jnp.minimum(ellipse_x - half_x, mean_x - radius), 1.0),

@@ -16,6 +16,7 @@ Integer = Array | int
 def safe_divide(numerator: Array, denominator: Array, fallback: float = 0.0) -> Array:
     """Return numerator / denominator, or `fallback` with zero gradient where the denominator is 0."""
     is_zero = denominator == 0
+    # `where` differentiates both branches: a division by 0 in the unused one makes gradients NaN.
     quotient = numerator / jnp.where(is_zero, 1.0, denominator)
     return jnp.where(is_zero, fallback, quotient)
 
@@ -61,6 +62,7 @@ def pixel_sum(x: Array) -> Array:
     A product with ones is vectorised everywhere. CPUs do not vectorise a reduction; they fuse it with its operand,
     which is then computed one pixel at a time.
     """
+    # HIGHEST: GPUs may otherwise round the factors of a product to TF32.
     return jnp.dot(x, jnp.ones(x.shape[-1], x.dtype), precision=jax.lax.Precision.HIGHEST)
 
 

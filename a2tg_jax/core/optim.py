@@ -50,7 +50,7 @@ def adam_update(
     *,
     b1: float = 0.9,
     b2: float = 0.999,
-    eps: float = 1e-15,
+    eps: float = 1e-15,  # as in 3DGS: gradients of one Gaussian may be far below 1e-8
 ) -> OptStep:
     """Make one bias-corrected update of Adam (Kingma & Ba, 2015); ε is added after the correction, as in PyTorch.
 
@@ -88,6 +88,7 @@ def adam_update(
     nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
 
     def step(rate: Array, param: Array, m: Array, v: Array) -> Array:
+        # Rates have JAX's default dtype, which under x64 would promote float32 parameters.
         rate = jnp.asarray(rate, param.dtype)
         root = jnp.sqrt(v) / jnp.sqrt(_bias_correction(b2, count, param.dtype))
         change: Array = rate / _bias_correction(b1, count, param.dtype) * (m / (root + eps))
@@ -148,4 +149,5 @@ def _check_floats(params: object) -> None:
 
 def _bias_correction(decay: float, count: Array, dtype: DTypeLike) -> Array:
     """Return 1 - decay^count; the plain formula loses four digits in float32 at the first steps."""
+    # A decay of 0 needs no correction, and has no logarithm.
     return -jnp.expm1(count.astype(dtype) * math.log(decay)) if decay else jnp.ones((), dtype)

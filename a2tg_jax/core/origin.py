@@ -18,6 +18,7 @@ BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 
 
+# eq=False: the generated == would ask arrays for one truth value, which raises.
 @dataclasses.dataclass(frozen=True, eq=False)
 class Origin:
     """V cameras and their world, on the host. Two origins are equal if all their numbers are."""
@@ -68,6 +69,7 @@ class Origin:
     def moved(self, similarity: Similarity) -> "Origin":
         """Return the same cameras in the world that `similarity` leads to, without the corrections they contain."""
         viewmats = np.array([similarity.apply_to_viewmat(viewmat) for viewmat in self.viewmats]).reshape(-1, 4, 4)
+        # Learned rows are in units of the world that is left here; `viewmats` contain them already.
         transform = self.transform.then(similarity)
         return dataclasses.replace(self, viewmats=viewmats, transform=transform, corrections={})
 

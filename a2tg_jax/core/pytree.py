@@ -61,6 +61,7 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
 
     def unflatten(values: tuple[object, ...], children: Iterable[object]) -> Any:
         node = object.__new__(made)
+        # Through `__dict__`, because fields of a frozen dataclass cannot be assigned.
         node.__dict__.update(zip(dynamic, children, strict=True))
         node.__dict__.update(zip(fixed, values, strict=True))
         node.__dict__.update(left_out)
@@ -82,13 +83,14 @@ def check_pytree(name: str, value: object) -> None:
             ahead += node.children()
     for kind in kinds:
         is_other = dataclasses.is_dataclass(kind) or (kind is type(value) and not issubclass(kind, tuple | list | dict))
+        # `__dict__`, not getattr: an undecorated subclass inherits the mark of its base.
         if is_other and kind.__dict__.get(MARK) is not kind:
             raise ValueError(f"{name} must be a pytree: decorate the class {kind.__name__} with @a2tg_jax.pytree")
 
 
 def num_compiled(jitted: Any) -> int:
     """Return the number of compiled programs of a function of `jax.jit` in this process."""
-    return int(jitted._cache_size())
+    return int(jitted._cache_size())  # JAX has no public counterpart
 
 
 # Floats of a pytree, which training differentiates and changes, apart from the rest: `jax.grad` rejects integers, such

@@ -15,6 +15,7 @@ NUM_BASES = (1, 4, 9, 16)
 
 def sh_basis(directions: Array) -> Array:
     """Return the 16 basis functions [..., 16] at unit directions [..., 3]."""
+    # Factors and signs of 3DGS's program, whose files hold coefficients of this basis.
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     xx, yy, zz = x * x, y * y, z * z
     return jnp.stack(
@@ -47,6 +48,7 @@ def sh_sum(sh: Array, means: Array, center: Array, degree: ArrayLike) -> Array:
     """
     directions = normalize(means - center[None, :])
     degrees = jnp.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3], jnp.int32)
+    # A mask, not a slice: the degree may be traced.
     is_used = degrees <= jnp.asarray(degree, jnp.int32)
     basis = jnp.where(is_used[None, :], sh_basis(directions), 0.0)[:, : sh.shape[1]]
     # A sum, which CPUs do several times faster than many small matrix products.

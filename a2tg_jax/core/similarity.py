@@ -94,6 +94,7 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
     means = similarity.apply(np.asarray(gaussians.means, np.float64))
     turned = Rotation.from_matrix(rotation) * Rotation.from_quat(np.asarray(gaussians.quats), scalar_first=True)
     log_scales = np.asarray(gaussians.log_scales, np.float64) + np.log(similarity.scale)
+    # D is block diagonal: lower degrees need its upper left part only.
     turned_sh = sh_rotation(rotation)[: gaussians.sh.shape[1], : gaussians.sh.shape[1]]
     sh = np.einsum("lk,nkc->nlc", turned_sh, np.asarray(gaussians.sh, np.float64))
     dtype = gaussians.means.dtype
@@ -116,6 +117,7 @@ def sh_rotation(rotation: np.ndarray) -> np.ndarray:
     z, angle = 1 - 2 * index / NUM_DIRECTIONS, np.pi * (1 + 5**0.5) * index
     radius = np.sqrt(1 - z * z)
     directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
+    # The fit is exact: rotations keep degrees apart, and 64 directions determine 7 functions.
     before, after = _basis(directions), _basis(directions @ rotation.T)
     matrix = np.zeros((16, 16))
     for degree in SH_DEGREES:
@@ -125,5 +127,6 @@ def sh_rotation(rotation: np.ndarray) -> np.ndarray:
 
 def _basis(directions: np.ndarray) -> np.ndarray:
     """Return the renderer's basis [P, 16] in float64."""
+    # Without x64 JAX would cut the directions to float32.
     with jax.enable_x64(True):
         return np.asarray(sh_basis(jnp.asarray(directions)))

@@ -95,6 +95,7 @@ class Table:
     @classmethod
     def _padded(cls, capacity: int, size: Size, dtype: DTypeLike, padding: Sequence[float] | None = None) -> np.ndarray:
         values = np.asarray(cls.padding if padding is None else padding, dtype)
+        # A copy, because views of broadcasting are read-only.
         return np.broadcast_to(values, (capacity, *size, len(values))).copy()
 
     @classmethod
@@ -132,6 +133,7 @@ class Table:
         ends, groups = np.cumsum(sizes.prod(axis=1)), []
         for index, size in enumerate(places.bucket_sizes):
             ids = np.flatnonzero(np.asarray(places.bucket) == index)
+            # A block ends where the running sum of areas does.
             rows = ends[ids, None] + np.arange(-math.prod(size), 0)
             groups.append((ids, elements[rows].reshape(len(ids), *size, elements.shape[1])))
         return cls.of_groups(groups)
@@ -188,6 +190,7 @@ class Table:
         if len(self.buckets) != 1:
             name, num = type(self).__name__.lower(), len(self.buckets)
             raise ValueError(f"{name} of {num} sizes cannot change rows: densify and prune before they grow")
+        # With one bucket, row i is Gaussian i's (`plan_places`); padding follows and stays.
         (bucket,) = self.buckets
         spare = jnp.arange(len(rows), len(bucket), dtype=jnp.int32)
         moved = rows_moved(bucket, jnp.concatenate([jnp.asarray(rows, jnp.int32), spare]))
@@ -254,6 +257,7 @@ def bucket_capacity(count: int) -> int:
     """Return the rows allotted to `count` blocks, rounded up to 1/16 of its power of two so that few shapes occur."""
     if count == 0:
         return 0
+    # At most an eighth is spare: counts of b bits are at least 2^(b−1), and rounded up to 2^(b−4).
     granule: int = max(1, 2 ** (count.bit_length() - 4))
     return -(-count // granule) * granule
 
@@ -408,6 +412,7 @@ def check_places(table: Table, name: str = "textures") -> None:
     """Raise ValueError unless each block has its own row; the table must have passed `check_table` (host)."""
     bucket, row = on_host(table.bucket), on_host(table.row)
     capacities = np.asarray([len(blocks) for blocks in table.buckets], np.int64)
+    # With the rows of all buckets numbered through, equal numbers are shared rows.
     starts = np.cumsum(capacities) - capacities
     if bucket.size and np.bincount(starts[bucket] + row).max() > 1:
         raise ValueError(f"{name} must have a row for each Gaussian; some share one")

@@ -138,11 +138,13 @@ class FillingDensity(CloneSplitPrune):
         is_there = _is_live(model)
         num_live = jnp.sum(is_there, dtype=jnp.int32)
         reached = number_to_reach(num_live, self.cap, now.times.num_left(now.iteration))
+        # An event doubles a Gaussian once at most.
         reached = jnp.minimum(reached, 2 * num_live)
         is_kept = is_there & ~self._is_pruned(now, model)
         opacities = model.appearance.opacities(model.gaussians)
         # Those that would stay anyway come first.
         place = _ranks(jnp.where(is_kept, jnp.inf, opacities), is_there)
+        # Half of the number to reach, since each of these can be doubled.
         is_kept = is_kept | (is_there & jnp.any(is_kept) & (place < (reached + 1) // 2))
         num_doubled = reached - jnp.sum(is_kept, dtype=jnp.int32)
         is_doubled = is_kept & (_ranks(gradients, is_kept) < num_doubled)
@@ -223,6 +225,7 @@ class OpacityReset(StepEvent):
 
         # Adam forgets whatever was changed.
         mu, nu = (
+            # `is`: `limit_opacities` returns the same array where it changes nothing.
             jax.tree.map(lambda x, old, new: x if new is old else jnp.zeros_like(x), moment, before, after)
             for moment in (moments.mu, moments.nu)
         )

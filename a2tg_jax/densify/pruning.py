@@ -161,6 +161,7 @@ def _weights(
         color, back = jax.vjp(draw, nothing)
         (weights,) = back(jnp.broadcast_to(weight, color.shape))
         total, num = found
+        # All three channels have the same weights.
         return (total + weights[:, 0], num + (weights[:, 0] >= least).astype(num.dtype)), None
 
     none = jnp.zeros(len(nothing), jnp.int32)
@@ -210,6 +211,7 @@ class PruneFloaters(HostEvent):
         is_kept = np.ones(num, bool)
         if self.min_views:
             num_views = shown_in(model, due.views, self.least).num_views[:num]
+            # Fewer training views than that could keep nothing.
             is_kept = num_views >= min(self.min_views, len(due.views))
         if self.near:
             is_kept &= ~are_near(means, due.views, self.near)
@@ -232,6 +234,7 @@ def are_near(means: np.ndarray, views: Sequence[View], near: float) -> np.ndarra
     for camera in (view.camera for view in views):
         viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
         x, y, z = viewmat[:3, :3] @ means.T + viewmat[:3, 3:]
+        # Behind the camera nothing is inside: comparisons with NaN are False.
         depth = np.where(z > 0, z, np.nan)
         column, row, _ = K @ np.stack([x / depth, y / depth, np.ones_like(z)])
         (left, top), (right, bottom) = np.zeros(2), np.asarray([camera.width, camera.height])

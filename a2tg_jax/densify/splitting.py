@@ -70,6 +70,7 @@ class SplitByGradient(FillingMcmc):
         moves = plan_relocation(to_move, model.appearance.opacities(model.gaussians), num_live, draw)
         model, moments, state = split_rows(to_split, moves, model, moments, state)
         cap, least = min(self.cap, model.gaussians.num), self.least(now, num_live)
+        # Rows that have moved are smaller now and share their statistic.
         draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
         moves = plan_growth(to_add, model.appearance.opacities(model.gaussians), num_live, cap, least, draw)
         model, moments, state = split_rows(now.keys[1], moves, model, moments, state)
@@ -90,6 +91,7 @@ def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: A
     noisy = jnp.log(weights) + jax.random.gumbel(key, weights.shape, weights.dtype)
     order = jnp.argsort(jnp.where(is_host, -noisy, jnp.inf)).astype(jnp.int32)
     place = jnp.cumsum(is_target, dtype=jnp.int32) - 1
+    # With more targets than hosts the order begins again.
     return order[jnp.maximum(place, 0) % jnp.maximum(jnp.sum(is_host, dtype=jnp.int32), 1)]
 
 

@@ -44,6 +44,7 @@ class ViewDependence:
     def observe(self, means: Array, centers: Array, colors: Array) -> "ViewDependence":
         """Add V views: cameras at centers [V, 3], and gradients [V, N, 3] by the colour of each Gaussian."""
         total = self.total
+        # One view at a time: all at once would take [V, N, 16, 3].
         for center, color in zip(centers, colors, strict=True):
             basis = sh_basis(normalize(means - center[None, :]))
             total = total + basis[:, :, None] * color[:, None, :]
@@ -97,6 +98,7 @@ class AdaptDegrees(HostEvent):
             return model, moments
         budget = bytes_of(self.budget_mb)
         left = budget - model.num_bytes + BYTES_PER_FLOAT * table.count_floats(model.num)
+        # Each time raises a degree by one.
         highest = min(self.highest, base + len(self.iterations(num_iterations)))
         room = most_blocks(left, base, highest, model.num, table)
         if BYTES_PER_FLOAT * len(table.padding) * room.num_elements > MOST_ROOM * budget:
@@ -119,6 +121,7 @@ class AdaptDegrees(HostEvent):
             )
         degrees = without_idle(table, base, self.idle)
         floats = 3 * np.asarray(NUM_BASES)
+        # Bytes of bands that are removed now can be spent at once.
         saved = BYTES_PER_FLOAT * int((floats[model.degrees[:num]] - floats[degrees[:num]]).sum())
         used = model.num_bytes - saved
         budget = event_budget(bytes_of(self.budget_mb), used, due.index, due.count)
@@ -131,6 +134,7 @@ class AdaptDegrees(HostEvent):
 def most_blocks(num_bytes: float, base_degree: int, highest: int, num: int, table: Coefficients) -> Shape:
     """Return a shape with room for all blocks, of degrees up to the highest, that `num` Gaussians can have within some
     bytes (host)."""
+    # All Gaussians may have none.
     counts = {(0,): bucket_capacity(table.num)}
     for degree in range(base_degree + 1, highest + 1):
         size = NUM_BASES[degree] - NUM_BASES[base_degree]
@@ -163,6 +167,7 @@ def raised_degrees(degrees: np.ndarray, strengths: np.ndarray, budget: float, hi
 
     Strengths [N, 3] are of the bands of degree 1, 2 and 3; the budget is in bytes.
     """
+    # Gaussians of the highest degree need some valid band here, and are no candidates below.
     following = np.minimum(degrees, MAX_DEGREE - 1)
     cost = BYTES_PER_FLOAT * np.asarray([floats_of_band(degree) for degree in (1, 2, 3)])[following]
     strength = np.take_along_axis(strengths, following[:, None], axis=1)[:, 0]

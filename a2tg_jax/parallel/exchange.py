@@ -86,6 +86,7 @@ class ImageBands(NamedTuple):
 
     def pairs_of_rows(self, boxes: Rectangles) -> Array:
         """Return the number of pairs in each row of tiles, [rows] int32."""
+        # Counts are columns times rows of tiles.
         end = boxes.y0 + boxes.counts // jnp.maximum(boxes.columns, 1)
         columns = jnp.where(boxes.counts > 0, boxes.columns, 0)
         # Each box adds its columns at its first row and takes them away after its last: the running sum is the count.
@@ -318,6 +319,7 @@ def _composite_band(
         image = jnp.concatenate([channels, transmittance[None]])
         image = bands.to_even(image, borders[view], index, len(borders), AXIS)
         channels, transmittance = image[:-1], image[-1]
+    # As a capacity of a whole image, of which bands and messages have fixed shares.
     needed = jnp.maximum(lists.num_pairs / pairs_share, num_sent / exchange.rows_per_pair)
     is_moved_too_far = jnp.any(jax.vmap(bands.room_for)(borders) > jnp.asarray(bands.room))
     overflow = lists.overflow | (num_sent > most_sent) | is_moved_too_far
@@ -333,6 +335,7 @@ def _send(chosen: Array, x: Array, fill: float = 0.0) -> Array:
 
 def _shifted(M: Array, top: Array) -> Array:
     """Return homographies [N, 3, 3] to pixels counted from row `top`."""
+    # y − top = (M₁ − top·M₂)·p / (M₂·p) with p = (u, v, 1).
     return M.at[:, 1].add(-top.astype(M.dtype) * M[:, 2])
 
 
@@ -356,6 +359,7 @@ def value_and_grad_of_views(
     """
 
     def of_views(gaussians: Any, appearance: object, rows: object, probe: object, views: object) -> tuple[Array, Any]:
+        # Each view has its own inputs but for the appearance, so the gradient of the sum keeps views apart.
         of_each = jax.vmap(loss, in_axes=(0, None, 0, 0, axes), axis_name=VIEWS_AXIS)
         values, aux = of_each(gaussians, appearance, rows, probe, views)
         return jnp.sum(values), (values, aux)
@@ -377,6 +381,7 @@ def map_views(function: Callable[[Any], tuple[Any, Any]], views: object, num_at_
     Each of the G groups of devices draws V/G views in a row, whose photographs alone it needs (`sharding_of_batch`).
     The function returns results of the views, which come back as [V, ...], and results that they share, [V/G, ...].
     """
+    # Group g draws the g-th part of the views, a view a round: `lax.map` goes along the rounds.
     rounds = jax.tree.map(lambda x: x.reshape(num_at_once, -1, *x.shape[1:]).swapaxes(0, 1), views)
     of_views, shared = jax.lax.map(function, rounds)
     of_views = jax.tree.map(lambda x: x.swapaxes(0, 1).reshape(-1, *x.shape[2:]), of_views)

@@ -73,15 +73,16 @@ def exchange_with_room(
     The room is a multiple of the present rooms of some views; the capacity is the number of pairs of an image.
     """
     rows = -(-num // exchange.num)
+    # While Gaussians are added, the existing ones are in the first rows: the share of these is taken for all.
     share = min(1.0, growth * max(1, *(own.rows for own in rooms)) / max(1, min(num_live, rows)))
     above, below = (max(own) for own in zip(*(each.borders for each in rooms), strict=True))
-    borders = BorderRoom(*(int(growth * own) + tile_size for own in (above, below)))
+    borders = BorderRoom(*(int(growth * own) + tile_size for own in (above, below)))  # borders move by rows of tiles
     return dataclasses.replace(exchange, rows_per_pair=share * rows / capacity, border_room=borders)
 
 
 def with_wider_borders(exchange: Exchange, height: int, tile_size: int) -> Exchange:
     """Return the exchange with about twice the room for borders in images of some rows of pixels."""
     assert exchange.border_room is not None
-    room = BorderRoom(*(2 * rows + 1 for rows in exchange.border_room))
+    room = BorderRoom(*(2 * rows + 1 for rows in exchange.border_room))  # + 1: 0 must grow as well
     covers_image = min(room) >= height + tile_size
     return dataclasses.replace(exchange, border_room=None if covers_image else room)

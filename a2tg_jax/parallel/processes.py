@@ -61,6 +61,7 @@ class Liveness:
 
     def _say(self, message: bytes) -> None:
         with self._sending:
+            # A copy, since lost connections are removed.
             for number, connection in list(self._others.items()):
                 try:
                     connection.send_bytes(message)
@@ -111,7 +112,9 @@ def accept(listener: socket.socket, key: bytes, count: int) -> dict[int, Connect
 
     def admit(guest: socket.socket) -> None:
         with contextlib.suppress(AuthenticationError, EOFError, OSError):
+            # Detached: a socket that is deleted would close the descriptor.
             connection = Connection(guest.detach())
+            # Both sides prove that they have the key, in an order that mirrors `connect`.
             deliver_challenge(connection, key)
             answer_challenge(connection, key)
             arrived.put((int.from_bytes(connection.recv_bytes(), "big"), connection))
@@ -149,7 +152,7 @@ JOIN_SECONDS = 300
 LEAVE_SECONDS = 60
 """Time in which all processes must have finished training."""
 AUTO = "auto"
-LOST = 75
+LOST = 75  # EX_TEMPFAIL of sysexits.h
 """Exit code after another process was lost: training can resume from its last checkpoint."""
 LONGEST_HOST = 255
 LONGEST_REASON = 300
@@ -192,8 +195,10 @@ class Team:
             host = socket.gethostname()
             with contextlib.suppress(OSError):
                 address = socket.gethostbyname(host)
+                # Some systems resolve their own name to a loopback address, which is of no use to others.
                 host = host if address.startswith("127.") else address
             host = host[:LONGEST_HOST]
+        # 4 bytes of port, 32 of key, then the host.
         sent = broadcast(b"".join([own[1].to_bytes(4, "big"), own[2], host.encode()]) if own else b"")
         others = accept(own[0], own[2], self.count) if own else connect(
             sent[36:].decode(), int.from_bytes(sent[:4], "big"), sent[4:36], self.index
@@ -234,6 +239,7 @@ class Team:
                 print("; ".join(filter(None, (f"a2tg: error: {reason}", self.advice()))), file=sys.stderr)
         sys.stdout.flush()
         sys.stderr.flush()
+        # Not `sys.exit`, which would end this thread only: the main one waits in XLA.
         os._exit(LOST)
 
 
@@ -310,6 +316,7 @@ def broadcast(data: bytes) -> bytes:
 
 def gather(data: bytes) -> list[bytes]:
     """Return the bytes of all processes, in the order of their numbers; all call it together."""
+    # All processes must send arrays of one shape: lengths first, then padded bytes.
     length = np.frombuffer(len(data).to_bytes(8, "big"), np.uint8)
     sizes = [int.from_bytes(bytes(own), "big") for own in multihost_utils.process_allgather(length)]
     padded = np.frombuffer(data.ljust(max(1, *sizes), b"\0"), np.uint8)
@@ -318,6 +325,7 @@ def gather(data: bytes) -> list[bytes]:
 
 def is_of_collectives(error: BaseException) -> bool:
     """Return whether an error was raised because processes could not reach each other."""
+    # Out of memory is this process's own failure, though JAX raises the same class.
     if "RESOURCE_EXHAUSTED" in str(error):
         return False
     return isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error) or "NCCL" in str(error)

@@ -38,6 +38,7 @@ def num_processes(mesh: Mesh | None) -> int:
 
 def sharding_of_rows(mesh: Mesh, shape: tuple[int, ...], axis: int = 0) -> NamedSharding:
     """Return where the rows of an array are, along one of its axes; every device has all if D does not divide them."""
+    # JAX divides arrays evenly only; any other array is whole on each device.
     is_divided = len(shape) > axis and shape[axis] >= mesh.size and shape[axis] % mesh.size == 0
     return NamedSharding(mesh, P(*[None] * axis, mesh.axis_names[0]) if is_divided else P())
 

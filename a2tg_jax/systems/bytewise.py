@@ -109,6 +109,7 @@ class Bytewise(TwoStages):
             budget = self._num_bytes() / MEGABYTE
             events.append(dataclasses.replace(self.details, select="budget", budget_mb=budget))
             rates |= {"texture": TexelRates(self.texel_rate, 0.0)}
+            # Without texels at first: one texel would add to the Gaussian's colour and opacity only.
             detailed = dataclasses.replace(detailed, texture=Texture(None, (0, 0), self.lookup), max_alpha=None)
         return first, self.later_stage("details", detailed, (*events, *limits), rates)
 

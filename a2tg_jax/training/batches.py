@@ -100,6 +100,7 @@ class BatchOrder:
 
     def _draw(self, epoch: int) -> list[tuple[int, ...]]:
         """Return one epoch: every view once. The last batch of a kind is filled from the start of its order."""
+        # Seeded by epoch, so that a resumed run need not draw the earlier ones.
         rng = np.random.default_rng([*self._seeds, epoch])
         by_kind: dict[Kind, list[int]] = {}
         for index in rng.permutation(len(self.kinds)):

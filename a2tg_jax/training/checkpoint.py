@@ -155,7 +155,7 @@ class Interrupted(KeyboardInterrupt):
         self.checkpoint = checkpoint
 
     def __reduce__(self) -> tuple[type["Interrupted"], tuple[Checkpoint]]:
-        return type(self), (self.checkpoint,)
+        return type(self), (self.checkpoint,)  # by default, pickle calls __init__ with the message
 
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:
@@ -199,11 +199,12 @@ def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = 
 def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], options: System) -> Checkpoint:
     options.check()
     stages, index, is_ahead = options.stages(), header["stage"], header["is_ahead"]
-    if type(index) is not int or not 0 <= index < len(stages):
+    if type(index) is not int or not 0 <= index < len(stages):  # bool is an int
         raise ValueError(f"stage must be a number in 0..{len(stages) - 1}; got {shortened(index)}")
     stage = stages[index]
     if not isinstance(is_ahead, list) or len(is_ahead) != len(stage.events) or {type(x) for x in is_ahead} - {bool}:
         raise ValueError(f"is_ahead must say true or false of {len(stage.events)} events; got {shortened(is_ahead)}")
+    # Any leaves: only the paths of the fields count.
     (gaussians,) = _filled((Gaussians(*range(5)),), arrays)
     check_gaussians(gaussians)
     shown = {name.removeprefix(SHOWN): array for name, array in arrays.items() if name.startswith(SHOWN)}

@@ -142,6 +142,7 @@ class CorrectionState:
 
 def exposed(exposure: Array, color: Array) -> Array:
     """Return A·c + b for colours [H, W, 3] and an exposure [3, 4] = [A | b]."""
+    # HIGHEST: GPUs may otherwise round the factors to TF32.
     mixed = jnp.einsum("ij,hwj->hwi", exposure[:, :3], color, precision=jax.lax.Precision.HIGHEST)
     return mixed + exposure[:, 3][None, None]
 
@@ -162,6 +163,7 @@ def initial_corrections(
                 shapes = f"{list(neutral.shape)}, as {type(correction).__name__} has them; got {list(row.shape)}"
                 raise ValueError(f"corrections called {correction.name!r} of the model to start from must be {shapes}")
         rows = jnp.asarray(np.stack(found), dtype)
+        # Counted per view, so that the bias correction fits each view's own steps.
         moments = dataclasses.replace(adam_init(rows), count=jnp.zeros(len(rows), jnp.int32))
         states.append(CorrectionState(rows, moments))
     return tuple(states)
@@ -221,12 +223,14 @@ def updated(
 ) -> CorrectionState:
     """Return the state after a step of Adam on the rows of the views [B] that were seen, of which one may occur twice;
     the gradients [B, ...] are of each view's own loss by its row."""
+    # A view that occurs twice gets the sum of its gradients.
     sums = jnp.zeros_like(state.rows).at[views].add(grads)
     is_seen = jnp.zeros(len(state.rows), bool).at[views].set(True)
     rate = correction.learning_rate(progress)
     check_scalar(f"{type(correction).__name__}.learning_rate", rate)
     step = jax.vmap(lambda row, grad, moments: adam_update(row, grad, moments, rate))(state.rows, sums, state.moments)
 
+    # Adam would also move the rows of other views, by their moments.
     rows, moments = jax.tree.map(
         lambda new, old: jnp.where(is_seen.reshape(-1, *[1] * (new.ndim - 1)), new, old),
         (step.params, step.state), (state.rows, state.moments),
@@ -328,6 +332,7 @@ def sliced(grid: Array, color: Array) -> Array:
     along_y, along_x = hats(rows, height), hats(columns, width)
     luminance = jnp.clip(color @ jnp.asarray(LUMINANCE, color.dtype), 0, 1) * (levels - 1)
 
+    # Else the backward pass would keep the maps [H, W, 3, 4] of all L levels.
     @jax.checkpoint
     def add(total: Array, level: tuple[Array, Array]) -> tuple[Array, None]:
         nodes, number = level

@@ -186,6 +186,7 @@ def differentiate(
         value, auxiliary = loss(shown, seen, output)
         return value, (auxiliary, num_pairs)
 
+    # Adds nothing to the render; the gradient at it is the statistic.
     probe = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if has_probe else None
     with_gradients = jax.value_and_grad(of_floats, argnums=(0, 1, 2, 3), has_aux=True)
     if settings.exchange is not None and settings.exchange.views_at_once > 1:

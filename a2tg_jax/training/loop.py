@@ -389,6 +389,7 @@ class StageRun:
 
     def _mend(self, iteration: int, info: StepInfo) -> None:
         """Make more room for the tile lists; raise an error for every other cause."""
+        # Any other status would keep all further steps idle.
         self.state = dataclasses.replace(self.state, status=jnp.zeros_like(self.state.status))
         if info.status == OVERFLOW:
             self.num_regrown += 1

@@ -19,7 +19,7 @@ SSIM_RADIUS = 5
 SSIM_WINDOW = 2 * SSIM_RADIUS + 1
 _WEIGHTS = np.exp(-0.5 * (np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) / SSIM_SIGMA) ** 2)
 SSIM_TAPS = tuple((_WEIGHTS / _WEIGHTS.sum()).tolist())
-SSIM_C1 = 0.01**2
+SSIM_C1 = 0.01**2  # (K₁·L)² and (K₂·L)² of Wang et al., for a data range L of 1
 SSIM_C2 = 0.03**2
 
 
@@ -71,6 +71,7 @@ def mean_ssim(image: Array, target: Array) -> Array:
 def _similarity(mean_x: Array, mean_y: Array, mean_squares: Array, mean_product: Array) -> Array:
     """SSIM of a window, from its means of x, y, x² + y² and x·y; element-wise."""
     means_product, means_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    # E(x·y) − E(x)·E(y) is the covariance; of the squares, the sum of both variances.
     luminance = (2 * means_product + SSIM_C1) / (means_squares + SSIM_C1)
     structure = (2 * (mean_product - means_product) + SSIM_C2) / (mean_squares - means_squares + SSIM_C2)
     return luminance * structure
@@ -152,4 +153,5 @@ def back_project(depth: Array, camera: Camera) -> Array:
         x, y = jnp.moveaxis(jnp.where(jnp.isfinite(camera.rays), camera.rays, 0.0), -1, 0)
     rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ jnp.linalg.inv(camera.K).T
     rotation = camera.viewmat[:3, :3]
+    # Rays are rows: r·Rc is Rcᵀ·r, transposed.
     return (rays @ rotation) * depth[..., None] + camera.center[None, None]

@@ -298,6 +298,7 @@ class StageEffects:
         for event in self._stage.events:
             if isinstance(event, StepEvent):
                 times = event.times(end)
+                # The first multiple of `every` from `first` on.
                 first = max(1, -(-times.first // times.every)) * times.every if times.num_times else end
             else:
                 found: Any = event.iterations(end) if isinstance(event, HostEvent) else ()

@@ -101,6 +101,7 @@ def sky_of(scene: Scene, num: int, *, opacity: float, sh_degree: int) -> Gaussia
         for view, tree, colors in zip(cells, trees, colors_of_cells, strict=True):
             reach = REACH / 2 * view.spacing
             distances, at = tree.query(_units(positions - view.center), distance_upper_bound=reach)
+            # Beyond the reach, distances of `query` are infinite.
             rows = np.flatnonzero(np.isfinite(distances))
             num_looking[rows] += 1
             rows = rows[view.is_empty[at[rows]]]
@@ -114,6 +115,7 @@ def sky_of(scene: Scene, num: int, *, opacity: float, sh_degree: int) -> Gaussia
     means = center + radius * directions
     facing = directions * np.where(directions[:, 2:] < 0, -1, 1)  # Splats have two sides.
     x, y, z = facing.T
+    # The shortest turn from +z to f, (1 + z, ẑ × f); z >= 0 keeps it away from 0.
     quats = np.stack([1 + z, -y, x, np.zeros(num)], axis=1)
     return Gaussians(
         means=jnp.asarray(means, jnp.float32),
@@ -187,6 +189,7 @@ def cell_rays(camera: Camera) -> tuple[np.ndarray, float]:
     else:
         x, y = np.moveaxis(np.asarray(camera.rays, np.float64)[np.ix_(rows, columns)], -1, 0)
     pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
+    # Rays are rows here: K⁻¹·p and Rcᵀ·r, transposed.
     to_world = np.linalg.inv(np.asarray(camera.K, np.float64)).T @ np.asarray(camera.viewmat, np.float64)[:3, :3]
     rays = _units(pixels @ to_world)
     gaps = [np.linalg.norm(np.diff(rays, axis=axis), axis=-1).ravel() for axis in (0, 1)]
@@ -241,8 +244,10 @@ def even_directions(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tup
         found = fibonacci(total)
         found = found[np.isfinite(near.query(found, distance_upper_bound=reach)[0])]
         found = found[is_sky(found)]
+        # Falls in each round, so that the loop ends.
         share = min(max(len(found), 1) / total, share / MORE)
     chosen = np.linspace(0, len(found) - 1, num).round().astype(int)
+    # Directions that are left out make room for wider gaps.
     return found[chosen], _spacing(total) * float(np.sqrt(len(found) / num))
 
 
@@ -254,6 +259,6 @@ def _spacing(num: int) -> float:
 def fibonacci(num: int) -> np.ndarray:
     """Return unit vectors [num, 3] spread evenly over the sphere, a Fibonacci lattice."""
     index = np.arange(num) + 0.5
-    z, angle = 1 - 2 * index / num, np.pi * (1 + 5**0.5) * index
+    z, angle = 1 - 2 * index / num, np.pi * (1 + 5**0.5) * index  # 2π times the golden ratio
     across = np.sqrt(1 - z * z)
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)

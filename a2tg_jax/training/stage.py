@@ -156,7 +156,7 @@ class Stage:
         where = f"stage {self.name!r}:"
         if not isinstance(self.iterations, int | np.integer):
             raise ValueError(f"{where} iterations must be an integer; got {self.iterations!r}")
-        if not 1 <= self.iterations < 2**31:
+        if not 1 <= self.iterations < 2**31:  # counted as int32 in the step
             raise ValueError(
                 f"a stage must have at least 1 iteration, and fewer than 2^31; {self.name!r} has {self.iterations}"
             )
@@ -239,7 +239,7 @@ class Stage:
             num_iterations=self.iterations,
             per_iteration=1.0 / self.iterations,
             log_decay=math.log(self.rates.means_final_factor),
-            sh_interval=max(1, round(self.iterations / 30)),
+            sh_interval=max(1, round(self.iterations / 30)),  # 1,000 of 30,000 iterations in 3DGS
             times=tuple(None if times == EVERY_ITERATION else times for times in times),
         )
 

@@ -228,6 +228,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
             appearance = appearance.with_shapes(appearance.shapes.at[:num].set(shapes))
     if is_same and room > num:
         (new, rest), (old, _) = partition(appearance), partition(model.appearance)
+        # strict=False: whether structures agree is tested next.
         pairs = zip(jax.tree.leaves(new), jax.tree.leaves(old), strict=False)
         is_grown: bool = jax.tree.structure(new) != jax.tree.structure(old)  # type: ignore[operator]
         if is_grown or any(more.shape[1:] != few.shape[1:] or len(more) < len(few) for more, few in pairs):

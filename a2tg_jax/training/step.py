@@ -155,11 +155,13 @@ def train_step(
     """
     tried = attempt(settings, stage, clock, state, photographs, views, scene_scale, key, rows)
     found = tried.views
+    # The last assignment wins: after an overflow all other numbers are meaningless.
     status = jnp.where(tried.info.is_possible, FINE, IMPOSSIBLE)
     status = jnp.where(jnp.mean(found.loss) > clock.largest_loss, EXPLODED, status)
     status = jnp.where(tried.is_finite, status, NOT_FINITE)
     status = jnp.where(jnp.any(found.is_overflow), OVERFLOW, status).astype(jnp.int32)
     status = jnp.where(state.status == FINE, status, state.status)
+    # Chosen inside the step, because it has taken over the old state's buffers.
     new, old = (dataclasses.replace(known, status=status) for known in (tried.state, state))
     chosen = jax.tree.map(lambda a, b: jnp.where(status == FINE, a, b), new, old)
     if settings.render.exchange is not None:
@@ -178,6 +180,7 @@ def attempt(
     """Return the outcome of one iteration. Arguments as of `train_step`, none of them donated."""
     iteration, model = state.iteration + 1, state.model
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
+    # By iteration, so that repeated and resumed steps draw the same numbers.
     keys = jax.random.split(jax.random.fold_in(key, iteration), 1 + num_keys)
     dtype = model.gaussians.means.dtype
     batch = photographs.of(views, dtype)
@@ -202,6 +205,7 @@ def attempt(
     cameras = Camera(batch.viewmats, batch.Ks, width, height)
     if own:
         cameras = jax.vmap(functools.partial(corrected_camera, stage.corrections))(own, cameras)
+    # ∂L/∂colour: the colour is linear in the first coefficient, with the factor SH_C0.
     colors = found.grads[0].sh[:, :, 0] / SH_C0
     statistic = jnp.zeros_like(colors), jnp.zeros(colors.shape[:2], bool)
     if found.statistic is not None and stage.statistic is not None:
@@ -218,6 +222,7 @@ def attempt(
     made: Any = partition(change.model)[0]
     if settings.due is not None:
         # Adam's steps are finite if gradients are. A check of what nothing else changed makes a GPU write it twice.
+        # What no projection or event changed is the same tracer.
         known_ids = {id(leaf) for leaf in jax.tree.leaves(step.params)}
         made = [leaf for leaf in jax.tree.leaves(made) if id(leaf) not in known_ids]
     checked = jax.tree.leaves((found.loss, grads, found.grads[2], made, [known.rows for known in corrections]))

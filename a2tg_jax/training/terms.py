@@ -189,9 +189,11 @@ def inliers(residual: Array, share: Array | float, factor: Array | float, mask: 
         return jax.lax.reduce_window(patches, zero, jax.lax.add, around, (1, 1), reach)
 
     sums, nums = (sums_around(x) for x in (jax.lax.stop_gradient(residual) * counts, counts))
+    # NaN: patches without pixels that count are no part of the quantiles, and pass as inliers.
     patches = jnp.where(nums > 0, sums / jnp.maximum(nums, 1), jnp.nan)
     quantiles = jnp.stack([jnp.asarray(0.5, residual.dtype), 1 - jnp.asarray(share, residual.dtype)])
     middle, high = jnp.nanquantile(patches, quantiles)
+    # Not `<=`, which is False for NaN.
     is_fine = ~(patches > jnp.maximum(high, factor * middle))
     found = jnp.repeat(jnp.repeat(is_fine, side, axis=0), side, axis=1)
     return found[:height, :width]
@@ -251,6 +253,7 @@ def depth_loss(depth: Array, alpha: Array, prior: Array, counts: Array, *, has_s
       has_shift: whether there is a shift.
     """
     counts = counts & (alpha > LEAST_ALPHA) & (depth > 0)
+    # Before any product, because 0·NaN is NaN.
     inverse = jnp.where(counts, safe_divide(alpha, depth), 0.0)
     prior = jnp.where(counts, prior, 0.0)
     scale, shift = jax.lax.stop_gradient(scale_and_shift(prior, inverse, counts, has_shift=has_shift))
@@ -291,6 +294,7 @@ def scale_and_shift(prior: Array, inverse: Array, counts: Array, *, has_shift: b
     num = jnp.maximum(jnp.sum(weights), 1)
     zero = jnp.zeros((), prior.dtype)
     middle, wanted = (jnp.sum(weights * x) / num if has_shift else zero for x in (prior, inverse))
+    # Centred on the means, which leaves t out of the equation of s, and cancels less in float32.
     centered = weights * (prior - middle)
     scale = safe_divide(jnp.sum(centered * (inverse - wanted)), jnp.sum(centered * centered))
     scale = jnp.maximum(scale, 0)
