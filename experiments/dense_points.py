@@ -53,7 +53,7 @@ def measured(scene: a2tg.Scene, name: str, ratio: float) -> dict[str, float | st
     system = dataclasses.replace(preset, memory_budget=budget, **ITERATIONS)
     start = time.perf_counter()
     try:
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as wording:
             warnings.simplefilter("always")
             model = a2tg.fit(scene, system, progress=False, session=a2tg.Session(tidy_memory)).model
     except ValueError as error:
@@ -64,7 +64,7 @@ def measured(scene: a2tg.Scene, name: str, ratio: float) -> dict[str, float | st
         "num_gaussians": model.num,
         "megabytes": model.num_bytes / MEGABYTE,
         "seconds": time.perf_counter() - start,
-        "warnings": " ".join(str(warning.message) for warning in told),
+        "warnings": " ".join(str(warning.message) for warning in wording),
     }
 
 
@@ -76,14 +76,14 @@ def table(found: Mapping[str, Mapping[str, float | str]]) -> str:
             cells = [found.get(key_of(name, num, ratio), {}) for num in NUM_POINTS]
             psnrs = [float(cell["train_psnr"]) for cell in cells if "train_psnr" in cell]
             lost = max((max(psnrs[:at]) - psnr for at, psnr in enumerate(psnrs) if at), default=0.0)
-            shown = [_told(cell) for cell in cells]
+            shown = [_as_text(cell) for cell in cells]
             rows.append([name, f"{ratio:g}", *shown, f"{lost:.2f}" if lost > LARGEST_LOSS else "–"])
     return tables.markdown(
         ["system", "budget ×", *(f"{num:,} points" for num in NUM_POINTS), "lost in training, dB"], rows
     )
 
 
-def _told(cell: Mapping[str, float | str]) -> str:
+def _as_text(cell: Mapping[str, float | str]) -> str:
     if "train_psnr" not in cell:
         return "refused" if "refused" in cell else tables.MISSING
     return f"{cell['train_psnr']:.2f} / {cell['psnr']:.2f} ({cell['num_gaussians']:,})"

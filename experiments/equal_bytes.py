@@ -60,20 +60,20 @@ def gains(results: Sequence[tables.Result], reference: str) -> str:
     for label in by_budget(results):
         if label != reference:
             found = [at_budget(results, budget) for budget in budgets]
-            shown = [told_gain(own, label, reference) for own in found]
+            shown = [gain_text(own, label, reference) for own in found]
             means = [tables.gains_by_scene(own, label, reference, "psnr").values() for own in found]
             average = np.mean([np.mean(list(own)) for own in means]) if all(means) else float("nan")
             rows.append([label, *shown, tables.signed(float(average), 2)])
     return tables.markdown(["method", *(f"{size:g} MB: dB · LPIPS" for size in budgets), "mean"], rows)
 
 
-def told_gain(results: Sequence[tables.Result], label: str, other: str) -> str:
+def gain_text(results: Sequence[tables.Result], label: str, other: str) -> str:
     """Return the gain in dB with its interval, the gain in LPIPS, and the number of scenes."""
     psnr, lpips = (tables.gains_by_scene(results, label, other, figure).values() for figure in ("psnr", "lpips"))
     if not psnr:
         return tables.MISSING
     distance = tables.signed(tables.over_scenes(lpips).mean, 3)
-    return f"{tables.over_scenes(psnr).told(2)} · {distance} ({len(psnr)})"
+    return f"{tables.over_scenes(psnr).as_text(2)} · {distance} ({len(psnr)})"
 
 
 def on_scene(results: Sequence[tables.Result], scene: str, label: str, other: str) -> str:
@@ -92,7 +92,7 @@ def panels(results: Sequence[tables.Result]) -> list:
     scenes = {result.run.cell.scene for result in results}
     num_sizes = len({result.run.cell.budget for result in results})
     found = []
-    for figure, told in FIGURES:
+    for figure, wording in FIGURES:
         curves = {
             label: [
                 (tables.mean(group, "mb"), tables.mean(group, figure))
@@ -102,7 +102,7 @@ def panels(results: Sequence[tables.Result]) -> list:
             for label, sizes in by_budget(results).items()
         }
         shown = {label: points for label, points in curves.items() if 2 * len(points) > num_sizes}
-        found.append((f"mean of {len(scenes)} scenes", shown, "MB", told))
+        found.append((f"mean of {len(scenes)} scenes", shown, "MB", wording))
     return found
 
 

@@ -120,13 +120,13 @@ def table(methods: Iterable[str], found: Mapping[str, Mapping[str, float]]) -> s
     others = [label for label in methods if label != REFERENCE]
     gains = {name: {label: _gain(found, own, label) for label in others} for name, own in rows.items()}
     shown = [label for label in others if any(own[label] is not None for own in gains.values())]
-    told = []
+    wording = []
     for name, own in rows.items():
         views = _mean([found[key] for key in _keys(own[0], REFERENCE) if key in found], ("views",))
         num = tables.MISSING if views is None or len(own) > 1 else f"{views[0]:g}"
-        reference = _told(_figures(found, own, REFERENCE), "{:.2f}")
-        told.append([name, num, reference, *(_told(gains[name][label], "{:+.2f}") for label in shown)])
-    return tables.markdown(["capture", "training views", REFERENCE, *shown], told)
+        reference = _as_text(_figures(found, own, REFERENCE), "{:.2f}")
+        wording.append([name, num, reference, *(_as_text(gains[name][label], "{:+.2f}") for label in shown)])
+    return tables.markdown(["capture", "training views", REFERENCE, *shown], wording)
 
 
 def _figures(found: Mapping[str, Mapping[str, float]], names: Iterable[str], label: str) -> np.ndarray | None:
@@ -153,7 +153,7 @@ def _mean(cells: Sequence[Mapping[str, float]], figures: Sequence[str] = FIGURES
     return np.mean([[cell[figure] for figure in figures] for cell in cells], axis=0) if cells else None
 
 
-def _told(figures: np.ndarray | None, form: str) -> str:
+def _as_text(figures: np.ndarray | None, form: str) -> str:
     return tables.MISSING if figures is None else " / ".join(map(form.format, figures))
 
 

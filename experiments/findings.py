@@ -68,7 +68,7 @@ def rows_of_bytewise(results: Sequence[Result]) -> list[Row]:
             place = f"{budget:g} MB" if stratum == DENSE else f"{budget:g} MB, {FEW}"
             others = {BEST: "best plain method", f"{MCMC}, degree 0": "MCMC, degree 0", MCMC: "MCMC, degree 3"}
             others |= {f"3DGS-MCMC, degree {degree}": f"3DGS-MCMC, degree {degree}" for degree in (0, 3)}
-            rows += [Row(f"bytewise − {told}, {place}", own, BYTEWISE, label) for label, told in others.items()]
+            rows += [Row(f"bytewise − {wording}, {place}", own, BYTEWISE, label) for label, wording in others.items()]
             rows.append(Row(f"bytewise − best plain method, {place}, equal time", own, BYTEWISE, BEST + EQUAL_TIME))
     return rows
 
@@ -98,7 +98,7 @@ def table_of(rows: Sequence[Row]) -> str:
 
 def with_interval(found: Comparison, figure: str) -> str:
     """Return a mean with its t interval, in bold if the interval excludes 0."""
-    text = tables.SceneMean(found.mean, found.half_width, found.p_value).told(DIGITS[figure])
+    text = tables.SceneMean(found.mean, found.half_width, found.p_value).as_text(DIGITS[figure])
     return f"**{text}**" if found.is_decided else text
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from equal_bytes import at_budget, on_scene, told_gain
+from equal_bytes import at_budget, gain_text, on_scene
 from lab import tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid
@@ -20,12 +20,12 @@ COMPARED = (
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """Write the gains at both sizes of the photographs, then the figures of the larger ones."""
     larger, smaller = (tables.results_of(grid, lab.records) for grid in grids)
-    told = (
+    wording = (
         "dB · LPIPS, test views, one seed, photographs of so many pixels on the longer side. A mean has its 95 % t "
         "interval over scenes (number of scenes)."
     )
     figures = f"## Figures of the larger photographs\n\n{tables.quality_tables(grids[0], larger)}"
-    lab.write(LARGER, f"# {grids[0].title}\n\n{told}\n\n{gains(smaller, larger)}\n{figures}")
+    lab.write(LARGER, f"# {grids[0].title}\n\n{wording}\n\n{gains(smaller, larger)}\n{figures}")
 
 
 def gains(smaller: Sequence[tables.Result], larger: Sequence[tables.Result]) -> str:
@@ -43,8 +43,8 @@ def gains(smaller: Sequence[tables.Result], larger: Sequence[tables.Result]) -> 
     for label, other in COMPARED:
         for scene in dict.fromkeys(scene for scene, _, _ in cells):
             rows.append([f"{label} less {other}: {scene}", *(on_scene(own, scene, label, other) for _, own in groups)])
-        rows.append([f"**{label} less {other}: mean**", *(told_gain(own, label, other) for _, own in groups)])
-    return tables.markdown(["", *(f"{budget:g} MB, {_told_pixels(own)}" for budget, own in groups)], rows)
+        rows.append([f"**{label} less {other}: mean**", *(gain_text(own, label, other) for _, own in groups)])
+    return tables.markdown(["", *(f"{budget:g} MB, {_pixels_text(own)}" for budget, own in groups)], rows)
 
 
 def _cell(result: tables.Result) -> tuple[str, float, int]:
@@ -53,7 +53,7 @@ def _cell(result: tables.Result) -> tuple[str, float, int]:
     return cell.scene.label, cell.budget or 0.0, cell.seed
 
 
-def _told_pixels(results: Sequence[tables.Result]) -> str:
+def _pixels_text(results: Sequence[tables.Result]) -> str:
     """Return the longer sides of the photographs."""
     sides = sorted({max(result["pixels"]) for result in results})
     return " and ".join(map(str, sides)) + " pixels"

@@ -69,14 +69,14 @@ def _measure(lab: Lab, result: tables.Result, model: a2tg.Model) -> dict[str, An
         "num_bytes": model.num_bytes,
         "psnr": [before.psnr, after.psnr],
         "lpips": [before.lpips, after.lpips],
-        "best": {most: _told(trial) for most, trial in best.items()},
+        "best": {most: _as_text(trial) for most, trial in best.items()},
         "parts": bytes_by_part(reported),
         "coders": {coder: _size(model, best[REPORTED], coder) for coder in CODER_CHOICES},
-        "trials": [_told(trial) for trial in trials],
+        "trials": [_as_text(trial) for trial in trials],
     }
 
 
-def _told(trial: Trial) -> dict[str, Any]:
+def _as_text(trial: Trial) -> dict[str, Any]:
     kept = {group: getattr(trial.choices, group) for group in ([trial.group] if trial.group else GROUPS)}
     return {"kept": kept, "bytes": trial.num_bytes, "train_loss": trial.losses[0], "test_loss": trial.losses[1]}
 

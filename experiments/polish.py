@@ -24,7 +24,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     num_steps = _num_steps(lab)
     rows, gains = [], []
     for result, found in measured_once(lab, EXPERIMENT.name, grid, _measure):
-        shown = [_told(found[str(steps)], found["0"]) for steps in num_steps]
+        shown = [_as_text(found[str(steps)], found["0"]) for steps in num_steps]
         gains.append([found[str(steps)]["psnr"] - found["0"]["psnr"] for steps in num_steps])
         size = f"{result.run.cell.budget:g} MB"
         rows.append([result.run.cell.scene.label, size, result.label, f"{found['0']['psnr']:.2f}", *shown])
@@ -59,7 +59,7 @@ def _quality(lab: Lab, scene: a2tg.Scene, model: a2tg.Model, background) -> dict
     return {"psnr": test.psnr, "lpips": lpips, "train": a2tg.evaluate(train, model, background=background).psnr}
 
 
-def _told(after: Mapping[str, float], before: Mapping[str, float]) -> str:
+def _as_text(after: Mapping[str, float], before: Mapping[str, float]) -> str:
     digits = {"psnr": 2, "lpips": 3, "train": 2}
     return " · ".join(tables.signed(after[figure] - before[figure], digits[figure]) for figure in digits)
 

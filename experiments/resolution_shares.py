@@ -21,8 +21,8 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     rows = [[place, *(tables.percent(own.get(size, 0.0)) for size in sizes)] for place, own in shares.items()]
     (paper,) = tables.PAPER["resolution_shares"]
     text = tables.markdown(["scene", *(size.replace("x", "×") for size in sizes)], rows)
-    told = f"In the paper, on {paper['scene']}, {tables.percent(paper['1x1'])} keep 1×1 texels.\n"
-    lab.write(EXPERIMENT.name, f"# Shares of texture resolutions (rows × columns)\n\n{text}\n{told}")
+    wording = f"In the paper, on {paper['scene']}, {tables.percent(paper['1x1'])} keep 1×1 texels.\n"
+    lab.write(EXPERIMENT.name, f"# Shares of texture resolutions (rows × columns)\n\n{text}\n{wording}")
     densest = {result.run.cell.scene.label: result for result in sorted(results, key=lambda result: result["num"])}
     if densest:
         charted = {_place(result): shares[_place(result)] for result in densest.values()}

@@ -48,8 +48,8 @@ def experiments() -> dict[str, Experiment]:
 
 def parse_arguments(known: Mapping[str, Experiment], arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Return the names and options of a call."""
-    told = {**{name: experiment.summary for name, experiment in known.items()}, **OTHERS}
-    listed = "\n".join(f"  {name:20s} {textwrap.shorten(text, 110)}" for name, text in told.items())
+    wording = {**{name: experiment.summary for name, experiment in known.items()}, **OTHERS}
+    listed = "\n".join(f"  {name:20s} {textwrap.shorten(text, 110)}" for name, text in wording.items())
     parser = argument_parser(f"{(__doc__ or '').strip()}\n\nnames:\n{listed}")
     parser.add_argument("names", nargs="+", metavar="NAME", help="experiments to run, as above, or grid files")
     args = parser.parse_intermixed_args(arguments)

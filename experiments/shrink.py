@@ -25,11 +25,11 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     for result, figures in measured_once(lab, EXPERIMENT.name, grid, _measure):
         cell = result.run.cell
         size = f"{cell.gaussians:,}" if cell.budget is None else f"{cell.budget:g} MB"
-        shown = [_told(figures[str(most)], figures["0"]) for most in max_losses]
+        shown = [_as_text(figures[str(most)], figures["0"]) for most in max_losses]
         rows.append([cell.scene.label, size, result.label, _kilobytes(figures["0"]), *shown])
     header = ["scene", "size", "method", "kB: all, texels", *(f"within {most} dB" for most in max_losses)]
-    told = "kB of all and of texels, and dB · LPIPS on test views against the model before."
-    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{told}\n\n{tables.markdown(header, rows)}")
+    wording = "kB of all and of texels, and dB · LPIPS on test views against the model before."
+    lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{wording}\n\n{tables.markdown(header, rows)}")
 
 
 def _max_losses(lab: Lab) -> tuple[float, ...]:
@@ -59,7 +59,7 @@ def _kilobytes(figures: dict[str, Any]) -> str:
     return f"{figures['bytes'] / 1e3:.1f}, {16 * figures['texels'] / 1e3:.1f}"
 
 
-def _told(after: dict[str, Any], before: dict[str, Any]) -> str:
+def _as_text(after: dict[str, Any], before: dict[str, Any]) -> str:
     is_measured = None not in (after["lpips"], before["lpips"])
     lpips = after["lpips"] - before["lpips"] if is_measured else float("nan")
     return f"{_kilobytes(after)} kB: {tables.signed(after['psnr'] - before['psnr'], 2)} · {tables.signed(lpips, 3)}"

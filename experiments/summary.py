@@ -4,7 +4,7 @@ import dataclasses
 import re
 from collections.abc import Collection, Mapping, Sequence
 
-from equal_bytes import GRIDS, at_budget, on_scene, told_gain, unique
+from equal_bytes import GRIDS, at_budget, gain_text, on_scene, unique
 from lab import tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid
@@ -53,9 +53,9 @@ def bytes_table(results: Sequence[tables.Result]) -> str:
     scenes, rows = sorted({result.run.cell.scene.label for result in results}), []
     for scene in scenes:
         rows.append([f"{BYTEWISE} less {BEST}: {scene}", *(on_scene(own, scene, BYTEWISE, BEST) for own in found)])
-    for told, (label, other) in OTHERS.items():
-        means = [told_gain(own, label, other).removesuffix(f" ({len(scenes)})") for own in found]
-        rows.append([f"**{told}: mean**", *means])
+    for wording, (label, other) in OTHERS.items():
+        means = [gain_text(own, label, other).removesuffix(f" ({len(scenes)})") for own in found]
+        rows.append([f"**{wording}: mean**", *means])
     return tables.markdown(["", *(f"{budget:g} MB: dB · LPIPS" for budget in budgets)], rows)
 
 
@@ -84,11 +84,11 @@ def textures_table(budgets: Sequence[tables.Result], claim: Sequence[tables.Resu
     return tables.markdown(["compared", "cells", "dB", "p", "LPIPS", "p"], rows)
 
 
-def _row(told: str, results: Sequence[tables.Result], label: str, other: str) -> list[str]:
+def _row(wording: str, results: Sequence[tables.Result], label: str, other: str) -> list[str]:
     """Return one comparison: number of cells, means with intervals, p-values."""
     cells = {(cell.scene, cell.gaussians, cell.budget) for cell in _shared_cells(results, label, other)}
     psnr, lpips = (_estimate(tables.gains_by_scene(results, label, other, figure)) for figure in ("psnr", "lpips"))
-    return [told, str(len(cells)), psnr.told(3), _p_value(psnr), lpips.told(4), _p_value(lpips)]
+    return [wording, str(len(cells)), psnr.as_text(3), _p_value(psnr), lpips.as_text(4), _p_value(lpips)]
 
 
 def _shared_cells(results: Sequence[tables.Result], label: str, other: str) -> set:

@@ -89,8 +89,8 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     found = measured_once(lab, EXPERIMENT.name, grid, _measure, first_stage=True)
     header = ["criterion", *(f"{result.run.cell.scene.label}, {result.run.cell.budget:g} MB" for result, _ in found)]
     ranks = [_rank_correlations(figures) for _, figures in found]
-    rows = [[told, *(tables.signed(own[name], 2) for own in ranks)] for name, told in CRITERIA.items()]
-    gains = [[told, *(_quarters(figures, name) for _, figures in found)] for name, told in CRITERIA.items()]
+    rows = [[wording, *(tables.signed(own[name], 2) for own in ranks)] for name, wording in CRITERIA.items()]
+    gains = [[wording, *(_quarters(figures, name) for _, figures in found)] for name, wording in CRITERIA.items()]
     num_groups = max((len(figures["groups"]) for _, figures in found), default=0)
     noise = ", ".join(f"{np.std(figures['without']):.3f}" for _, figures in found)
     parts = [

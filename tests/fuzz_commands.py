@@ -53,11 +53,11 @@ def run_commands(run: Path) -> None:
         ["train", "--out", str(run), "--resume"],
     )
     try:
-        told = [_command(command) for command in commands]
+        printed = [_command(command) for command in commands]
     finally:
         shutil.rmtree(new, ignore_errors=True)
-    if all(told):
-        raise ValueError(told[0])
+    if all(printed):
+        raise ValueError(printed[0])
 
 
 def _command(arguments: list[str]) -> str:

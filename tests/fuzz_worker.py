@@ -59,7 +59,7 @@ class Watch:
         return found
 
 
-def told(error: BaseException) -> str:
+def printed(error: BaseException) -> str:
     """The innermost place in this package, or anywhere, at which an error came up."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if "a2tg_jax" in frame.filename] or frames
@@ -72,13 +72,15 @@ def outcome(read, *arguments) -> tuple[str, str]:
         read(*arguments)
     except (ValueError, OSError) as error:
         text = str(error)
-        return ("refused", "") if 0 < len(text) <= LONGEST_MESSAGE and "\n" not in text else ("many lines", told(error))
+        return (
+            ("refused", "") if 0 < len(text) <= LONGEST_MESSAGE and "\n" not in text else ("many lines", printed(error))
+        )
     except MemoryError as error:
-        return "memory", told(error)
+        return "memory", printed(error)
     except AssertionError as error:
-        return "taken for sound", told(error)
+        return "taken for sound", printed(error)
     except BaseException as error:
-        return "other error", told(error)
+        return "other error", printed(error)
     return "read", ""
 
 

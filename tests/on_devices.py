@@ -203,18 +203,18 @@ def overflowing(folder):
     view, model, exchange = scene().train[0], plain(), exchange_among(jax.devices()[:4])
     enough = a2tg.plan_render(model, [view.camera]).capacity
 
-    def told(capacity, rows_per_pair):
+    def printed(capacity, rows_per_pair):
         own = dataclasses.replace(exchange, rows_per_pair=rows_per_pair)
         settings = a2tg.RenderSettings(capacity=capacity, exchange=own)
         render = jax.jit(lambda m: render_traced(m.gaussians, view.camera, m.appearance, jnp.zeros(3), settings))
         output, num_pairs = render(spread(exchange.mesh, model))
         return bool(output.overflow), float(num_pairs)
 
-    assert told(enough, 1.0)[0] is False
+    assert printed(enough, 1.0)[0] is False
     for rows_per_pair in (1.0, 4 / enough):
-        is_overflow, needed = told(64 if rows_per_pair == 1.0 else enough, rows_per_pair)
+        is_overflow, needed = printed(64 if rows_per_pair == 1.0 else enough, rows_per_pair)
         assert is_overflow
-        assert told(int(np.ceil(needed)), rows_per_pair)[0] is False, "what is asked for is enough"
+        assert printed(int(np.ceil(needed)), rows_per_pair)[0] is False, "what is asked for is enough"
     borders_find_room()
 
 
@@ -317,10 +317,10 @@ def training(folder):
     assert path.is_file() and len(whole.model.gaussians.means.devices()) == 1, "results are on one device"
     alone = fit(own, 1, on_checkpoint=keeping(path_alone), checkpoint_every=12)
     for count, start in ((4, path), (3, path), (2, path_alone)):
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as printed:
             warnings.simplefilter("always")
             again = fit(own, count, resume=a2tg.load_checkpoint(start))
-        assert any("152 rows, which 3 devices cannot share" in str(one.message) for one in told) == (count == 3)
+        assert any("152 rows, which 3 devices cannot share" in str(one.message) for one in printed) == (count == 3)
         assert again.model.num == alone.model.num and abs(psnr_of(again) - psnr_of(alone)) < 0.02, count
         if count == 4:
             np.testing.assert_array_equal(whole.model.gaussians.means, again.model.gaussians.means)

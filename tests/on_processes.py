@@ -87,12 +87,12 @@ def started(arguments):
 def ended(processes, timeout=600):
     """Text that processes write to stderr, once they have ended well; they are killed after some seconds."""
     try:
-        told = [process.communicate(timeout=timeout)[1] for process in processes]
+        printed = [process.communicate(timeout=timeout)[1] for process in processes]
     finally:
         for process in processes:
             process.kill()
-    assert all(process.returncode == 0 for process in processes), "\n".join(told)[-5000:]
-    return told
+    assert all(process.returncode == 0 for process in processes), "\n".join(printed)[-5000:]
+    return printed
 
 
 def fit(own, path, session, **options):
@@ -207,22 +207,22 @@ def losses(seconds=8.0):
             while not list(out.glob("checkpoints/*.npz")):
                 assert all(process.poll() is None for process in processes)
                 time.sleep(0.1)
-            took, told = survivor_of(processes, victim, number, 5 * seconds)
+            took, printed = survivor_of(processes, victim, number, 5 * seconds)
             checkpoint = a2tg.load_checkpoint(sorted(out.glob("checkpoints/*.npz"))[-1])
             assert took < 3 * seconds
-            print(victim, number.name, took, told.splitlines()[-1], checkpoint)
+            print(victim, number.name, took, printed.splitlines()[-1], checkpoint)
 
 
 def survivor_of(processes, victim, number, timeout):
     """Seconds until the other process has ended, and what it wrote to stderr."""
     os.kill(processes[victim].pid, number)
     at = time.perf_counter()
-    told = processes[1 - victim].communicate(timeout=timeout)[1]
+    printed = processes[1 - victim].communicate(timeout=timeout)[1]
     took = time.perf_counter() - at
     processes[victim].kill()
     processes[victim].communicate()
-    assert processes[1 - victim].returncode == LOST, told
-    return took, told
+    assert processes[1 - victim].returncode == LOST, printed
+    return took, printed
 
 
 def main():

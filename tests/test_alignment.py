@@ -134,7 +134,7 @@ def test_a_run_reports_both_scores_and_what_it_learned(tmp_path, capsys):
     arguments = "train synthetic --system gaussians-2d-mcmc --preset smoke --downscale 8 --stage1-iterations 12 "
     arguments += "--exposure --refine-poses --initial-gaussians 200 --densify.cap 210 --out"
     assert main([*arguments.split(), str(out)]) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text())["models"]
     for measured in metrics.values():
         for split in ("test", "train"):
@@ -142,7 +142,7 @@ def test_a_run_reports_both_scores_and_what_it_learned(tmp_path, capsys):
                 assert np.isfinite(measured[f"{split}{way}"]["psnr"])
         assert measured["test_aligned_color_fit"]["psnr"] >= measured["test"]["psnr"]
     for title in ("test, colours fitted: PSNR (dB)", "train, poses aligned: SSIM"):
-        assert title in told and title in (out / "report.html").read_text()
+        assert title in printed and title in (out / "report.html").read_text()
     (file,) = (out / "corrections").glob("*.json")
     learned = json.loads(file.read_text())
     assert len(learned) == metrics[file.stem]["train"]["views"]

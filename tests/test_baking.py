@@ -186,8 +186,12 @@ def test_convert_bakes(tmp_path, capsys):
     save_model(tmp_path / "a.npz", dataclasses.replace(model, appearance=official))
     arguments = ["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.ply"), "--bake", "--bake-iterations", "0"]
     assert main(arguments) == 0
-    told = capsys.readouterr().out
-    assert "baked: 3 splats into" in told and "against the model in 1 training view" in told and "textures" not in told
+    printed = capsys.readouterr().out
+    assert (
+        "baked: 3 splats into" in printed
+        and "against the model in 1 training view" in printed
+        and "textures" not in printed
+    )
     assert load_splats(tmp_path / "b.ply").num > 3
     assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.ply"), "--bake"]) == 2
     assert "needs a model with cameras" in capsys.readouterr().err

@@ -193,9 +193,9 @@ def test_cameras_of_metashape_that_are_not_used(tmp_path):
     off = '<camera id="8" sensor_id="0" label="0.png" enabled="false"><transform>0</transform></camera>'
     file.write_text(file.read_text().replace("</cameras>", f"{unaligned}{off}</cameras>"))
     (tmp_path / "mesh.ply").touch()
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as printed:
         scene = load_scene(tmp_path)
-    texts = " ".join(str(warning.message) for warning in told)
+    texts = " ".join(str(warning.message) for warning in printed)
     assert "2 of 6 cameras have no pose or are switched off, such as 9.png: not used" in texts
     assert "2 PLY files are beside it, mesh.ply, points.ply: none used" in texts
     assert len(scene.train) + len(scene.test) == COUNT
@@ -237,8 +237,8 @@ def test_rigs_of_metashape(tmp_path, master):
         save_dot(tmp_path / "images" / f"{index}_0.png", pinhole_place(pose, **lens))
         save_dot(tmp_path / "images" / f"{index}_1.png", pinhole_place(pose @ OPENCV @ in_rig @ OPENCV, **lens))
     (tmp_path / "cameras.xml").write_text(rig_xml(in_rig, master=master))
-    told = f"4 of 8 cameras have no own pose, such as 0_{1 - master}.png: placed by their sensors' offsets"
-    with pytest.warns(UserWarning, match=told):
+    printed = f"4 of 8 cameras have no own pose, such as 0_{1 - master}.png: placed by their sensors' offsets"
+    with pytest.warns(UserWarning, match=printed):
         scene = load_scene(tmp_path)
     assert len(scene.train) + len(scene.test) == 8
     check_dots(scene, 0.05)
@@ -405,9 +405,9 @@ def test_points_of_another_coordinate_system_are_left_out(tmp_path):
     write_metashape(tmp_path)
     xml = metashape_xml(WORLD).replace(numbers(translation), numbers(translation + np.array([4e6, 0, 5e6])))
     (tmp_path / "cameras.xml").write_text(xml)
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as printed:
         scene = load_scene(tmp_path)
-    texts = " ".join(str(warning.message) for warning in told)
+    texts = " ".join(str(warning.message) for warning in printed)
     assert "the points beside it are far from its cameras" in texts
     assert "starting from" in texts and np.abs(scene.points).max() < 100
 

@@ -448,8 +448,8 @@ def test_export_and_what_view_would_serve(run, tmp_path, monkeypatch, capsys):
 def test_export_for_other_programs(run, tmp_path, capsys):
     """Flat 3D Gaussians, which this program's reader takes for what they were; so is the run's own point cloud."""
     assert cli.main(["export", str(run.path), "--ply", str(tmp_path / "new" / "fox.ply")]) == 0
-    told = "fox.ply: 60 Gaussians\nnot kept by this format: textures (bake turns them into plain splats)"
-    assert told in capsys.readouterr().out
+    printed = "fox.ply: 60 Gaussians\nnot kept by this format: textures (bake turns them into plain splats)"
+    assert printed in capsys.readouterr().out
     for path in (tmp_path / "new" / "fox.ply", run.point_cloud):
         assert b"property float scale_2\n" in path.read_bytes()
         assert load_ply(path).num == 60
@@ -568,8 +568,11 @@ def test_flights_without_ffmpeg(run, tmp_path, monkeypatch, capsys):
         assert cli.main([*command, str(num)]) == 0
         made = {"frame_0000.png", "frame_0001.png", "flight.webp", LIST}
         assert {path.name for path in tmp_path.iterdir()} == names | made
-    told = capsys.readouterr().out
-    assert "no video: ffmpeg is not installed; install it" in told and f"animation: {tmp_path / 'flight.webp'}" in told
+    printed = capsys.readouterr().out
+    assert (
+        "no video: ffmpeg is not installed; install it" in printed
+        and f"animation: {tmp_path / 'flight.webp'}" in printed
+    )
     with Image.open(tmp_path / "flight.webp") as animation:
         assert (animation.size, animation.n_frames) == ((48, 20), 2)
         animation.seek(1)
@@ -594,11 +597,11 @@ def test_render_replaces_only_what_it_wrote(run, tmp_path, monkeypatch, capsys, 
 @pytest.mark.long
 def test_doctor_compares_the_compositors(capsys, monkeypatch):
     assert cli.main(["doctor"]) == 0
-    told = capsys.readouterr().out
-    assert f"jax {jax.__version__}" in told and re.search(r"native: .* at most \de-\d\d from XLA's image", told)
-    assert "cuda is not available: it needs JAX on an NVIDIA GPU" in told
-    assert "devices     the CPU\n" in told and re.search(r"memory +[\d.]+ GB may be used\n", told)
-    assert told.splitlines()[-1].split(maxsplit=1) == ["verdict", "everything works on this machine"]
+    printed = capsys.readouterr().out
+    assert f"jax {jax.__version__}" in printed and re.search(r"native: .* at most \de-\d\d from XLA's image", printed)
+    assert "cuda is not available: it needs JAX on an NVIDIA GPU" in printed
+    assert "devices     the CPU\n" in printed and re.search(r"memory +[\d.]+ GB may be used\n", printed)
+    assert printed.splitlines()[-1].split(maxsplit=1) == ["verdict", "everything works on this machine"]
     assert "but on the CPU" in doctor._verdict("cpu", {}, has_driver=True)
     assert "but slowly: native is not available" in doctor._verdict("cpu", {"native": "…"}, has_driver=False)
     monkeypatch.setattr(doctor, "_compare", lambda available: float("inf"))

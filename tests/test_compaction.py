@@ -87,8 +87,8 @@ def test_the_command_on_a_model(tmp_path, monkeypatch, capsys):
     assert load_compact(tmp_path / "scene.a2tgz").num == a_model().num
     part = f"1/{a_model().num_bytes / size:.1f}"
     assert text.startswith("trying up to ") and "on a CPU this takes minutes\n" in text
-    told = f"{tmp_path / 'scene.a2tgz'}: {in_bytes(size)} on disk, {part} of the model's numbers, 0."
-    assert text.splitlines()[-1].startswith(told) and text.endswith(" dB of PSNR lost\n")
+    printed = f"{tmp_path / 'scene.a2tgz'}: {in_bytes(size)} on disk, {part} of the model's numbers, 0."
+    assert text.splitlines()[-1].startswith(printed) and text.endswith(" dB of PSNR lost\n")
     assert "dB lost, if 30 dB" in text and "opacities 2 " in text and "texels" not in text
 
 

@@ -86,9 +86,9 @@ def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
         assert cli.main([*TUNE, str(run.path), "--out", str(plain), "--max-loss", "0.02"]) == 0
     capsys.readouterr()
     assert cli.main([*TUNE, str(run.path), "--out", str(tuned), "--max-loss", "0.02"]) == 0
-    told, scene = capsys.readouterr().out, read_record(run).scene.load()
-    assert re.search(r"\ntuning 1 of up to 4: .* for the other \d+, without compiling\n", told)  # Nothing grows.
-    assert "then training up to" in told and "\ntuned 1 " in told and "\ntuned 1: means " in told
+    printed, scene = capsys.readouterr().out, read_record(run).scene.load()
+    assert re.search(r"\ntuning 1 of up to 4: .* for the other \d+, without compiling\n", printed)  # Nothing grows.
+    assert "then training up to" in printed and "\ntuned 1 " in printed and "\ntuned 1: means " in printed
     before, after = (
         evaluate(scene.train, m).psnr for m in (load_model(run.model("a2tg-textures")), load_compact(tuned))
     )
@@ -149,8 +149,8 @@ def test_a_tuning_that_ends_early(error, code, run, tmp_path, monkeypatch, capsy
     assert cli.main([*TUNE, str(run.path), "--out", str(tmp_path / "a.a2tgz"), "--max-loss", "0.5"]) == code
     assert [path.name for path in tmp_path.iterdir()] == ([] if code else ["a.a2tgz"])
     if code == 0:
-        told = "tuning ended early, what was found before is kept: the loss has exploded\n"
-        assert told in capsys.readouterr().out and load_compact(tmp_path / "a.a2tgz").num == 60
+        printed = "tuning ended early, what was found before is kept: the loss has exploded\n"
+        assert printed in capsys.readouterr().out and load_compact(tmp_path / "a.a2tgz").num == 60
 
 
 @pytest.mark.long
@@ -186,9 +186,9 @@ def test_only_a_file_that_the_run_wrote_is_replaced(run, tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize(
-    ("name", "told"), [("plain.a2tgz", ", which is compressed already"), ("c.ply", ""), ("c.SOG", "")]
+    ("name", "printed"), [("plain.a2tgz", ", which is compressed already"), ("c.ply", ""), ("c.SOG", "")]
 )
-def test_compress_names_what_it_reads(name, told, tmp_path, monkeypatch, capsys):
+def test_compress_names_what_it_reads(name, printed, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / name).touch()
-    assert f"a2tg compress reads a run folder or *.npz; got {name}{told}\n" in fails(capsys, "compress", name)
+    assert f"a2tg compress reads a run folder or *.npz; got {name}{printed}\n" in fails(capsys, "compress", name)

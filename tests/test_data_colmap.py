@@ -284,9 +284,9 @@ def test_the_model_of_the_most_images_is_read(tmp_path, text):
         write_scene(tmp_path / str(index), names=own, text=text)
         shutil.copytree(tmp_path / str(index) / "images", tmp_path / "scene" / "images", dirs_exist_ok=True)
         shutil.copytree(tmp_path / str(index) / "sparse" / "0", tmp_path / "scene" / "sparse" / f"{index}")
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as printed:
         assert [view.name for view in loaded(tmp_path / "scene", 10).train] == names[3:13]
-    models, photographs = (str(warning.message) for warning in told)
+    models, photographs = (str(warning.message) for warning in printed)
     assert "3 COLMAP models; sparse/1 (10 images) is read, and not sparse/0 (3 images), sparse/2 (2 images)" in models
     assert "5 photographs without a pose, such as 00.png: not used" in photographs
     other = models.rpartition("give its folder, such as ")[2]
@@ -401,11 +401,11 @@ def test_an_image_is_removed_as_the_error_says(tmp_path, text):
     (tmp_path / "images" / "img_04.png").unlink()
     with pytest.raises(
         FileNotFoundError, match=r"img_04\.png: no such image, but the scene has a camera for it"
-    ) as told:
+    ) as printed:
         load_scene(tmp_path)
     if text:
         file = tmp_path / MODEL / "images.txt"
-        assert str(told.value).rpartition("or ")[2] == f"delete its two lines in {file}"
+        assert str(printed.value).rpartition("or ")[2] == f"delete its two lines in {file}"
         lines = file.read_text().splitlines(keepends=True)
         at = next(index for index, line in enumerate(lines) if "img_04.png" in line)
         file.write_text("".join(lines[:at] + lines[at + 2 :]))
@@ -414,7 +414,7 @@ def test_an_image_is_removed_as_the_error_says(tmp_path, text):
         with pytest.raises(Exception, match="Image with ID 5 does not exist"):
             pycolmap().Reconstruction(str(file.parent))
     else:
-        exec(str(told.value).partition("in Python: ")[2], {})
+        exec(str(printed.value).partition("in Python: ")[2], {})
         assert loaded(tmp_path, 8).train[0].points.depths.shape == (2,)
 
 

@@ -60,9 +60,9 @@ def test_photographs_of_two_folders_become_a_scene(tmp_path):
         file = tmp_path / "a" / f"view_{index:03d}.png"
         save_turned(Image.open(file), tmp_path / "b" / f"{file.stem}.jpg", orientation)
         file.unlink()
-    told = []
-    summary = run_sfm([tmp_path / "a", tmp_path / "b"], tmp_path / "scene", progress=False, on_note=told.append)
-    assert (summary.num_photos, summary.num_registered, told) == (5, 5, ["2 photographs turned as EXIF says"])
+    printed = []
+    summary = run_sfm([tmp_path / "a", tmp_path / "b"], tmp_path / "scene", progress=False, on_note=printed.append)
+    assert (summary.num_photos, summary.num_registered, printed) == (5, 5, ["2 photographs turned as EXIF says"])
     assert 0 < summary.mean_error < 1
     assert sorted(file.name for file in (tmp_path / "scene").iterdir()) == ["images", "sparse"]
     scene = load_scene(tmp_path / "scene", test_every=0)
@@ -123,9 +123,9 @@ def seen_by_colmap(file):
 def test_turned_photographs_are_turned_back(tmp_path, orientation):
     for suffix in ("jpg", "png", "tif", "webp", "avif"):
         save_turned(Image.fromarray(GREY), tmp_path / f"{suffix}.{suffix}", orientation)
-    told = []
-    found = staged([tmp_path], tmp_path / "work", tell=told.append)
-    assert told == ["5 photographs turned as EXIF says"]
+    printed = []
+    found = staged([tmp_path], tmp_path / "work", tell=printed.append)
+    assert printed == ["5 photographs turned as EXIF says"]
     names = ["avif.avif.jpg", "jpg.jpg", "png.png", "tif.tif.png", "webp.webp.jpg"]
     assert found.names == names
     assert {group.size for group in found.groups} == {(96, 64)}
@@ -195,9 +195,9 @@ def test_photographs_that_lose_their_alpha(tmp_path, mode):
         image.putpixel((index, 0), (0, 0, 0, 0 if index < 2 else 255))
         image.convert("RGB" if index == 3 else mode).save(tmp_path / f"{index}.png")
         image.putpixel((index, 0), (255, 255, 255, 255))
-    with pytest.warns(UserWarning, match=r"2 of 4 photographs have transparent pixels.* folder masks") as told:
+    with pytest.warns(UserWarning, match=r"2 of 4 photographs have transparent pixels.* folder masks") as printed:
         staged([tmp_path], tmp_path / "work")
-    assert len(told) == 1
+    assert len(printed) == 1
 
 
 def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):
@@ -226,9 +226,9 @@ def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd, monkeypatch, is
     save_photos(tmp_path / "photos", 4, 128, 96)
     with contextlib.suppress(ValueError):  # The phases count, not what they find.
         run_sfm(tmp_path / "photos", tmp_path / "scene")
-    told = capfd.readouterr().err
-    assert is_terminal == ("\r" in told)
-    lines = told.replace("\r", "\n").splitlines()
+    printed = capfd.readouterr().err
+    assert is_terminal == ("\r" in printed)
+    lines = printed.replace("\r", "\n").splitlines()
     assert all(re.match(r"(features|matching|mapping|undistorting)\b|$", line) for line in lines)
     assert any(("4/4" if is_terminal else "4 of 4") in line for line in lines if line.startswith("features"))
     assert any(line.startswith("matching 6 pairs: 00:0" if is_terminal else "matching 6 pairs …") for line in lines)
@@ -242,9 +242,9 @@ def test_too_little_in_common(tmp_path, capfd):
         Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.png")
     with pytest.raises(
         ValueError, match=r"none of the 3 photographs could be placed \(3 pairs match\); photographs match"
-    ) as told:
+    ) as printed:
         run_sfm(tmp_path / "photos", tmp_path / "new" / "scene", progress=False)
-    assert "features" not in str(told.value)
+    assert "features" not in str(printed.value)
     assert capfd.readouterr().err == "" and not (tmp_path / "new").exists()
 
 
@@ -303,9 +303,9 @@ def test_what_is_skipped_is_counted(tmp_path, names, words):
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    with pytest.raises(ValueError) if len(names) < 4 else pytest.warns(UserWarning) as told:
+    with pytest.raises(ValueError) if len(names) < 4 else pytest.warns(UserWarning) as printed:
         find_photos(tmp_path)
-    text = str(told.value if len(names) < 4 else told[0].message)
+    text = str(printed.value if len(names) < 4 else printed[0].message)
     assert all(word in text for word in words)
 
 
@@ -340,9 +340,9 @@ def test_pictures_that_are_no_photographs_are_left_out(tmp_path):
             )
     (tmp_path / "sparse").mkdir()
     (tmp_path / "run" / ".a2tg-run").write_text("a2tg-jax run\n.a2tg-run\ntest/0.png\n")
-    with pytest.warns(UserWarning) as told:
+    with pytest.warns(UserWarning) as printed:
         assert find_photos(tmp_path) == sorted(photos)
-    assert str(told[0].message) == (
+    assert str(printed[0].message) == (
         f"{tmp_path}: Not taken for photographs: written by a2tg: 2 (cameras.png, run/test/0.png); "
         "in hidden folders: 1 (.thumbs/0.jpg); masks or depth maps: 8 (Depth-Maps/*.jpg, images/1_mask.png, "
         "images/mask_2.jpg, masks/*.png); copies of others: 7 (images/0.png, images_2/*.jpg, small/images/*.jpg). "

@@ -175,8 +175,8 @@ def test_room_on_the_disk_is_checked_first(server, tmp_path):
 def test_the_command_lists_and_fetches(server, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(BENCHMARK_SETS, "tiny", archive_of(server, {"a.txt": "a"}, content="a text"))
     assert cli.main(["download", "--list"]) == 0
-    told = capsys.readouterr().out
-    assert all(f"{name} " in told for name in BENCHMARK_SETS)
+    printed = capsys.readouterr().out
+    assert all(f"{name} " in printed for name in BENCHMARK_SETS)
     assert cli.main(["download", "tiny", "--out", str(tmp_path / "scenes")]) == 0
     assert (tmp_path / "scenes/360_v2/a.txt").is_file() and "tiny: unpacked in" in capsys.readouterr().out
     assert cli.main(["download", "mipnerf", "--out", str(tmp_path / "scenes")]) == 2

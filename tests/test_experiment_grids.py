@@ -217,7 +217,7 @@ def test_a_grid_file_of_ones_own_names_scenes_and_table(tmp_path):
         ("budgets = [0.3]", "budgets = [0.3", "mine.toml: Unclosed array"),
     ],
 )
-def test_mistakes_in_a_grid_file_are_told(tmp_path, before, after, words):
+def test_mistakes_in_a_grid_file_are_reported(tmp_path, before, after, words):
     text = OWN_GRID.replace(before, after)
     if before == "[small]":
         text = text.replace("[small.scenes]", "[full.scenes]")
@@ -265,8 +265,8 @@ def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
 def test_misspelt_names_are_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
     with pytest.raises(SystemExit) as ended:
         main([*arguments, "--out", str(tmp_path), "--work", str(tmp_path)])
-    told = capsys.readouterr().err
-    assert ended.value.code == 2 and words in told and told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert ended.value.code == 2 and words in printed and printed.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -291,7 +291,7 @@ def test_names_may_follow_options_that_can_be_repeated():
 @pytest.mark.parametrize(
     "text, words", [("[1]", "records.json must hold an object"), ('{"a": [1]}', "records.json: 'a' must be an object")]
 )
-def test_damaged_records_are_told(tmp_path, text, words, capsys):
+def test_damaged_records_are_reported(tmp_path, text, words, capsys):
     (tmp_path / "records.json").write_text(text)
     with pytest.raises(SystemExit) as ended:
         main(["claim", "--scale", "smoke", "--plan", "--work", str(tmp_path), "--out", str(tmp_path)])
@@ -366,8 +366,8 @@ def test_a_fingerprint_is_of_what_decides_the_result():
         "import sys; sys.path.append('experiments'); import a2tg_jax as a; from lab.fingerprint import fingerprint;"
         "print(fingerprint(a.A2tg.preset('quick'), 1))"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert told.strip() == fingerprint(quick, 1), "another process says the same"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert printed.strip() == fingerprint(quick, 1), "another process says the same"
 
 
 KEYS = """
@@ -381,8 +381,8 @@ print(*[job.key for name in {names} for job in read_grid(name, "small").jobs({{}
 @pytest.mark.long
 def test_keys_are_the_same_in_every_process():
     script = KEYS.format(folder=str(EXPERIMENTS), names=NAMES)
-    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
-    assert told == [job.key for name in NAMES for job in read_grid(name, "small").jobs({})]
+    printed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    assert printed == [job.key for name in NAMES for job in read_grid(name, "small").jobs({})]
 
 
 def test_functions_without_a_name_have_no_fingerprint():

@@ -177,8 +177,8 @@ def test_a_preempted_job_is_queued_again(tmp_path):
 
 def test_errors_of_jobs_are_one_line():
     trace = "Job (task=0) failed with trace:\n----\nTraceback (most recent call last):\nValueError: no scene\n----"
-    assert queue.told_error(RuntimeError(trace)) == "ValueError: no scene"
-    assert queue.told_error(ValueError("one\nand two")) == "ValueError: one and two"
+    assert queue.error_text(RuntimeError(trace)) == "ValueError: no scene"
+    assert queue.error_text(ValueError("one\nand two")) == "ValueError: one and two"
 
 
 def test_processes_begin_without_ctrl_c():

@@ -49,10 +49,10 @@ def test_the_best_plain_method_is_that_of_each_cell_which_has_all():
     best = summary.best_plain(results, summary.PLAIN_METHODS, summary.BEST)
     assert [(one.run.cell.seed, one["psnr"]) for one in best] == [(0, 23), (1, 24)]
     assert {one.label for one in best} == {summary.BEST}
-    told = summary.bytes_table([dataclasses.replace(one, run=with_budget(one.run, 0.3)) for one in results])
-    assert "Bytewise less the best plain method: fox | +1.50" in told
-    assert "less the best plain method without pruning: mean** | +1.50" in told
-    assert "less MCMC of degree 0: mean** | +3.00" in told
+    printed = summary.bytes_table([dataclasses.replace(one, run=with_budget(one.run, 0.3)) for one in results])
+    assert "Bytewise less the best plain method: fox | +1.50" in printed
+    assert "less the best plain method without pruning: mean** | +1.50" in printed
+    assert "less MCMC of degree 0: mean** | +3.00" in printed
 
 
 def with_budget(run: Run, megabytes: float) -> Run:
@@ -83,17 +83,17 @@ def test_an_interval_over_scenes_is_that_of_students_t():
     found = tables.over_scenes([1.0, 2.0, 3.0, 6.0])
     error = np.sqrt(14 / 3 / 4)
     assert found.mean == 3.0 and found.half_width == pytest.approx(3.18245 * error, rel=1e-5)
-    assert found.told(2) == "+3.00 ± 3.44" and 0.05 < found.p_value < 0.1, "0 is inside the interval"
+    assert found.as_text(2) == "+3.00 ± 3.44" and 0.05 < found.p_value < 0.1, "0 is inside the interval"
     assert tables.over_scenes([2.0, 2.1, 1.9]).p_value < 0.001
     alone = tables.over_scenes([2.0])
-    assert alone.told(2) == "+2.00" and np.isnan(alone.p_value)
-    assert np.isnan(tables.over_scenes([]).mean) and tables.over_scenes([1.0, np.nan]).told(2) == tables.MISSING
+    assert alone.as_text(2) == "+2.00" and np.isnan(alone.p_value)
+    assert np.isnan(tables.over_scenes([]).mean) and tables.over_scenes([1.0, np.nan]).as_text(2) == tables.MISSING
 
 
 def test_lpips_without_weights_is_a_dash_in_every_table():
     results = [at(scene, label, 20.0, lpips=None) for scene in "ab" for label in ("own", "other")]
     texts = [tables.gains_table(results, "own", ["other"]), tables.choices_table(results, "own")]
-    texts += [equal_bytes.told_gain(results, "own", "other"), tables.quality_tables(GRID, results)]
+    texts += [equal_bytes.gain_text(results, "own", "other"), tables.quality_tables(GRID, results)]
     for text in texts:
         assert "nan" not in text
         assert f"· {tables.MISSING}" in text or f"/ {tables.MISSING}" in text
@@ -102,9 +102,9 @@ def test_lpips_without_weights_is_a_dash_in_every_table():
 def test_figures_that_are_missing_are_dashes_in_pages_of_models():
     nan = float("nan")
     figures = {"psnr": 20.0, "lpips": nan, "train": 21.0}
-    assert polish._told(figures, figures) == "+0.00 · – · +0.00"
+    assert polish._as_text(figures, figures) == "+0.00 · – · +0.00"
     sizes = {"bytes": 1000, "texels": 10, "psnr": 20.0, "lpips": None}
-    assert shrink._told(sizes, {**sizes, "lpips": 0.1}).endswith(": +0.00 · –")
+    assert shrink._as_text(sizes, {**sizes, "lpips": 0.1}).endswith(": +0.00 · –")
     group = {"criterion": "paper", "train": nan, "scores": {}}
     assert upscale_gains._quarters({"groups": [group]}, "paper") == tables.MISSING
 
@@ -153,7 +153,7 @@ def test_without_a_second_seed_nothing_is_said_to_be_above():
     assert "| +1.00 · +0.000 · +1.00 |" in text and "No cell has two seeds" in text
 
 
-def test_columns_are_data_sets_and_what_is_missing_in_one_is_told():
+def test_columns_are_data_sets_and_what_is_missing_in_one_is_reported():
     """A mean over all of them counts each once, as the paper does."""
     scenes = [SceneAt(label, label, 1) for label in ("A/x", "A/y", "B/z")]
     cells = [dataclasses.replace(CELL, scene=scene) for scene in scenes]

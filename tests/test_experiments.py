@@ -1,4 +1,4 @@
-"""Experiments as a user calls them: killed, continued, planned, told."""
+"""Experiments as a user calls them: killed, continued, planned."""
 
 import dataclasses
 import json
@@ -79,8 +79,8 @@ def test_an_experiment_is_killed_goes_on_and_is_not_run_again(tmp_path):
     before = json.loads((out / "records.json").read_text())
     assert 1 <= len(before) < 8
     done = call("claim", "--out", out, "--work", work, "--jobs", 2)
-    told, _ = done.communicate(timeout=600)
-    assert done.returncode == 0, told
+    printed, _ = done.communicate(timeout=600)
+    assert done.returncode == 0, printed
     after = json.loads((out / "records.json").read_text())
     assert len(after) == 8 and {key: after[key] for key in before} == before
     assert not list((work / "checkpoints").glob("*.npz")), "what is finished needs none"
@@ -90,8 +90,8 @@ def test_an_experiment_is_killed_goes_on_and_is_not_run_again(tmp_path):
     assert len(last) == 2 and all(0.99 * own["mb"] < row["mb"] <= own["mb"] for row in last)
     assert "against 2DGS*-MCMC, equal bytes" in (out / "claim.md").read_text()
     again = call("claim", "--out", out, "--work", work)
-    told, _ = again.communicate(timeout=120)
-    assert again.returncode == 0 and ".npz" not in told and " dB;" not in told
+    printed, _ = again.communicate(timeout=120)
+    assert again.returncode == 0 and ".npz" not in printed and " dB;" not in printed
 
 
 @pytest.mark.long
@@ -102,8 +102,8 @@ def test_submitit_sends_jobs_out(tmp_path):
     process = call(
         "efficiency", "--out", out, "--work", work, "--cluster", "local", "--cluster-parameter", "timeout_min=10"
     )
-    told, _ = process.communicate(timeout=600)
-    assert process.returncode == 0, told
+    printed, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, printed
     assert len(json.loads((out / "records.json").read_text())) == 2
     assert list((work / "submitit").iterdir())
 
@@ -112,24 +112,24 @@ def test_ctrl_c_is_one_line_and_says_how_to_continue(capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["run.py", "claim", "--scenes", "my scenes"])
     with pytest.raises(SystemExit) as ended, interruptible():
         raise KeyboardInterrupt
-    told = capsys.readouterr().err.strip()
-    assert ended.value.code == 130 and told.count("\n") == 0
-    assert told.endswith("run.py claim --scenes 'my scenes'")
+    printed = capsys.readouterr().err.strip()
+    assert ended.value.code == 130 and printed.count("\n") == 0
+    assert printed.endswith("run.py claim --scenes 'my scenes'")
 
 
 def test_sigterm_ends_as_ctrl_c_does(capsys):
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as ended, interruptible():
         signal.raise_signal(signal.SIGTERM)
-    told = capsys.readouterr().err.strip()
-    assert ended.value.code == 143 and told.count("\n") == 0 and "terminated; what is finished is kept" in told
+    printed = capsys.readouterr().err.strip()
+    assert ended.value.code == 143 and printed.count("\n") == 0 and "terminated; what is finished is kept" in printed
     assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_records_of_an_earlier_version_are_told_and_trained_again_on_request(tmp_path):
     old, new = record(system="bytewise"), record(system="bytewise", version=a2tg.Bytewise.version)
-    assert versions.told([old, new, old]) == "2 of bytewise (version 1, now 2)"
-    assert versions.told([new, record(system="a2tg"), record(system="nowhere:Gone", version=3)]) == ""
+    assert versions.as_text([old, new, old]) == "2 of bytewise (version 1, now 2)"
+    assert versions.as_text([new, record(system="a2tg"), record(system="nowhere:Gone", version=3)]) == ""
     (tmp_path / "records.json").write_text(json.dumps({"old": old, "new": new}), encoding="utf-8")
     given = ["claim", "--out", str(tmp_path), "--work", str(tmp_path / "work")]
     assert set(Lab(parse_arguments(experiments(), given)).records) == {"old", "new"}
@@ -190,15 +190,17 @@ def test_progress_names_stages_in_words(tmp_path, capsys):
     last = list(grid.jobs(records))[-1]
     progress.start(last)
     progress.failed(queue.Failure(last, "no room"))
-    told = capsys.readouterr().out.splitlines()
-    assert told[0] == f"8 stages to train, 2 at a time at most; log: {tmp_path / 'log.txt'}"
-    assert told[1] == "1 of 8 start: built-in 1/2, A²TG, stage gaussians, 400 Gaussians, seed 0"
-    assert told[2].startswith("1 of 8 done: built-in 1/2, A²TG, ") and "25.00 dB" in told[2]
-    assert told[2].endswith("; 3 s, 10 ms a step") and told[3].endswith("; 3 s"), "a short stage has no pace"
-    assert told[4].startswith("2 of 8 start: built-in 1/2, Textured Gaussians*, stage textures, bytes of 400 Gaussians")
-    assert told[5].startswith("2 of 8 FAILED: ") and told[5].endswith(": no room")
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == f"8 stages to train, 2 at a time at most; log: {tmp_path / 'log.txt'}"
+    assert printed[1] == "1 of 8 start: built-in 1/2, A²TG, stage gaussians, 400 Gaussians, seed 0"
+    assert printed[2].startswith("1 of 8 done: built-in 1/2, A²TG, ") and "25.00 dB" in printed[2]
+    assert printed[2].endswith("; 3 s, 10 ms a step") and printed[3].endswith("; 3 s"), "a short stage has no pace"
+    assert printed[4].startswith(
+        "2 of 8 start: built-in 1/2, Textured Gaussians*, stage textures, bytes of 400 Gaussians"
+    )
+    assert printed[5].startswith("2 of 8 FAILED: ") and printed[5].endswith(": no room")
     log = (tmp_path / "log.txt").read_text(encoding="utf-8").splitlines()
-    assert len(log) == 6 and all(line.endswith(shown) for line, shown in zip(log, told, strict=True))
+    assert len(log) == 6 and all(line.endswith(shown) for line, shown in zip(log, printed, strict=True))
 
 
 def test_arguments_have_defaults():

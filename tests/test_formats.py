@@ -158,8 +158,8 @@ def test_cut_colours_and_scales_are_counted(tmp_path, suffix, num):
     lost = lost_by(Model(g), f"a{suffix}")
     assert np.count_nonzero(changed.any(axis=(1, 2))) == num
     assert f"colours of {num} Gaussians beyond the format's range (cut)" in lost
-    told = "scales of 2 Gaussians beyond the format's range (cut)"
-    assert (told in lost) == (suffix == ".spz") == bool(np.abs(found.log_scales - g.log_scales).max() > 0.4)
+    printed = "scales of 2 Gaussians beyond the format's range (cut)"
+    assert (printed in lost) == (suffix == ".spz") == bool(np.abs(found.log_scales - g.log_scales).max() > 0.4)
 
 
 @pytest.mark.parametrize("suffix", [f".{kind}" for kind in KINDS])
@@ -199,8 +199,8 @@ def test_what_a_format_does_not_keep():
 def test_convert_on_the_command_line(tmp_path, capsys):
     save_model(tmp_path / "a.npz", textured())
     assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.ply")]) == 0
-    told = capsys.readouterr().out
-    assert f"not kept by this format: {TEXTURES}\n" in told and "times)" in told
+    printed = capsys.readouterr().out
+    assert f"not kept by this format: {TEXTURES}\n" in printed and "times)" in printed
     assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.npz")]) == 0
     np.testing.assert_array_equal(load_model(tmp_path / "c.npz").gaussians.means, load_ply(tmp_path / "b.ply").means)
     assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "b.ply")]) == 2
@@ -217,8 +217,8 @@ def test_textures_and_origin_pass_through_gltf(tmp_path, capsys, suffix):
     )
     save_model(tmp_path / "a.npz", model)
     main(["convert", str(tmp_path / "a.npz"), str(tmp_path / f"b{suffix}")])
-    assert "not kept by this format: last digits\n" in (told := capsys.readouterr().out) and "(0." not in told
-    assert f"not shown by other programs: {TEXTURES}\n" in told
+    assert "not kept by this format: last digits\n" in (printed := capsys.readouterr().out) and "(0." not in printed
+    assert f"not shown by other programs: {TEXTURES}\n" in printed
     main(["convert", str(tmp_path / f"b{suffix}"), str(tmp_path / "c.npz")])
     found = load_model(tmp_path / "c.npz")
     assert found.origin == model.origin and template_of(found.appearance) == template_of(model.appearance)

@@ -318,7 +318,7 @@ def test_shapes_are_what_the_extension_says(tmp_path, saved):
     assert found.appearance.exponents is None and found.textures is not None
 
 
-def test_other_kernels_and_colours_are_told(tmp_path):
+def test_other_kernels_and_colours_are_reported(tmp_path):
     path, linear = tmp_path / "m.glb", {"colorSpace": "lin_rec709_display"}
     rewritten(path, plain(), lambda described: first_primitive(described)["extensions"][SPLATS].update(linear))
     with pytest.warns(UserWarning, match="colorSpace lin_rec709_display; they are read as srgb_rec709_display"):

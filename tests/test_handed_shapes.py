@@ -64,7 +64,7 @@ def test_shapes_of_a_file_are_kept_or_its_nearest_gaussians_taken(tmp_path, scen
         np.testing.assert_array_equal(found.appearance.shapes, SHAPES)
 
 
-def test_a_first_stage_without_shapes_is_told(tmp_path, recwarn):
+def test_a_first_stage_without_shapes_is_reported(tmp_path, recwarn):
     a2tg.save_model(tmp_path / "a.npz", shaped())
     check_init(tmp_path / "a.npz", tmp_path / "run", a2tg.Bytewise())
     assert not recwarn.list

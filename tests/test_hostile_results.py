@@ -199,8 +199,8 @@ def test_texts_are_measured_before_they_are_parsed(parse, text):
 
 def test_brackets_in_strings_do_not_count():
     deep = "[" * 100
-    told = json.dumps({'a"' + deep: ["\\", deep, '\\"' + deep]})
-    assert parse_json(told) == json.loads(told)
+    printed_text = json.dumps({'a"' + deep: ["\\", deep, '\\"' + deep]})
+    assert parse_json(printed_text) == json.loads(printed_text)
     text = f"a = '{deep}' # {deep}\nb = \"\\\"{deep}\"\nc = \"\"\"\n\"{deep}\"\"\"\nd = '''{deep}'''\n'{deep}' = 1\n"
     assert parse_toml(text.encode())["b"] == '"' + deep
     assert parse_toml(b"a = [" + b"0.5," * 100 + b"]") == {"a": [0.5] * 100}

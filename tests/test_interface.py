@@ -50,8 +50,8 @@ def of_headers(tmp_path_factory) -> dict[str, int]:
     text = ["#include <stdio.h>", '#include "xla/ffi/api/c_api.h"', "int main(void) {", *lines, "return 0; }"]
     source.write_text("\n".join(text))
     subprocess.run([compiler, "-I", jax.ffi.include_dir(), "-o", program, source], check=True)
-    told = subprocess.run([program], capture_output=True, text=True, check=True).stdout
-    return {name: int(number) for name, number in (line.split() for line in told.splitlines())}
+    printed = subprocess.run([program], capture_output=True, text=True, check=True).stdout
+    return {name: int(number) for name, number in (line.split() for line in printed.splitlines())}
 
 
 @pytest.mark.parametrize("own", FIELDS, ids=lambda own: own.__name__.strip("_"))

@@ -88,10 +88,10 @@ def test_pause_holds_the_training_until_it_is_resumed_or_stopped():
     app = application(live.routes, Door(port=80))
 
     def post(path: str, **more) -> str:
-        told = []
+        printed = []
         environ = {"REQUEST_METHOD": "POST", "PATH_INFO": path, "HTTP_HOST": "127.0.0.1:80", **more}
-        list(app(environ, lambda status, headers: told.append(status)))
-        return told[0]
+        list(app(environ, lambda status, headers: printed.append(status)))
+        return printed[0]
 
     own = {"HTTP_ORIGIN": "http://127.0.0.1:80"}
     assert post("/pause").startswith("403") and post("/pause", HTTP_ORIGIN="http://evil.example").startswith("403")

@@ -268,8 +268,8 @@ def test_the_command_writes_the_original_world(model, tmp_path, capsys):
     a2tg.save_model(tmp_path / "model.npz", model)
     arguments = ["mesh", str(tmp_path / "model.npz"), "--voxel", "0.4", "--out", str(tmp_path / "made.ply")]
     assert cli.main(arguments) == 0
-    told = capsys.readouterr().out
-    assert "fused 14 views at voxels of 0.4, within 24 of the centre" in told and "faces" in told
+    printed = capsys.readouterr().out
+    assert "fused 14 views at voxels of 0.4, within 24 of the centre" in printed and "faces" in printed
     content = (tmp_path / "made.ply").read_bytes()
     start, num = content.index(b"end_header\n") + 11, int(content.split(b"vertex ")[1].split()[0])
     kind = np.dtype([("position", "<f4", 3), ("color", "u1", 3)])
@@ -375,7 +375,7 @@ def test_textures_are_read_back_by_another_library(textured, tmp_path, suffix):
     assert [path.suffix for path in files] == ([".glb"] if suffix == ".glb" else [".obj", ".mtl", ".png"])
 
 
-def test_missing_libraries_are_told(sphere, monkeypatch):
+def test_missing_libraries_are_reported(sphere, monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     with pytest.raises(ValueError, match=r"xatlas, which is not installed: pip install 'a2tg-jax\[mesh\]'"):

@@ -586,9 +586,9 @@ NAMES |= {**globals(), "Path": Path}
 @pytest.mark.parametrize("mistake", cases(CALLS, lambda code: "trained(" in code and "target.depth" not in code))
 def test_a_mistake_in_python(mistake, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises((ValueError, FileNotFoundError)) as told:
+    with pytest.raises((ValueError, FileNotFoundError)) as printed_text:
         eval(mistake, NAMES)
-    assert_says(str(told.value), CALLS[mistake])
+    assert_says(str(printed_text.value), CALLS[mistake])
     assert not list(tmp_path.iterdir()), "nothing is written"
 
 
@@ -608,13 +608,13 @@ ADVICE = {
 
 @pytest.mark.parametrize("mistake", ADVICE)
 def test_what_a_message_says_to_write_works(mistake, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="say ") as told:
+    with pytest.raises(ValueError, match="say ") as printed_text:
         eval(mistake, NAMES)
     monkeypatch.chdir(tmp_path)
     write_colmap(tmp_path / "fox")
     given = {"gaussians": GAUSSIANS, "model": MODEL, "image": np.zeros((12, 16, 3)), "key": jax.random.key(0)}
     given["appearance"] = TEMPLATE.appearance
-    for code in str(told.value).rpartition("say ")[2].partition(" of ")[0].split(" or "):
+    for code in str(printed_text.value).rpartition("say ")[2].partition(" of ")[0].split(" or "):
         assert isinstance(eval(code, NAMES | given), ADVICE[mistake])
 
 
@@ -723,14 +723,16 @@ BY_HAND = shaded(lambda u, v: ((u + v, u, u), v))
 
 @pytest.mark.long
 def test_a_matrix_product_in_shade_is_composited_by_xla(monkeypatch):
-    told = r"the primitive '(stack|broadcast_in_dim)' in Mixed\.shade"
-    with pytest.warns(UserWarning, match=rf"Mixed is composited by XLA, which is slower: .*{told}"):
+    printed_text = r"the primitive '(stack|broadcast_in_dim)' in Mixed\.shade"
+    with pytest.warns(UserWarning, match=rf"Mixed is composited by XLA, which is slower: .*{printed_text}"):
         found = drawn(MIXED, "auto")
     np.testing.assert_allclose(found, drawn(MIXED_BY_HAND, "auto"), atol=1e-5)
     monkeypatch.setitem(platforms.PLATFORMS, "cuda", "cpu")
     monkeypatch.setattr(platforms.nvrtc, "find", lambda: True)
     for name in ("native", "cuda"):
-        with pytest.raises(ValueError, match=rf"compositor='{name}' cannot run Mixed: .*{told}\. Say 'xla', or 'auto'"):
+        with pytest.raises(
+            ValueError, match=rf"compositor='{name}' cannot run Mixed: .*{printed_text}\. Say 'xla', or 'auto'"
+        ):
             drawn(MIXED, name)
 
 

@@ -185,9 +185,9 @@ def test_the_error_of_a_full_disk_names_the_file(tmp_path, monkeypatch, capsys, 
     monkeypatch.setattr(runs.Info, "run", write)
     assert cli.main(["info", "run"]) == 2
     where = rf"{tmp_path / 'x.npz'}: the disk is full( or has no inodes left)?, \d+\.\d MB are free"
-    told = where if is_ours else "the disk is full"
+    printed = where if is_ours else "the disk is full"
     error = capsys.readouterr().err
-    assert re.fullmatch(f"a2tg: error: {told}: make room, or write to another disk\n", error)
+    assert re.fullmatch(f"a2tg: error: {printed}: make room, or write to another disk\n", error)
 
 
 # Two processes
@@ -481,8 +481,8 @@ def test_a_signal_in_training_keeps_its_state(scene, stopped, tmp_path, monkeypa
         patch.setattr(StageRun, "_launch", launch_and_signal)
         assert cli.main([*TRAIN, "--out", str(out)]) == code
     run = RunFolder(out)
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert told == (
+    printed = capsys.readouterr().err.splitlines()[-1]
+    assert printed == (
         f"a2tg: interrupted; the last checkpoint is {run.checkpoint(NAME, 7)}; "
         f"continue with: a2tg train --out {out} --resume"
     )
@@ -516,8 +516,8 @@ def test_errors_of_training_come_with_advice(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_training, "save_checkpoint", raising(OSError(28, "No space left on device")))
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
-    told = "the disk is full: make room, or write to another disk"
-    assert f"{told}; there is no checkpoint yet; continue with: a2tg train" in error
+    printed = "the disk is full: make room, or write to another disk"
+    assert f"{printed}; there is no checkpoint yet; continue with: a2tg train" in error
     assert run_training.how_to_go_on(RunFolder(tmp_path / "run")) in error
 
 
@@ -531,21 +531,23 @@ LACKS = {
 
 
 def test_a_lack_of_memory_in_training_comes_with_advice(tmp_path, monkeypatch, capsys):
-    told = next(iter(LACKS))
-    monkeypatch.setattr(run_training, "fit_stage", raising(LACKS[told]))
+    printed = next(iter(LACKS))
+    monkeypatch.setattr(run_training, "fit_stage", raising(LACKS[printed]))
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     how = run_training.how_to_go_on(RunFolder(tmp_path / "run"))
-    assert error.startswith(f"a2tg: error: {told}close other programs, or start another run with a larger --downscale")
+    assert error.startswith(
+        f"a2tg: error: {printed}close other programs, or start another run with a larger --downscale"
+    )
     assert error.endswith(how)
 
 
 @pytest.mark.parametrize(("name", "advice"), [("render", "lower --size or --supersample"), ("info", "close other")])
 def test_a_lack_of_memory_outside_training_is_one_line(name, advice, monkeypatch, capsys):
-    for told, error in LACKS.items():
+    for printed, error in LACKS.items():
         monkeypatch.setattr(cli.command_class(name), "run", raising(error))
         assert cli.main([name, "run"]) == 2
-        assert f"a2tg: error: {told}{advice}" in capsys.readouterr().err
+        assert f"a2tg: error: {printed}{advice}" in capsys.readouterr().err
 
 
 def test_an_internal_error_is_not_reported_as_a_mistake_of_the_user(monkeypatch):

@@ -188,7 +188,7 @@ def test_training_moves_depths_to_the_points(scene):
     assert error(loss={"points_weight": 1.0}) < 0.9 * error()
 
 
-@pytest.mark.parametrize("points, told", [
+@pytest.mark.parametrize("points, printed", [
     (a2tg.ObservedPoints(np.zeros((1, 2), np.int32), np.ones((1, 2), np.float32)), "must be pixels [S] int32 and"),
     (a2tg.ObservedPoints(np.zeros(2, np.int32), np.ones(2, np.float32)), "must have increasing pixels from 0 to 1199"),
     (a2tg.ObservedPoints(np.array([1200], np.int32), np.ones(1, np.float32)), "must have increasing pixels from 0 to"),
@@ -196,9 +196,9 @@ def test_training_moves_depths_to_the_points(scene):
     ((np.zeros(1, np.int32), np.ones(1, np.float32)), "must be ObservedPoints; got tuple"),
     (3, "must be ObservedPoints; got int"),
 ])  # fmt: skip
-def test_other_points_are_refused(scene, points, told):
+def test_other_points_are_refused(scene, points, printed):
     first = dataclasses.replace(scene.train[0], points=points)
-    with pytest.raises(ValueError, match=re.escape(f"points of view {first.name} {told}")) as caught:
+    with pytest.raises(ValueError, match=re.escape(f"points of view {first.name} {printed}")) as caught:
         a2tg.fit(dataclasses.replace(scene, train=(first,)), small(), progress=False)
     assert str(caught.value).endswith(": make them with observed_points")
 

@@ -94,13 +94,13 @@ def test_panoramas_become_a_rig(tmp_path, panorama, choice):
     """The views of one panorama share a place: a frame of the rig, with cameras that are known."""
     for index in range(3):
         Image.fromarray(panorama[::4, ::4]).save(tmp_path / f"{index}.png")
-    told = []
-    found = staged([tmp_path], tmp_path / "work", choice, told.append)
+    printed = []
+    found = staged([tmp_path], tmp_path / "work", choice, printed.append)
     cameras, frames = cameras_of(found, tmp_path)
     if choice == "no":
-        assert (len(cameras), len(frames), told) == (1, 3, [])
+        assert (len(cameras), len(frames), printed) == (1, 3, [])
         return
-    assert told == ["3 panoramas of 160x80, each cut into 8 views of 60x60; panorama='no' leaves them whole"]
+    assert printed == ["3 panoramas of 160x80, each cut into 8 views of 60x60; panorama='no' leaves them whole"]
     assert (len(cameras), len(frames), found.num_places, len(found.names)) == (8, 3, 3, 24)
     assert all(len(frame.data_ids) == 8 for frame in frames)
     assert all(camera.model.name == "PINHOLE" and camera.has_prior_focal_length for camera in cameras)

@@ -190,13 +190,13 @@ def stale(spec, name, num_tiles, inputs, results, totals=()):
 def test_xla_takes_over_from_kernels_that_are_wrong(a_gpu, monkeypatch, broken, words):
     """The warning is one line, and comes again in the next process, which does not run the kernels again."""
     monkeypatch.setattr(composite, "launch", broken)
-    with pytest.warns(UserWarning, match=f"by XLA, which is slower: CUDA kernels {words}; .* delete ") as told:
+    with pytest.warns(UserWarning, match=f"by XLA, which is slower: CUDA kernels {words}; .* delete ") as printed:
         found = drawn() if broken is fails else platforms.choose("auto", "cpu")
-    assert len(told) == 1 and "\n" not in str(told[0].message)
+    assert len(printed) == 1 and "\n" not in str(printed[0].message)
     if broken is fails:
         assert_drawn_like_xla(found)
     (file,) = a_gpu.iterdir()
-    assert str(file) in str(told[0].message) and file.read_text() in str(told[0].message)
+    assert str(file) in str(printed[0].message) and file.read_text() in str(printed[0].message)
     platforms.has_cuda.cache_clear()
     monkeypatch.setattr(check, "largest_difference", None)
     with pytest.warns(UserWarning, match="CUDA kernels"):

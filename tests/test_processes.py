@@ -53,8 +53,8 @@ def test_events_change_the_same_in_two_processes():
 @pytest.mark.long
 def test_another_seed_than_the_first_process_has_is_refused(tmp_path):
     first, other = trainings(tmp_path / "run", SHORT, (), ("--seed", "1"))
-    told, _ = [process.communicate(timeout=120)[1] for process in (first, other)]
-    assert "process 1 of 2 failed: this process has other options than the first" in told
+    printed, _ = [process.communicate(timeout=120)[1] for process in (first, other)]
+    assert "process 1 of 2 failed: this process has other options than the first" in printed
     assert first.returncode == LOST
 
 
@@ -71,9 +71,9 @@ def waiting(what="wait"):
 def test_each_process_reads_what_it_draws_and_an_error_of_the_first_ends_both_at_once():
     first, other = waiting("read")
     first.send_signal(signal.SIGINT)
-    told = [process.communicate(timeout=20)[1] for process in (first, other)]
-    assert "KeyboardInterrupt" in told[0] and first.returncode == -signal.SIGINT
-    assert told[1] == "" and other.returncode == LOST
+    printed = [process.communicate(timeout=20)[1] for process in (first, other)]
+    assert "KeyboardInterrupt" in printed[0] and first.returncode == -signal.SIGINT
+    assert printed[1] == "" and other.returncode == LOST
 
 
 @pytest.mark.parametrize(
@@ -81,12 +81,12 @@ def test_each_process_reads_what_it_draws_and_an_error_of_the_first_ends_both_at
 )
 def test_a_lost_process_is_noticed(victim, number):
     processes = waiting()
-    took, told = survivor_of(processes, victim, number, 60)
+    took, printed = survivor_of(processes, victim, number, 60)
     reason = "has ended" if number == signal.SIGKILL else "was not heard from for 2 s"
-    assert told == f"a2tg: error: process {victim} of 2 {reason}; go on\n" and took < 8
+    assert printed == f"a2tg: error: process {victim} of 2 {reason}; go on\n" and took < 8
 
 
-def test_a_process_that_does_not_come_is_told():
+def test_a_process_that_does_not_come_is_reported():
     """And before, that there is no cluster."""
     code = f"""
 import os, sys
@@ -101,9 +101,9 @@ p.JOIN_SECONDS = 1
 p.joined(p.ProcessPlace("127.0.0.1:{free_port()}", 2, 0, 60.0)).__enter__()
 """
     alone = started(["-c", code])
-    told = alone.communicate(timeout=120)[1]
-    assert "--coordinator auto: no Slurm, Open MPI or Kubernetes was found: give HOST:PORT" in told
-    assert alone.returncode == LOST and "not all processes have joined --coordinator 127.0.0.1:" in told
+    printed = alone.communicate(timeout=120)[1]
+    assert "--coordinator auto: no Slurm, Open MPI or Kubernetes was found: give HOST:PORT" in printed
+    assert alone.returncode == LOST and "not all processes have joined --coordinator 127.0.0.1:" in printed
 
 
 @pytest.fixture
@@ -147,7 +147,7 @@ def test_processes_that_live_are_left_alone(three):
 
 
 @pytest.mark.parametrize(
-    ("living", "messages", "told", "quiet"),
+    ("living", "messages", "printed", "quiet"),
     [
         ((0, 1), [], dict.fromkeys((0, 1), f"process 2 of 3 was not heard from for {SECONDS} s"), ()),
         (
@@ -161,13 +161,13 @@ def test_processes_that_live_are_left_alone(three):
     ],
     ids=["silent", "interrupted", "failed", "quit"],
 )
-def test_the_end_of_a_process_is_reported_to_those_who_wait(three, monkeypatch, living, messages, told, quiet):
+def test_the_end_of_a_process_is_reported_to_those_who_wait(three, monkeypatch, living, messages, printed, quiet):
     monkeypatch.setattr(processes, "INTERRUPTED_GRACE", SECONDS)
     everyone, ends = watched(three, living), three[1]
     for number, kind, reason in messages:
         everyone[number].end(kind, reason)
-    until(lambda: all(ends[number] for number in told))
-    assert {number: ends[number] for number in told} == {number: [reason] for number, reason in told.items()}
+    until(lambda: all(ends[number] for number in printed))
+    assert {number: ends[number] for number in printed} == {number: [reason] for number, reason in printed.items()}
     assert not any(ends[number] for number in quiet)
 
 
@@ -231,7 +231,7 @@ def test_a_lack_of_memory_is_no_lost_connection():
 
 
 @pytest.mark.parametrize(
-    ("flags", "told"),
+    ("flags", "printed"),
     [
         ("--num-processes 2", "--num-processes needs --coordinator HOST:PORT"),
         ("--coordinator h:1 --process-id 0", "--coordinator HOST:PORT also needs --num-processes"),
@@ -246,9 +246,9 @@ def test_a_lack_of_memory_is_no_lost_connection():
         ("--coordinator ::1:7700 --num-processes 2 --process-id 0", "[IPv6]:PORT or auto; got '::1:7700'"),
     ],
 )
-def test_wrong_places_are_told(tmp_path, capsys, flags, told):
+def test_wrong_places_are_reported(tmp_path, capsys, flags, printed):
     assert cli.main(["train", "synthetic", "--out", str(tmp_path / "run"), *flags.split()]) == 2
-    assert told in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
 
 
 @pytest.mark.long
@@ -273,6 +273,6 @@ if not os.fork():
     os._exit(0)
 os.wait()
 """
-    rendered, *told = started(["-c", code]).communicate(timeout=60)[0].splitlines()
-    assert rendered == "(12, 16, 3)" and len(told) == 3
-    assert all("waits for its threads forever: start processes by spawn" in line for line in told)
+    rendered, *printed = started(["-c", code]).communicate(timeout=60)[0].splitlines()
+    assert rendered == "(12, 16, 3)" and len(printed) == 3
+    assert all("waits for its threads forever: start processes by spawn" in line for line in printed)

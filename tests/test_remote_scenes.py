@@ -192,10 +192,10 @@ def test_large_files_are_fetched_in_pieces(store, monkeypatch, size, num):
     assert store.num_of("cat_file") == num == sum(store.num.values())
 
 
-def listed_as(monkeypatch, **told):
+def listed_as(monkeypatch, **printed):
     """Change what the store lists about files."""
     ls = fsspec.filesystem("memory").ls
-    listed = lambda fs, path, **options: [{**entry, **told} for entry in ls(path, **options)]  # noqa: E731
+    listed = lambda fs, path, **options: [{**entry, **printed} for entry in ls(path, **options)]  # noqa: E731
     monkeypatch.setattr(type(fsspec.filesystem("memory")), "ls", listed)
 
 
@@ -272,9 +272,9 @@ def test_a_run_that_loses_its_store_is_resumed(tmp_path, monkeypatch, capsys, fo
     out = tmp_path / "run"
     system = ("--system", "gaussians-2d-mcmc", "--stage1-iterations", "20", "--initial-gaussians", "40")
     assert cli.main(["train", f"{URL}/", "--out", str(out), *system, "--densify.cap", "40", "--quiet"]) == 2
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert "cannot be read from its store (ConnectionError: network is unreachable); " in told
-    assert "the last checkpoint is" in told and "--resume" in told
+    printed = capsys.readouterr().err.splitlines()[-1]
+    assert "cannot be read from its store (ConnectionError: network is unreachable); " in printed
+    assert "the last checkpoint is" in printed and "--resume" in printed
     assert read_record(RunFolder(out)).scene.path == URL
     store.failing = []
     monkeypatch.setattr(PhotoStore, "batch", batch)

@@ -123,8 +123,8 @@ def test_the_report_says_what_is_special_about_a_run(tmp_path):
     plain = some_result()
     result = dataclasses.replace(plain, models={name: special(found) for name, found in plain.models.items()})
     report, usual = (written_report(tmp_path / str(id(each)), each) for each in (result, plain))
-    for told in ("2 views, none held out", "Training PSNR", "Colours fitted: ", "Poses aligned: ", "did not learn"):
-        assert told in report and told not in usual
+    for printed in ("2 views, none held out", "Training PSNR", "Colours fitted: ", "Poses aligned: ", "did not learn"):
+        assert printed in report and printed not in usual
     assert "4 views, 2 held out" in usual and "test views: " in usual and "test views: " not in report
 
 

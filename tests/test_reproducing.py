@@ -55,7 +55,7 @@ def test_what_may_change_bits_is_reported():
     here = this_machine()
     assert here.differences(here) == []
     other = Machine("0.1", here.jaxlib, "gpu: other", here.processor, here.threads + 1)
-    assert [told.split(" is ")[0] for told in other.differences(here)[:2]] == ["jax", "device"]
+    assert [printed.split(" is ")[0] for printed in other.differences(here)[:2]] == ["jax", "device"]
     assert "A2TG_NUM_THREADS=" in other.differences(here)[2]
     on_gpu = dataclasses.replace(here, device="gpu: other")
     assert dataclasses.replace(on_gpu, threads=here.threads + 1).differences(on_gpu) == []

@@ -177,8 +177,8 @@ def test_model_is_a_short_table():
 )
 def test_help_has_the_docstrings_of_fields(kind, field, text):
     """As `help` prints them, and once. Of subclasses, those of the base classes, too."""
-    told = pydoc.render_doc(kind, renderer=pydoc.plaintext)
-    assert told.count(f" {field}: {text}") == 1 and told.count(" Attributes:\n") == 1
+    printed = pydoc.render_doc(kind, renderer=pydoc.plaintext)
+    assert printed.count(f" {field}: {text}") == 1 and printed.count(" Attributes:\n") == 1
     assert inspect.getdoc(kind) == kind.__doc__ and f"\n  {field}: {text}" in kind.__doc__
 
 
@@ -193,5 +193,5 @@ def test_every_public_class_has_a_docstring():
 def test_the_command_line_prints_fields_as_options_only(capsys):
     assert "Attributes:" in a2tg.Gaussians2d.__doc__ + a2tg.LossConfig.__doc__
     assert cli(["train", "--system", "gaussians-2d", "--help-all"]) == 0
-    told = capsys.readouterr().out
-    assert "Attributes:" not in told and "--loss.ssim-weight" in told
+    printed = capsys.readouterr().out
+    assert "Attributes:" not in printed and "--loss.ssim-weight" in printed

@@ -203,10 +203,10 @@ def test_info_shows_what_is_intact_and_names_what_is_damaged(tmp_path):
     run.metrics.write_text("{")
     run.model("a2tg-gaussians").parent.mkdir()
     run.model("a2tg-gaussians").write_bytes(b"PK")
-    told = describe_run(run)
-    assert f"damaged  {run.metrics}" in told and f"a2tg eval {run.path} rewrites it" in told
-    assert "a2tg-gaussians  damaged: " in told and "a2tg-textures   not begun" in told
-    assert told.endswith(f"training is not finished; continue with: a2tg train --out {run.path} --resume")
+    printed = describe_run(run)
+    assert f"damaged  {run.metrics}" in printed and f"a2tg eval {run.path} rewrites it" in printed
+    assert "a2tg-gaussians  damaged: " in printed and "a2tg-textures   not begun" in printed
+    assert printed.endswith(f"training is not finished; continue with: a2tg train --out {run.path} --resume")
 
 
 def test_info_is_json_on_request(tmp_path, capsys):

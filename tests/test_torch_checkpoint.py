@@ -39,7 +39,7 @@ class Tensor:
 
     dtype = "<f4"
 
-    def __init__(self, array, lie=lambda *told: told):
+    def __init__(self, array, lie=lambda *printed: printed):
         self.array, self.lie = np.ascontiguousarray(array, self.dtype), lie
 
     def __reduce__(self):
@@ -49,8 +49,8 @@ class Tensor:
 
 
 class _Call:
-    def __init__(self, function, told, rest):
-        self.function, self.arguments = function, (*told, *rest)
+    def __init__(self, function, printed, rest):
+        self.function, self.arguments = function, (*printed, *rest)
 
     def __reduce__(self):
         return self.function, self.arguments

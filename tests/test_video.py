@@ -114,7 +114,7 @@ def test_what_is_no_video_is_named(tmp_path):
             extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 3)
 
 
-def test_without_the_extra_the_command_is_told(tmp_path, monkeypatch):
+def test_without_the_extra_the_command_is_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(
         ValueError, match=r"a video needs PyAV, which is not installed: pip install 'a2tg-jax\[video\]'"

@@ -40,10 +40,10 @@ from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serv
 
 def ask(app, path="/", method="GET", host="127.0.0.1:80"):
     """Status, headers and body of an answer."""
-    told = []
+    printed = []
     environ = {"REQUEST_METHOD": method, "PATH_INFO": path, "HTTP_HOST": host}
-    body = b"".join(app(environ, lambda status, headers: told.append((status, dict(headers)))))
-    ((status, headers),) = told
+    body = b"".join(app(environ, lambda status, headers: printed.append((status, dict(headers)))))
+    ((status, headers),) = printed
     return int(status[:3]), headers, body
 
 
@@ -355,10 +355,10 @@ def test_photographs_are_those_of_the_cameras():
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "printed"),
     [(FileNotFoundError("no folder"), "photographs of"), (ValueError("a.png: is truncated"), r"a\.png: is truncated")],
 )
-def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkeypatch, error, told):
+def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkeypatch, error, printed):
     """The viewer and the page go on without them, with a warning; what needs them tells the error."""
 
     def fail(self):
@@ -369,12 +369,12 @@ def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkey
     save_model(run.model("a2tg-textures"), dataclasses.replace(textured(), origin=origin_of_scene(scene)))
     monkeypatch.setattr(SceneSource, "load", fail)
     source = open_source(run.path)
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=printed):
         write_mesh(source, tmp_path / "a.glb", MeshOptions(texture="photographs"))
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=printed):
         export_web(source, tmp_path / "site", photographs=True)
     is_told = isinstance(error, ValueError)
-    warned = pytest.warns(UserWarning, match=told) if is_told else contextlib.nullcontext()
+    warned = pytest.warns(UserWarning, match=printed) if is_told else contextlib.nullcontext()
     with warned:
         assert json.loads(routes_of(source)["/photographs.json"].read()) == []
     with warned:

@@ -187,8 +187,8 @@ class TestDepthPrior:
 
     @pytest.mark.long
     def test_a_training_needs_some_and_may_lack_others(self, scene, trained):
-        told = r"loss.depth_weight, or a custom term, needs depth maps, but no training view has one"
-        with pytest.raises(ValueError, match=told):
+        printed = r"loss.depth_weight, or a custom term, needs depth maps, but no training view has one"
+        with pytest.raises(ValueError, match=printed):
             a2tg.fit(scene, small(loss={"depth_weight": 1.0}), progress=False)
         assert np.isfinite(trained.history.loss).all()
 

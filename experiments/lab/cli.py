@@ -102,7 +102,7 @@ class Lab:
             except KeyboardInterrupt:
                 pool.abort()
                 raise
-        return [f"{progress.told(failure.job)}: {failure.reason}" for failure in failures]
+        return [f"{progress.as_text(failure.job)}: {failure.reason}" for failure in failures]
 
     @property
     def is_partial(self) -> bool:
@@ -151,7 +151,7 @@ class Lab:
 
     def present(self, experiment: "Experiment", grids: Sequence[Grid]) -> None:
         """Write the rows and the pages of an experiment."""
-        old = versions.told(self.records_of(grids))
+        old = versions.as_text(self.records_of(grids))
         self._note = f"\n*Runs from before: {old}.*\n" if old else ""
         self.write_rows(experiment.name, grids)
         experiment.present(self, grids)
@@ -224,7 +224,7 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
         lab = Lab(args)
         names = list(dict.fromkeys(name for experiment in experiments for name in experiment.grids))
         grids = {name: lab.grid(name) for name in names}
-        if old := versions.told(lab.records_of(list(grids.values()))):
+        if old := versions.as_text(lab.records_of(list(grids.values()))):
             print(f"Runs from before: {old}. --renew trains them again.", flush=True)
         if args.plan:
             lab.check_inputs(list(grids.values()))
@@ -240,8 +240,8 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
         except (ValueError, OSError) as error:
             errors.append(f"{experiment.name}: {error}")
     if errors:
-        told = "\n".join(f"  {error}" for error in errors)
-        sys.exit(f"error: some jobs failed, and what needs them is missing. Call again to retry:\n{told}")
+        wording = "\n".join(f"  {error}" for error in errors)
+        sys.exit(f"error: some jobs failed, and what needs them is missing. Call again to retry:\n{wording}")
     return lab
 
 

@@ -37,8 +37,8 @@ def _described(value: Any) -> Any:
     if value is None or isinstance(value, str | bool | int | float):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        told = tuple((field.name, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
-        return _name_of(type(value)), told
+        wording = tuple((field.name, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
+        return _name_of(type(value)), wording
     if isinstance(value, tuple | list):
         return _name_of(type(value)), *map(_described, value)
     if isinstance(value, Mapping):
@@ -47,7 +47,7 @@ def _described(value: Any) -> Any:
         return np.asarray(value).tolist()
     if isinstance(value, type) or callable(value):
         return _name_of(value)
-    raise ValueError(f"a stage holds {value!r}, which cannot be told from others in another process")
+    raise ValueError(f"a stage holds {value!r}, which has no name that another process could know it by")
 
 
 def _name_of(value: Any) -> str:

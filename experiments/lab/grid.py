@@ -164,8 +164,8 @@ def _system(place: str, preset: str, method: Method, cell: Cell) -> a2tg.System:
     system = type(a2tg.find_system(method.system)).preset(preset)
     size = {"densify": {"cap": cell.gaussians}} if cell.budget is None else {"memory_budget": cell.budget}
     basis = {"seed": cell.seed, **size, "stage1_iterations": first, "stage2_iterations": second}
-    told = {"": basis, f" options on {cell.scene.label!r}": cell.scene.options, " options": method.options}
-    for part, changes in told.items():
+    wording = {"": basis, f" options on {cell.scene.label!r}": cell.scene.options, " options": method.options}
+    for part, changes in wording.items():
         system = changed_config(system, changes, f"{place}{part}")
     return system
 

@@ -34,9 +34,9 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _advice(told: str) -> str:
+def _advice(wording: str) -> str:
     command = shlex.join([Path(sys.executable).name, *sys.argv])
-    return f"\n{told}; what is finished is kept; continue with: {command}"
+    return f"\n{wording}; what is finished is kept; continue with: {command}"
 
 
 def _terminate(*_: Any) -> None:

@@ -169,7 +169,7 @@ def run_job(job: Job, folders: Folders) -> Record:
     else:
         result = _train(job, folders, scene)
         a2tg.save_model(_ready(model), result.model)
-        record = {**_told_training(job, scene, result), **_quality(scene, result.model, folders)}
+        record = {**_training_facts(job, scene, result), **_quality(scene, result.model, folders)}
     write_json(_ready(path), record)
     folders.checkpoint(job).unlink(missing_ok=True)
     return record
@@ -205,7 +205,7 @@ def _load_checkpoint(path: Path, job: Job) -> a2tg.Checkpoint:
     return dataclasses.replace(checkpoint, system=job.system)
 
 
-def _told_training(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Record:
+def _training_facts(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Record:
     """Return what was trained and what it took."""
     first = scene.test[0].camera
     return {

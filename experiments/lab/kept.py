@@ -41,7 +41,7 @@ class KeptFigures:
 
     def __init__(self, folder: Path, name: str, table: Callable[[Mapping[str, Figures]], str]):
         folder.mkdir(parents=True, exist_ok=True)
-        self._json, self._table, self._told = folder / f"{name}.json", folder / f"{name}.md", table
+        self._json, self._table, self._as_text = folder / f"{name}.json", folder / f"{name}.md", table
         self.found: dict[str, Figures] = read_kept(self._json)
 
     def has_all(self, keys: Iterable[str]) -> bool:
@@ -59,7 +59,7 @@ class KeptFigures:
 
     def table(self) -> str:
         """Return the table of what is known."""
-        return self._told(self.found)
+        return self._as_text(self.found)
 
 
 def _rounded(figures: Figures) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from lab.grid import Grid
 from lab.jobs import Folders, Job, Record, model_bytes, num_gaussians
 from lab.markdown import table
 from lab.queue import estimated_bytes
-from lab.stages import Stage, runs_by_cell, stages_of, told_scene
+from lab.stages import Stage, runs_by_cell, scene_text, stages_of
 
 GPU_SECONDS, GPU_SECONDS_PER_GAUSSIAN = 0.002, 2.4e-8
 """Time of a plain step: 14 ms for 500,000 Gaussians, from the paper's 7.18 minutes for 30,000 iterations."""
@@ -69,12 +69,12 @@ def plan_of(grids: Sequence[Grid], records: Mapping[str, Record], folders: Folde
     return (
         f"{_cells(grids, records)}\n"
         f"{len(left)} of {len(stages)} stages are left, {steps:,} iterations; one that several methods share "
-        f"counts once.\n\n{told_jobs(left, estimates)}\n{_time(estimates, machine)}\n"
+        f"counts once.\n\n{jobs_text(left, estimates)}\n{_time(estimates, machine)}\n"
         f"{_room(left, folders, machine)}"
     )
 
 
-def told_jobs(left: Sequence[Stage], estimates: Sequence[Estimate]) -> str:
+def jobs_text(left: Sequence[Stage], estimates: Sequence[Estimate]) -> str:
     """Return a row for each stage that is left, with its hours and memory as a job of its own."""
     rows = [
         [str(stage), f"{one.seconds / 3600:.2g}", in_bytes(estimated_bytes(stage.job))]
@@ -91,13 +91,13 @@ def _cells(grids: Sequence[Grid], records: Mapping[str, Record]) -> str:
         left = [label for label, run in runs.items() if run.job.key not in records]
         length = "+".join(f"{count:,}" for count in cell.iterations)
         done = f"{len(runs) - len(left)} of {len(runs)}"
-        rows.append([told_scene(cell.scene), cell.size, str(cell.seed), length, done, _told_left(left, len(runs))])
+        rows.append([scene_text(cell.scene), cell.size, str(cell.seed), length, done, _left_text(left, len(runs))])
     more = f"… and {len(rows) - MOST_ROWS} more cells\n" if len(rows) > MOST_ROWS else ""
     header = ["scene", "Gaussians or budget", "seed", "iterations", "methods finished", "methods left"]
     return table(header, rows[:MOST_ROWS]) + more
 
 
-def _told_left(labels: Sequence[str], num: int) -> str:
+def _left_text(labels: Sequence[str], num: int) -> str:
     if not labels:
         return "–"
     return "all" if len(labels) == num > 1 else "; ".join(labels)

@@ -29,21 +29,21 @@ class Progress:
         """Tell that a stage starts."""
         self._numbers.setdefault(job.key, len(self._numbers) + 1)
         self._total = max(self._total, len(self._numbers))
-        self._tell(f"{self._place(job)} start: {self.told(job)}")
+        self._tell(f"{self._place(job)} start: {self.as_text(job)}")
 
     def done(self, job: Job, record: Record) -> None:
         """Tell the figures of a finished stage."""
         pace = record["ms_per_step"]
         self._tell(
-            f"{self._place(job)} done: {self.told(job)}: {record['num']:,} Gaussians, {record['mb']:.2f} MB, "
+            f"{self._place(job)} done: {self.as_text(job)}: {record['num']:,} Gaussians, {record['mb']:.2f} MB, "
             f"{record['psnr']:.2f} dB; {record['seconds']:.0f} s{'' if pace is None else f', {pace:.0f} ms a step'}"
         )
 
     def failed(self, failure: Failure) -> None:
         """Tell a failure."""
-        self._tell(f"{self._place(failure.job)} FAILED: {self.told(failure.job)}: {failure.reason}")
+        self._tell(f"{self._place(failure.job)} FAILED: {self.as_text(failure.job)}: {failure.reason}")
 
-    def told(self, job: Job) -> str:
+    def as_text(self, job: Job) -> str:
         """Return a stage in words; those at equal bytes have a name once the bytes are known."""
         if job.key not in self._stages:
             self._stages |= stages_of(self._grids, self._records)

@@ -211,7 +211,7 @@ class Elsewhere:
         return submitit.helpers.DelayedSubmission(self, job, folders)
 
 
-def told_error(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """Return an error on one line; of a trace that submitit quotes, the line of its error."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [""]
     quoted = [line for line in lines if re.match(r"[A-Za-z_][\w.]*(Error|Exception|Interrupt|Exit)\b", line)]
@@ -220,7 +220,7 @@ def told_error(error: Exception) -> str:
     return shortened(f"{type(error).__name__}: {' '.join(lines)}", LONGEST_REASON)
 
 
-def told_log(handle: Handle) -> str:
+def log_text(handle: Handle) -> str:
     """Return where the log of a job lies, if it has one."""
     paths = getattr(handle, "paths", None)
     return f"; log: {paths.stderr}" if paths is not None else ""
@@ -275,10 +275,10 @@ def run_all(
                 record = handle.result()
             except Exception as error:
                 if not pool.is_death(error):
-                    fail(job, f"{told_error(error)}{told_log(handle)}")
+                    fail(job, f"{error_text(error)}{log_text(handle)}")
                 elif deaths[key] and was_alone:
                     twice = "its process died twice, the second time with nothing beside it; of memory?"
-                    fail(job, f"{twice} {told_error(error)}{told_log(handle)}")
+                    fail(job, f"{twice} {error_text(error)}{log_text(handle)}")
                 else:
                     deaths[key] += 1
             else:

@@ -1,4 +1,4 @@
-"""The stages of a sweep with the runs that need them, and how they are told."""
+"""The stages of a sweep with the runs that need them, and their names in tables and logs."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,10 +22,10 @@ class Stage:
         if self.run.equal:
             size = f"{self.run.equal} of {size}"
         fold = "" if cell.scene.fold is None else f", fold {cell.scene.fold}"
-        return f"{told_scene(cell.scene)}{fold}, {self.run.method.label}, stage {stage}, {size}, seed {cell.seed}"
+        return f"{scene_text(cell.scene)}{fold}, {self.run.method.label}, stage {stage}, {size}, seed {cell.seed}"
 
 
-def told_scene(scene: SceneAt) -> str:
+def scene_text(scene: SceneAt) -> str:
     """Return the label of a scene with its size."""
     return scene.label if scene.downscale == 1 else f"{scene.label} 1/{scene.downscale}"
 

@@ -41,7 +41,7 @@ def table_experiment(name: str, description: str, grid: str | None = None) -> Ex
 
     def present(lab: Lab, grids: Sequence[Grid]) -> None:
         (grid,) = grids
-        lab.write(name, f"# {grid.title}\n\n{_told(lab, grid)}")
+        lab.write(name, f"# {grid.title}\n\n{_as_text(lab, grid)}")
 
     return Experiment(name, (grid or name,), present, description)
 
@@ -57,7 +57,7 @@ def paper_experiment(name: str, place: str, description: str) -> Experiment:
 
     def present(lab: Lab, grids: Sequence[Grid]) -> None:
         (grid,) = grids
-        text = f"# {grid.title}\n\n{_told(lab, grid)}"
+        text = f"# {grid.title}\n\n{_as_text(lab, grid)}"
         if grid.scale in BESIDE_PAPER:
             text += f"\n## In the paper\n\n{tables.paper_table(name, place, tables.QUALITY_COLUMNS)}"
         lab.write(name, text)
@@ -70,7 +70,7 @@ def file_experiment(path: str) -> Experiment:
     return table_experiment(Path(path).name.removesuffix(SUFFIX), f"The grid {path}.", path)
 
 
-def _told(lab: Lab, grid: Grid) -> str:
+def _as_text(lab: Lab, grid: Grid) -> str:
     return WRITERS[grid.table](grid, tables.results_of(grid, lab.records))
 
 

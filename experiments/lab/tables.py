@@ -86,7 +86,7 @@ class SceneMean:
     p_value: float
     """Two-sided p-value of Student's t-test of a mean of 0; NaN with fewer than two scenes."""
 
-    def told(self, digits: int) -> str:
+    def as_text(self, digits: int) -> str:
         """Return the mean and its interval for a table."""
         if np.isnan(self.half_width):
             return signed(self.mean, digits)
@@ -133,10 +133,10 @@ def percent(share: float) -> str:
 
 def quality(results: Sequence[Result]) -> str:
     """Return PSNR / SSIM / LPIPS for a table."""
-    return _told_quality(*(mean(results, figure) for figure in QUALITY)) if results else MISSING
+    return _quality_text(*(mean(results, figure) for figure in QUALITY)) if results else MISSING
 
 
-def _told_quality(*figures: float) -> str:
+def _quality_text(*figures: float) -> str:
     return " / ".join(number(value, DIGITS[name]) for name, value in zip(QUALITY, figures, strict=True))
 
 
@@ -186,7 +186,7 @@ def _mean_of_columns(by_column: Mapping[str, Sequence[Result]]) -> str:
     *figures, mb = (
         float(np.mean([mean(found, figure) for found in by_column.values()])) for figure in (*QUALITY, "mb")
     )
-    return f"{_told_quality(*figures)} · {number(mb, 2)}"
+    return f"{_quality_text(*figures)} · {number(mb, 2)}"
 
 
 def iterations(results: Sequence[Result]) -> str:
@@ -247,14 +247,14 @@ def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]
                 f"{signed(float(np.mean(gains)), 2)}{said} · {signed(float(np.mean(lpips)), 3)} · "
                 f"{signed(float(np.mean(train)), 2)}"
             )
-        rows.append([*_told_place(place, own[0]), number(mean(own, "mb"), 2), quality(own), _seeds(own), *shown])
+        rows.append([*_place_texts(place, own[0]), number(mean(own, "mb"), 2), quality(own), _seeds(own), *shown])
     rows.append(["*mean ± 95 % interval*", *[""] * 6, *map(_mean_and_interval, every.values())])
     header = ["scene", "pixels", "iterations", "Gaussians", "MB", f"{reference}: PSNR / SSIM / LPIPS", "seeds"]
     text = markdown([*header, *(f"against {other}: dB · LPIPS · train dB" for other in others)], rows)
-    return f"{text}\n{_told_spread(spread)}\n"
+    return f"{text}\n{_spread_text(spread)}\n"
 
 
-def _told_spread(spread: float | None) -> str:
+def _spread_text(spread: float | None) -> str:
     interval = "The last row is the mean over scenes, each counted once, with its 95 % t interval over scenes."
     if spread is None:
         return f"No cell has two seeds, so no verdict is given. {interval}"
@@ -264,7 +264,7 @@ def _told_spread(spread: float | None) -> str:
     )
 
 
-def _told_place(cell: Cell, result: Result) -> list[str]:
+def _place_texts(cell: Cell, result: Result) -> list[str]:
     """Return scene, pixels, iterations and Gaussians of a cell; a budget has those that the run ended with."""
     width, height = result.record["pixels"]
     length = "+".join(f"{count:,}" for count in cell.iterations)
@@ -280,7 +280,7 @@ def _mean_and_interval(gains: Mapping[str, Sequence[float]]) -> str:
     """Return the mean over scenes, after averaging the sizes within each scene."""
     if len(gains) < 2:
         return MISSING
-    return over_scenes(float(np.mean(own)) for own in gains.values()).told(2)
+    return over_scenes(float(np.mean(own)) for own in gains.values()).as_text(2)
 
 
 def seed_spread(results: Sequence[Result], reference: str, others: Sequence[str]) -> float | None:
@@ -325,7 +325,7 @@ def paper_table(
     """
     table = PAPER[name]
     datasets = list(dict.fromkeys(row.get("dataset", everywhere) for row in table))
-    header = [PLACES[place], "method", *(f"{one}: {' / '.join(told for _, told in columns)}" for one in datasets)]
+    header = [PLACES[place], "method", *(f"{one}: {' / '.join(heading for _, heading in columns)}" for one in datasets)]
     cells: dict[tuple[str, str], dict[str, str]] = {}
     for row in sorted(table, key=lambda row: -row[place]):
         label = row["method"] + (f", {row['side']}×{row['side']}" if "side" in row else "")
@@ -363,8 +363,8 @@ def choices_table(results: Sequence[Result], default: str) -> str:
             rows.append([f"*{default}, as it is*", *shown, number(mean(own, "psnr"), 2), number(mean(own, "mb"), 2)])
             continue
         gains = [_mean_gain(found, base) for found in by_column.values()]
-        average = MISSING if None in gains else _told_gain(np.mean(gains, axis=0))
-        shown = [MISSING if gain is None else _told_gain(gain) for gain in gains]
+        average = MISSING if None in gains else _gain_text(np.mean(gains, axis=0))
+        shown = [MISSING if gain is None else _gain_text(gain) for gain in gains]
         rows.append([label, *shown, average, number(mean(own, "mb"), 2)])
     return markdown(["choice", *(f"{column}: dB · LPIPS" for column in columns), "mean", "MB"], rows)
 
@@ -380,6 +380,6 @@ def _mean_gain(results: Sequence[Result], base: Mapping[Cell, Result]) -> tuple[
     return psnr, lpips
 
 
-def _told_gain(gain: Sequence[float]) -> str:
+def _gain_text(gain: Sequence[float]) -> str:
     decibels, distance = gain
     return f"{signed(decibels, 2)} · {signed(distance, 3)}"

@@ -1,4 +1,4 @@
-"""Records that an earlier version of a system made: which they are, and how that is told."""
+"""Records that an earlier version of a system made: which they are, in words."""
 
 import collections
 import functools
@@ -18,7 +18,7 @@ def is_from_before(record: Record) -> bool:
     return _version(record) != _present_version(record.get("system", ""), _version(record))
 
 
-def told(records: Iterable[Record]) -> str:
+def as_text(records: Iterable[Record]) -> str:
     """Return in words which records are from before; empty if none is."""
     old = [record for record in records if is_from_before(record)]
     counts = collections.Counter((record["system"], _version(record)) for record in old)
