@@ -15,9 +15,11 @@ def __getattr__(name: str) -> Any:
     """Import a public name, or a package or module of this library, at its first use."""
     if name == "__version__":
         return importlib.import_module("importlib.metadata").version("a2tg-jax")
+    # The stub lists names, not modules.
     if name not in __all__ and importlib.util.find_spec(f"{__name__}.{name}") is not None:
         return importlib.import_module(f"{__name__}.{name}")
     value = _import_name(name)
+    # Each time, because it completes the modules that are imported so far.
     importlib.import_module(f"{__name__}.host.field_docs").list_fields()
     return value
 

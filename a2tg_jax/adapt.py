@@ -139,6 +139,7 @@ class Upscale(HostEvent):
         present = BYTES_PER_TEXEL * textures.count_elements(model.num)
         left = self._budget_bytes - num_bytes + present
         room = most_textures(textures.sizes, left, self.cap)
+        # So much padding costs more than to compile a step each time textures grow.
         if BYTES_PER_TEXEL * room.num_elements > MOST_ROOM * self._budget_bytes:
             return model, moments
         rebuilt = reallocate(textures, textures.sizes, moments, room=room)
@@ -190,6 +191,7 @@ class Upscale(HostEvent):
         names = [name for name in ("anisotropic", "k_a", "k_s") if getattr(self, name) != getattr(Upscale, name)]
         if not names:
             return None
+        # Not up to the own cap, where both rules may end at the same size.
         thin = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, axes=self.axes)
         round_ = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, anisotropic=False)
         if (thin != round_).any():
@@ -254,12 +256,14 @@ def most_textures(sizes: np.ndarray, num_bytes: float, cap: int) -> Shape:
     while len(reached) > num_before:
         num_before = len(reached)
         larger = [
+            # With these limits every Gaussian that is not round is thin.
             next_sizes(reached, np.broadcast_to(scales, reached.shape), k_a=1.0, k_s=math.inf, cap=cap)
             for scales in ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0))  # Round; thin along each axis.
         ]
         reached = np.unique(np.concatenate([reached, *larger]), axis=0)
     counts = {}
     for height, width in reached.tolist():
+        # Textures of one size alone may take all bytes.
         area = height * width
         count = int(min(len(sizes), num_bytes // (BYTES_PER_TEXEL * area))) if area else len(sizes)
         if count > 0:

@@ -60,7 +60,7 @@ class Times(NamedTuple):
         return max(0, int(self.num_left(max(1, self.first))))
 
 
-EVERY_ITERATION = Times(1, 2**31 - 1, 1)
+EVERY_ITERATION = Times(1, 2**31 - 1, 1)  # the largest int32
 NEVER = Times(1, 0, 1)
 
 
@@ -241,6 +241,7 @@ class HostEvent(Event):
 
         The default is one each time before the end of the stage. Override it if shapes stay (`keep_rows`).
         """
+        # After the last iteration there is no step to compile.
         return sum(1 <= iteration < num_iterations for iteration in self.iterations(num_iterations))
 
     def with_room(
@@ -322,6 +323,7 @@ def clear_moments(model: Model, moments: AdamState, is_cleared: Array) -> AdamSt
     _, rest = partition(model)
 
     def cleared(moment: Model) -> Model:
+        # Tables find rows by their places, which are integers and so not in moments.
         whole = combine(moment, rest)
         gaussians, appearance = clear_rows((whole.gaussians, whole.appearance), is_cleared)
         floats, _ = partition(dataclasses.replace(whole, gaussians=gaussians, appearance=appearance))

@@ -180,6 +180,7 @@ def perturb(key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array |
     # Sums of products instead of matmuls, which accelerators may round to fewer bits.
     in_plane = jnp.sum(axes * noise[:, :, None], axis=1) * gaussians.scales**2
     shift = jnp.sum(axes * in_plane[:, None, :], axis=2)
+    # 1 − o, without the cancellation of the difference.
     transparency = jax.nn.sigmoid(-gaussians.logit_opacities)
     gate = jax.nn.sigmoid(NOISE_STEEPNESS * (transparency - NOISE_TRANSPARENCY))
     strength = gate * (jnp.asarray(lr, dtype) * NOISE_SCALE)
@@ -196,6 +197,7 @@ def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
     num = opacities.shape[0]
     if num == 0:
         return jnp.zeros(0, jnp.int32)
+    # A power of two, for the bisection below.
     width = 2 ** math.ceil(math.log2(num) / 2)
     num_blocks = -(-num // width)
     num_hosts = jnp.sum(is_host, dtype=jnp.int32)
@@ -206,6 +208,7 @@ def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
     blocks = jnp.cumsum(within[:, -1])
     u_block, u_within = jax.random.uniform(key, (2, num), opacities.dtype)
     block = jnp.searchsorted(blocks, u_block * blocks[-1], side="right")
+    # Rounding may lead past the last block that has hosts.
     block = jnp.minimum(block, jnp.maximum(num_hosts - 1, 0) // width).astype(jnp.int32)
     # By bisection, the first column above the target in the block's ascending row.
     target, column, step = u_within * within[block, -1], jnp.zeros_like(block), width // 2

@@ -187,6 +187,7 @@ class Model:
             moved = model.transform(similarity)
             moved.render(moved.origin.cameras[0], settings=settings.transform(similarity))
         """
+        # Dense, because a rotation mixes all coefficients of a degree.
         turned = transform_gaussians(dataclasses.replace(self.gaussians, sh=jnp.asarray(self.sh)), similarity)
         model = self.with_sh(np.asarray(turned.sh))
         return dataclasses.replace(
@@ -232,6 +233,7 @@ def _indices(rows: ArrayLike | slice, num: int) -> np.ndarray:
     if chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "biu"):
         raise ValueError(f"rows must be a mask [{num}], indices or a slice; got {chosen.dtype} {[*chosen.shape]}")
     try:
+        # An empty list becomes an array of floats, which cannot index.
         return np.arange(num)[chosen if chosen.size else slice(0)]
     except IndexError as error:
         raise ValueError(f"rows must choose among {num} Gaussians: {error}") from None

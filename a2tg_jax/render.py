@@ -89,6 +89,7 @@ def render_appearance(
     planned = with_capacity(settings, gaussians, camera, appearance, num_live)
     background = jnp.asarray(background, gaussians.means.dtype)
     output, _ = jitted_render()(gaussians, camera, appearance, background, planned, num_live=num_live)
+    # A capacity planned here suffices; one from the caller may not.
     if settings.capacity is not None:
         kind = settings, camera.width, camera.height, gaussians.num
         _watch_overflow(output.overflow, settings.capacity, kind)
@@ -98,6 +99,7 @@ def render_appearance(
 @functools.cache
 def jitted_render() -> Callable[..., tuple[RenderOutput, Array]]:
     """Return `render_traced` under jit; its cache counts the compilations."""
+    # Made at the first call: importing this library calls no `jax.jit`.
     return jax.jit(render_traced, static_argnums=(4,), static_argnames=("has_geometry",))
 
 
@@ -119,6 +121,7 @@ def _watch_overflow(overflow: Array, capacity: int, kind: Hashable) -> None:
             if not _pending or not (_pending[0][0].is_deleted() or _pending[0][0].is_ready()):
                 return
             done, its_capacity = _pending.popleft()
+        # The flag of a deleted output has no value to read.
         if not done.is_deleted() and bool(done):
             warnings.warn(
                 f"settings.capacity of {its_capacity:,} was too small for a render: its image is only the background. "
@@ -128,7 +131,7 @@ def _watch_overflow(overflow: Array, capacity: int, kind: Hashable) -> None:
             )
 
 
-_watch_lock = threading.Lock()
+_watch_lock = threading.Lock()  # threads may render at the same time
 _watched_kinds: set[Hashable] = set()
 _pending: collections.deque[tuple[Any, int]] = collections.deque(maxlen=64)
 """Flags of renders that may not be done yet, and their capacities; the oldest are forgotten."""

@@ -97,6 +97,7 @@ def textures_from_arrays(arrays: Sequence[ArrayLike]) -> Textures:
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(f"texture {index} must be floats; got {array.dtype}")
     sizes = checked_sizes(np.array([array.shape[:2] for array in given], np.int64).reshape(-1, 2))
+    # Keeps the dtype, and the number of channels, without any texture.
     empty = np.zeros((0, 4), given[0].dtype if given else np.float32)
     return Textures.of_flat(sizes, np.concatenate([empty, *(array.reshape(-1, 4) for array in given)]))
 

@@ -21,6 +21,7 @@ def as_bytes(image: object) -> np.ndarray | None:
         return None
     if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape or not np.issubdtype(pixels.dtype, np.floating):
         return None
+    # NaN has no byte, and is shown as 0.
     return np.rint(255 * np.clip(np.nan_to_num(pixels), 0, 1)).astype(np.uint8)
 
 

@@ -54,6 +54,7 @@ def spread(mesh: Mesh | None, tree: T, axis: int = 0) -> T:
         digest = 0
         for x in map(np.asarray, own):
             values: Any = np.ascontiguousarray(x).view(np.uint8)
+            # With the shape, which is not in the bytes.
             digest = zlib.crc32(values, zlib.crc32(repr(x.shape).encode(), digest))
         if len(np.unique(multihost_utils.process_allgather(np.asarray(digest, np.uint32)))) > 1:
             raise ValueError("the processes differ after a change of the model: train on machines that are alike")

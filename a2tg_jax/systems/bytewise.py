@@ -28,7 +28,7 @@ from a2tg_jax.training.stage import Stage
 class LimitExponents(StepEvent):
     """Lower limit of the exponents of kernels (`Appearance.exponents`), after every iteration."""
 
-    least: float = 0.6
+    least: float = 0.6  # an opaque kernel reaches 5.7σ, and 11.7σ at 1/e (docs/results-appendix.md)
     """Smallest exponent of a kernel, 0 to 1. Smaller ones have longer tails, which take longer to draw; up to 1/e it
     limits nothing."""
 
@@ -61,7 +61,7 @@ class Bytewise(TwoStages):
     prune: Prune = PRUNING
     """Pruning of the Gaussians that show least, up to 0.8 of the first stage; others grow in their place. The end of
     the stage prunes in any case."""
-    kernel_rate: float = 0.01
+    kernel_rate: float = 0.01  # 0.02 and 0.005 are worse (docs/results-appendix.md, "Shapes of kernels")
     """Adam's learning rate of the kernels' shapes; 0: all kernels are Gaussians, as other programs draw them, for which
     a view_dependence_share of 0.23 is better."""
     exponents: LimitExponents = LimitExponents()

@@ -69,6 +69,7 @@ class Photographs(NamedTuple):
         """Return the views of some indices, or all; with a dtype, cameras and depths are of it."""
         batch = self
         if views is not None:
+            # Rays are of the lens and have no axis of views.
             batch = jax.tree.map(lambda x: x[views], self._replace(rays=None))._replace(rays=self.rays)
         if dtype is None:
             return batch
@@ -180,6 +181,7 @@ class PhotoStore:
         self._places = {index: place for found in self._of_kind.values() for place, index in enumerate(found)}
         is_waiting = any(view.picture.is_remote for view in views)
         self._ahead = Ahead(self._read, self.num_ahead, is_waiting=is_waiting)
+        # All processes must launch the same program, so one without room makes all stream.
         self.is_resident = not asked_by_any(self._mesh, not plan.is_resident)
 
     def batch(self, iteration: int) -> tuple[Photographs, np.ndarray | None]:

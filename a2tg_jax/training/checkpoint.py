@@ -212,6 +212,7 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], option
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     check_appearance(appearance, gaussians)
     model = Model(gaussians, appearance, jnp.zeros((), jnp.int32))
+    # Shapes only; nothing is allocated.
     wanted: TrainState = jax.eval_shape(lambda: initial_state(stage, model, [""]))
     events = (event if ahead else None for event, ahead in zip(wanted.events, is_ahead, strict=True))
     wanted = dataclasses.replace(wanted, events=tuple(events))

@@ -248,6 +248,7 @@ def corrected_origin(origin: Origin, corrections: Sequence[Correction], states: 
     rows = {}
     for correction, state in zip(corrections, states, strict=True):
         own = np.asarray(state.rows)
+        # Nothing is learned for test views.
         of_test_views = np.broadcast_to(correction.neutral, (len(origin.names) - len(own), *own.shape[1:]))
         rows[correction.name] = np.concatenate([own, of_test_views.astype(own.dtype)])
     viewmats = origin.viewmats.copy()
@@ -330,6 +331,7 @@ def sliced(grid: Array, color: Array) -> Array:
         return jnp.maximum(1 - jnp.abs(places[:, None] - jnp.arange(num, dtype=grid.dtype)[None]), 0)
 
     along_y, along_x = hats(rows, height), hats(columns, width)
+    # Renders may leave [0, 1], where the outer levels continue.
     luminance = jnp.clip(color @ jnp.asarray(LUMINANCE, color.dtype), 0, 1) * (levels - 1)
 
     # Else the backward pass would keep the maps [H, W, 3, 4] of all L levels.

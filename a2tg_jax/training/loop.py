@@ -139,6 +139,7 @@ class Session:
         Capacities are kept by place, a stage and an image size.
         """
         known = self.capacities.setdefault(place, set())
+        # Few different capacities, at most half as large again as needed.
         power = 2 ** (needed.bit_length() - 1)
         rounded = next(room for room in (power, power + power // 2, 2 * power) if room >= needed)
         # The largest: lists that overflowed in an earlier run will do so again.
@@ -284,6 +285,7 @@ class StageRun:
                     bar.update(info, self._rows[-1] if self._rows else None)
                 ahead = self.effects.programs_ahead(iteration)
                 bar.tell_pace(iteration, self.num_compiled, ahead, self.effects.seconds_a_program)
+                # Not where a step could not be taken, or training is being stopped.
                 if iteration == stop:
                     self._host_events(iteration)
                 self.started += watch(self, is_stopped)

@@ -396,6 +396,7 @@ def like(kind: Any, other: object) -> Any:
         own, others = getattr(value, field.name), getattr(other, field.name, None)
         if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
             changes[field.name] = like(own, others)
+        # The same name with another type means something else.
         elif hints[field.name] == other_hints.get(field.name):
             changes[field.name] = others
     return dataclasses.replace(value, **changes)

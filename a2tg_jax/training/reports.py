@@ -175,6 +175,7 @@ class LearningCheck:
         if iteration != self._at:
             return
         reached, flat = float(np.mean([psnr for _, psnr in self._seen])), []
+        # Flat colours of the same views, because some are easier than others.
         for iteration, _ in self._seen:
             for view in (self._views[index] for index in self._order.indices(iteration)):
                 mask = None if view.mask is None else jnp.asarray(view.mask.read())
@@ -278,6 +279,7 @@ class StageEffects:
             if left := len(self._ahead(event, iteration)):
                 times = event.iterations(self._stage.iterations)
                 known = own.num_compiled, own.num_applied
+                # What it caused so far, or else its own forecast.
                 caused, among = known if own.num_applied else (event.num_programs(self._stage.iterations), len(times))
                 num += left * caused / among
         return round(num * self._num_sizes)

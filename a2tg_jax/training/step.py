@@ -133,6 +133,7 @@ class Attempt(NamedTuple):
 @functools.cache
 def jitted_step() -> jax.stages.Wrapped:
     """Return `train_step`, jitted, with the state's buffers donated; its cache counts the traces."""
+    # Made at the first call: importing this library calls no `jax.jit`.
     return jax.jit(train_step, static_argnums=(0,), donate_argnums=(3,))
 
 
@@ -284,6 +285,7 @@ def batch_gradients(
         if added := penalties(seen.corrections, seen.rows):
             parts_by_name["corrections"] = functools.reduce(jnp.add, added)
         value = functools.reduce(jnp.add, [*values, *added])
+        # PSNR is of what a screen shows; the loss is of unclipped colours (`losses`).
         error = jnp.mean((jnp.clip(output.color, 0, 1) - target.image) ** 2)
         if mask is not None:  # The mean over the pixels that count; the error of the others is 0.
             error = error / jnp.mean(mask.astype(error.dtype))
