@@ -72,6 +72,7 @@ def bake(
     if not cameras or not growth >= 1:
         raise ValueError(f"baking needs cameras and a growth of at least 1; got {len(cameras)} and {growth}")
     model = model.live
+    # Splitting renders each view several times, for which some of them suffice; training uses all.
     baked = split_splats(model, cameras[:: -(-len(cameras) // MOST_VIEWS)], growth)
     return distill(baked, model, cameras, iterations=iterations, progress=progress) if iterations else baked
 
@@ -88,6 +89,7 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
                 break
         return degree, most
 
+    # Subclasses of Appearance may show their textures in another way.
     options = model.appearance.texture_options if model.appearance.is_portable else None
     if options is None or model.textures is None:
         whole = plain_gaussians(model)
@@ -101,12 +103,14 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
     pieces, shapes, uv = [], model.appearance.shapes, options.uv
     for ids, texels in tables:
         parents, own, size = whole[ids], None if shapes is None else np.asarray(shapes)[ids], texels.shape[1:3]
+        # A single splat cannot imitate a kernel by a grid: it takes the nearest Gaussian.
         if own is not None and size == (1, 1):
             parents, own = nearest_gaussians(parents, own), None
         axes = [kernels(side, uv) for side in size]
         at_centers = [_weights(means, side, uv) for (means, _), side in zip(axes, size, strict=True)]
         pieces.append(_grid(parents, own, np.einsum("ntsc,tv,su->nvuc", texels, *at_centers), *axes))
     joined: Gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *pieces)
+    # Fainter splats are skipped by every renderer, and would only take bytes.
     is_seen = np.asarray(joined.opacities) >= LEAST_ALPHA
     return as_plain(joined[is_seen if is_seen.any() else slice(None)], model)
 
@@ -135,16 +139,19 @@ Kernels = tuple[np.ndarray, np.ndarray]
 @functools.cache
 def kernels(num: int, convention: str) -> Kernels:
     """Return the Gaussians along an axis for `num` texels."""
+    # A sum over steps of 1/400: exp(−u²/2) is below 2·10⁻⁸ beyond ±6.
     u = np.linspace(-6, 6, 4801)
     weights = _weights(u, num, convention) * np.exp(-0.5 * u * u)
     masses = weights.sum(axis=1)
     means = weights @ u / masses
+    # Variance: E[u²] − E[u]².
     return means, np.sqrt(weights @ (u * u) / masses - means**2)
 
 
 def _weights(u: np.ndarray, num: int, convention: str) -> np.ndarray:
     """Return the bilinear weights [num, Q] of texels at points of an axis."""
     place = np.asarray(texel_coordinates(jnp.asarray(u), jnp.asarray(float(num)), convention), np.float64)
+    # Clamped coordinates give the outer texels all of the edge, so that the weights add up to 1.
     return np.maximum(0.0, 1 - np.abs(place[None] - np.arange(num)[:, None]))
 
 
@@ -161,18 +168,22 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
     else:
         falloff = np.asarray(falloff_of(curves_of(jnp.asarray(shapes)[:, None, None]), jnp.asarray(rho)[None]), float)
     shown = np.asarray(parents.opacities, np.float64)[:, None, None] * texels[..., 3] * falloff
+    # Overlapping alphas multiply as 1 − alpha: their optical depths −log(1 − alpha) add up.
     depths = -np.log1p(-np.clip(shown, 0, MOST_ALPHA))
     # Each Gaussian reaches the centres of the others: the inverse of these shares, axis by axis, gives its own depth.
     unmixed = [
         np.linalg.inv(np.exp(-0.5 * ((means[:, None] - means[None, :]) / widths[None, :]) ** 2))
         for means, widths in (v, u)
     ]
+    # The shares are a product of the two axes, so that two small inverses do.
     own = np.einsum("vw,nwx,xu->nvu", unmixed[0], depths, unmixed[1].T)
+    # The inverse may give negative depths next to opaque texels.
     alphas = np.clip(1 - np.exp(-np.maximum(own, 0)), 1e-6, MOST_ALPHA).reshape(-1)
     axes = np.asarray(rotation_matrices(parents.quats))[:, :, :2] * np.asarray(parents.scales)[:, None, :]
     means = np.asarray(parents.means)[:, None] + np.einsum("nxk,pk->npx", axes, places)
     several = functools.partial(np.repeat, repeats=tv * tu, axis=0)
     sh = several(np.asarray(parents.sh))
+    # RGB residuals add to the colour; Y₀ = SH_C0 does not depend on the direction.
     sh[:, 0] += texels[..., :3].reshape(-1, 3) / SH_C0
     log_scales = np.asarray(parents.log_scales)[:, None] + np.log(scales)
     dtype = parents.means.dtype
@@ -198,6 +209,7 @@ def distill(
     """
     highest = model.gaussians.sh_degree
     behind: Background = "white" if np.mean(wanted.background) > 0.5 else "black"
+    # Only the second stage runs: it does not change the number of Gaussians.
     system = Gaussians2d(stage1_iterations=1, stage2_iterations=iterations, sh_degree=highest, background=behind)
     scene, start = drawn_scene(wanted, cameras, BACKGROUNDS[behind]), dataclasses.replace(model, origin=None)
     trained = fit_stage(scene, system, 1, start, progress=progress, title="bake").model

@@ -76,8 +76,10 @@ def loss_on_views(
     def psnr(other: Model) -> float:
         decibels = []
         for view, image in zip(views, draw(other), strict=True):
+            # `...` selects all pixels.
             counts = ... if view.mask is None else view.mask.read()
             error = _squared_error(image[counts], np.clip(view_image(view, background), 0, 1)[counts])
+            # At most 120 dB: equal images would be infinite.
             decibels.append(-10 * math.log10(max(error, 1e-12)))
         return float(np.mean(decibels))
 
@@ -132,6 +134,7 @@ def _squared_error(image: np.ndarray, target: np.ndarray) -> float:
 
 def try_choices(model: Model, choices: CompactChoices, losses: Sequence[Loss], group: str = "") -> Trial:
     """Return the size of a file, and the loss of the model in it by each measure (host)."""
+    # Measured on what the file gives back, not on a simulation of it.
     data = encode_model(model, choices)
     again = decode_model(data)
     return Trial(choices, len(data), tuple(loss(again) for loss in losses), group)
@@ -157,6 +160,7 @@ def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDE
     trials = []
     for group, steps in ladder.items():
         coarsest = finest.keeping({group: steps[0]})
+        # Groups without numbers, such as texels of a model without textures, do not change the size.
         if len(encode_model(model, coarsest)) < 0.999 * len(encode_model(model, finest)):
             tried = (finest.keeping({group: step}) for step in steps)
             trials += [try_choices(model, choices, losses, group) for choices in tried]
@@ -185,8 +189,10 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
     by_group: dict[str, list[Trial]] = {}
     for trial in trials:
         by_group.setdefault(trial.group, []).append(trial)
+    # A finer step may take fewer bytes: coders decide.
     by_size = {group: sorted(own, key=lambda trial: trial.num_bytes) for group, own in by_group.items()}
     finest = {group: own[-1].precision for group, own in by_size.items()}
+    # The sum of separate losses is only an estimate: coarser groups may interact.
     for chosen in [*reversed(_descent(by_size, max_loss)), finest]:
         found = try_choices(model, finest_choices().keeping(chosen), losses)
         if found.losses[0] <= max_loss:
@@ -215,6 +221,7 @@ def _descent(by_group: Mapping[str, Sequence[Trial]], max_loss: float) -> list[d
     path: list[dict[str, Precision]] = []
     # Greedy, as for a knapsack: bytes saved per loss. A step may skip precisions that save little.
     while True:
+        # Negative losses are noise, and must not pay for others.
         predicted = sum(max(trial.losses[0], 0.0) for trial in at.values())
         steps = [
             ((at[group].num_bytes - trial.num_bytes) / max(lost, LEAST_LOSS), group, trial)

@@ -77,7 +77,9 @@ def polish(
     model = model.live
     dtype = model.gaussians.means.dtype
     background = jnp.asarray(model.background if background is None else background, dtype)
+    # Planned once: colours do not change which splats a tile lists.
     settings = plan_render(model, [view.camera for view in views])
+    # Views of one size and lens share a program.
     groups = [
         Targets(
             jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),
@@ -96,6 +98,7 @@ def _solve(
     model: Model, groups: list[Targets], background: Array, settings: RenderSettings, num_steps: int, ridge: ArrayLike
 ) -> Colors:
     """Return the changes of the colours."""
+    # A linear function's derivative is the same at any point: 0 will do.
     nothing = jax.tree.map(jnp.zeros_like, colors_of(model))
 
     def pulled(residual: Callable[[Camera, Targets], Array]) -> Colors:
@@ -109,6 +112,7 @@ def _solve(
                 _, back = jax.vjp(lambda change: draw_change(model, change, camera, settings), nothing)
                 return jax.tree.map(jnp.add, total, back(view.weights * residual(camera, view))[0]), None
 
+            # scan slices every leaf by view; all views of a group share the rays.
             total, _ = jax.lax.scan(step, total, group._replace(rays=None))
         return total
 
@@ -119,6 +123,7 @@ def _solve(
     def normal(change: Colors) -> Colors:
         return pulled(lambda camera, _: draw_change(model, change, camera, settings))
 
+    # Normal equations (JᵀWJ + ridge)·d = JᵀW·(photograph − picture); tol 0: always num_steps steps.
     return solve_cg(normal, pulled(missing), ridge=ridge, maxiter=num_steps, tol=0.0)
 
 
@@ -127,7 +132,9 @@ def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSe
     is_shown = color_sums(model.appearance, model.gaussians, camera, HIGHEST_DEGREE) + 0.5 > 0
     changed = with_colors(model, change)
     sums = color_sums(changed.appearance, changed.gaussians, camera, HIGHEST_DEGREE)
+    # Where max(·, 0) cuts a colour off, its derivative is 0.
     appearance = dataclasses.replace(changed.appearance, given_colors=jnp.where(is_shown, sums, 0.0))
+    # Over black: the background is the constant of an affine picture, not part of J.
     black = jnp.zeros(3, model.gaussians.means.dtype)
     output, _ = render_traced(model.gaussians, camera, appearance, black, settings, has_geometry=False)
     return output.color

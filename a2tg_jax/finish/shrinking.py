@@ -96,6 +96,7 @@ class Step(NamedTuple):
 def _cheapest(model: Model, step: Step, is_allowed: Callable[[Model], bool]) -> Model:
     """Return the model after the cheapest steps per byte, as many as are allowed."""
     order = np.argsort(step.cost / np.maximum(step.saved, 1), kind="stable")
+    # Textures of odd sides have no step.
     order = order[step.saved[order] > 0]
     # By bisection: what is lost grows with the number of steps.
     least, most, best = 0, len(order), model
@@ -106,6 +107,7 @@ def _cheapest(model: Model, step: Step, is_allowed: Callable[[Model], bool]) -> 
             least, best = middle, found
         else:
             most = middle - 1
+        # Each trial draws all views: the last few steps are not worth one.
         if most - least < LEAST_SAVED * len(order):
             break
     return best
@@ -119,6 +121,7 @@ def halve_textures(model: Model, weights: Textures) -> Step:
     halved: list[Group] = []
     cost, single = np.zeros(textures.num), np.tile(np.asarray(NEUTRAL_TEXEL, np.float64), (textures.num, 1))
     for (ids, texels), (_, own) in zip(textures.groups(), weights.groups(), strict=True):
+        # The reverse of doubling: odd sides were never doubled.
         axes = [axis for axis in (1, 2) if texels.shape[axis] > 1 and texels.shape[axis] % 2 == 0]
         for chosen, smaller, _, costs in _halved(ids, texels, own + LEAST_WEIGHT, axes):
             cost[chosen] = costs
@@ -131,6 +134,7 @@ def halve_textures(model: Model, weights: Textures) -> Step:
     sh = np.array(gaussians.sh, np.float64)
     sh[:, 0] += single[:, :3] / SH_C0
     opacities = np.clip(np.asarray(gaussians.opacities, np.float64) * single[:, 3], LEAST_OPACITY, 1 - LEAST_OPACITY)
+    # Gaussians that absorb no alpha keep their logit to the last bit.
     logits = np.where(single[:, 3] == 1, np.asarray(gaussians.logit_opacities), np.log(opacities / (1 - opacities)))
     dtype = gaussians.means.dtype
     absorbed = dataclasses.replace(gaussians, sh=jnp.asarray(sh, dtype), logit_opacities=jnp.asarray(logits, dtype))
@@ -146,6 +150,7 @@ def taken(model: Model, step: Step, is_chosen: np.ndarray) -> Model:
         return jnp.where(is_chosen.reshape(-1, *[1] * (before.ndim - 1)), after, before)
 
     gaussians = jax.tree.map(chosen, model.gaussians, step.gaussians)
+    # Row i + N is texture i after its step.
     textures = step.textures.take(np.arange(model.num) + model.num * is_chosen)
     return dataclasses.replace(model, gaussians=gaussians).with_textures(textures)
 
@@ -167,11 +172,13 @@ def texel_weights(model: Model, cameras: Sequence[Camera], background: ArrayLike
             return render_traced(*drawn, has_geometry=False)[0].color
 
         color, back = jax.vjp(draw, textures.buckets)
+        # Hutchinson: for random signs ε, E[(Jᵀε)²] is the sum of J² over the pixels, h.
         (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
         return tuple(map(jnp.square, slopes))
 
     total, jitted = tuple(map(jnp.zeros_like, model.textures.buckets)), jax.jit(weights_in)
     for index, camera in enumerate(cameras):
+        # A key for each view, fixed, so that the same model shrinks in the same way.
         total = jax.tree.map(jnp.add, total, jitted(model, camera, background, jax.random.key(index)))
     return dataclasses.replace(model.textures, buckets=total)
 
@@ -194,6 +201,7 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Grou
             own = np.concatenate([texels.astype(np.float64), visible], axis=-1)
         start.append((ids, own))
     start = tables = _merged(start)
+    # An empty first entry: concatenation needs one even if no texture can be halved.
     steps: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int),) * 4]
     least, number = np.zeros(textures.num), 0
     while tables := [table for table in tables if table[1].shape[1:3] != (1, 1)]:
@@ -209,7 +217,9 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Grou
     ids, numbers, costs, saved_texels = (np.concatenate(parts) for parts in zip(*steps, strict=True))
     order = np.lexsort((numbers, costs))  # By cost, and steps of one texture in their order.
     excess = sum(texels[..., 0].size for _, texels in start) - most
+    # + 1: the step that reaches the excess is included.
     count = int(np.searchsorted(np.cumsum(saved_texels[order]), excess)) + 1 if excess > 0 else 0
+    # A texture takes its steps in order, so that their number says which.
     rounds, tables = np.bincount(ids[order[:count]], minlength=textures.num), start
     for index in range(int(rounds.max(initial=0))):
         moved: list[Group] = []
@@ -249,8 +259,10 @@ def _halved(
     for axis in axes if len(ids) else ():
         size = texels.shape[axis]
         starts = np.arange(0, size, 2)
+        # reduceat leaves an odd last texel by itself.
         sums = np.add.reduceat(weights, starts, axis=axis)
         means = np.add.reduceat(weights * texels, starts, axis=axis) / sums
+        # δ of the module's Σ h·δ².
         error = weights * (texels - np.take(means, np.arange(size) // 2, axis=axis)) ** 2
         choices.append((means, sums, error.sum(axis=(1, 2, 3))))
     costs = np.asarray([cost for *_, cost in choices])

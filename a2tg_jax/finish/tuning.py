@@ -67,6 +67,7 @@ class Steps(NamedTuple):
         """Return 2^bits steps between two ends, or one if the ends are equal; centre and spread may come before."""
         *contraction, low, high = ends
         last = (1 << bits) - 1
+        # Size 1 instead of 0: it divides.
         size, last = ((high - low) / last, last) if high > low else (1.0, 0)
         return cls(low, size, last, tuple(contraction))
 
@@ -125,6 +126,7 @@ class GridRounding:
         if "quats" in steps:
             quats = _with_w(nearest("quats", _xyz(quats)))
         if "opacities" in steps:
+            # The file has steps of opacities, not of logits.
             opacities = nearest("opacities", jax.nn.sigmoid(logits))
             logits = logit(jnp.clip(opacities, LEAST_OPACITY, 1 - LEAST_OPACITY))
         log_scales = nearest("log_scales", gaussians.log_scales)
@@ -134,6 +136,7 @@ class GridRounding:
         if (textures := shown.textures) is not None:
             shown = shown.with_textures(dataclasses.replace(textures, buckets=tuple(map(texels, textures.buckets))))
         if shown.shapes is not None and "shapes" in steps:
+            # The file has steps of log-exponents; arctanh needs shares inside ±1.
             shares = nearest("shapes", LARGEST_LOG_EXPONENT * jnp.tanh(shown.shapes)) / LARGEST_LOG_EXPONENT
             shown = shown.with_shapes(jnp.arctanh(jnp.clip(shares, -MOST_SHARE, MOST_SHARE)))
         rounded = Gaussians(means, quats, log_scales, logits, bands(gaussians.sh, 0))
@@ -162,6 +165,7 @@ class GradualRounding(StepEvent):
 
     rounding: GridRounding
 
+    # Times come from a fixed key: the event draws nothing later.
     num_keys = 0
 
     def init(self, model: Model) -> Model:
@@ -182,6 +186,7 @@ def partly_rounded(rounding: GridRounding, model: Model, is_rounded: Model) -> M
     a quaternion follows from its other numbers."""
     (rounded, _), (before, rest) = partition(rounding(model)), partition(model)
     chosen: Model = jax.tree.map(jnp.where, is_rounded, rounded, before)
+    # Rounded and exact x, y, z may be mixed in one quaternion: w must follow from the mixture.
     if "quats" in rounding.steps:
         pair = _xyz(rounded.gaussians.quats), _xyz(before.gaussians.quats)
         quats = _with_w(jnp.where(is_rounded.gaussians.quats[:, 1:], *pair))
@@ -254,6 +259,7 @@ def tune_compact(
             f"model must have the corrections that training learned, {' and '.join(missing)}, which a compact file "
             "drops: give the model that training saved"
         )
+    # `half_turned` goes through a file, which drops corrections: the origin is put back.
     start = dataclasses.replace(half_turned(model), origin=model.origin)
     grids = grids_of(start, choices)
     tuning = dataclasses.replace(
@@ -263,10 +269,12 @@ def tune_compact(
         rates=dataclasses.replace(stage.rates, means=RATE_OF_MEANS * stage.rates.means),
         events=(GradualRounding(GridRounding.to(grids, choices)),),
         corrections=tuple(_held(type(own))(**own.__dict__) for own in stage.corrections),  # type: ignore[arg-type]
+        # The model has its final degrees.
         raises_sh_degree=False,
         cools_down=True,
     )
     shared = {field.name: getattr(system, field.name) for field in dataclasses.fields(System)}
+    # Tuning changes no sizes, so no budget applies.
     one_stage = _OneStage(**shared | {"memory_budget": None}, stage=tuning)
     found = fit_stage(scene, one_stage, 0, start, progress=progress, title=title).model
     return Tuned(dataclasses.replace(found, origin=start.origin), choices, grids)
@@ -291,6 +299,7 @@ def _held(kind: type[Correction]) -> type[Correction]:
 
     @pytree
     class Held(kind):  # type: ignore[misc, valid-type]
+        # No penalty pulls at the rows, and no average moves them.
         penalty, project = Correction.penalty, Correction.project
 
         def learning_rate(self, progress: Array) -> Array:
@@ -332,6 +341,7 @@ def smallest_tuned(
             choices = smallest_within(model, losses, tolerance, trials).choices
         except TooMuchLostError:
             break
+        # These choices were tuned already and are within the loss.
         if found.chosen is not None and choices == found.chosen.choices:
             break
         try:
@@ -342,6 +352,7 @@ def smallest_tuned(
         found.tried.append(trial)
         if trial.losses[0] > max_loss:
             factor = math.sqrt(2)
+            # A file within max_loss needs no tuning.
             tolerance = max(tolerance / factor, max_loss)
             continue
         if found.chosen is None or trial.num_bytes < found.chosen.num_bytes:

@@ -31,7 +31,7 @@ NUM_STEPS = 100
 FIRST_RATE = 2e-3
 LAST_RATE = 2e-5
 """Learning rate in radians and units of the normalised world, which falls exponentially: 2.5° in all steps together."""
-HEAD_ROOM = 1.5
+HEAD_ROOM = 1.5  # Moved cameras list other splats than planned.
 
 
 def color_fit(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> np.ndarray:
@@ -58,6 +58,7 @@ def color_fit(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite where its pixels count; it has NaN or infinite colours")
     inputs = np.concatenate([colors, np.ones((len(colors), 1))], axis=1)
+    # Normal equations, 4 × 4, instead of a row a pixel; lstsq takes the least solution of singular ones.
     return np.linalg.lstsq(inputs.T @ inputs, inputs.T @ wanted, rcond=None)[0].T
 
 
@@ -95,6 +96,7 @@ def align_poses(
         mask = None if view.mask is None else jnp.asarray(view.mask.read())[..., None]
         camera = jax.tree.map(lambda x: jnp.asarray(x, background.dtype), view.camera)
         inputs, settings = (model.gaussians, model.appearance, camera, target, mask, background), planned
+        # A full tile list drops splats, which makes the loss wrong: the descent is repeated.
         while (found := descend(*inputs, settings, num_steps))[1]:
             assert settings.capacity is not None
             settings = dataclasses.replace(settings, capacity=2 * settings.capacity)
@@ -108,6 +110,7 @@ def _descent(
     settings: RenderSettings, num_steps: int,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return the twist of least loss among those that Adam comes to, and whether a render needs more capacity."""
+    # SSIM needs a whole window.
     ssim_weight = 0.2 if min(target.shape[:2]) >= SSIM_WINDOW else 0.0
     shown = target if mask is None else jnp.where(mask, target, 0.0)
 
@@ -120,6 +123,7 @@ def _descent(
     def step(carry: Any, index: Array) -> tuple[Any, None]:
         twist, moments, least, best, is_full = carry
         (value, overflow), grad = jax.value_and_grad(loss, has_aux=True)(twist)
+        # A NaN loss is not less, so it is never kept.
         best, least = jnp.where(value < least, twist, best), jnp.where(value < least, value, least)
         rate = FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (index / num_steps)
         twist, moments = adam_update(twist, grad, moments, rate)
@@ -127,5 +131,6 @@ def _descent(
 
     start = jnp.zeros(6, target.dtype)
     carry = start, adam_init(start), jnp.asarray(jnp.inf, target.dtype), start, jnp.zeros((), bool)
+    # + 1: each loss belongs to the twist before its update, so that the last update is judged too.
     (_, _, _, best, is_full), _ = jax.lax.scan(step, carry, jnp.arange(num_steps + 1, dtype=target.dtype))
     return best, is_full

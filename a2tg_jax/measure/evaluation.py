@@ -140,9 +140,11 @@ def evaluate(
     for view in views:
         image, target = renderer(view.camera).color, jnp.asarray(view_image(view, background))
         start = time.perf_counter()  # The renderer has drawn this size before.
+        # JAX dispatches asynchronously.
         jax.block_until_ready(renderer(view.camera))
         seconds.append(time.perf_counter() - start)
         mask = None if view.mask is None else jnp.asarray(view.mask.read())
+        # Not clipped here: the metrics clip both images.
         if fit_colors:
             image = exposed(jnp.asarray(color_fit(image, target, mask), image.dtype), image)
         decibels, similarity, flat = (float(figure) for figure in measure(image, target, mask))

@@ -25,7 +25,7 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.texture import BYTES_PER_TEXEL, Textures
 from a2tg_jax.training import losses
 
-LPIPS_MIN_SIDE = 32
+LPIPS_MIN_SIDE = 32  # A stride of 4 and two poolings, or of 2 and three, must leave pixels.
 
 
 def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
@@ -41,6 +41,7 @@ def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
     """
     image, target = _clip_pair(image, target, mask)
     error = jnp.mean((image - target) ** 2)
+    # Both images are black where pixels do not count: the mean is rescaled to those that do.
     return -10 * jnp.log10(error if mask is None else error / jnp.mean(jnp.asarray(mask, error.dtype)))
 
 
@@ -61,7 +62,9 @@ def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
     # Windows in which nothing counts are equal, and count 1 each.
     window = (losses.SSIM_WINDOW, losses.SSIM_WINDOW)
     counts = jnp.asarray(mask).astype(similarity.dtype)
+    # The windows of `mean_ssim`: VALID, stride 1.
     counts = jax.lax.reduce_window(counts, -jnp.inf, jax.lax.max, window, (1, 1), "VALID")
+    # docs/equations.md, Measuring: 1 − (1 − SSIM)·n/n'.
     return 1 - (1 - similarity) / jnp.mean(counts)
 
 
@@ -106,11 +109,13 @@ def lpips(
         raise ValueError(
             f"LPIPS needs sides of at least {LPIPS_MIN_SIDE} pixels; got {pair.shape[2]} by {pair.shape[1]}"
         )
+    # Constants of LPIPS's ScalingLayer: ImageNet's mean and deviation for inputs in [−1, 1].
     shift = jnp.asarray([[[[-0.030, -0.088, -0.188]]]], pair.dtype)
     scale = jnp.asarray([[[[0.458, 0.448, 0.450]]]], pair.dtype)
     features = _FEATURES[weights.network](weights.arrays, (2 * pair - 1 - shift) / scale)
     distances = []
     for index, feature in enumerate(features):  # Spatial means of weighted squared differences of unit features.
+        # 1e-10 as in LPIPS's normalize_tensor; safe_norm has a gradient at 0.
         first, second = feature / (safe_norm(feature, keepdims=True) + 1e-10)
         linear = jnp.asarray(weights.arrays[f"lin{index}.weight"], feature.dtype).reshape(1, 1, -1)
         distances.append(jnp.mean(jnp.sum(linear * (first - second) ** 2, axis=-1)))
@@ -159,6 +164,7 @@ def _load_lpips(path: Path) -> LpipsWeights:
         arrays = read_npz(path)
     except ValueError as error:
         raise ValueError(f"{path} is not an .npz archive of LPIPS weights ({error})") from error
+    # Only SqueezeNet has fire modules.
     network = "squeeze" if "features.3.squeeze.weight" in arrays else "alex"
     # The network is tried by shapes alone.
     image = jax.ShapeDtypeStruct((1, LPIPS_MIN_SIDE, LPIPS_MIN_SIDE, 3), jnp.float32)
@@ -180,6 +186,7 @@ def _load_lpips(path: Path) -> LpipsWeights:
 def _alexnet(arrays: Mapping[str, np.ndarray], x: Array) -> list[Array]:
     """Return the five ReLU outputs of torchvision's AlexNet that LPIPS compares; x and they are NHWC."""
     shown = [_conv_relu(arrays, "features.0", x, stride=4, padding=2)]
+    # torchvision's indices; pooling comes before the second and third convolution only.
     for layer, padding in ((3, 2), (6, 1), (8, 1), (10, 1)):
         pooled = _max_pool(shown[-1]) if layer < 8 else shown[-1]
         shown.append(_conv_relu(arrays, f"features.{layer}", pooled, padding=padding))
@@ -198,6 +205,7 @@ def _squeezenet(arrays: Mapping[str, np.ndarray], x: Array) -> list[Array]:
         narrow = _conv_relu(arrays, f"features.{layer}.expand1x1", squeezed)
         wide = _conv_relu(arrays, f"features.{layer}.expand3x3", squeezed, padding=1)
         x = jnp.concatenate([narrow, wide], axis=-1)
+        # LPIPS takes the last fire module before each pooling, and all after the last.
         if layer not in (3, 6):
             shown.append(x)
     return shown
@@ -215,6 +223,7 @@ def _conv_relu(arrays: Mapping[str, np.ndarray], name: str, x: Array, stride: in
         window_strides=(stride, stride),
         padding=[(padding, padding)] * 2,
         dimension_numbers=("NHWC", "OIHW", "NHWC"),
+        # By default GPUs and TPUs may compute in TF32 or bfloat16, which changes LPIPS.
         precision=jax.lax.Precision.HIGHEST,
     )
     return jax.nn.relu(y + bias.reshape(1, 1, 1, -1))
@@ -222,5 +231,6 @@ def _conv_relu(arrays: Mapping[str, np.ndarray], name: str, x: Array, stride: in
 
 def _max_pool(x: Array, is_ceil: bool = False) -> Array:
     """3×3 maximum at stride 2; `is_ceil` keeps the last window that only starts inside the image."""
+    # As PyTorch's ceil_mode; −inf padding never wins.
     padding = [(0, (size - 3) % 2 if is_ceil else 0) for size in x.shape[1:3]]
     return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), [(0, 0), *padding, (0, 0)])

@@ -165,6 +165,7 @@ def training_cameras(model: Model) -> list[Camera]:
     if model.origin is None:
         return []
     pairs = list(zip(model.origin.cameras, model.origin.is_test, strict=True))
+    # A model all of whose cameras are test views is fused from these.
     return [camera for camera, is_test in pairs if not is_test] or [camera for camera, _ in pairs]
 
 
@@ -186,6 +187,7 @@ def common_sphere(viewmats: ArrayLike) -> tuple[np.ndarray, float]:
     """
     viewmats = np.asarray(viewmats, np.float64)
     centers = camera_centers(viewmats)
+    # Row 2 of a rotation is the optical axis in the world.
     center = nearest_point(centers, viewmats[:, 2, :3]) if len(viewmats) > 1 else centers[0]
     return center, float(RADII * np.median(np.linalg.norm(centers - center, axis=1)))
 
@@ -199,17 +201,20 @@ def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh
     parts = list(_parts(grid, least_weight))
     if not parts:
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
+    # Faces of a brick count its own vertices from 0.
     starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts[:-1])])
     vertices = np.concatenate([vertices for vertices, _, _ in parts])
     faces = np.concatenate([faces + start for (_, faces, _), start in zip(parts, starts, strict=True)])
     colors = np.concatenate([colors for _, _, colors in parts])
     # Vertices that two bricks share become one, and faces between such vertices vanish.
     side = BRICK * SIDE
+    # Only vertices on the faces of bricks can be shared: the tree stays small.
     on_border = np.flatnonzero((np.abs(vertices - side * np.rint(vertices / side)) < SAME).any(axis=1))
     pairs = on_border[cKDTree(vertices[on_border]).query_pairs(SAME, output_type="ndarray")] if len(on_border) else []
     if len(pairs):
         graph = coo_matrix((np.ones(len(pairs), bool), tuple(np.transpose(pairs))), [len(vertices)] * 2)
         _, labels = connected_components(graph, directed=False)
+        # Labels are 0 to n − 1, so that they are the new indices.
         _, first = np.unique(labels, return_index=True)
         a, b, c = labels[faces].T
         vertices, colors = vertices[first], colors[first]
@@ -231,19 +236,23 @@ def _parts(grid: BlockGrid, least_weight: float) -> Iterator[tuple[np.ndarray, n
         rows = rows[found]
         weight = grid.weight[rows]
         known = weight > least_weight
+        # 1, a truncation in front of any surface, where nothing is known.
         mean = np.where(known, grid.distance[rows] / np.where(known, weight, 1.0), 1.0)
         distance, is_known = _dense(mean.astype(np.float32), found, 1.0), _dense(known, found, False)
         for axis in range(3):  # A cell is known if its eight corners are, and is named by its last corner.
             is_known &= np.roll(is_known, 1, axis)
             is_known[(slice(None),) * axis + (0,)] = False
+        # scikit-image raises if the level is outside of the range.
         if not is_known.any() or not distance.min() < 0 < distance.max():
             continue
         try:
+            # descent: distances fall towards the inside.
             vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=is_known, gradient_direction="descent")
         except RuntimeError:  # No cell has a surface.
             continue
         color = np.rint(255 * np.clip(grid.color[rows].astype(np.float32), 0, 1)).astype(np.uint8)
         nearest = tuple(np.rint(vertices).astype(int).T)
+        # float64: indices of far bricks leave float32 too few digits to match borders.
         yield vertices.astype(np.float64) + brick * (BRICK * SIDE), faces, _dense(color, found, 0)[nearest]
 
 
@@ -253,6 +262,7 @@ def _dense(values: np.ndarray, places: np.ndarray, empty: float) -> np.ndarray:
     whole = np.full((num**3, VOXELS, *channels), empty, values.dtype)
     whole[places] = values
     whole = whole.reshape(num, num, num, SIDE, SIDE, SIDE, *channels)
+    # [bx, by, bz, x, y, z] → [bx, x, by, y, bz, z]: blocks become neighbours.
     whole = whole.transpose(0, 3, 1, 4, 2, 5, *range(6, whole.ndim)).reshape(*[num * SIDE] * 3, *channels)
     end = BRICK * SIDE + 1
     return whole[:end, :end, :end]

@@ -60,6 +60,7 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     if suffix == ".glb":
         _save_glb(path, mesh, transform)
         return [path]
+    # Mesh.transform returns float64, which map coordinates need.
     mesh = mesh if transform is None else mesh.transform(transform.inverse())
     if suffix == ".obj":
         return _save_obj(path, mesh)
@@ -70,6 +71,7 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     rows = np.empty(mesh.num_vertices, [(name, dtype) for name, dtype, _ in columns])
     for name, _, values in columns:
         rows[name] = values
+    # A list property is a count, then as many indices.
     faces = np.empty(mesh.num_faces, [("number", "u1"), ("corners", "<i4", 3)])
     faces["number"], faces["corners"] = 3, mesh.faces
     words = {"<f4": "float", "<f8": "double", "u1": "uchar"}
@@ -95,19 +97,23 @@ def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
     if mesh.texture is not None:
         _, material, picture = written
         lines += [f"mtllib {material.name}", "usemtl texture"]
+        # Picture and material first, so that the mesh never names a missing file.
         with replacing(picture) as temporary:
             Image.fromarray(mesh.texture).save(temporary, "PNG")
         with replacing(material) as temporary:
+            # Ka and Kd 1, illum 0: colours of the picture, without lights.
             temporary.write_text(f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {picture.name}\n")
     with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
         rows = mesh.vertices
         if mesh.colors is not None and mesh.texture is None:
             rows = np.hstack([rows, mesh.colors / 255])
+        # 15 and 9 digits bring a float64 (nearly) and a float32 back.
         number = " %.15g" if _needs_doubles(mesh.vertices) else " %.9g"
         np.savetxt(file, rows, "v" + number * 3 + " %.4g" * (rows.shape[1] - 3))
         if mesh.uv is not None:
             np.savetxt(file, mesh.uv, "vt %.6f %.6f")
+            # OBJ counts from 1; positions and texture coordinates have the same numbers.
             np.savetxt(file, np.repeat(mesh.faces + 1, 2, axis=1), "f %d/%d %d/%d %d/%d")
         else:
             np.savetxt(file, mesh.faces + 1, "f %d %d %d")
@@ -136,7 +142,9 @@ def _save_glb(path: Path, mesh: Mesh, transform: Similarity | None) -> None:
         attributes["TEXCOORD_0"] = builder.add((mesh.uv * (1, -1) + (0, 1)).astype(np.float32))
         surface["baseColorTexture"] = {"index": 0}
     elif mesh.colors is not None:
+        # RGBA: attributes of uint16 are aligned to 4 bytes, which three columns are not.
         opaque = np.full((mesh.num_vertices, 1), 65535)
+        # 16 bits: linear colours in 8 bits show steps in the dark.
         rows = np.hstack([np.rint(65535 * linear_colors(mesh.colors / 255)), opaque])
         attributes["COLOR_0"] = builder.add(rows.astype(np.uint16), normalized=True)
     indices = builder.add(mesh.faces.astype(np.uint32).reshape(-1), is_attribute=False)
@@ -154,6 +162,7 @@ def _save_glb(path: Path, mesh: Mesh, transform: Similarity | None) -> None:
         file = io.BytesIO()
         Image.fromarray(mesh.texture).save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)
         described["images"] = [{"bufferView": builder.add_bytes(file.getvalue()), "mimeType": "image/jpeg"}]
+        # Linear, mipmaps between levels, and clamped edges, in OpenGL's numbers.
         described["samplers"] = [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}]
         described["textures"] = [{"source": 0, "sampler": 0}]
     builder.save(path, described)

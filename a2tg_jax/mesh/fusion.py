@@ -33,6 +33,7 @@ LEAST_ALPHA = 0.5
 SIDE = 8
 """Voxels along a side of a block."""
 VOXELS = SIDE**3
+# Distance, weight and colour weight as float32, colours as three float16.
 BYTES_PER_BLOCK = VOXELS * (3 * 4 + 3 * 2)
 LOCAL = np.stack(np.meshgrid(*[np.arange(SIDE, dtype=np.int32)] * 3, indexing="ij"), -1).reshape(-1, 3)
 """[VOXELS, 3] voxels within a block."""
@@ -108,6 +109,7 @@ class BlockGrid:
         """Make an empty grid with a memory budget."""
         self.capacity = max(1, int(max_bytes) // BYTES_PER_BLOCK)
         # Weighted sums of distances, in units of the truncation, and sums of their weights.
+        # np.zeros reserves address space only: pages take memory when blocks are written.
         self.distance, self.weight = (np.zeros((self.capacity, VOXELS), np.float32) for _ in range(2))
         # Mean colours, and sums of their weights.
         self.color = np.zeros((self.capacity, VOXELS, 3), np.float16)
@@ -143,6 +145,7 @@ class BlockGrid:
 def _keys_of(blocks: np.ndarray) -> np.ndarray:
     """Return [B] int64 names of blocks [B, 3], different for different ones."""
     x, y, z = blocks.astype(np.int64).T + LIMIT
+    # LIMIT makes each coordinate positive, below 2^21.
     return x << 42 | y << 21 | z
 
 
@@ -162,10 +165,12 @@ def rendered_depth(output: RenderOutput, camera: Camera) -> RenderedDepth:
     is_opaque = (output.alpha > LEAST_ALPHA) & jnp.isfinite(output.depth)
     alpha = jnp.where(is_opaque, output.alpha, 1.0)
     depth = jnp.where(is_opaque, output.depth, 0.0) / alpha
+    # distortion is Σ w_i·w_j·(z_i − z_j)²/2, which is alpha² times the variance.
     spread = jnp.sqrt(jnp.maximum(output.distortion, 0.0)) / alpha
     normal = normalize(output.normal)
     rays = back_project(jnp.ones_like(depth), camera) - camera.center[None, None]
     slant = jnp.abs(jnp.sum(normal * rays, axis=-1))
+    # Rays have z = 1: divided by their lengths, slant is the cosine.
     facing = jnp.maximum(slant / jnp.linalg.norm(rays, axis=-1), LEAST_FACING)
     slant = jnp.clip(slant, LEAST_FACING, 1.0)
     color = jnp.clip(jnp.nan_to_num(output.color), 0.0, 1.0)
@@ -175,6 +180,7 @@ def rendered_depth(output: RenderOutput, camera: Camera) -> RenderedDepth:
 def fuse(grid: BlockGrid, depths: RenderedDepth, space: Space) -> None:
     """Fuse one view into the blocks within a truncation of its depths. GridFullError: the grid's memory budget has no
     room for the blocks."""
+    # On the host: how many blocks there are depends on values.
     rows = grid.allocate(np.asarray(jax.jit(_blocks_near)(depths, space)))
     arrays: tuple[np.ndarray, ...] = grid.distance, grid.weight, grid.color, grid.color_weight
     jitted = jax.jit(_fused)
@@ -183,6 +189,7 @@ def fuse(grid: BlockGrid, depths: RenderedDepth, space: Space) -> None:
         padded = np.resize(chosen, CHUNK)  # Blocks repeat, so that all chunks have one shape.
         fused = jitted([array[padded] for array in arrays], grid.coordinates[padded], depths, space)
         for array, values in zip(arrays, fused, strict=True):
+            # Without the repeated rows.
             array[chosen] = np.asarray(values)[: len(chosen)]
 
 
@@ -215,10 +222,13 @@ def _fused(voxels: list[Array], blocks: Array, depths: RenderedDepth, space: Spa
     pixel = _pixels(x, y, *depths.depth.shape)
     spread, slant, facing = (image.reshape(-1)[pixel] for image in (depths.spread, depths.slant, depths.facing))
     signed = slant * (seen - z) / truncation
+    # 1 to within a voxel behind the surface, falling to 0 at the truncation: a view does not show what is deeper.
     behind = jnp.clip((1 + signed) / (1 - 1 / TRUNCATION), 0.0, 1.0)
     sure = facing**2 * behind / (1 + (spread / (SURE * truncation)) ** 2)
+    # Voxels deeper than a truncation behind the surface are hidden, and unknown to this view.
     own = jnp.where(is_seen & is_ahead & (signed >= -1), sure, 0.0).reshape(-1, VOXELS)
     distance = distance + own * jnp.minimum(signed, 1.0).reshape(-1, VOXELS)
+    # Colours count near the surface only, not in the free space before it.
     near = jnp.where(signed.reshape(-1, VOXELS) < 1, own, 0.0)
     color_weight = color_weight + near
     share, mean = near / jnp.maximum(color_weight, 1e-12), color.astype(jnp.float32)
@@ -236,6 +246,7 @@ def _depths_at(depth: Array, x: Array, y: Array, truncation: Array) -> tuple[Arr
     """
     height, width = depth.shape
     flat = depth.reshape(-1)
+    # Pixel centres are at half-integers.
     left, top = jnp.floor(x - 0.5), jnp.floor(y - 0.5)
     right, below = x - 0.5 - left, y - 0.5 - top
     a, b, c, d = (flat[_pixels(left + dx, top + dy, height, width)] for dy in (0.5, 1.5) for dx in (0.5, 1.5))

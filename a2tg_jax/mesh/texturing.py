@@ -95,7 +95,9 @@ def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Texels]:
     source, faces, uv = atlas.get_mesh(0)
     own = None if mesh.colors is None else mesh.colors[source]
     mesh = Mesh(mesh.vertices[source], faces.astype(np.int32), own, uv := np.asarray(uv, np.float32))
+    # uv begins at the lower left, rows of the atlas at the top.
     corners = (uv * (size, -size) + (0, size)).astype(np.float32)[mesh.faces]
+    # At one depth: charts do not overlap.
     drawn = _draw(corners, np.ones(mesh.faces.shape, np.float32), size, size)
     place = np.flatnonzero(drawn.face >= 0)
     hit, weights = drawn.face.reshape(-1)[place], drawn.weights.reshape(-1, 3)[place]
@@ -115,19 +117,23 @@ def _seen(
     farther than the drawn mesh's depth [H, W] are hidden."""
     viewmat, K = np.asarray(camera.viewmat, np.float32), np.asarray(camera.K, np.float32)
     at = texels.position @ viewmat[:3, :3].T + viewmat[:3, 3]
+    # In camera axes: distance times the cosine between normal and the direction to the camera.
     toward = -np.sum(at * (texels.normal @ viewmat[:3, :3].T), axis=1)
     seen = np.flatnonzero((at[:, 2] > 0) & (toward > 0))
     at, toward = at[seen], toward[seen]
     x, y = ((at / at[:, 2:]) @ K[:2].T).T
     distance = np.linalg.norm(at, axis=1)
     is_inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height) & (toward > LEAST_FACING * distance)
+    # Any valid index will do outside; is_inside excludes these.
     row, column = (np.where(is_inside, each, 0).astype(int) for each in (y, x))
     is_seen = is_inside & (at[:, 2] < (1 + HIDDEN) * depth[row, column])
     if mask is not None:
         is_seen &= mask[row, column]
+    # map_coordinates has pixel centres at whole numbers.
     places = np.stack([y, x])[:, is_seen] - np.float32(0.5)
     channels = [map_coordinates(picture[..., channel], places, order=1, mode="nearest") for channel in range(3)]
     distance = distance[is_seen]
+    # cosine·focal length/distance: `toward` is the cosine times the distance.
     own = (toward[is_seen] * K[0, 0] / camera.width / distance**2) ** POWER
     return seen[is_seen], own.astype(np.float32), np.stack(channels, -1)
 
@@ -148,6 +154,7 @@ def draw_view(mesh: Mesh, camera: Camera) -> Raster:
     viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
     at = mesh.vertices @ viewmat[:3, :3].T + viewmat[:3, 3]
     z = at[:, 2]
+    # Faces at the camera plane would have infinite pixels.
     least = NEAR * np.median(z[z > 0]) if (z > 0).any() else 1.0
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = np.where(z[:, None] > least, (at / z[:, None]) @ K[:2].T, np.nan)
@@ -173,6 +180,7 @@ def _draw(points: np.ndarray, depths: np.ndarray, width: int, height: int) -> Ra
         shows = shows[np.argsort(-depth[shows], kind="stable")]  # The nearest is written last.
         chosen = pixels[shows]
         face[chosen], nearest[chosen], weights[chosen] = faces[shows], depth[shows], own[shows]
+    # Perspective: what is linear on the triangle is linear over depth in the image.
     corrected = weights / np.where(face[:, None] >= 0, depths[face], 1.0)
     corrected /= np.maximum(corrected.sum(axis=1, keepdims=True), 1e-30)
     shape = height, width
@@ -182,6 +190,7 @@ def _draw(points: np.ndarray, depths: np.ndarray, width: int, height: int) -> Ra
 def _candidates(points: np.ndarray, width: int, height: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield (faces, pixels) [P] of the pixels within the bounds of each face, some at a time."""
     with np.errstate(invalid="ignore"):
+        # Pixels whose centres, at half-integers, are within the bounds.
         low = np.maximum(np.ceil(points.min(axis=1) - 0.5), 0)
         high = np.minimum(np.floor(points.max(axis=1) - 0.5), (width - 1, height - 1))
         order = np.flatnonzero((high >= low).all(axis=1))
@@ -191,6 +200,7 @@ def _candidates(points: np.ndarray, width: int, height: int) -> Iterator[tuple[n
     # Chunks of whole faces, so that arrays stay bounded however large the faces are drawn.
     start = done = 0
     while start < len(order):
+        # At least one face, even if it alone exceeds the chunk.
         end = max(start + 1, int(np.searchsorted(ends, done + CHUNK, side="right")))
         rows = np.repeat(np.arange(start, end), areas[start:end])
         index = done + np.arange(len(rows)) - (ends - areas)[rows]  # Number of the pixel within its face's bounds.

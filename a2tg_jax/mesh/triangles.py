@@ -83,11 +83,14 @@ def largest_clusters(mesh: Mesh, most: int, least_faces: int) -> tuple[Mesh, int
     if not mesh.num_faces:
         return mesh, 0
     a, b, c = mesh.faces.T
+    # Two edges of a triangle connect its three vertices.
     edges = np.concatenate([a, b]), np.concatenate([b, c])
     graph = coo_matrix((np.ones(len(edges[0]), bool), edges), [mesh.num_vertices] * 2)
     _, labels = connected_components(graph, directed=False)
+    # By faces: one vertex of each, since all three have one label.
     _, cluster, sizes = np.unique(labels[a], return_inverse=True, return_counts=True)
     ranks = np.empty(len(sizes), int)
+    # The inverse permutation: rank of each cluster by size.
     ranks[np.argsort(-sizes, kind="stable")] = np.arange(len(sizes))
     is_kept = (ranks < most) & (sizes >= least_faces)
     return mesh.with_faces(is_kept[cluster]), int((~is_kept).sum())
@@ -119,6 +122,7 @@ def simplify_mesh(mesh: Mesh, num_faces: int) -> Mesh:
     )
     if not len(faces):
         raise ValueError(f"no faces are left of {mesh.num_faces:,}: choose more faces than {num_faces:,}")
+    # Decimation moves vertices and drops colours: each takes the nearest old one's.
     colors = None if mesh.colors is None else mesh.colors[cKDTree(mesh.vertices).query(vertices)[1]]
     return Mesh(vertices, faces.astype(np.int32), colors).with_faces(np.arange(len(faces)))
 
@@ -189,8 +193,11 @@ def sample_surface(mesh: Mesh, spacing: float, seed: int = 0) -> np.ndarray:
         return points
     rng = np.random.default_rng(seed)
     ends = np.cumsum(areas)
+    # Stratified by area: one point in each of num equal parts.
     chosen = np.searchsorted(ends, (np.arange(num) + rng.uniform(size=num)) * (ends[-1] / num))
+    # The root makes (1 − a, a·(1 − b), a·b) uniform in a triangle.
     a, b = np.sqrt(rng.uniform(size=num)), rng.uniform(size=num)
+    # Rounding of the sum may lead beyond the last face.
     chosen = np.minimum(chosen, len(areas) - 1)
     for part in (slice(start, start + CHUNK) for start in range(0, num, CHUNK)):
         weights = np.stack([1 - a[part], a[part] * (1 - b[part]), a[part] * b[part]], -1)

@@ -51,8 +51,8 @@ def compress(
 
     Args:
       source: a run folder, whose last model is taken; or a model, *.npz.
-      out: the file, *.a2tgz; None: next to the model. Files that this function did not write into the run's folder are
-        replaced only with `overwrite`.
+      out: the file, *.a2tgz; None: next to the model. Files that this function did not write into the run's folder
+        need `overwrite`.
       max_loss: largest loss in dB.
       tune_iterations: iterations of training with rounding for each choice of bits that is tuned
         (`finish.tuning.smallest_tuned`); 0: the model's numbers are only rounded.
@@ -76,6 +76,7 @@ def compress(
     out = default if out is None else out
     check_output(out)
     check_export(out, default, "--out", overwrite=overwrite)
+    # Before the photographs are loaded, and minutes of trials.
     check_encodable(model.appearance)
     scene, tune = opened.load_scene(), None
     if tune_iterations:
@@ -91,7 +92,7 @@ def compress(
     print(f"trying {ways}{tunings}; on a CPU this takes minutes", flush=True)
     trials = measure_choices(model, measures, ladder)
     untuned, found = None, TunedFiles([])
-    # Rounding alone may lose too much, which tuning may make up for: only without tuning is that an error.
+    # Rounding alone may lose too much. With tuning, that is no error yet.
     try:
         untuned = smallest_within(model, measures, max_loss, trials)
     except TooMuchLostError:
@@ -100,6 +101,7 @@ def compress(
     if tune is not None:
         found = smallest_tuned(model, measures, max_loss, trials, tune)
     chosen, data = _smaller(model, untuned, found, max_loss)
+    # Only the default path is listed in the marker: any other file is the user's.
     if source.is_dir() and out == default:
         RunFolder(source).own(out)
     with replacing(out) as temporary:
@@ -122,6 +124,7 @@ def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: 
         kept = ", ".join(f"{group} {getattr(trial.choices, group)}" for group in GROUPS if group in groups)
         bits.append(f"{name}: {kept}")
     if found.diverged:
+        # Before the line of the chosen file.
         bits.insert(-1, f"tuning ended early, what was found before is kept: {found.diverged}")
     return [*aligned(list(zip(*rows, strict=True))), *bits]
 
@@ -147,6 +150,7 @@ def _tuned(scene: Scene, system: System, iterations: int, model: Model, choices:
 def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict[str, Loss]:
     """Return loss measures by name; the first decides."""
     if scene is not None:
+        # Held-out views are measured as well, but never decide.
         train = refined_views(scene.train[:: -(-len(scene.train) // MOST_VIEWS)], model)
         losses = {"training views": loss_on_views(model, train, settings=settings)}
         return losses | ({"test views": loss_on_views(model, scene.test, settings=settings)} if scene.test else {})
@@ -156,5 +160,6 @@ def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict
         )
     pairs = zip(model.origin.cameras, model.origin.is_test, strict=True)
     cameras = [camera for camera, is_test in pairs if not is_test]
+    # `or 1`: a step of 0 is an error if there are no training cameras.
     cameras = cameras[:: -(-len(cameras) // MOST_VIEWS) or 1]
     return {f"if {ASSUMED_PSNR:g} dB": loss_beside_renders(model, cameras, settings=settings)}

@@ -50,11 +50,12 @@ def convert(
     overwrite: bool = False,
 ) -> str:
     """Write a run's model `name`, or a file of any known format, in the format of another suffix, and return a summary.
-    `baking` is how textured splats become plain ones (None: they do not), `float64` as in `save_ply`. Raises ValueError
+    `baking` turns textured splats into plain ones (None: no baking); `float64` is as in `save_ply`. Raises ValueError
     or OSError if a format is unknown, or the source cannot be read or the file not be written."""
     writer_of(out)  # Baking takes minutes.
     if float64 and format_of(out).save is not save_ply:
         raise ValueError(f"`float64` needs an OUT that ends in .ply and is not packed; got {out}")
+    # A *.gltf is several files, none of which may be both read and written.
     sources = {file.resolve() for file in files_of(source)}
     for file in files_written(out):
         if file.is_dir():
@@ -95,6 +96,7 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
         return model, "baked: nothing, for the model is plain"
     training, held_out = cameras_apart(model.origin)
     plain = bake(model, training, growth=options.growth, iterations=options.iterations, progress=True)
+    # The bake has not seen held-out cameras, so that they judge it fairly.
     views = held_out or training
     views = views[:: -(-len(views) // MOST_VIEWS)]
     likeness_db = likeness(pictures(plain, views), pictures(model, views))

@@ -158,6 +158,7 @@ def _thinned(column: np.ndarray) -> np.ndarray:
 
 def sizes_figure(sizes: np.ndarray) -> Figure:
     """Plot the number of Gaussians by the resolution of their textures, sizes [N, 2], as a map of Tv × Tu."""
+    # Textures grow by doubling their sides.
     sides = 2 ** np.arange(int(np.log2(max(4, sizes.max()))) + 1)
     counts = np.array([[np.sum((sizes == (tv, tu)).all(axis=1)) for tu in sides] for tv in sides])
     figure = Figure(figsize=(1.2 + 0.95 * len(sides), 0.9 + 0.75 * len(sides)), layout="constrained")
@@ -201,6 +202,7 @@ def learned_textures(model: Model) -> np.ndarray | None:
     rows, columns = -(-len(order) // TEXTURES_PER_ROW), min(len(order), TEXTURES_PER_ROW)
     sheet = np.zeros((rows * step - TEXTURE_MARGIN, columns * step - TEXTURE_MARGIN, 4), np.uint8)
     for place, index in enumerate(order):
+        # A whole factor: every texel stays a sharp square.
         scale = TEXTURE_SIDE // max(texels[index].shape[:2])
         large = np.kron(texels[index], np.ones((scale, scale, 1)))  # [h, w, 4]: RGB residual and alpha factor
         alpha, color = np.clip(large[..., 3:], 0, 1), np.clip(colors[index] + large[..., :3], 0, 1)
@@ -226,6 +228,7 @@ def depth_picture(output: RenderOutput) -> tuple[np.ndarray, list[tuple[float, n
 
 def normal_picture(output: RenderOutput, camera: Camera) -> np.ndarray:
     """Return uint8 [H, W, 3] of the normals in camera axes, chequered as in `depth_picture`."""
+    # Camera axes are x right, y down, z forward: flipped to right, up, towards the camera.
     normal = np.asarray(output.normal) @ np.asarray(camera.viewmat)[:3, :3].T * (1, -1, -1)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     is_seen = _is_hit(output) & (length[..., 0] > 0)
@@ -255,11 +258,13 @@ def level_picture(model: Model, levels: np.ndarray, camera: Camera, settings: Re
     dependence, over a chequered background."""
     colors = (level_colors(int(levels.max()) + 1)[levels] - 0.5) / SH_C0
     if model.textures is not None:
+        # Alpha factors stay: they shape the splats.
         buckets = tuple(bucket.at[..., :3].set(0.0) for bucket in model.textures.buckets)
         model = model.with_textures(dataclasses.replace(model.textures, buckets=buckets))
     model = with_flat_colors(model, np.ones(model.gaussians.num, bool), colors)
     output = Renderer(model, settings=settings, has_geometry=False)(camera)
     behind = (1 - np.asarray(output.alpha))[..., None]
+    # The render has its own background behind it, (1 − alpha) of it, which the squares replace.
     ground = _ground((camera.height, camera.width)) - np.asarray(model.background)
     return to_uint8(np.asarray(output.color) + behind * ground)
 
@@ -311,6 +316,7 @@ def save_camera_picture(scene: Path, path: Path) -> None:
     rotations = viewmats[:, :3, :3]
     centers = -np.einsum("vij,vi->vj", rotations, viewmats[:, :3, 3])
     # Right, ahead and up of the picture; up is the mean upper side of the photographs.
+    # Rows of a rotation are the camera's axes in the world; y points down.
     up = -rotations[:, 1].mean(axis=0)
     up = up / max(float(np.linalg.norm(up)), 1e-9)
     right = rotations[:, 0].mean(axis=0)

@@ -51,6 +51,7 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     options.check()
     record, planned = finished_stage(source)
     path, run = source.model(planned.name), RunFolder(out)
+    # The checksum ties finish.json to the very model: a run trained again is another source.
     origin = {"source": str(source.path.resolve()), "model": planned.name, "sha256": sha256_of(path)}
     content = {**origin, **dataclasses.asdict(options)}
     _is_written(run, content)
@@ -60,6 +61,7 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
         raise ValueError("the run learned exposures, which polishing does not support: add `polish_steps` 0")
     if not can_polish and not (options.max_loss and can_shrink(model)):
         raise ValueError(f"{planned.name} shows nothing that these options can shrink or polish")
+    # Raises before any work if a model that the evaluation needs is missing.
     finished_stages(source, record.plan)
     with claimed(run):
         is_written = _is_written(run, content)  # Another process may have been here meanwhile.
@@ -68,9 +70,11 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
         for name, after in changed:
             models[name], steps[name] = after, _measured(after, scene, planned)
         if not is_written:
+            # A process that was killed before the record may have left files.
             run.clear()
             write_json(run.own(run.finish), content)
             for name in record.plan.names:
+                # The report compares all models of the run: the others are copied.
                 for find in (RunFolder.model, RunFolder.history):
                     if find(source, name).is_file() and find(source, name) != path:
                         with replacing(run.own(find(run, name))) as copy:

@@ -40,6 +40,7 @@ from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import config_from_dict
 
+# If the newest is damaged, training continues from the one before.
 KEPT_CHECKPOINTS = 2
 MARKER = "a2tg-jax run"
 DAMAGED = ".damaged"
@@ -108,7 +109,7 @@ class RunFolder:
         """Return the paths of names that are files within the folder, except the marker."""
         root, found = self.path.resolve(), []
         for path in (self.path / name for name in dict.fromkeys(names)):
-            # A line that a crash has cut off may name a folder, and a damaged one what no file can be called.
+            # A line cut off by a crash may name a folder, a damaged one an impossible path.
             with contextlib.suppress(OSError):
                 if path != self.marker and path.is_file() and path.resolve().is_relative_to(root):
                     found.append(path)
@@ -120,6 +121,7 @@ class RunFolder:
             path.unlink(missing_ok=True)
             remove_if_empty(path.parent, self.path)
         if self.marker.is_file():
+            # The same file: it holds the lock of this process.
             os.truncate(self.marker, 0)
             self.own(self.marker)
 
@@ -151,6 +153,7 @@ class RunFolder:
 
     def checkpoints(self, name: str, ending: str = "") -> list[Path]:
         """Return the checkpoints of a stage, oldest first."""
+        # Iterations have ten digits, so that names sort by number.
         return sorted((self.path / "checkpoints").glob(f"{glob.escape(name)}-{'[0-9]' * 10}.npz{ending}"))
 
     def drop_old_checkpoints(self, name: str, keep: int = KEPT_CHECKPOINTS) -> None:
@@ -197,6 +200,7 @@ def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
     """Return the command line that continues a training on these devices; None: on those of its newest checkpoint."""
     if devices is None:
         devices = ALONE
+        # By time: checkpoints of several stages do not sort by name.
         found = sorted((run.path / "checkpoints").glob("*.npz"), key=lambda path: path.stat().st_mtime_ns)
         with contextlib.suppress(ValueError, OSError):  # It may be damaged.
             kept = read_archive_header(found[-1]).get("devices", {}) if found else {}
@@ -228,6 +232,7 @@ def claimed(run: RunFolder) -> Iterator[None]:
     """
     run.written()
     run.path.mkdir(parents=True, exist_ok=True)
+    # Append: opening must not empty the marker of a run that another process has claimed.
     with open(run.marker, "a", encoding="utf-8") as file:
         if not try_lock(file.fileno()):
             raise FileExistsError(
@@ -235,6 +240,7 @@ def claimed(run: RunFolder) -> Iterator[None]:
             )
         run.own(run.marker)
         put_back_old(run)
+        # Only partial files of listed files: others may be of another program.
         own = {run.path / name for name in run.written()}
         for folder in {path.parent for path in own}:
             for partial, path in left_over(folder).items():
@@ -309,6 +315,7 @@ def _move(source: RunFolder, target: RunFolder, *, is_record_first: bool) -> Non
         moved.parent.mkdir(parents=True, exist_ok=True)
         os.replace(path, moved)
         remove_if_empty(path.parent, source.path)
+    # Renames reach the disk before the old marker is emptied.
     flush_folder(target.path)
 
 
@@ -316,7 +323,7 @@ def _move(source: RunFolder, target: RunFolder, *, is_record_first: bool) -> Non
 
 
 def check_output(path: Path) -> None:
-    """Raise ValueError if a file or folder cannot be made, naming what is in the way.
+    """Raise ValueError if a file or folder cannot be made, naming the obstacle.
 
     New folders on more than one level outside the current folder, such as at a misspelt drive, are reported on stderr.
     """
@@ -328,6 +335,7 @@ def check_output(path: Path) -> None:
     if not existing.is_dir():
         raise ValueError(f"{path} cannot be made, for {existing} is a file")
     try:
+        # Trying is the only sure test: permissions, read-only mounts and network drives differ.
         os.rmdir(tempfile.mkdtemp(dir=existing))
     except OSError as error:
         raise ValueError(f"{path} cannot be made, for nothing can be written in {existing}: {error.strerror}") from None
@@ -337,6 +345,7 @@ def check_output(path: Path) -> None:
 
 def check_apart(out: Path, other: Path) -> None:
     """Raise ValueError if one of two paths, at least one of which is written, is in the other."""
+    # Links resolved: names alone do not show an overlap.
     one, two = out.resolve(), other.resolve()
     if one.is_relative_to(two) or two.is_relative_to(one):
         raise ValueError(f"{out} and {other} overlap: choose an output folder outside it")

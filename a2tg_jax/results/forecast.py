@@ -106,6 +106,7 @@ class RunForecast:
     def check_disk(self, out: Path) -> None:
         """Raise ValueError unless the disk of a folder, which need not exist, has room for the run."""
         path = Path(os.path.abspath(out))
+        # The nearest existing folder decides the disk.
         free = shutil.disk_usage(next(folder for folder in (path, *path.parents) if folder.is_dir())).free
         if self.disk_bytes > free:
             raise ValueError(
@@ -123,6 +124,7 @@ class RunForecast:
 def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_devices: int = 1) -> RunForecast:
     """Return a forecast of the bytes that a run will take (host; nothing is compiled). `num_given` is the number of
     Gaussians of the file that replaces the main system's first stage; memory is the sum over all devices."""
+    # On accelerators programs and photographs take the host's memory, not the device's.
     is_host = default_platform() == "cpu"
     stages: dict[str, StageForecast] = {}
     for chain in plan.chains.values():
@@ -140,6 +142,7 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     phases["evaluation"] = Bytes(
         program=(resident + REPORT) if is_host else 0,
         photographs=held_bytes(scene) if is_host else 0,
+        # Evaluation holds all models at once.
         model=sum(model_bytes),
         pixels=EVALUATION_PER_PIXEL * largest_view((*scene.test, *scene.train)),
     )
@@ -194,6 +197,7 @@ def allowed_memory(max_memory: int | None, num_devices: int = 1) -> int:
     """Return the bytes a run may use: the given limit, or what the machine or its accelerators have available."""
     if max_memory is not None:
         return max_memory
+    # CPUs have no such figures.
     stats = jax.local_devices()[0].memory_stats() or {}
     return num_devices * stats.get("bytes_limit", 0) or memory_limit()
 

@@ -1,4 +1,4 @@
-"""Frames of a finished run, and a video: its test views, or a path past the cameras, around the subject or by hand.
+"""Frames of a finished run, and a video: its test views, or a path past the cameras, an orbit or saved views.
 
 The folder has a list of the files that renders wrote. No other file is replaced without `overwrite`, or deleted.
 """
@@ -50,6 +50,7 @@ class FrameFolder:
         """Names of the files that renders wrote."""
         if not is_regular(self.path / LIST):
             return []
+        # surrogateescape: names of views may be bytes of any encoding.
         lines = read_regular(self.path / LIST, MOST_BYTES).decode(errors="surrogateescape").splitlines()
         return list(dict.fromkeys(lines))
 
@@ -63,6 +64,7 @@ class FrameFolder:
         """Yield a temporary path for a file of the folder, as `replacing` does, and list the file."""
         with replacing(self.path / name) as temporary:
             yield temporary
+            # Listed before the rename: a killed render leaves no file that is unlisted.
             with open(self.path / LIST, "a", encoding="utf-8", errors="surrogateescape") as file:
                 file.write(f"{name}\n")
 
@@ -129,6 +131,7 @@ def render_frames(
     for file_name, camera in progress_over(list(cameras.items()), "frames", "frame"):
         with folder.writing(file_name) as temporary:
             write_png(temporary, to_uint8(renderer(camera).color))
+    # A render of test views leaves a flight's frames in place.
     folder.tidy(cameras, drops_frames=route != "test")
     return [out / file_name for file_name in cameras]
 
@@ -152,6 +155,7 @@ def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER
     def opened() -> Iterator[Image.Image]:
         for frame in frames:
             with Image.open(frame) as image:
+                # Read now: the file is closed when the generator resumes.
                 image.load()
                 yield image
 
@@ -162,7 +166,9 @@ def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER
         # Most players decode yuv420p only, which needs even sides.
         even_sides = "pad=ceil(iw/2)*2:ceil(ih/2)*2"
         source = ["-framerate", str(frames_per_second), "-i", str(frames[0].with_name(FRAME_NAME))]
+        # Otherwise ffmpeg continues with whatever numbered files follow.
         made = ["-frames:v", str(len(frames)), "-vf", even_sides, "-pix_fmt", "yuv420p", "-f", "mp4"]
+        # ffmpeg chooses formats by suffix, which the temporary path lacks: hence -f mp4.
         command = [program, "-y", "-loglevel", "error", *source, *made, str(temporary)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:

@@ -49,10 +49,12 @@ def read_history(path: Path) -> History:
                 raise ValueError(f"has a column twice: {shortened(', '.join(terms))}")
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # A history may be empty.
+                # comments=None: "#" in a damaged file is an error, not a comment.
                 values = np.loadtxt(file, delimiter=",", comments=None, ndmin=2)
             if values.size and values.shape[1] != len(first):
                 raise ValueError(f"has rows of {values.shape[1]} numbers; {len(first)} are wanted")
             values = values.reshape(-1, len(first))
+            # PSNR of equal images is infinite.
             is_large = np.abs(values[:, [name != "psnr" for name in first]]) > LARGEST
             if np.isnan(values[:, : len(NAMES)]).any() or is_large.any():
                 raise ValueError("has numbers that are not finite")
@@ -87,13 +89,16 @@ class EventWriter:
             return
         if self._file is None:
             folder = self._run.tensorboard
+            # tensorboardX chooses the name: what is new afterwards is this writer's.
             before = set(folder.glob("events.*"))
             library: Any = importlib.import_module(LIBRARY)
+            # The suffix keeps files of several stages and processes apart.
             self._file = library.SummaryWriter(str(folder), filename_suffix=f".{len(before)}.{self._name}")
             self._run.own_all([f"{folder.name}/{path.name}" for path in sorted(set(folder.glob("events.*")) - before)])
         columns = history.to_dict()
         for row in rows:
             for name in columns.keys() - {"stage", "iteration"}:
+                # A loss term that a stage lacks is NaN.
                 if not np.isnan(columns[name][row]):
                     value, iteration = float(columns[name][row]), int(history.iteration[row])
                     self._file.add_scalar(f"{name}/{self._name}", value, iteration)

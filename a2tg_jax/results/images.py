@@ -46,6 +46,7 @@ def checkered(shape: tuple[int, ...], side: int) -> np.ndarray:
 
 def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the absolute difference, brightened ERROR_GAIN times."""
+    # uint8 differences would wrap.
     difference = np.abs(image.astype(np.int32) - target.astype(np.int32))
     return np.minimum(ERROR_GAIN * difference, 255).astype(np.uint8)
 
@@ -98,8 +99,10 @@ def picture_names(view_names: Iterable[str]) -> dict[str, str]:
         stem = os.path.splitext(view_name)[0].replace("/", "_")
         data = stem.encode(errors="surrogatepass")
         if len(data) > LONGEST_STEM:
+            # ignore drops a character that the cut divided.
             stem = f"{data[:LONGEST_STEM].decode(errors='ignore')}-{hashlib.sha256(data).hexdigest()[:8]}"
         choices = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
+        # casefold: macOS and Windows do not distinguish case.
         chosen = next(choice for choice in choices if choice.casefold() not in taken)
         taken.add(chosen.casefold())
         names[view_name] = f"{chosen}.png"
@@ -120,6 +123,7 @@ def write_png(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -
 def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
     """Return an image as a data: URI, enlarged `zoom` times without smoothing, and reduced if it is very large."""
     picture = Image.fromarray(np.ascontiguousarray(image))
+    # NEAREST: pixels of a crop stay visible.
     picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
     picture.thumbnail((LONGEST_SIDE, LONGEST_SIDE))
     buffer = io.BytesIO()
@@ -138,4 +142,5 @@ def save_animation(
 ) -> None:
     """Write pictures as a looping animated WebP, with one of them in memory at a time."""
     duration = round(1000 / frames_per_second)
+    # Pillow draws the rest from the generator, one at a time.
     next(pictures).save(file, "WEBP", save_all=True, append_images=pictures, duration=duration, loop=0, **options)

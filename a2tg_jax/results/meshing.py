@@ -105,12 +105,14 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
     origin = source.model.origin
     if origin is None or not origin.names:
         raise ValueError(f"{source.title} has no cameras to fuse depths from; give a run folder, or a model of a run")
+    # Photographs are checked here, before minutes of fusion; they are read later.
     pictures = _photographs(source, origin) if options.texture == "photographs" else _renders(source)
     scale, megabytes = origin.transform.scale, megabytes_of(options.max_memory, "max_memory")
     try:
         result = extract_mesh(
             source.model,
             resolution=options.resolution,
+            # Lengths of the original world times scale are lengths of the model's.
             voxel=None if options.voxel is None else options.voxel * scale,
             radius=None if options.radius is None else options.radius * scale,
             unbounded=options.unbounded,
@@ -120,6 +122,7 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
             progress=True,
         )
     except GridFullError as error:
+        # The library's advice names its arguments; the command's options are called otherwise.
         raise ValueError(f"{str(error).partition(': ')[0]}: {GRID_FULL}") from None
     except NoSurfaceError as error:
         raise ValueError(f"{error.reason(scale)}: {SMALL_PARTS if error.num_dropped else NO_SURFACE}") from None
@@ -156,6 +159,7 @@ def _photographs(source: Source, origin: Origin) -> Iterator[Picture]:
             f"the photographs of {source.title} are distorted by their lens (`lens` keep), and a texture needs "
             "pinhole photographs: choose `texture` renders"
         )
+    # The model's cameras, which training may have refined, not the scene's.
     cameras = dict(zip(origin.names, origin.cameras, strict=True))
     views = [view for view in scene.train if view.name in cameras]
     background = source.model.background

@@ -60,6 +60,7 @@ class Source:
         means = np.asarray(self.model.live.gaussians.means, np.float64)
         # The radius that holds three quarters of the Gaussians.
         radius = np.quantile(np.linalg.norm(means - np.median(means, axis=0), axis=1), 0.75)
+        # 2 % of the scene: the default 0.2 is made for worlds with cameras at 1.
         return min(self.settings.near_plane, 0.02 * float(max(radius, 1e-6)))
 
     @functools.cached_property
@@ -98,7 +99,7 @@ def open_source(path: Path, name: str | None = None) -> Source:
         def load_scene() -> Scene | None:
             try:
                 return record.scene.load()
-            except FileNotFoundError:
+            except FileNotFoundError:  # A run is worth showing without its photographs.
                 return None
 
         title, file = f"{record.scene.name} · {planned.name}", run.model(planned.name)
@@ -112,6 +113,7 @@ def open_source(path: Path, name: str | None = None) -> Source:
         raise ValueError(f"{path}: is not a scene to show; give {SHOWN}")
     # Warnings of the reader are shown in the viewer as well.
     with warnings.catch_warnings(record=True) as caught:
+        # A warning that was shown once in this process would not be recorded.
         warnings.simplefilter("always")
         model = load_splats(path)
     notes = [str(warning.message).removeprefix(f"{path}: ") for warning in caught]
@@ -129,6 +131,7 @@ def _run_at(folder: Path) -> RunFolder:
     """Return the run folder, or raise FileNotFoundError with what the folder holds instead."""
     if is_regular(RunFolder(folder).record):
         return open_run(folder)
+    # A scene folder is a likely mistake.
     if is_scene(folder):
         command = ["a2tg", "train", str(folder), "--out", f"runs/{folder.resolve().name}", "--preset", "quick"]
         raise FileNotFoundError(f"{folder} is a scene that must be trained first: {shlex.join(command)}")
@@ -163,7 +166,7 @@ def check_init(file: Path, out: Path, system: System) -> Model:
     shown, lost = splats.appearance, []
     has_shapes = shown.exponents is not None
     if has_shapes and system.stages()[0].appearance.exponents is None:
-        lost.append("the shapes of its kernels (the nearest Gaussians take their place)")
+        lost.append("the shapes of its kernels (the nearest Gaussians replace them)")
     if not shown.is_portable or shown.texture is not None:
         lost.append("what its splats show besides " + ("kernels" if has_shapes else "Gaussians"))
     if splats.sh.shape[1] > NUM_BASES[degree]:
@@ -181,6 +184,7 @@ def write_first_stage(run: RunFolder, record: RunRecord, splats: Model, scene: S
     splats, appearance, system = splats.live, planned.stage.appearance, planned.system
     has_shapes = splats.appearance.exponents is not None and appearance.exponents is not None
     shapes = splats.appearance.shapes if has_shapes else None
+    # File → original world → the scene's normalised one.
     to_scene = scene.transform if splats.origin is None else splats.origin.transform.inverse().then(scene.transform)
     gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=shapes is not None), to_scene)
     # Spherical harmonics are cut off, or filled with zeros, to the degree that training begins with.
@@ -192,5 +196,6 @@ def write_first_stage(run: RunFolder, record: RunRecord, splats: Model, scene: S
     if shapes is not None:
         shown = shown.with_shapes(shapes)
     model = Model(gaussians, shown, background=BACKGROUNDS[system.background], origin=origin_of_scene(scene))
+    # No system in the header: none has trained it, so that resuming compares no options.
     save_model(run.own(run.model(planned.name)), model, {"init": record.init})
     write_history(run.own(run.history(planned.name)), History.empty())

@@ -96,6 +96,7 @@ class RunRecord:
 
     def check(self) -> None:
         """Raise ValueError if the run cannot be trained, naming the option."""
+        # The table of a system that is not compared would have no effect.
         for name in self.compare_options:
             if name not in self.compare:
                 reason = f"compare_options.{shortened(name)}: the run does not compare this system"
@@ -313,6 +314,7 @@ class PlannedStage:
     @property
     def checkpoint_every(self) -> int:
         """Number of iterations between its checkpoints."""
+        # At least ten in a stage, so that a killed short one loses a tenth at most.
         return max(1, min(LONGEST_WITHOUT_CHECKPOINT, self.stage.iterations // 10))
 
 
@@ -383,6 +385,7 @@ def common_options(system: System) -> list[Any]:
 def is_equal(a: Stage, b: Stage) -> bool:
     """Return whether two stages are equal in everything, arrays and classes included."""
     (leaves, structure), (others, other) = jax.tree.flatten(a), jax.tree.flatten(b)
+    # jax.tree compares classes and static fields; arrays are leaves, which == does not reduce to one bool.
     if structure != other:  # type: ignore[operator]
         return False
     return all(np.array_equal(np.asarray(x), np.asarray(y)) for x, y in zip(leaves, others, strict=True))

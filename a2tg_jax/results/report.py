@@ -303,9 +303,11 @@ def write_report(
     loader = PackageLoader("a2tg_jax.results")
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     # The browser accepts only this style and script, by their hashes, so no text from a scene can act as one.
+    # Pictures are data: URIs, so that the page is one file.
     policy, inlined = "default-src 'none'; img-src data:", {}
     for name, suffix in (("style", "css"), ("script", "js")):
         text = loader.get_source(pages, f"report.{suffix}")[0]
+        # A CSP hash covers the exact text between the tags.
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         policy, inlined[name] = f"{policy}; {name}-src 'sha256-{digest}'", Markup(text)
     main, held_out = result.models[result.main], result.record.scene.held_out
@@ -363,6 +365,7 @@ def _best(row: Sequence[str]) -> list[int]:
 def _views(result: RunResult, names: Sequence[str], split: str) -> Table:
     """Return PSNR and SSIM of each view and model, with the model's size next to its name."""
     sizes = [f"{name} ({megabytes(result.models[name].num_bytes)} MB)" for name in names]
+    # Views come in one order for all models.
     found = zip(*(result.models[name].splits[split].per_view for name in names), strict=True)
     rows, best = [], set()
     for at, views in enumerate(found):

@@ -60,6 +60,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     plan = record.plan
     models = {name: load_model(run.model(name)) for name in finished_stages(run, plan)}
     scene = scene or record.scene.load()
+    # Before minutes of measuring.
     for name, model in models.items():
         check_held_out(model, scene, run.model(name))
     histories = {name: read_history(run.history(name)) for name in models}
@@ -86,6 +87,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
             write_json(run.own(run.corrections(name)), learned(model.origin))
     main, settings = models[result.main], settings_of(plan[result.main].system)
     save_ply(run.own(run.point_cloud), main)
+    # Browsers cannot show subclasses of Appearance.
     if main.appearance.is_portable:
         data = encode_web_scene(main, title=f"{scene.name} · {result.main}")
         with replacing(run.own(run.viewer)) as temporary:
@@ -93,6 +95,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     starts = {name: plan.first_iteration(name) for name in models}
     figures = write_figures(run, main, (*scene.test, *scene.train)[0].camera, settings, histories, starts)
     write_report(run, result, _write_sheets(run, result, models, scene), figures)
+    # Until then, the replaced run is the only one with all its models.
     if len(models) == len(plan.names):
         drop_old(run)
     return result
@@ -183,6 +186,7 @@ def _with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dic
         metrics, per_view = read_json(run.metrics), read_json(run.per_view)
         network, changed = metrics["lpips_network"], dict(measured)
         for name, found in measured.items():
+            # LPIPS belongs to the bytes of a model, not to its name.
             if network and metrics["models"].get(name, {}).get("sha256") == found.sha256:
                 splits = {split: merged(own, per_view[name][split]) for split, own in found.splits.items()}
                 changed[name] = dataclasses.replace(found, splits=splits)
@@ -210,6 +214,7 @@ def _write_sheets(run: RunFolder, result: RunResult, models: Mapping[str, Model]
         sheet = side_by_side([*images, error], [*captions, f"error, {ERROR_GAIN} times"])
         save_picture(run.own(run.test / files[view.name]), sheet)
         if index % -(-len(views) // REPORTED_VIEWS) == 0:
+            # Where the main model gains most over the first of the others.
             crop = largest_gain(truth, renders[0], renders[-1]) if len(renders) > 1 else None
             reported.append(Comparison.of(view.name, images, captions, crop))
     return reported

@@ -108,8 +108,10 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     """
     record.check()
     check_weights(options.lpips_weights)
+    # Neither is a folder here.
     if record.scene.path != SYNTHETIC and not is_url(record.scene.path):
         check_apart(out, Path(record.scene.path))
+    # Cheap checks come before the scene is loaded.
     check_free(out, overwrite=options.overwrite)
     given = None if record.init is None else check_init(Path(record.init), out, record.options)
     check_output(out)
@@ -126,6 +128,7 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
         check_free(out, overwrite=options.overwrite)  # Another process may have been here meanwhile.
         if run.is_begun:
             set_aside(run)
+        # Before any checkpoint, so that a killed run can be resumed.
         write_record(run, record)
         if given is not None:
             write_first_stage(run, record, given, scene)
@@ -216,8 +219,11 @@ def train_run(
                 events.add(result.history)
                 events.close()
             write_history(run.own(run.history(planned.name)), result.history)
+            # After the history: a model says that its stage is finished.
             save_model(run.own(path), result.model, {"system": system_to_dict(planned.system)})
+        # Also if the model was there: a process may have been killed between the two.
         run.drop_old_checkpoints(planned.name, keep=0)
+    # Ends `follow_first_process`.
     _send_stage(None)
 
 
@@ -282,6 +288,7 @@ def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | No
     """Return the newest readable checkpoint of a stage, made with the same options; None without one. Raises ValueError
     if there are some, and none can be read."""
     damaged: list[tuple[Path, ValueError]] = []
+    # Newest first; a damaged one gives way to the one before.
     for path in reversed(run.checkpoints(planned.name)):
         try:
             checkpoint = load_checkpoint(path, system=type(planned.system))
@@ -342,6 +349,7 @@ def digests_of(record: RunRecord, scene: Scene, session: Session) -> list[bytes]
     def checksum(x: Any) -> tuple[tuple[int, ...], int]:
         return np.shape(x), zlib.crc32(np.ascontiguousarray(x).tobytes())
 
+    # A dataclass's repr has every option.
     systems = [(label, repr(system)) for label, system in record.systems.items()]
     devices = [] if session.mesh is None else [(one.process_index, one.id) for one in session.mesh.devices.flat]
     views = []

@@ -112,10 +112,12 @@ class LiveView:
         """Record metrics, take a snapshot when one is due, and wait while the training is paused."""
         if self._now() >= self._noted + NOTED_SECONDS:
             self._note(run)
+        # One snapshot at a time; a paused training is shown as it is now.
         is_free = self._encoder is None or not self._encoder.is_alive()
         if is_free and (self._now() >= self._due or self._paused.is_set()):
             began = self._now()
             background, origin = BACKGROUNDS[run.system.background], origin_of_scene(self._scene)
+            # Copied now: the next step donates the state's buffers.
             model = dataclasses.replace(jax.device_get(run.state.model), background=background, origin=origin)
             self._due = np.inf  # The thread sets it when it is done.
             self._encoder = threading.Thread(target=self._encode, args=(model, began), daemon=True)
@@ -164,6 +166,7 @@ class LiveView:
         except ValueError as error:
             with self._lock:
                 self._status |= {"message": str(error)}
+        # Waiting 1 / SHARE times as long as a snapshot took bounds its share of the time.
         self._due = self._now() + max(SECONDS, (self._now() - began) / SHARE)
 
 
@@ -189,6 +192,7 @@ def check_page(out: Path, *, single_file: bool, photographs: bool, overwrite: bo
         raise FileExistsError(f"{out} is a folder; with `single_file`, `web` must be the path of a file")
     if not single_file and out.is_file():
         raise FileExistsError(f"{out} is a file; choose a folder with `web`, or a name that ends in .html for one file")
+    # An index.html without a scene next to it is not this program's.
     if not single_file and (out / "index.html").exists() and not (out / SCENE_NAME).exists():
         raise ValueError(f"{out} holds a page other than the viewer's; choose another folder with `web`")
     files = [out] if single_file else [out / name for name in ("index.html", SCENE_NAME, PHOTOGRAPHS_NAME)]
@@ -248,6 +252,7 @@ def losses_of(source: Source) -> dict[str, float]:
     model = source.model
     if not model.num:
         return {}
+    # The near plane that the page has.
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
     again, scene = decode_model(source.encoded), source.load_scene_or_warn()
     if scene is not None:

@@ -14,6 +14,7 @@ STATUS_NAME = "training.json"
 def viewer_html(*, is_training: bool = False) -> str:
     """Return the viewer's page, which shows the scene next to it, or follows a running training."""
     page = resources.files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
+    # An attribute, not a script: the page's policy allows no other script than its own.
     return page.replace("<html ", '<html data-training="yes" ', 1) if is_training else page
 
 

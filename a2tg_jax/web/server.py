@@ -1,7 +1,7 @@
 """Server of a page and its files from memory; runs on waitress.
 
-It listens on the loopback, or on a network. There it answers only below a random path, the token: whoever has the
-address has access.
+It listens on the loopback, or on a network. There it answers only below a random path, the token: the address grants
+access.
 """
 
 import contextlib
@@ -22,6 +22,7 @@ from a2tg_jax.host import signals
 LOOPBACK, ANY = "127.0.0.1", "0.0.0.0"
 ELSEWHERE = "192.0.2.1"
 """Address that no machine has (RFC 5737)."""
+# Other sites can neither frame the page nor read the scene; browsers keep no copy of a changing one.
 HEADERS = (
     ("Cache-Control", "no-store"),
     ("Content-Security-Policy", "frame-ancestors 'none'"),
@@ -41,7 +42,7 @@ class Route:
     content: bytes | Callable[[], bytes | None]
     """Bytes, or a function that finds them at each request and returns None if there are none."""
     act: Callable[[], None] | None = None
-    """Function called first. Such a path answers POST, from the page itself."""
+    """Function called first. Such a path answers only POST requests from the page itself."""
 
     def read(self) -> bytes | None:
         return self.content() if callable(self.content) else self.content
@@ -66,9 +67,11 @@ class Door:
         return f"http://{host}:{self.port}/{self.token}/" if self.token else f"http://{host}:{self.port}/"
 
     def admits(self, host: str) -> bool:
-        """Return whether `host`, such as 127.0.0.1:8000, names this server, and not by a name that others chose."""
+        """Return whether `host`, such as 127.0.0.1:8000, names this server by a name that others cannot choose."""
+        # DNS rebinding: a page elsewhere can let its own name lead to this address.
         name, _, port = host.rpartition(":")
         is_own = name in (self.name, self.address, LOOPBACK, "localhost")
+        # An IPv4 address cannot be rebound; any of this machine's may be used.
         if self.address == ANY and not is_own:
             with contextlib.suppress(ValueError):
                 ipaddress.IPv4Address(name)
@@ -79,6 +82,7 @@ class Door:
         """Return the path behind the token; None if the path has another token or none."""
         if not self.token:
             return path
+        # Compared in constant time: the time of an answer must not reveal the token.
         token, slash, rest = path.removeprefix("/").partition("/")
         return f"/{rest}" if slash and secrets.compare_digest(token.encode(), self.token.encode()) else None
 
@@ -115,6 +119,7 @@ def application(routes: Mapping[str, Route], door: Door) -> Application:
         if method not in (("GET", "HEAD") if act is None else ("POST",)):
             return refuse("405 Method Not Allowed")
         if act is not None:
+            # Forms of other sites can POST here; only the page itself has this origin.
             if environ.get("HTTP_ORIGIN") != f"http://{environ['HTTP_HOST']}":
                 return refuse("403 Forbidden")
             act()
@@ -142,7 +147,7 @@ def serve(
       ValueError: if waitress is not installed, the port is taken, or this machine has no such address.
       Stopped: if the process is to end otherwise (`signals.raised`).
     """
-    with _running(routes, host, port) as (url, ended):  # In a thread, for waitress hides how its loop was ended.
+    with _running(routes, host, port) as (url, ended):  # In a thread: waitress hides how its loop ended.
         try:
             on_start(url)
             while not ended.done():
@@ -186,6 +191,7 @@ def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tupl
     is_private = ipaddress.IPv4Address(address).is_loopback
     door = Door(host.lower(), address, port, "" if is_private else secrets.token_urlsafe(16))
     connections: dict[int, Any] = {}
+    # An own socket map: waitress's default is global, and would mix servers of one process.
     server = waitress.create_server(
         application(routes, door), map=connections, sockets=[listening], threads=4, ident=None
     )
@@ -195,6 +201,7 @@ def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tupl
         try:
             server.run()
             ended.set_result(None)
+        # SystemExit included: the future must end however the thread does.
         except BaseException as error:
             ended.set_exception(error)
 
