@@ -1,7 +1,7 @@
 """Adaptive textures: the anisotropic rule, the selection, and the rebuild of the buckets (A²TG).
 
 The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select` choose who gets them, and calls
-`reallocate`. All but the statistic runs on the host, on one array at a time.
+`reallocate`. Except for the statistic, all of it runs on the host, one array at a time.
 """
 
 import math
@@ -196,7 +196,7 @@ class Upscale(HostEvent):
         round_ = next_sizes(sizes, scales, k_a=self.k_a, k_s=self.k_s, cap=MAX_SIDE, anisotropic=False)
         if (thin != round_).any():
             return None
-        return f"{' and '.join(names)} made no difference, for no Gaussian whose texture grew was elongated and thin"
+        return f"{' and '.join(names)} made no difference: no Gaussian whose texture grew was elongated and thin"
 
 
 def next_sizes(
@@ -224,7 +224,7 @@ def next_sizes(
       axes: "paper", or "authors": their program doubles the short axis of a thin Gaussian, Tv where s_x is the longer.
 
     Returns:
-      [N, 2] int64 (Tv, Tu), nowhere below `sizes`.
+      [N, 2] int64 (Tv, Tu), never below `sizes`.
 
     Raises:
       ValueError: if the shapes differ, or a number is out of range.

@@ -137,7 +137,7 @@ class Change(NamedTuple):
 class Event:
     """Base class of both kinds of event.
 
-    Where several devices train together, the rows of arrays are spread over the devices; whatever `init`, `gather` and
+    Where several devices train together, the rows of arrays are spread over the devices; what `init`, `gather` and
     an event on the host return is spread again. On the host, read arrays by `on_host`, and place new ones by
     `placed_like`, which never puts all rows on one device (`parallel.sharded_rows`).
     """

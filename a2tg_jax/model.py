@@ -52,7 +52,7 @@ class Model:
     and models that differ only in it share compiled programs."""
 
     def __post_init__(self) -> None:
-        """Refuse this library's other values instead of Gaussians and appearance; rates and the like pass."""
+        """Check the types of values of this library; others pass, such as rates instead of arrays."""
         is_ours = type(self.gaussians).__module__.startswith("a2tg_jax.")
         if is_ours or isinstance(self.gaussians, str):
             check_kind("gaussians", self.gaussians, Gaussians)

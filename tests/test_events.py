@@ -164,8 +164,8 @@ def test_events_without_effect_are_warned_of(scene):
         warnings.simplefilter("always")
         fitted(scene, PruneFaint("all"), Late(), Early())
     assert [str(one.message) for one in caught] == [
-        "stage 'own': Late never happens, for it is first due at iteration 50 of 20",
-        "stage 'own': Early never happens, for it is first due at iteration 0 of 20",
+        "stage 'own': Late never happens: it is first due at iteration 50 of 20",
+        "stage 'own': Early never happens: it is first due at iteration 0 of 20",
         "stage 'own': PruneFaint changed nothing, though it happened 5 times",
     ]
 
@@ -179,7 +179,7 @@ def test_choices_about_anisotropy_that_make_no_difference_are_warned_of(scene, g
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         a2tg.training.fit_stage(scene, system, 1, start, progress=False)
-    wanted = [f"stage 'textures': texture.{name} made no difference, for no Gaussian whose" for name in given]
+    wanted = [f"stage 'textures': texture.{name} made no difference: no Gaussian whose" for name in given]
     assert [str(one.message)[: len(wanted[0])] for one in caught] == wanted
 
 

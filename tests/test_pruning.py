@@ -134,7 +134,7 @@ def test_impossible_numbers_are_refused_before_training():
 def test_two_gaussians_are_left_at_least():
     """Pruning 0.993 of 300 Gaussians leaves 2. Pruning 0.997 would leave 1, so none is pruned."""
     assert pruned(Prune(share=0.993))[-1].model.num == 2
-    with pytest.warns(UserWarning, match=r"^nothing is pruned, for 1 of 300 Gaussians .* needs 2: lower the share$"):
+    with pytest.warns(UserWarning, match=r"^nothing is pruned, because 1 of 300 .* needs 2: lower the share$"):
         assert pruned(Prune(share=0.997))[-1].model.num == 300
 
 

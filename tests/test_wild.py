@@ -300,7 +300,7 @@ class TestFloaters:
         system = small()
         model = initial_model(scene, system)
         moments = adam_init(a2tg.partition(model)[0])
-        with pytest.warns(UserWarning, match=r"no floaters are pruned, for 0 of 150 .* min_views"):
+        with pytest.warns(UserWarning, match=r"no floaters are pruned, because 0 of 150 .* min_views"):
             change = a2tg.PruneFloaters(min_views=2, least=1e9).apply(Due(views=scene.train), model, moments, ())
         assert change.model.num == model.num
 

@@ -82,7 +82,7 @@ class Appearance:
     """Number of floats of a Gaussian that are not trained, such as an opacity that the appearance does not use."""
 
     def __post_init__(self) -> None:
-        """Refuse exponents where the kernel is not a Gaussian; take the default limit of alpha for None."""
+        """Check that only Gaussian kernels have exponents; normalise the default limit of alpha to None."""
         if self.exponents is not None and type(self).falloff is not Appearance.falloff:
             raise ValueError(f"exponents replace a Gaussian falloff, and {type(self).__name__} has another one")
         # Equal appearances have one form, so that systems share stages, and models compiled programs.
@@ -442,7 +442,7 @@ def take_rows(tree: T, rows: np.ndarray) -> T:
 
 
 def join_rows(trees: Sequence[T]) -> T:
-    """Return the rows of several trees of one structure but for their tables, one after the other (host)."""
+    """Concatenate the rows of several trees, which have the same structure except for their tables (host)."""
 
     def joined(*leaves: Any) -> Any:
         return type(leaves[0]).joined(leaves) if is_table(leaves[0]) else jnp.concatenate(leaves)

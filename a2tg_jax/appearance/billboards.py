@@ -47,7 +47,7 @@ class Billboards(Appearance):
     replaced_floats = 1
 
     def __post_init__(self) -> None:
-        """Refuse sides and colours out of range."""
+        """Check the ranges of the side and the colour."""
         super().__post_init__()
         if not 2 <= self.side <= MAX_SIDE:
             raise ValueError(f"side must be in 2..{MAX_SIDE}; got {self.side}")

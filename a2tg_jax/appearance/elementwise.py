@@ -42,7 +42,7 @@ def check_is_appearance(appearance: Any, gaussians: Gaussians | None = None) -> 
 
 
 class Elementwise(NamedTuple):
-    """What pixels read of an appearance: its methods, composed with its parts."""
+    """Per-pixel methods of an appearance, composed with its parts."""
 
     texel_position: Callable[[TextureRegion, Array, Array], tuple[Array, Array]]
     shade: Callable[[tuple[Array, ...], tuple[Array, ...], Array, Array], tuple[Residual, Factor]]

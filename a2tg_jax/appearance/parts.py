@@ -46,9 +46,9 @@ class Part:
 
 
 Residual = tuple[Array, ...] | None
-"""Added to the D colours; None stands for 0."""
+"""Added to the D colours; None: 0."""
 Factor = Array | None
-"""Multiplies alpha; None stands for 1."""
+"""Multiplies alpha; None: 1."""
 
 
 # The texture of A²TG: where (u, v) is in a splat's texture, and how its RGB and alpha change the splat. `texture`

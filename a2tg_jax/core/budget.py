@@ -109,7 +109,7 @@ def event_budget(total_bytes: float, current_bytes: float, event_index: int, num
       ValueError: if the budget is already exceeded or the event does not exist.
     """
     if not 1 <= event_index <= num_events:
-        raise ValueError(f"event_index must lie in 1..{num_events}; got {event_index}")
+        raise ValueError(f"event_index must be in 1..{num_events}; got {event_index}")
     if total_bytes < current_bytes:
         raise ValueError(
             f"the memory budget of {total_bytes / 1e6:.3f} MB is below the {current_bytes / 1e6:.3f} MB the Gaussians "

@@ -109,7 +109,7 @@ def check_camera(camera: Camera, name: str = "camera") -> None:
 
 
 def check_is_camera(camera: Camera, name: str = "camera") -> None:
-    """Raise ValueError unless a value is a camera, whatever is in it."""
+    """Raise ValueError unless a value is a camera; its fields are not checked."""
     check_kind(name, camera, Camera, "use view.camera" if hasattr(camera, "camera") else "")
 
 
@@ -147,7 +147,7 @@ def check_intrinsics(K: np.ndarray, width: int, height: int, what: str) -> None:
     K = np.asarray(K, np.float64)
     focal, offset = K[[0, 1], [0, 1]], K[[0, 1], [2, 2]]
     if not ((focal >= SHORTEST_FOCAL * side) & (focal <= LONGEST_FOCAL * side)).all():  # False for NaN.
-        wanted = f"{SHORTEST_FOCAL * side:g}..{LONGEST_FOCAL * side:g} pixels, for its image is {width}x{height}"
+        wanted = f"{SHORTEST_FOCAL * side:g}..{LONGEST_FOCAL * side:g} pixels, because its image is {width}x{height}"
         raise ValueError(f"{what}: its focal lengths must be in {wanted}; got {_numbers(focal)}")
     if not (np.abs(offset) <= LARGEST_OFFSET * side).all():
         wanted = f"within {LARGEST_OFFSET:g} sides of its image of {width}x{height}"

@@ -154,7 +154,7 @@ def kind_of(value: object) -> str:
 
 
 def check_shape(name: str, x: Any, wanted: Wanted) -> None:
-    """Raise ValueError unless x has the wanted shape; a letter that occurs twice stands for one size.
+    """Raise ValueError unless x has the wanted shape; axes of the same letter have the same size.
 
     x is an array, a tracer, or nested sequences of numbers.
     """

@@ -208,7 +208,7 @@ def init_from_points(
     if hasattr(colors, "dtype") and not np.issubdtype(found.dtype, np.floating):
         raise ValueError(f"colors must be floats in [0, 1]; got {found.dtype}: divide bytes by 255")
     if (outside := found[(found < -COLOR_SLACK) | (found > 1 + COLOR_SLACK)]).size:  # NaN is refused below.
-        raise ValueError(f"colors must lie in [0, 1]; got {outside.flat[0]:g}: divide bytes by 255")
+        raise ValueError(f"colors must be in [0, 1]; got {outside.flat[0]:g}: divide bytes by 255")
     points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
         raise ValueError(f"points and colors must both be [P, 3]; got {points.shape} and {colors.shape}")

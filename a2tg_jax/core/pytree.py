@@ -22,7 +22,7 @@ def static(*, default: object = dataclasses.MISSING) -> Any:
 
 
 def beside(*, default: object) -> Any:
-    """Return a field that is no part of the pytree: whatever a transformation returns has the default instead."""
+    """Return a field outside the pytree: results of transformations have its default instead."""
     return dataclasses.field(default=default, metadata={"beside": True})
 
 

@@ -224,7 +224,7 @@ class OpacityReset(StepEvent):
         limited = dataclasses.replace(model, gaussians=gaussians, appearance=appearance)
         (before, _), (after, _) = partition(model), partition(limited)
 
-        # Adam forgets whatever was changed.
+        # Moments belong to the values before the reset.
         mu, nu = (
             # `is`: `limit_opacities` returns the same array where it changes nothing.
             jax.tree.map(lambda x, old, new: x if new is old else jnp.zeros_like(x), moment, before, after)

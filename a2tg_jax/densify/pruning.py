@@ -68,7 +68,7 @@ class Prune(HostEvent):
         left = num - round(num * float(self.share)) if self.keep is None else min(num, self.keep)
         if left < LEAST_LEFT:
             warnings.warn(
-                f"nothing is pruned, for {left} of {counted(num, 'Gaussian')} would be left, and training needs "
+                f"nothing is pruned, because {left} of {counted(num, 'Gaussian')} would be left, and training needs "
                 f"{LEAST_LEFT}: lower the share",
                 stacklevel=2,
             )
@@ -217,8 +217,8 @@ class PruneFloaters(HostEvent):
             is_kept &= ~are_near(means, due.views, self.near)
         if is_kept.sum() < LEAST_LEFT:
             warnings.warn(
-                f"no floaters are pruned, for {is_kept.sum()} of {num:,} Gaussians would be left, and training needs "
-                f"{LEAST_LEFT}: lower near or min_views",
+                f"no floaters are pruned, because {is_kept.sum()} of {num:,} Gaussians would be left, and training "
+                f"needs {LEAST_LEFT}: lower near or min_views",
                 stacklevel=2,
             )
             is_kept[:] = True

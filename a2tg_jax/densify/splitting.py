@@ -9,7 +9,7 @@ opacity would be twice as opaque together, where two halves of a large splat cov
 share opacity in proportion to what the filter adds to their area (`logits_of_halves`).
 
 Hosts are drawn without replacement. A splat at an outlying point covers whole views, so its weight is thousands of
-times that of others: with replacement it would be the host of nearly all new Gaussians.
+times larger than others: with replacement it would be the host of nearly all new Gaussians.
 """
 
 import dataclasses

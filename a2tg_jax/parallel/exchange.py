@@ -359,7 +359,7 @@ def value_and_grad_of_views(
     """
 
     def of_views(gaussians: Any, appearance: object, rows: object, probe: object, views: object) -> tuple[Array, Any]:
-        # Each view has its own inputs but for the appearance, so the gradient of the sum keeps views apart.
+        # Views share only the appearance, so the gradient of the sum keeps all others apart.
         of_each = jax.vmap(loss, in_axes=(0, None, 0, 0, axes), axis_name=VIEWS_AXIS)
         values, aux = of_each(gaussians, appearance, rows, probe, views)
         return jnp.sum(values), (values, aux)

@@ -105,8 +105,8 @@ class Liveness:
 
 
 def accept(listener: socket.socket, key: bytes, count: int) -> dict[int, Connection]:
-    """Return the connections of processes 1 to `count` - 1, each of which first sends its number. Strangers, who lack
-    the key or send nothing, are turned away and keep nobody waiting."""
+    """Return the connections of processes 1 to `count` - 1, each of which first sends its number. Connections
+    without the key, or that send nothing, are rejected, and no process waits for them."""
     arrived: queue.SimpleQueue[tuple[int, Connection]] = queue.SimpleQueue()
     found: dict[int, Connection] = {}
 
@@ -140,7 +140,7 @@ def connect(host: str, port: int, key: bytes, number: int) -> dict[int, Connecti
 
 
 def listen() -> tuple[socket.socket, int, bytes]:
-    """Return a listener on a free port, by IPv4 and, if available, IPv6, the port, and a key for who may connect."""
+    """Return a listener on a free port, by IPv4 and, if available, IPv6, the port, and the key that clients need."""
     has_both = socket.has_dualstack_ipv6()
     family = socket.AF_INET6 if has_both else socket.AF_INET
     listener = socket.create_server(("", 0), family=family, backlog=64, dualstack_ipv6=has_both)
@@ -188,7 +188,7 @@ class Team:
         return self.index == 0
 
     def watch(self, coordinator: str) -> None:
-        """Connect the processes, which watch each other from now on."""
+        """Connect the processes and start watching them."""
         own = listen() if self.is_first else None
         host = coordinator.rpartition(":")[0].strip("[]")
         if coordinator == AUTO:

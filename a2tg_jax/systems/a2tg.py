@@ -81,14 +81,14 @@ class A2tg(TwoStages):
             check_number("single_texel_rate", self.single_texel_rate, least=0)
 
     def check_number(self, num: int) -> None:
-        """Refuse a budget of textures that the Gaussians of the first stage already exhaust."""
+        """Check that the texture budget has room for the Gaussians of the first stage."""
         option = "initial_gaussians"
         if self.densify.cap:
             option, num = "densify.cap", self.densify.grown(num, self.stage1_iterations)
         self._check_budget(num, f"raise it, or lower {option}")
 
     def check_given_number(self, num: int) -> None:
-        """Refuse a memory budget, or a budget of textures, that the given Gaussians already exhaust."""
+        """Check that the memory budget and the texture budget have room for the given Gaussians."""
         self.check_given_bytes(num)
         self._check_budget(num, "raise it")
 

@@ -165,7 +165,7 @@ class Bytewise(TwoStages):
         for path, event, name in by_shares:
             if getattr(event, name) != getattr(type(event), name):
                 raise ValueError(
-                    f"{path}.{name} must stay {getattr(type(event), name)!r}, for the shares of the bytes decide; got "
+                    f"{path}.{name} must stay {getattr(type(event), name)!r}, because the shares decide; got "
                     f"{getattr(event, name)!r}"
                 )
         if self.texture_share:
@@ -197,7 +197,7 @@ class Bytewise(TwoStages):
             raise ValueError(f"{self._limit} must leave room for 2 Gaussians with degrees and textures; got {size}")
 
     def check_given_number(self, num: int) -> None:
-        """Refuse more given Gaussians than degrees and textures leave bytes for."""
+        """Check that the given Gaussians leave bytes for degrees and textures."""
         super().check_given_number(num)
         if not self._share:
             return

@@ -67,7 +67,7 @@ class TwoStages(System):
                 if not floaters.at:
                     raise ValueError(
                         "floaters.at must hold a fraction before the last growth, which is at iteration "
-                        f"{last.last_time:,} of {length:,}, for others replace what is pruned; got "
+                        f"{last.last_time:,} of {length:,}, so that others replace what is pruned; got "
                         f"{shortened(self.floaters.at)}"
                     )
             events = (*events, floaters)

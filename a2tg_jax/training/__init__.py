@@ -1,4 +1,4 @@
-"""Training: stages and events, the step, the loop. It knows no system."""
+"""Training: stages and events, the step, the loop. It does not depend on any system."""
 
 from a2tg_jax.training.checkpoint import (
     Checkpoint as Checkpoint,

@@ -83,7 +83,7 @@ class Photographs(NamedTuple):
 
 class BatchOrder:
     """Batches of views of one image size and lens, in shuffled epochs. The order depends on the seed and the iteration
-    alone, so a resumed run sees the same one."""
+    alone, so a resumed run has the same one."""
 
     def __init__(self, views: tuple[View, ...], batch_size: int, seed: int, number: int = 0):
         """`number` selects one of the orders of a seed, from 0."""
@@ -293,7 +293,7 @@ def stack_views(
         whole = np.ones(size, bool)
         of_views = {place: whole if view.mask is None else view.mask.read() for place, view in read.items()}
         masks = stacked(of_views, bool)
-    if extras.points:  # Those of all views, for every device has them.
+    if extras.points:  # Of all views, because every device has them.
         length = max(0 if view.points is None else len(view.points.pixels) for view in alike)
         points = stacked_points([view.points for view in views], size, length)
     if extras.depths:

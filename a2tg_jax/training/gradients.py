@@ -102,7 +102,7 @@ def view_gradients(
 def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callable[..., tuple[Any, Model]]:
     """Return a function of a model that gives a loss and its gradient in all floats of the model.
 
-    `jax.value_and_grad` refuses a model with integers, such as the places of textures. The gradient is a model with
+    `jax.value_and_grad` rejects a model with integers, such as the places of textures. The gradient is a model with
     None for these: the floats of `partition(model)`, which an optimizer updates and `combine` puts back.
 
     Args:
@@ -169,8 +169,8 @@ def differentiate(
     `view_gradients`, which describes the arguments, and of the training step.
 
     The loss is a function of the model, the corrected view and its render, and returns a scalar and any auxiliary
-    value. It is differentiated in all floats of the model and the view's rows. G views have a leading axis, but for the
-    corrections and the camera's rays.
+    value. It is differentiated in all floats of the model and the view's rows. G views have a leading axis, except
+    for the corrections and the camera's rays.
     """
     floats, rest = partition(model.appearance)
 

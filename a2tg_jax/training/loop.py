@@ -149,7 +149,7 @@ class Session:
 
 
 class StageRun:
-    """One stage during training: its state, and what Python keeps besides."""
+    """One stage during training: its state, and the bookkeeping in Python."""
 
     def __init__(
         self,

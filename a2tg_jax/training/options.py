@@ -67,7 +67,7 @@ class LossConfig:
         """Return the loss terms whose weight is not 0.
 
         Args:
-          is_first: whether they are for the first stage, at whose beginning robust_share leaves out nothing.
+          is_first: whether they are for the first stage, in which robust_share acts only after a while.
         """
         first: LossTerm = Photometric(self.ssim_weight) if self.ssim_weight else Term(l1)
         if self.robust_share:
@@ -256,7 +256,7 @@ class System:
         """Check all options before training.
 
         Raises:
-          ValueError: beginning with the path of the option, then what was wanted and what came.
+          ValueError: beginning with the path of the option, then the wanted and the given value.
         """
         self.check_options()
         self._check_stages()
@@ -353,7 +353,7 @@ class System:
         """Check the options for a number of Gaussians at the start.
 
         Raises:
-          ValueError: naming the option, what was wanted and what came.
+          ValueError: naming the option, the wanted and the given value.
         """
 
     def check_given_number(self, num: int) -> None:

@@ -307,7 +307,7 @@ class StageEffects:
                 first = next((time for time in found if time >= 1), found[-1] if found else end)
             if not 1 <= first <= end:
                 warnings.warn(
-                    f"stage {self._stage.name!r}: {self._system.path_of(event)} never happens, for it is first due at "
+                    f"stage {self._stage.name!r}: {self._system.path_of(event)} never happens: it is first due at "
                     f"iteration {first:,} of {end:,}",
                     stacklevel=2,
                 )

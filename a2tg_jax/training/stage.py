@@ -143,15 +143,15 @@ class Stage:
         return not isinstance(event, HostEvent) or bool(event.iterations(self.iterations))
 
     def check(self) -> None:
-        """Refuse an invalid stage.
+        """Check all fields.
 
         Raises:
-          ValueError: naming the option, what was wanted and what came.
+          ValueError: naming the option, the wanted and the given value.
         """
         self._check_kinds()
         if not re.fullmatch(r"[A-Za-z0-9_-]+", self.name):
             raise ValueError(
-                f"a stage's name must be letters, digits, - and _, for files are called so; got {self.name!r}"
+                f"a stage's name must be letters, digits, - and _, because it names files; got {self.name!r}"
             )
         where = f"stage {self.name!r}:"
         if not isinstance(self.iterations, int | np.integer):
@@ -189,7 +189,7 @@ class Stage:
             raise ValueError(f"the corrections of {self.name!r} must have different names; got {', '.join(names)}")
 
     def _check_kinds(self) -> None:
-        """Refuse fields of another kind than they must have."""
+        """Check the types of all fields."""
         check_kind("name of a stage", self.name, str)
         where = f"stage {self.name!r}:"
         check_kind(f"{where} appearance", self.appearance, Appearance)

@@ -171,7 +171,7 @@ def check_views(views: tuple[View, ...]) -> None:
                     f"got {list(image.shape)}"
                 )
         if view.mask is not None and not view.mask.num:
-            raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or mend its mask")
+            raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or fix its mask")
         if view.points is not None:
             check_observed_points(view.points, (height, width), f"points of view {view.name}")
 
@@ -205,7 +205,7 @@ def initial_number(scene: Scene, system: System, first: Stage) -> int:
 def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> Model:
     """Return the model with the appearance of a stage and with spare rows for its events.
 
-    If the model's appearance has the stage's options, its arrays are kept; otherwise new ones are allocated, but for
+    If the model's appearance has the stage's options, its arrays are kept; otherwise new ones are allocated, except
     the shapes of kernels. A stage without shapes takes the nearest Gaussians, with a warning. The number of devices
     divides the number of rows. ValueError: if Gaussians would be added to a model whose textures have grown.
     """

@@ -267,7 +267,7 @@ def batch_gradients(
             weight = alpha.astype(photograph.dtype)[..., None] / 255
             photograph = weight * photograph + (1 - weight) * seen.background[None, None, :]
         color = corrected_color(seen.corrections, seen.rows, output.color)
-        if mask is not None:  # Excluded pixels of both are black, so that no loss term sees them.
+        if mask is not None:  # Excluded pixels of both are black, so that they add to no loss term.
             photograph, color = (jnp.where(mask[..., None], x, jnp.zeros_like(x)) for x in (photograph, color))
         target = Target(seen.camera, photograph, seen.background, mask, clock.progress(iteration - 1), depth, points)
         output = dataclasses.replace(output, color=color)
