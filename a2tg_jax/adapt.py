@@ -106,7 +106,7 @@ class Upscale(HostEvent):
                 raise ValueError(
                     f"{name} is {number}, but select is {self.select!r}: set select to {rule!r}, or leave {name} out"
                 )
-        self.iterations(PAPER_ITERATIONS)
+        self.iterations(PAPER_ITERATIONS)  # checks `at`
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         fractions = self.at

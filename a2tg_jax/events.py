@@ -42,6 +42,7 @@ class Times(NamedTuple):
 
     def is_due(self, iteration: object) -> Array:
         """Return whether the event follows this iteration."""
+        # `&`, not `and`: the numbers may be traced.
         return (iteration >= self.first) & (iteration <= self.last) & (iteration % self.every == 0)
 
     def num_left(self, iteration: Any) -> Any:

@@ -128,6 +128,7 @@ def plan_relocation(key: Array, opacities: Array, num_live: Array, draw: DrawHos
     hosts = draw_hosts(key, opacities, is_host) if draw is None else draw(key, is_host, is_moved)
     rows, num_draws = _copied_rows(hosts, is_moved)
     info = MoveInfo(jnp.sum(is_dead, dtype=jnp.int32), jnp.zeros((), jnp.int32), has_hosts)
+    # The host itself keeps one of the shares.
     return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), num_draws > 0, info)
 
 
@@ -310,6 +311,7 @@ class Mcmc(StepEvent):
     def _move(model: Model, moments: AdamState, plan: Callable[..., Moves]) -> tuple[Model, AdamState, MoveInfo]:
         num_live = model.live_count
         moves = plan(model.appearance.opacities(model.gaussians), num_live)
+        # Shared before they are copied, so that copies have their share too.
         gaussians, appearance = model.appearance.share(model.gaussians, moves.num_shares)
         num_live = num_live + moves.info.num_added
         shared = dataclasses.replace(model, gaussians=gaussians, appearance=appearance, num_live=num_live)

@@ -274,6 +274,7 @@ def concatenate(models: Sequence[Model]) -> Model:
             raise ValueError(f"models must have one dtype; got {dtypes}")
     for index, model in enumerate(models[1:], 1):
         if first.origin is not None and model.origin is not None and not model.origin.names:
+            # The other model's zero in the world of the first.
             apart = model.origin.transform.inverse().then(first.origin.transform).apply(np.zeros(3))
             if np.abs(apart).max() > SAME_PLACE:
                 move = f"models[{index}].origin.transform.inverse().then(models[0].origin.transform)"

@@ -398,6 +398,7 @@ def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
         part.check(gaussians)
     for field in array_fields(appearance):
         name = f"{kind}.{field}"
+        # Parts were checked above.
         for leaf in () if field in PARTS else jax.tree.leaves(getattr(appearance, field), is_leaf=is_table):
             if isinstance(leaf, Table):
                 check_table(leaf, gaussians.num, name)

@@ -93,6 +93,7 @@ def interpolate(corners: tuple[Corner, ...], texels: tuple[tuple[Array, ...], ..
 
 def or_empty(sample: Sample, region: TextureRegion, empty: tuple[float, ...]) -> Sample:
     """Return the sample, or the values `empty` if the region has no texels."""
+    # Every splat has a texture then: kernels need no test.
     if not empty:
         return sample
     values = zip(empty, sample.values, strict=True)

@@ -14,6 +14,7 @@ from a2tg_jax.host.text import shortened
 
 BYTES_PER_FLOAT = 4
 MEGABYTE = 10**6
+# As text, for Decimal.
 MEGABYTES = {
     "": "1", "kb": "1e-3", "mb": "1", "gb": "1e3", "kib": "0.001024", "mib": "1.048576", "gib": "1073.741824",
 }  # fmt: skip

@@ -191,6 +191,7 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     along = _lengths(knots, 1e-9)
     num_fine = max(20 * num_frames, 1000)
     dense = _interpolated(np.linspace(0.0, along[-1], num_fine), along, knots)
+    # "nearest" repeats the end points, so that the path never leads beyond the cameras.
     dense = gaussian_filter1d(dense, SMOOTHING * num_fine, axis=0, mode="nearest")
     travelled = _lengths(dense, 1e-12)
     curve = _interpolated(np.linspace(0.0, travelled[-1], num_frames), travelled, dense)

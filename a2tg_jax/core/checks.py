@@ -97,7 +97,7 @@ def _is_numeric(value: object) -> bool:
     """Return whether a value is a real number, or an array or a tracer of numbers."""
     if hasattr(value, "dtype"):
         return bool(jnp.issubdtype(value.dtype, jnp.number))
-    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)  # bool is a Real
 
 
 def check_array(name: str, x: object, hint: str = "") -> None:

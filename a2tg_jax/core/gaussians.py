@@ -40,12 +40,13 @@ def _note_devices() -> None:
         _forked_from.add(os.getpid())
 
 
-if hasattr(os, "register_at_fork"):
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
     os.register_at_fork(before=_note_devices)
 
 
 def check_process() -> None:
     """Raise RuntimeError, rather than hang, if this process was forked after JAX had started its devices."""
+    # Only children, which inherit the set, lack JAX's threads.
     if _forked_from - {os.getpid()}:
         raise RuntimeError(
             "this process was forked from one in which JAX had started, and waits for its threads forever: start "

@@ -30,6 +30,7 @@ Floats = Array | np.ndarray
 def pixel_sizes(means: Floats, scales: Floats, viewmat: Floats, K: Floats) -> Floats:
     """Return the smaller standard deviation of Gaussians in pixels [N], of NumPy or JAX; 0 before the near plane."""
     depths = means @ viewmat[2, :3] + viewmat[2, 3]
+    # The geometric mean, for pixels that are not square.
     focal = (K[0, 0] * K[1, 1]) ** 0.5
     return (depths > NEAR_PLANE).astype(depths.dtype) * scales.min(axis=1) * focal / depths.clip(NEAR_PLANE)
 
@@ -42,6 +43,7 @@ def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
     scale_x, scale_y = gaussians.scales[:, 0], gaussians.scales[:, 1]
     to_pixels = camera.K @ camera.viewmat[:3]
 
+    # Row i of equation (1): the axes are directions, only the mean is translated.
     def row(i: int) -> list[Array]:
         u, v, w = (sum(to_pixels[i, k] * axis[k] for k in range(3)) for axis in (x_axis, y_axis, mean))
         return [scale_x * u, scale_y * v, w + to_pixels[i, 3]]
@@ -145,6 +147,7 @@ def clipped_box(M: Sequence[Sequence[Array]], outline: Outline, cutoff: Array, n
 
     def joined(box: Box, is_valid: Array, point: Sequence[Array]) -> Box:
         x, y, depth = point
+        # A point that is not valid adds the mean, where the box begins.
         depth = jnp.where(is_valid, jnp.maximum(depth, near_plane), 1.0)
         x, y = jnp.where(is_valid, x / depth, mean_x), jnp.where(is_valid, y / depth, mean_y)
         return jnp.minimum(box[0], x), jnp.minimum(box[1], y), jnp.maximum(box[2], x), jnp.maximum(box[3], y)

@@ -50,6 +50,7 @@ class Origin:
         """Make an origin of cameras; by default named by number, none held out, in their original world."""
         num = len(cameras)
         return Origin(
+            # Reshaped, because without cameras the array has one axis.
             viewmats=np.array([camera.viewmat for camera in cameras], np.float64).reshape(num, 4, 4),
             Ks=np.array([camera.K for camera in cameras], np.float64).reshape(num, 3, 3),
             sizes=np.array([(camera.width, camera.height) for camera in cameras], np.int64).reshape(num, 2),

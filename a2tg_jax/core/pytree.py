@@ -48,6 +48,7 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
         kind = next((kind for kind in ("static", "beside") if field.metadata.get(kind)), "dynamic")
         kinds[kind].append(field.name)
     dynamic, fixed = tuple(kinds["dynamic"]), tuple(kinds["static"])
+    # For errors, which name a leaf by its path, such as params.gaussians.means.
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in dynamic)
     left_out = {field.name: field.default for field in dataclasses.fields(made) if field.name in kinds["beside"]}
 

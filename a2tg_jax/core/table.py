@@ -151,7 +151,7 @@ class Table:
     def joined(cls, tables: Sequence[Self]) -> Self:
         """Return the blocks of several tables, one after the other (host)."""
         starts = itertools.accumulate((table.num for table in tables), initial=0)
-        own = zip(tables, starts, strict=False)
+        own = zip(tables, starts, strict=False)  # the last start is the total
         return cls.of_groups((ids + start, blocks) for table, start in own for ids, blocks in table.groups())
 
     @property
@@ -359,6 +359,7 @@ def _moved(
     (old_bucket, old_row), (new_bucket, new_row) = ends
     for index, bucket in enumerate(buckets):
         from_here = np.flatnonzero(old_bucket == index)
+        # Blocks with a side of 0 have nothing to move.
         if not bucket.size or not len(from_here):
             continue
         source = on_host(bucket)  # Each old bucket is read once, one after the other.

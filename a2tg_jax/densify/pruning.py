@@ -52,7 +52,7 @@ class Prune(HostEvent):
         check_number("share", self.share, least=0, below=1)
         if self.keep is not None:
             check_number("keep", self.keep, least=LEAST_LEFT)
-        self.iterations(1)
+        self.iterations(1)  # checks `at`
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return iterations_at(self.at, num_iterations, with_end=True)
@@ -198,7 +198,7 @@ class PruneFloaters(HostEvent):
         check_number("least", self.least, least=0)
         if not self.at:
             raise ValueError("at must hold at least one fraction of the stage; got none")
-        self.iterations(1)
+        self.iterations(1)  # checks `at`
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return iterations_at(self.at, num_iterations, with_end=True)
@@ -240,6 +240,7 @@ def are_near(means: np.ndarray, views: Sequence[View], near: float) -> np.ndarra
         (left, top), (right, bottom) = np.zeros(2), np.asarray([camera.width, camera.height])
         if camera.rays is not None:
             rays = np.asarray(camera.rays, np.float64).reshape(-1, 2)
+            # Without any ray left, the rectangle is inverted and contains nothing.
             rays = rays[np.isfinite(rays).all(axis=1)]
             (left, top), (right, bottom) = rays.min(axis=0, initial=np.inf), rays.max(axis=0, initial=-np.inf)
         is_inside = (column >= left) & (column <= right) & (row >= top) & (row <= bottom)

@@ -73,13 +73,13 @@ class AdaptDegrees(HostEvent):
     idle: float = 0.0
     """Smallest change of a colour by a band (root mean square over all directions); bands below it are removed."""
 
-    observes = True
+    observes = True  # `Seen.colors`, which needs no statistic
 
     def check_options(self) -> None:
         check_number("budget_mb", self.budget_mb, least=0)
         check_number("highest", self.highest, least=0, most=MAX_DEGREE)
         check_number("idle", self.idle, least=0)
-        self.iterations(1)
+        self.iterations(1)  # checks `at`
 
     def iterations(self, num_iterations: int) -> tuple[int, ...]:
         return iterations_at(self.at, num_iterations)
@@ -156,6 +156,7 @@ def without_idle(table: Coefficients, base_degree: int, idle: float) -> np.ndarr
             rows, values = on_host(owners), on_host(blocks)
             is_used = rows < table.num
             rows, values = rows[is_used], values[is_used]
+            # All blocks of a bucket are of one degree.
             last = floats_of_band(int(degrees[rows[0]])) // 3 if len(rows) else 0
             energy = np.square(values[:, values.shape[1] - last :]).sum(axis=(1, 2)) / (12 * np.pi)
             degrees[rows[energy < idle**2]] -= 1

@@ -95,6 +95,7 @@ class Liveness:
         self._end(f"process {number} of {self._count} {reason}")
 
     def _end(self, reason: str) -> None:
+        # Several may be lost at once, each with a thread here: the first reason counts.
         with self._ending:
             if self._is_left.is_set():
                 return

@@ -78,6 +78,7 @@ def placed(x: ArrayLike, sharding: NamedSharding) -> Array:
         return x
     if sharding.is_fully_addressable:
         return jax.device_put(x, sharding)
+    # `device_put` cannot reach the devices of other processes; each fills its own parts.
     return jax.make_array_from_callback(jnp.shape(x), sharding, on_host(x).__getitem__)
 
 
@@ -199,6 +200,7 @@ def cotangent_of(primal: object, cotangent: T) -> T:
     """Sum a cotangent over the devices that share its primal value, leaf by leaf."""
 
     def total(value: object, cotangent: object) -> Any:
+        # A value that devices share was broadcast to them; the transpose of that is a sum.
         shared = tuple(sorted(_axes(cotangent) - _axes(value)))
         return lax.psum(cotangent, shared) if shared else cotangent
 

@@ -277,6 +277,7 @@ def check_state(state: TrainState, wanted: TrainState, stage: Stage) -> None:
     check_count("state.moments.count", state.moments.count, np.iinfo(np.int32).max)
     check_finite("state.moments.mu", state.moments.mu)
     check_finite("state.moments.nu", state.moments.nu, is_signed=False)
+    # Only the number of names matters for shapes.
     names, dtype = [""] * len(state.corrections[0].rows) if state.corrections else [], state.model.gaussians.means.dtype
     neutral = jax.eval_shape(lambda: initial_corrections(stage.corrections, names, None, dtype))
     check_like("state.corrections", state.corrections, neutral)

@@ -157,6 +157,7 @@ def initial_corrections(
         neutral, known = correction.neutral, {}
         if origin is not None and correction.name in origin.corrections:
             known = dict(zip(origin.names, origin.corrections[correction.name], strict=True))
+        # By name, because the earlier training may have had other views.
         found = [known.get(name, neutral) for name in names]
         for row in found:
             if row.shape != neutral.shape:

@@ -47,6 +47,7 @@ def _spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:
     nothing: Any = None
     views = tried.views._replace(grads=nothing, statistic=nothing)
     rest: Attempt = spread(exchange.mesh, tried._replace(views=views))
+    # [V, N, ...]: rows are the second axis.
     grads, statistic = spread(exchange.mesh, of_views, axis=1)
     return rest._replace(views=rest.views._replace(grads=grads, statistic=statistic))
 

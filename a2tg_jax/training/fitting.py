@@ -124,6 +124,7 @@ def fit(
     results: list[StageResult] = []
     with signals.noted((signals.CTRL_C,)) as is_interrupted:
         for index in range(first, len(stages)):
+            # A checkpoint is of the first stage that is trained here.
             start = results[-1].model if results else None
             run = StageRun(scene, system, index, start, None if results else resume, session=session)
             run.train(

@@ -315,6 +315,7 @@ class StageRun:
         self._rows.append(dict(zip(COLUMNS, values, strict=True)) | terms)
         if on_log is not None:
             on_log(self._rows[-1])
+        # The first logged loss decides which later one is an explosion.
         if len(self._rows) == 1:
             self.clock = self.clock._replace(largest_loss=largest_loss(self.history))
 
@@ -326,6 +327,7 @@ class StageRun:
         while first + len(launched) <= last and not is_stopped():
             launched.append(self._launch(first + len(launched)))
         infos = jax.device_get(launched)  # Only here the loop waits for the device.
+        # After a step that was not taken, all others are idle and have its status.
         taken = [info for info in infos if info.status == FINE]
         self.num_refused += sum(int(info.num_refused) for info in taken)
         if len(taken) < len(infos):

@@ -61,6 +61,7 @@ class LearningRates:
           means: present rate of the means, a scalar.
           sh_degree: degree of spherical harmonics of the Gaussians, 0 to 3.
         """
+        # [1, K, 1] broadcasts against [N, K, 3].
         sh = jnp.full((1, NUM_BASES[sh_degree], 1), self.sh_rest).at[:, 0].set(self.sh_degree0)
         fields: Any = (means, self.quats, self.log_scales, self.logit_opacities, sh)
         return Gaussians(*fields)

@@ -25,7 +25,7 @@ from a2tg_jax.training.options import System
 from a2tg_jax.training.sky import check_sky, sky_of
 from a2tg_jax.training.stage import Stage
 
-KEY_OF_APPEARANCE = 0x7E8E1
+KEY_OF_APPEARANCE = 0x7E8E1  # no stage's number, which is folded into the same key
 LEAST_OPACITY = INITIAL_OPACITY
 """Lower bound of the reduced opacities: the initial opacity of 3DGS."""
 SMALLEST_SIDE = 1e-6
@@ -85,6 +85,7 @@ def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaus
     sizes = _largest_sizes(gaussians, cameras)
     layers = np.maximum(FILTER_VARIANCE / np.maximum(sizes, SMALLEST_SIDE) ** 2, 1.0)
     opacities = np.asarray(gaussians.opacities, np.float64)
+    # An opacity that is below the bound already stays.
     shared = np.maximum(1 - (1 - opacities) ** (1 / layers), np.minimum(opacities, LEAST_OPACITY))
     logits = np.where(shared < opacities, np.log(shared / (1 - shared)), np.asarray(gaussians.logit_opacities))
     return dataclasses.replace(gaussians, logit_opacities=jnp.asarray(logits, gaussians.logit_opacities.dtype))

@@ -192,6 +192,7 @@ def attempt(
     own = tuple(known.rows[rows] for known in state.corrections)
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
     found = batch_gradients(settings.render, stage, clock, model, batch, backgrounds, iteration, own, is_gathering)
+    # Without the gradients of corrections, each of which belongs to one view.
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads[:2])
 
     progress = clock.progress(state.iteration)

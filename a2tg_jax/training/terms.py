@@ -269,9 +269,11 @@ def points_loss(depth: Array, alpha: Array, points: ObservedPoints, mask: Array 
     def at_points(image: Array) -> Array:
         # 0 at pixels beyond the end of the image, which fill up the points of a view with few.
         values = image.reshape(-1).at[points.pixels]
+        # Padding ascends beyond the image (`stacked_points`), so that indices are unique and sorted.
         return values.get(mode="fill", fill_value=0, unique_indices=True, indices_are_sorted=True)
 
     depth, alpha = at_points(depth), at_points(alpha)
+    # The depth of padding is 0.
     counts = (points.depths > 0) & (alpha > LEAST_ALPHA) & (depth > 0)
     if mask is not None:
         counts = counts & at_points(mask)
