@@ -83,6 +83,7 @@ def _fill_help(value: Any) -> None:
     """Make each option's help one paragraph, in a dataclass and those in its fields; tyro would keep the source's line
     breaks."""
     kind = value if isinstance(value, type) else type(value)
+    # Bases first, because texts of subclasses replace theirs; the last one is object.
     params = [param for base in kind.__mro__[-2::-1] for param in parse_from_object(base).params]
     texts = {param.arg_name: " ".join(param.description.split()) for param in params if param.description}
     for field in dataclasses.fields(kind):

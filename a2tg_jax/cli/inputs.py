@@ -87,7 +87,7 @@ class Sfm:
         if len(self.sources) < 2:
             raise ValueError("SCENE is missing: the new scene folder comes last, or after --out")
         *sources, out = self.sources
-        has_model = (out / "sparse").exists()  # Such a folder is refused as one that exists already.
+        has_model = (out / "sparse").exists()  # run_sfm reports such a folder.
         if is_video(out) or (holds_photos(out) and not has_model):
             raise ValueError(f"{out} holds photographs, but the scene folder comes last; name that by --out SCENE")
         return sources, out
@@ -119,7 +119,7 @@ class Download:
                 print(f"{name:<17} {'      ?' if size is None else f'{size / 1e9:4.1f} GB'}  {known.content}")
             print("The server reports sizes with ? before the download.")
             return
-        for name in self.names:
+        for name in self.names:  # All names, before the first download.
             if name not in BENCHMARK_SETS:
                 near = did_you_mean(name, BENCHMARK_SETS)
                 raise ValueError(f"there is no data set {name!r}{near or ';'} they are {', '.join(BENCHMARK_SETS)}")

@@ -15,7 +15,7 @@ from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 
-BROKEN_PIPE = 128 + 13
+BROKEN_PIPE = 128 + 13  # The number of SIGPIPE, which Windows lacks.
 LONGEST_ERROR = 1000
 """Longest error line in characters."""
 OVERVIEW = """usage: a2tg COMMAND [OPTIONS]
@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 here = os.getcwd()
             except FileNotFoundError:
                 raise ValueError("the current folder was deleted: change to one that exists") from None
-            if here not in sys.path:  # Custom systems are modules there.
+            if here not in sys.path:  # Custom systems are modules there. At the end, it hides no other module.
                 sys.path.append(here)
             if name == "train" and {"-h", "--help"} & set(arguments):
                 print(f"usage: a2tg train SCENE --out RUN [OPTIONS]\n\n{inspect.getdoc(command_class(name))}")
@@ -93,6 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             except SystemExit as end:  # tyro has printed help, or an error.
                 return int(end.code or 0)
             command.run()
+            # A closed pipe raises here, not at exit.
             sys.stdout.flush()
     except KeyboardInterrupt as stop:
         stopped = signals.Stopped.of(stop)
@@ -107,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if text is None or os.environ.get("A2TG_DEBUG"):
             raise
         option, space, rest = text.partition(" ")
-        flag = f"--{option.replace('_', '-')}"  # An error begins with the name of an option: print it as it was typed.
+        flag = f"--{option.replace('_', '-')}"  # Errors begin with the name of an option: print it as typed.
         is_typed = any(word.partition("=")[0] == flag for word in arguments)
         return _fail(f"{flag}{space}{rest}" if is_typed else text)
     return 0

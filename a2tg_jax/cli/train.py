@@ -211,6 +211,7 @@ class Train:
     def whole_record(self) -> RunRecord:
         """Record with full paths, and with the baseline."""
         compare = (*self.record.compare, BASELINE) if self.baseline else self.record.compare
+        # A dict keeps the order and drops repetitions, such as of --baseline by --compare.
         return dataclasses.replace(self.record.placed(), compare=tuple(dict.fromkeys(compare)))
 
     def resumed(self, run: RunFolder, *, is_first: bool = True) -> RunRecord:
@@ -262,13 +263,15 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     if found.resume and found.config:
         raise ValueError("--resume takes every option from the run folder: leave out --config")
     if found.out and found.resume and not found.overwrite:
-        # Several processes read the folder at a time; the first one claims it later.
+        # Several processes read the folder at once; the first one locks it later.
         with contextlib.nullcontext(open_run(Path(found.out))) if found.coordinator else opened(Path(found.out)) as run:
             record = read_record(run)
     elif found.config:
         record = read_run_file(Path(found.config))
+    # A resumed run keeps its system and preset; `resumed` reports other ones.
     if not found.resume and (found.preset or found.system not in ("", record.system)):
         record = record.with_system(found.system or record.system, found.preset or None)
+    # MISSING makes SCENE required in tyro.
     scene = record.scene if record.scene.path else dataclasses.replace(record.scene, path=tyro.MISSING)
     return Train(dataclasses.replace(record, scene=scene), tyro.MISSING)
 

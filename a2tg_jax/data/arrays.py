@@ -1,4 +1,4 @@
-"""Scenes of arrays: images and cameras that are already in memory."""
+"""Scenes from arrays: images and cameras that are already in memory."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -16,13 +16,13 @@ from a2tg_jax.data.photo_store import DepthMap, Mask, Picture, how_to_convert
 from a2tg_jax.data.scene import Scene
 
 OFF_CENTER = 1.25
-"""Least ratio of the size of an image and twice its principal point, on both axes, that is warned of."""
+"""Smallest ratio between image size and twice the principal point, on both axes, that gives a warning."""
 MOST_COMPARED = 100
-"""Number of views whose poses are compared with other conventions; ten times as many points."""
+"""Number of views that are tested with other conventions; ten times as many points are."""
 LEAST_SEEN, CLEARLY = 0.05, 1.5
-"""Least share of the points that the views see by another convention, and how many times the share of the given one."""
+"""Smallest share of points in view by another convention, and its smallest ratio to the share by the given one."""
 PRECISIONS = 0.2, 0.01
-"""How near to the place, as a share of its distance, the axes of photographs and of rendered images may pass."""
+"""Largest offset of an axis from the common point, relative to its distance, for photographs and for renders."""
 
 
 def scene_from_arrays(
@@ -55,8 +55,8 @@ def scene_from_arrays(
       test_every: every k-th view is a test view; 0 keeps none.
       name: name of the scene.
 
-    It warns of what looks like a mistake: camera-to-world matrices, axes of OpenGL, intrinsics of another image size,
-    and colours of [0, 1] that were converted without a factor of 255.
+    Warns of likely mistakes: camera-to-world matrices, OpenGL axes, intrinsics for another image size, and colours in
+    [0, 1] that were converted without a factor of 255.
 
     Raises:
       ValueError: naming the argument, if one has another shape or kind, or the views make no scene.
@@ -103,7 +103,7 @@ def scene_from_arrays(
 def _mistakes(
     images: Sequence[object], colors: ArrayLike | None, shots: Sequence[Shot], points: np.ndarray | None
 ) -> Iterator[str]:
-    # Colours are only 0 and 1 of 255. One image is enough, as a rule.
+    # Colours in [0, 1] cast to uint8 are only 0 and 1. The first image usually settles it.
     arrays = {"images": [image for image in images if not isinstance(image, Picture)]}
     for name, own in (arrays | ({} if colors is None else {"colors": [colors]})).items():
         largest = 0
@@ -113,7 +113,7 @@ def _mistakes(
                 break
         if largest == 1:
             yield f"{name} hold no value above 1 of 255: multiply colours in [0, 1] by 255 before astype(np.uint8)"
-    # Principal points fit images of another size, which differs on both axes.
+    # K of another image size is off on both axes, a crop along one side on one.
     sizes = np.array([shot.picture.size[::-1] for shot in shots], float)
     twice = np.array([2 * shot.K[:2, 2] for shot in shots])
     is_off = (np.maximum(twice, sizes) > OFF_CENTER * np.minimum(twice, sizes)).all(axis=1)
@@ -131,13 +131,13 @@ def _mistakes(
 
 
 def _likelier_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
-    """Return what to say if the poses make sense by another convention only.
+    """Return a message if the poses only make sense by another convention.
 
-    With points: far more of them are then in the images. Without: all cameras then look at one place, and else do not.
+    With points, the test is how many of them are in the images; without, whether all cameras look at one place.
     """
     chosen = [shots[i] for i in np.unique(np.linspace(0, len(shots) - 1, MOST_COMPARED).astype(int))]
     given = np.stack([shot.viewmat for shot in chosen])
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])  # Between the camera axes of OpenGL and OpenCV.
     others = {
         "np.linalg.inv(viewmats), if these are camera to world": np.linalg.inv(given),
         "np.linalg.inv(viewmats @ np.diag([1, -1, -1, 1])), if these are camera to world with y up and z backward, as "
@@ -153,7 +153,7 @@ def _likelier_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
         return f"the views see {own:.0%} of the points, and would see {found[best]:.0%} with {[*others][best]}"
     for precision in PRECISIONS:
         own, *found = (_share_that_meet(viewmats, precision) for viewmats in (given, *others.values()))
-        best = int(np.argmax(found[:2]))  # Cameras that look outwards meet behind, as flipped ones do.
+        best = int(np.argmax(found[:2]))  # Not the flip: axes of cameras that look outwards meet behind.
         if own <= 0.5 and found[best] >= 0.9:
             return f"{own:.0%} of the cameras look at one place, and {found[best]:.0%} would with {[*others][best]}"
     return ""
@@ -169,10 +169,11 @@ def _share_seen(shots: Sequence[Shot], viewmats: np.ndarray, points: np.ndarray)
 
 
 def _share_that_meet(viewmats: np.ndarray, precision: float) -> float:
-    """Return the share of cameras that look at the place nearest to all optical axes, to a share of its distance."""
+    """Return the share of cameras that look at the point nearest to all axes, to `precision` times its distance."""
     centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
     offsets = nearest_point(centers, axes) - centers
     depths = np.sum(offsets * axes, axis=1)
+    # The axes are unit vectors, so |offset × axis| is the distance from the point to the axis.
     return float(np.mean((depths > 0) & (np.linalg.norm(np.cross(offsets, axes), axis=1) < precision * depths)))
 
 
@@ -183,7 +184,7 @@ def _matrices(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarra
 
 
 def _converted(name: str, kind: Callable[[Any], Any], values: object, size: tuple[int, int] | None = None) -> Any:
-    """Return what a view has for an array, or raise ValueError, naming it, if it has another kind or size (H, W)."""
+    """Return `kind` of an array, or raise a ValueError that names it if its kind or size (H, W) is wrong."""
     check_unmasked(name, values)
     try:
         made = kind(values if size is None else np.asarray(values))
@@ -209,6 +210,7 @@ def _cloud(points: ArrayLike, colors: ArrayLike | None) -> PointCloud:
 def _chosen(points: np.ndarray, indices: ArrayLike, what: str) -> np.ndarray:
     check_unmasked(what, indices)
     indices = np.asarray(indices)
+    # NumPy makes float64 of an empty list.
     is_index = indices.ndim == 1 and (np.issubdtype(indices.dtype, np.integer) or not indices.size)
     if not is_index or (indices.size and not 0 <= indices.min() <= indices.max() < len(points)):
         advice = ": say np.flatnonzero of a mask" if indices.dtype == bool else ""

@@ -32,7 +32,7 @@ NEAREST, DEEPEST_AROUND = 0.4, 2.0
 SHALLOWEST, DEEPEST = 0.5, 10.0
 """Depths of random points in front of other cameras."""
 FIRST_LOOK = 10_000
-"""Number of points, evenly chosen, that a view is tried with before all of them."""
+"""Number of evenly chosen points that a view is tested with first."""
 RANDOM_COLOR = 128
 FARTHEST = 1e5
 """Largest distance of a camera from the median centre, in units of the median distance."""
@@ -56,11 +56,11 @@ class Shot:
     picture: Picture
     mask: Mask | None = None
     rays: np.ndarray | None = None
-    """[H, W, 2] rays of the pixels, as `Camera.rays` has them, NaN where there is none; None of a pinhole."""
+    """[H, W, 2] rays of the pixels, as `Camera.rays` has them, NaN where there is none; None for a pinhole."""
     depth: DepthMap | None = None
     panorama: int | None = None
     points: ObservedPoints | None = None
-    """Points that it observed, their depths in units of the original world; None if they are not known."""
+    """Points that it observed, their depths in units of the original world; None if unknown."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -80,17 +80,18 @@ def assemble_scene(
     """Normalise the world and assemble the scene.
 
     Args:
-      name: of the scene.
-      train, test: shots to train and to test on, any order.
+      name: name of the scene.
+      train, test: shots to train and to test on, in any order.
       cloud: surface points. With fewer than two, or if no training view sees one, random points where the cameras look
         are used, with a warning. Another warning counts training views that see no point.
       source: name of the input in messages.
-      is_object: whether the scene is an object that all views show whole: random points are then in a cube around it,
-        and expected.
+      is_object: whether all views show one whole object: random points then fill a cube around it, without a
+        warning.
 
     Raises:
       ValueError: if the shots or their poses make no scene.
     """
+    # Sorted for _check_shots, and so that sums over cameras do not depend on the order of the files.
     shots = sorted([*train, *test], key=lambda shot: shot.name)
     _check_shots(shots, len(train), source)
     try:
@@ -101,12 +102,14 @@ def assemble_scene(
     sights = [Sight.of(viewmats[shot.name], shot.K, shot.picture.size, shot.rays) for shot in train]
     if cloud is not None:
         is_usable = _are_somewhere(cloud.points)
+        # Again in the normalised world: its unit is small if the cameras are close together.
         is_usable[is_usable] = _are_somewhere(transform.apply(cloud.points[is_usable]))
         if not is_usable.all():
             left_out = counted(int(np.count_nonzero(~is_usable)), "point")
             message = f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}"
             warnings.warn(message, stacklevel=3)
             cloud = PointCloud(cloud.points[is_usable], cloud.colors[is_usable])
+    # Initial Gaussians are as large as the distances to their neighbours, so one point is not enough.
     points = None if cloud is None or len(cloud.points) < 2 else transform.apply(cloud.points)
     unseen_by = [] if points is None else unseeing(points, sights)
     if cloud is None or points is None or len(unseen_by) == len(sights):
@@ -134,7 +137,7 @@ def assemble_scene(
 
 
 class Sight(NamedTuple):
-    """Part of the world that a view shows."""
+    """The part of the world that a view shows."""
 
     viewmat: np.ndarray
     """[4, 4] world to camera."""
@@ -150,10 +153,11 @@ class Sight(NamedTuple):
         """Return what a view of (height, width) shows, with `rays` as `Camera.rays` has them."""
         if rays is None:
             return Sight(viewmat, K, np.zeros(2), np.array(size[::-1], np.float64))
+        # NaN: pixels without a ray.
         return Sight(viewmat, K, np.nanmin(rays, axis=(0, 1)), np.nanmax(rays, axis=(0, 1)))
 
     def num_seen(self, points: np.ndarray) -> int:
-        """Return the number of points [P, 3] that are in the picture and not too near to be drawn."""
+        """Return the number of points [P, 3] in the picture and beyond the near plane."""
         own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         own = own[own[:, 2] > NEAR_PLANE]
         places = own @ self.K[:2].T / own[:, 2:]
@@ -161,7 +165,8 @@ class Sight(NamedTuple):
 
 
 def unseeing(points: np.ndarray, sights: Sequence[Sight]) -> list[int]:
-    """Return the numbers of the views that see none of the points [P, 3]."""
+    """Return the indices of the views that see none of the points [P, 3]."""
+    # Most views see one of a few points, which saves testing them all.
     some = points[:: max(1, len(points) // FIRST_LOOK)]
     return [number for number, sight in enumerate(sights) if not (sight.num_seen(some) or sight.num_seen(points))]
 
@@ -172,14 +177,15 @@ def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None
     They are in a cube around an object that all views show, or else in the pyramids that the views show.
 
     Args:
-      sights: of the training views. The origin is the point nearest to their optical axes.
-      object_axes: [3, 3] axes of the cube of a scene that is an object, by columns; None of other scenes.
+      sights: what each training view shows. The origin is the point nearest to their optical axes.
+      object_axes: [3, 3] axes of the object's cube, as columns; None for other scenes.
       seed: random seed.
     """
     rng = np.random.default_rng(seed)
     viewmats = np.stack([sight.viewmat for sight in sights])
     centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
     distances = np.linalg.norm(centers, axis=1)
+    # Width and height that a view shows at distance 1.
     slopes = np.stack([(sight.high - sight.low) / np.diag(sight.K)[:2] for sight in sights])
     if object_axes is not None:
         half_side = OBJECT_SHARE * np.median(distances * slopes.min(axis=1) / 2)
@@ -195,10 +201,13 @@ def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None
     # Cosine between the optical axis and the direction to the origin: near 1 if the cameras surround a subject.
     facing = -np.einsum("vi,vi->v", centers, axes) / np.maximum(distances, 1e-12)
     if np.median(facing) >= LEAST_FACING:
+        # A camera at the origin would have all of its points at its own centre.
         depths = (NEAREST + (DEEPEST_AROUND - NEAREST) * share) * np.maximum(distances, SHALLOWEST)[view]
     else:
+        # Even in log depth: as many points for each doubling of the distance.
         depths = SHALLOWEST * (DEEPEST / SHALLOWEST) ** share
     own = np.einsum("pij,pj->pi", to_rays, places) * depths[:, None]
+    # Back to the world, x = Rᵀ·own + centre; "pji" transposes R.
     offsets: np.ndarray = np.einsum("pji,pj->pi", viewmats[view, :3, :3], own)
     offsets += centers[view]
     return offsets
@@ -211,6 +220,7 @@ def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
         largest = np.abs(viewmat).max()
         found = f"exceeds ±{LARGEST_COORDINATE:g}, at {largest:g}" if np.isfinite(largest) else "is not finite"
         raise ValueError(f"{what}: its pose {found}; remove it from the scene or correct the pose")
+    # The nearest orthogonal matrix to R = U·S·Vᵀ is U·Vᵀ; it is a reflection if its determinant is -1.
     left, singular_values, right = np.linalg.svd(rotation)
     if np.abs(singular_values - 1).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
         raise ValueError(f"{what}: its pose is not a rigid motion; rotations must be orthonormal and right-handed")
@@ -234,6 +244,7 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
     # Medians, because one camera far away would move a mean towards itself.
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     farthest = int(np.argmax(distances))
+    # A median of 0, with most cameras at one place, is no unit.
     if 0 < FARTHEST * np.median(distances) < distances[farthest]:
         raise ValueError(
             f"{source}: {shots[farthest].name} is more than {FARTHEST:g} times as far away as half of the cameras; "
@@ -255,6 +266,7 @@ def _view(shot: Shot, viewmat: np.ndarray, scale: float) -> View:
     if shot.rays is not None and not np.isfinite(shot.rays).all():
         has_ray = np.isfinite(shot.rays).all(axis=2)
         mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
+    # Batches of views without masks carry one bool per view (scene.counted_pixels).
     mask = None if mask is None or mask.is_full else mask
     points = None if shot.points is None else shot.points.scaled(scale)
     return View(shot.name, camera, shot.picture, mask, shot.depth, shot.panorama, points)
@@ -270,24 +282,26 @@ def normalizing_similarity(viewmats: np.ndarray) -> Similarity:
     centers = camera_centers(viewmats)
     origin = nearest_point(centers, viewmats[:, 2, :3])
     rotation = np.eye(3)
+    # The rows of R are the axes of the camera in the world; y is down.
     up = -viewmats[:, 1, :3].mean(axis=0)
     if np.linalg.norm(up) >= MIN_UP_LENGTH:  # The smallest rotation that turns up to +z.
         up = up / np.linalg.norm(up)
         axis = np.cross(up, [0.0, 0.0, 1.0])
         sine = np.linalg.norm(axis)
-        axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+        axis = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])  # Up is z or -z: any level axis.
         rotation = Rotation.from_rotvec(axis * np.arctan2(sine, up[2])).as_matrix()
     zero = ZERO_SPREAD * max(float(np.linalg.norm(centers, axis=1).max()), np.finfo(np.float64).tiny)
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     distance = float(np.median(np.linalg.norm(centers - origin, axis=1)))
     if min(spread, distance) <= zero:
         raise ValueError("all cameras are at one place; photographs from different positions are needed")
-    return Similarity(1.0 / distance, rotation, -rotation @ origin / distance)
+    return Similarity(1.0 / distance, rotation, -rotation @ origin / distance)  # x' = R·(x - origin) / distance
 
 
 def scene_scale(centers: np.ndarray) -> float:
     """Return 1.1 × the largest distance of a camera centre [V, 3] from their mean, the unit of the means' learning
     rate."""
+    # As getNerfppNorm of 3DGS, whose learning rates are in this unit.
     return 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 
@@ -298,11 +312,11 @@ Held = TypeVar("Held", Shot, View)
 def with_validation_views(scene: Scene) -> Scene:
     """Return the scene for choosing options: every eighth training view is held out instead of the test views.
 
-    Cameras, points and world of the whole scene stay. Test views are left out, so that no choice can see them.
+    Cameras, points and world of the whole scene stay. Test views are left out, so that no choice depends on them.
     The views of a panorama are held out together and count as one.
 
     Raises:
-      ValueError: if there is one training view, or one panorama, only.
+      ValueError: if there is only one training view or panorama.
     """
     train, held_out = split_views(scene.train, VALIDATION_EVERY)
     if not train:
@@ -330,6 +344,7 @@ def split_views(views: Sequence[Held], every: int) -> tuple[list[Held], list[Hel
     kept: list[Held] = []
     held_out: list[Held] = []
     for index, view in enumerate(views):
+        # A panorama has one key, any other view its own; len(numbers) is the next free number.
         number = numbers.setdefault((view.panorama, index if view.panorama is None else 0), len(numbers))
         (held_out if every and number % every == 0 else kept).append(view)
     return kept, held_out

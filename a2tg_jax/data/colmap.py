@@ -26,12 +26,12 @@ SUFFIXES = (".bin", ".txt")
 IMAGES = "images"
 """Folder of photographs in a scene folder."""
 TRIED_NAMES = 10
-"""Number of photographs that are looked for in a folder before it is taken for another one."""
+"""Number of photographs to look for before giving up on a folder."""
 POINTS_PLY = "points3D.ply"
-"""Points of models without COLMAP's points3D, such as networks of depth write."""
+"""Points of models without COLMAP's points3D, as depth networks write them."""
 SAME_PLACE = 1e-3
 """Largest distance between the cameras of a panorama, in units of the distance between neighbouring frames. A
-refinement of the rig leaves that much of zero."""
+refined rig differs from one place by about that much."""
 
 
 class SparseModel(NamedTuple):
@@ -48,7 +48,7 @@ class SparseModel(NamedTuple):
     @property
     def viewmats(self) -> np.ndarray:
         """World-to-camera matrices [V, 4, 4] of the images."""
-        return np.array([viewmat_of(image) for image in self.images]).reshape(-1, 4, 4)
+        return np.array([viewmat_of(image) for image in self.images]).reshape(-1, 4, 4)  # [0, 4, 4] without images.
 
 
 def find_models(path: Path) -> list[Path]:
@@ -70,6 +70,7 @@ def _model_of(path: Path) -> Path:
     if len(models) == 1:
         return models[0]
     counts = {model: num_images(_model_files(model)["images"]) for model in models}
+    # A model's own folder, if given, is the user's choice.
     chosen = path if path in models else max(models, key=lambda model: counts[model])
     told = {
         model: f"{'/'.join(model.parts[len(path.parts) :]) or 'its own'} ({counted(counts[model], 'image')})"
@@ -88,7 +89,7 @@ def load_colmap(path: Path, options: Options) -> Scene:
     """Read a COLMAP scene: every registered image as a view, and the sparse points.
 
     The path is the scene folder, or the folder of the model itself. The folder `images` (or `images_k`) may be in it,
-    beside the model, or up to two folders above.
+    next to the model, or up to two folders above.
     """
     model = _model_of(path)
     contents = _read_model(model)
@@ -96,6 +97,7 @@ def load_colmap(path: Path, options: Options) -> Scene:
     images = [image._replace(name=inside(folder, image.name)) for image in contents.images]
     used = sorted({image.camera_id for image in images})
     lenses = {key: checked_lens(contents.cameras[key], f"{model}: camera {key}", options.lens) for key in used}
+    # Folders in the scene folder itself may hold other pictures.
     warn_of_unposed(folder, [image.name for image in images], is_deep=folder != scene)
     viewmats, panoramas = contents.viewmats, _panoramas(contents)
     photos = [
@@ -117,9 +119,11 @@ def load_colmap(path: Path, options: Options) -> Scene:
 
     shots = read_photos(photos, options, path, scene, how_to_remove)
     for index, (shot, image) in enumerate(zip(shots, images, strict=True)):
+        # Features without a point (NO_POINT), and points deleted from the model, drop out.
         own = image.point_ids[np.isin(image.point_ids, contents.points["id"])]
         if len(own):
             positions = contents.points["position"][np.searchsorted(contents.points["id"], own)]
+            # Features are places in the stored photograph; views may be undistorted and smaller, so project the points.
             places, (height, width) = before_camera(positions, shot.viewmat), shot.picture.size
             xy = lenses[image.camera_id].projected(places, shot.K, (width, height))
             shots[index] = dataclasses.replace(shot, points=observed_points(xy, places[:, 2], (height, width)))
@@ -128,7 +132,7 @@ def load_colmap(path: Path, options: Options) -> Scene:
 
 
 def _start_cloud(model: Path, contents: SparseModel) -> PointCloud:
-    """Return the points to start from: a model's own, or of `POINTS_PLY` if it has none."""
+    """Return the points to start from: the model's, or else those in `POINTS_PLY`."""
     ply = None if len(contents.points) else on_disk(model, POINTS_PLY)
     return PointCloud(contents.points["position"], contents.points["color"]) if ply is None else read_ply_points(ply)
 
@@ -147,6 +151,7 @@ def viewmat_of(image: ImageRecord) -> np.ndarray:
     length = np.linalg.norm(quaternion)
     if length == 0:
         raise ValueError(f"{image.name}: its pose has a quaternion of zeros; remove it from the model")
+    # Division by an infinite length would hide a bad pose as zeros; rigid_viewmat reports NaN.
     w, x, y, z = quaternion / length if np.isfinite(length) else np.full(4, np.nan)
     # Rotation of the unit quaternion w + xi + yj + zk, in Hamilton's convention.
     viewmat[:3, :3] = [
@@ -158,14 +163,17 @@ def viewmat_of(image: ImageRecord) -> np.ndarray:
 
 
 def _panoramas(model: SparseModel) -> dict[int, int]:
-    """Return the number of the frame of each image whose rig looks around from one place (`SAME_PLACE`), by its id."""
+    """Return the frame of each image whose rig looks around from one place (`SAME_PLACE`), both by their ids."""
     frames = {image_id: frame for frame in model.frames for image_id in frame.image_ids}
+    # Images without a frame get negative numbers, which no frame has.
     ids = [frames[image.id].id if image.id in frames else -image.id for image in model.images]
     places = dict(zip(ids, camera_centers(model.viewmats), strict=True))
     reach = 0.0
     if len(places) > 1:
         centers = np.stack(list(places.values()))
+        # The nearest of two is the centre itself.
         reach = SAME_PLACE * float(np.median(cKDTree(centers).query(centers, k=2)[0][:, 1]))
+    # A rig of one sensor has no translations and is no panorama.
     around = {
         rig.id
         for rig in model.rigs
@@ -204,18 +212,19 @@ def _read_model(model: Path) -> SparseModel:
                 f"{files['cameras'].name}; export the model again"
             )
     points = found.get("points3D", np.empty(0, POINT))
+    # load_colmap finds points by searchsorted.
     points = points[np.argsort(points["id"], kind="stable")]
     return SparseModel(cameras, found["images"], points, found.get("rigs", []), found.get("frames", []))
 
 
 def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downscale: int) -> tuple[Path, Path]:
-    """Return the scene folder of a model and the folder below which its images are named.
+    """Return a model's scene folder, and the folder that its image names start from.
 
     That is `images`, which need not exist if `images_k` does, or else the scene folder itself, with the photographs
-    beside the model or named with their folder.
+    next to the model or named with their folder.
     """
     model = model.resolve()
-    bases = [path.resolve(), model, *model.parents[:2]]
+    bases = [path.resolve(), model, *model.parents[:2]]  # sparse/0 is two below the scene.
     bases += [base.parent for base in bases if base.name == "colmap"]  # as nerfstudio has it: colmap/sparse/0
 
     def holds_some(folder: Path) -> bool:

@@ -99,7 +99,7 @@ def read_file(path: Path, kind: str) -> Any:
     with open_regular(path) as opened:
         if path.suffix.lower() != ".bin":
             return _read_text(opened, path, kind)
-        if os.fstat(opened.fileno()).st_size == 0:  # Nothing can be mapped.
+        if os.fstat(opened.fileno()).st_size == 0:  # mmap rejects empty files.
             return _Binary(path, b"").read(kind)
         with mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as data:
             return _Binary(path, data).read(kind)
@@ -129,7 +129,7 @@ _little_endian = functools.cache(lambda format: struct.Struct(f"<{format}"))
 
 
 class _Binary:
-    """Position in a binary file, which cannot pass the file's end. Methods with names of kinds return a record."""
+    """Reader of a binary file that never passes its end. Methods named after kinds return one record."""
 
     def __init__(self, path: Path, data: mmap.mmap | bytes):
         self.path, self.data, self.at, self.place = path, data, 0, "the count"
@@ -177,12 +177,13 @@ class _Binary:
         (count,) = self.take("Q")
         start = self.skip(FEATURE.itemsize * count)
         features = np.frombuffer(self.data, FEATURE, count, start) if count else np.empty(0, FEATURE)
+        # A view of the mapping would keep it from being closed (BufferError).
         return ImageRecord(number, pose, camera, name, features["id"].copy())
 
     def points3D(self) -> bytes:
         start = self.skip(POINT.itemsize)
         point = self.data[start : self.at]
-        self.skip(8 * self.take("Q")[0])
+        self.skip(8 * self.take("Q")[0])  # The track, which is not needed.
         return point
 
     def rigs(self) -> RigRecord:
@@ -190,7 +191,7 @@ class _Binary:
         translations: list[list[float] | None] = []
         for index in range(count):
             self.take("iI")
-            if index:
+            if index:  # The first sensor, the reference, has no pose.
                 translations.append(list(self.take("7d")[4:]) if self.take("B")[0] else None)
         return RigRecord(number, translations)
 
@@ -202,7 +203,7 @@ class _Binary:
 
 def _whole(word: bytes) -> int:
     """Return a whole number of at least 0, which may be written like 96.0."""
-    number = int(word) if word.isdigit() else float(word)
+    number = int(word) if word.isdigit() else float(word)  # A float would round ids above 2^53.
     if not 0 <= number <= NO_POINT or number != int(number):  # NaN fails as well.
         raise ValueError(f"{shortened(word.decode(errors='replace'))} is no whole number of at least 0")
     return int(number)
@@ -231,7 +232,7 @@ def _text_record(kind: str, path: Path, line: bytes, features: bytes) -> Any:
     elif kind == "images":
         number, pose, camera, _ = whole(), floats(7), whole(), next(words)
         name = _decoded_name(path, line.split(None, 9)[9].strip())  # The rest of the line, which may have spaces.
-        words = iter(())
+        words = iter(())  # The name took the rest of the line.
         try:
             # Each feature has x, y and the id of its point; -1 stands for none.
             triples = zip(*[iter(features.split())] * 3, strict=True)
@@ -273,7 +274,7 @@ def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
         try:
             found.append(_text_record(kind, path, line, next(lines, (0, b""))[1] if kind == "images" else b""))
         except (ValueError, OverflowError, StopIteration) as error:
-            if str(error).startswith(str(path)):
+            if str(error).startswith(str(path)):  # It names the file already.
                 raise
             told = "it is cut off" if isinstance(error, StopIteration) else shortened(str(error))
             raise ValueError(f"{path}: line {number} cannot be read ({told}); export the model again") from None
@@ -290,7 +291,7 @@ def _has_record(line: bytes) -> bool:
 def _lines(file: BinaryIO, path: Path) -> Iterator[tuple[int, bytes]]:
     """Yield the lines of a file with their numbers from 1, each of bounded length."""
     number = 0
-    while line := file.readline(LONGEST_LINE + 1):
+    while line := file.readline(LONGEST_LINE + 1):  # One byte more shows that a line is too long.
         number += 1
         if len(line) > LONGEST_LINE:
             raise ValueError(f"{path}: has a line of more than {LONGEST_LINE:,} bytes; export the model again")

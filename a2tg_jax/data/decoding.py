@@ -21,7 +21,7 @@ from a2tg_jax.host.text import shortened
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
 HEIC_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx"}
-"""Brands in the first box of HEIC files, one of which they name; AVIF files name others."""
+"""Brands of HEIC, at least one of which is in the first box of such a file; AVIF files have others."""
 LONGEST_BOX = 64
 BITS_PER_SAMPLE = 258
 """TIFF tag of the bits per sample."""
@@ -59,11 +59,12 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
         turn = image.tag_v2.get(ExifTags.Base.Orientation) if image.format == "TIFF" else None  # type: ignore[attr-defined]
         converted = image.convert("RGBA" if has_alpha else "RGB")
         pixels = np.asarray(converted.transpose(AS_STORED[turn]) if turn in AS_STORED else converted)
+    # One picture with alpha gives all batches an opacity (training.batches), so drop an opaque one.
     return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
 
 
 def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Return (width, height) of an image file as stored, without decoding it, so that it may be larger than others."""
+    """Return (width, height) of an image file as stored, without decoding it, so `MAX_PIXELS` does not apply."""
     with _opened(path, is_decoded=False) as image:
         return _stored_size(image)
 
@@ -86,7 +87,7 @@ class PictureFacts(NamedTuple):
     format: str
     """Pillow's name of the format."""
     lens: tuple[str, ...]
-    """Camera and focal length as EXIF has them."""
+    """Camera and focal length from EXIF."""
     is_transparent: bool
     """Whether some of its pixels are not opaque."""
 
@@ -97,9 +98,10 @@ def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
         turn = image.getexif().get(ExifTags.Base.Orientation, 1)  # Decoding TIFF removes it.
         width, height = _stored_size(image)
         size = (height, width) if turn in SIDEWAYS else (width, height)
-        image.load()
+        image.load()  # Opening is lazy: damage shows only now.
         exif = image.getexif()
         details = exif.get_ifd(ExifTags.IFD.Exif)
+        # Make and model are in the main directory of EXIF, focal lengths in the one below.
         lens = (*(exif.get(tag) for tag in LENS_TAGS), *(details.get(tag) for tag in LENS_TAGS))
         told = tuple(str(value) for value in lens if value)
         is_transparent = _has_alpha(image) and bool((np.asarray(image.convert("RGBA"))[..., 3] < 255).any())
@@ -123,11 +125,11 @@ def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> No
             {tag: value for tag, value in details.items() if tag != ExifTags.Base.MakerNote}
         )
         upright = ImageOps.exif_transpose(image)
-        exif[ExifTags.Base.Orientation] = 1
+        exif[ExifTags.Base.Orientation] = 1  # Or readers would turn the pixels again.
         if target.suffix.lower() == ".png":
             upright.convert("RGB").save(target, exif=exif, compress_level=1)
         else:
-            upright.convert("RGB").save(target, quality=quality, subsampling=0, exif=exif)
+            upright.convert("RGB").save(target, quality=quality, subsampling=0, exif=exif)  # 4:4:4 keeps colours sharp.
 
 
 def upright_thumbnail(path: str | os.PathLike[str], side: int) -> tuple[tuple[int, int], np.ndarray]:
@@ -167,8 +169,8 @@ def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool =
             if is_decoded and most_bits == 8 and (image.mode.startswith(("I", "F")) or _is_deep(image)):
                 raise ValueError(f"{path}: has more than 8 bits per channel; convert it to an 8-bit image")
             yield image
-    except Exception as error:  # what a damaged picture raises goes from SyntaxError to RuntimeError and struct.error
-        if str(error).startswith(f"{path}: "):  # The picture was refused, or its store does not answer.
+    except Exception as error:  # Damaged pictures raise anything from SyntaxError to struct.error.
+        if str(error).startswith(f"{path}: "):  # Raised above, or by a store that does not answer.
             raise
         reason = shortened(str(error) or type(error).__name__, LONGEST_REASON)
         raise ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from error
@@ -202,5 +204,6 @@ def _is_deep(image: Image.Image) -> bool:
     if image.format == "TIFF":
         return bool(max(image.tag_v2.get(BITS_PER_SAMPLE, (1,))) > 8)  # type: ignore[attr-defined]
     if image.format == "PPM":
+        # Pillow passes the largest level of the file last.
         return any(isinstance(args, tuple) and args[-1] > 255 for args in arguments)
-    return image.format == "PNG" and any(";16" in str(args) for args in arguments)
+    return image.format == "PNG" and any(";16" in str(args) for args in arguments)  # Such as RGB;16B.

@@ -14,7 +14,7 @@ from a2tg_jax.data.image_files import map_in_threads
 from a2tg_jax.host.text import shortened
 from a2tg_jax.parallel.processes import gather, is_of_collectives
 
-ERRORS = (FileNotFoundError, OSError, ValueError)
+ERRORS = (FileNotFoundError, OSError, ValueError)  # _plain takes the first that fits: subclasses first.
 """Errors that are raised in all processes."""
 Result = TypeVar("Result")
 
@@ -69,13 +69,14 @@ def divided(
     """Return the results for all items, each made by one process, in threads.
 
     Args:
-      division: processes that call this together; None: one.
+      division: processes that call this together; None: only this one.
       names: names of the items, the same in all processes.
       work: function of an item's number. If it fails, all processes raise the error of the first such item.
       place: path that the work reads from, as in `map_in_threads`.
     """
     if division is None:
         return map_in_threads(work, range(len(names)), place=place)
+    # Items are dealt by number, so all processes need the same list.
     division.check_same(names, "photographs")
 
     def attempt(number: int) -> Any:
@@ -103,9 +104,11 @@ def sharing_errors(division: Division | None) -> Iterator[None]:
         try:
             yield
         except ERRORS as error:
+            # If processes cannot reach each other, sending the error would wait for them.
             if not is_of_collectives(error):
                 division.send_error(error)
             raise
+        # A process that is done waits here, so that it still gets an error of another one.
         division.exchange("end of loading")
     except SharedError as shared:
         raise shared.error from None

@@ -37,10 +37,10 @@ class Archive(NamedTuple):
     folder: str
     """Folder, below the folder of all scenes, in which it is unpacked."""
     num_bytes: int | None = None
-    """Size, if it is known before the server is reached."""
+    """Size, if known before the download."""
     sha256: str | None = None
     content: str = ""
-    """Content in a few words."""
+    """Short description."""
 
 
 BENCHMARK_SETS = {
@@ -99,6 +99,7 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
     except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error) as error:
         file.unlink()
         raise ValueError(f"{file} is damaged, and was deleted: call again to fetch it ({error})") from error
+    # In this order: after a kill in between, nothing is fetched or replaced again.
     done.touch()
     begun.unlink()
     file.unlink()
@@ -118,9 +119,10 @@ def _download(archive: Archive, file: Path, progress: bool) -> None:
             time.sleep(PAUSE_SECONDS * 2 ** (attempt - 1))
         try:
             total = _receive(archive.url, partial, version, progress)
-        except urllib.error.HTTPError as error:
+        except urllib.error.HTTPError as error:  # The server has answered: no other attempt.
             raise OSError(f"{archive.url}: {error}") from error
         except (urllib.error.URLError, ConnectionError, TimeoutError, http.client.HTTPException) as error:
+            # If the first attempt finds no server, the address or the network is wrong: waiting would not help.
             if attempt == ATTEMPTS - 1 or (attempt == 0 and isinstance(error, urllib.error.URLError)):
                 raise OSError(f"{archive.url}: the connection broke ({error}); call again to continue") from error
             continue
@@ -145,6 +147,7 @@ def _receive(url: str, partial: Path, version: Path, progress: bool) -> int | No
             request.add_header("If-Range", version.read_text(encoding="ascii"))
     try:
         with urllib.request.urlopen(request, timeout=TIMEOUT_SECONDS) as response:
+            # Servers that ignore Range, or have another version (If-Range), send the whole file with status 200.
             start = have if response.status == http.HTTPStatus.PARTIAL_CONTENT else 0
             length = response.headers.get("Content-Length")
             total = None if length is None else int(length) + start
@@ -165,7 +168,7 @@ def _receive(url: str, partial: Path, version: Path, progress: bool) -> int | No
         if error.code != http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
             raise
         # No bytes are left to come: the server says how many there are.
-        with error:
+        with error:  # It holds the connection.
             return int(error.headers.get("Content-Range", f"*/{have}").rpartition("/")[2])
 
 
@@ -188,6 +191,7 @@ def _unpack(file: Path, folder: Path, begun: Path, progress: bool) -> None:
             if isinstance(member, tarfile.TarInfo) and not (member.isfile() or member.isdir()):
                 raise ValueError(f"{file}: the member {name!r} is a link or a device, which may lead outside {folder}")
             target = folder / name
+            # resolve also follows links that are in the folder already.
             if not target.resolve().is_relative_to(folder.resolve()):
                 raise ValueError(f"{file}: the member {name!r} would be written outside {folder}")
             if num_bytes is not None and not begun.is_file() and target.exists() and _size(target) != num_bytes:

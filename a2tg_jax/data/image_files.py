@@ -13,7 +13,7 @@ from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import counted, shortened
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif")
-"""Suffixes of photographs; capital letters do as well."""
+"""Suffixes of photographs, in lower or upper case."""
 LONGEST_NAME = 1000
 """Largest number of letters in an image's path below its folder."""
 MOST_READERS = 8
@@ -22,12 +22,13 @@ Result = TypeVar("Result")
 
 
 def find_image(folder: Path, name: str) -> Path | None:
-    """Return the file of an image, whose name is a path below a folder, perhaps without suffix; None without one.
+    """Return the file of an image, whose name is a path below a folder, perhaps without suffix; None if there is none.
 
     Raises:
       ValueError: if the name leads out of the folder.
     """
     name = inside(folder, name)
+    # NeRF's Blender scenes leave out the suffix .png.
     suffixes = ["", ".png", *(each for suffix in PHOTO_SUFFIXES for each in (suffix, suffix.upper()))]
     return next(filter(is_regular, (folder / (name + suffix) for suffix in suffixes)), None) or on_disk(folder, name)
 
@@ -50,6 +51,7 @@ def inside(folder: Path, name: str) -> str:
     if path.is_absolute() and not is_remote(folder):
         roots = os.path.abspath(folder), os.path.realpath(folder)  # The scene may have been written through a link.
         path = next((path.relative_to(root) for root in roots if path.is_relative_to(root)), path)
+    # On Windows /x has a root and C:x a drive, but neither is absolute.
     if PureWindowsPath(str(path)).root or path.drive or os.pardir in path.parts or "\0" in name:
         raise ValueError(
             f"{folder}: {shortened(name)} leads out of the scene's folder, and nothing outside is read; "
@@ -59,7 +61,7 @@ def inside(folder: Path, name: str) -> str:
 
 
 def on_disk(folder: Path, *names: str) -> Path | None:
-    """Return the first file of some paths below a folder that exists; None without one.
+    """Return the first file of some paths below a folder that exists; None if there is none.
 
     If none exists, return the first that differs from a file in capitals alone, unless it does from several.
     """
@@ -67,7 +69,7 @@ def on_disk(folder: Path, *names: str) -> Path | None:
     for name in () if files else names:
         found = [folder]
         for part in Path(name).parts:
-            # All that fit so far, because folders may differ in capitals as well.
+            # Several may fit: folders may differ in capitals as well.
             found = [each / own for each in found for own in names_in(each) if _letters(own) == _letters(part)]
         files += [found[0]] if len(found) == 1 and is_regular(found[0]) else []
     return files[0] if files else None
@@ -79,7 +81,7 @@ def _letters(name: str) -> str:
 
 
 def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) -> None:
-    """Warn of photographs in a folder of this machine (`is_deep`: and in folders of it) that are not among some names.
+    """Warn of photographs in a local folder (`is_deep`: and its subfolders) that are not among some names.
 
     The names are paths below it, whose suffixes and capitals may differ.
     """

@@ -17,20 +17,21 @@ from a2tg_jax.data.observations import pinhole_pixels
 PINHOLE_TOLERANCE = 1e-3
 """Largest deviation in pixels of a camera that still counts as a pinhole."""
 LARGEST_DISTORTION = 1e6
-"""Largest absolute value of one parameter. Telephoto lenses, with small angles, have large ones."""
+"""Largest absolute distortion parameter. Telephoto lenses, with small angles, have large ones."""
 GRID, MARGIN = 9, 0.1
 """Number of test points along an axis of an undistorted image, and their largest distance outside the photograph."""
-ROWS_AT_ONCE = 128
+ROWS_AT_ONCE = 128  # Rays of a whole photograph would take many times its memory.
 WIDEST_ANGLE = np.deg2rad(80.0)
 """Largest angle between a ray of a kept lens and the direction of view; pixels beyond it do not count."""
 FARTHEST_FROM_RAY = 0.1
-"""Largest distance in pixels between a pixel and the projection of its ray; a ray farther off is none."""
+"""Largest distance in pixels between a pixel and the projection of its ray; rays farther off are dropped."""
 LEAST_SEEN = 0.05
 CUT = ": find cameras again with a2tg sfm, which cuts panoramas into views"
 """What to do about cameras that look all around."""
 LensUse = Literal["undistort", "keep"]
 """Whether photographs are undistorted to pinholes, or kept as they are and drawn through the lens."""
 
+# lru_cache may compute a value twice, and scene.kinds_of recognises a lens by the identity of its rays.
 _LOCK = threading.Lock()
 
 
@@ -85,8 +86,8 @@ class Lens:
     def view_pixels(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Return the pixels [h', w', C] of a photograph's view, and their K [3, 3].
 
-        The photograph, [h, w, C] uint8, is of the calibrated size or that size scaled. It is undistorted, unless it is
-        kept, before it is divided by `downscale`, which keeps it sharp.
+        The photograph, [h, w, C] uint8, is of the calibrated size, perhaps scaled. Unless kept, it is undistorted before
+        it is downscaled, which keeps it sharp.
         """
         new_size, K = self.view_of((pixels.shape[1], pixels.shape[0]), downscale)
         if not (self.is_kept or self.is_pinhole):
@@ -95,12 +96,12 @@ class Lens:
                 planes[..., :3] *= planes[..., 3:] / 255
             planes = self._sampled(planes)
             if planes.shape[2] == 4:
-                planes[..., :3] *= 255 / np.maximum(planes[..., 3:], 1)
+                planes[..., :3] *= 255 / np.maximum(planes[..., 3:], 1)  # Colours are 0 where alpha is.
             pixels = np.clip(np.rint(planes), 0, 255).astype(np.uint8)
         return resize_pixels(pixels, *new_size), K
 
     def view_of(self, stored: tuple[int, int], downscale: int) -> tuple[tuple[int, int], np.ndarray]:
-        """Return (width, height) and K [3, 3] of the view of a photograph of a size, as `view_pixels` makes it."""
+        """Return (width, height) and K [3, 3] of the view that `view_pixels` makes of a photograph of a size."""
         K, size = (self._matrix(), self.size) if self.is_kept else self.pinhole
         width, height = stored if self.is_kept else self._undistorted_size(stored)
         new_size = max(1, round(width / downscale)), max(1, round(height / downscale))
@@ -114,7 +115,7 @@ class Lens:
         return round(size[0] * scales[0]), round(size[1] * scales[1])
 
     def view_plane(self, plane: np.ndarray) -> np.ndarray:
-        """Return numbers [h, w] float32 of a photograph's pixels as its view has them, not downscaled."""
+        """Return numbers [h, w] float32 of a photograph's pixels, undistorted like its view, not downscaled."""
         return plane if self.is_kept or self.is_pinhole else self._sampled(plane[..., None])[..., 0]
 
     def projected(self, points: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -127,13 +128,15 @@ class Lens:
     def rays(self, width: int, height: int) -> np.ndarray | None:
         """Return the rays [height, width, 2] of views of a size, as `Camera.rays` has them; NaN where there is none.
 
-        None of a pinhole, or if photographs are undistorted. Raise ValueError if next to no pixel has a ray.
+        None for a pinhole, or if photographs are undistorted. Raise ValueError if almost no pixel has a ray.
         """
         if not self.is_kept:
             return None
+        # Before is_pinhole, which raises an error without advice if the model has no image plane.
         K = _scaled_intrinsics(self._matrix(), self.size, (width, height))
         if self.is_pinhole:
             return None
+        # lru_cache needs arguments that can be hashed.
         camera = self.camera
         with _LOCK:  # Threads that read photographs of one lens share its rays.
             return _rays(camera.model.name, self.size, tuple(camera.params.tolist()), (width, height), K.tobytes())
@@ -183,7 +186,7 @@ def _rays(
         )
     rays = _homogeneous(slopes) @ np.frombuffer(K).reshape(3, 3)[:2].T
     found = np.where(is_ray[:, None], rays, np.nan).astype(np.float32).reshape(picture[1], picture[0], 2)
-    found.setflags(write=False)
+    found.setflags(write=False)  # Views share it.
     return found
 
 

@@ -63,6 +63,7 @@ class SceneSource:
         """Name of the scene in titles."""
         if self.path == SYNTHETIC:
             return SYNTHETIC
+        # os.path, because Path would make one slash of the two in a URL.
         folder = os.path.dirname(self.path) if Path(self.path).suffix == ".json" else self.path
         return scene_name(folder if is_url(folder) else Path(folder))
 
@@ -129,6 +130,7 @@ def _load(source: SceneSource, room: int | None, is_divided: bool, is_built_in: 
     with sharing_errors(division):
         if division is not None:
             given = [f"scene={SYNTHETIC if is_built_in else 'from files'}"]
+            # Machines may have the scene at different paths.
             given += [f"{name}={value}" for name, value in vars(source).items() if name != "path"]
             division.check_same(given, "options of the scene")
         check_literal("alpha", source.alpha, AlphaMeaning)
@@ -164,6 +166,7 @@ def _read(path: Path, options: Options) -> Scene:
         if is_video(path):
             command = f"`a2tg sfm {as_argument(path)} SCENE`"
             raise ValueError(f"{path}: is a video; to make a scene of it, run {command} first")
+        # OpenSfM's reconstruction.json is JSON as well, but no transforms file.
         is_json = is_json and is_regular(path) and told_of_capture(path) is None
     else:
         check_reachable(path.parent if path.suffix.lower() in (".json", ".xml") else path)
@@ -188,6 +191,7 @@ def _read(path: Path, options: Options) -> Scene:
     if told is not None:
         again = f"; or find cameras again: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
         raise FileNotFoundError(f"{path}: {told}{again}")
+    # Such as scene/images, or a folder in it.
     scene = next((parent for parent in path.resolve().parents[:2] if _loader(parent) is not None), None)
     if scene is not None:
         raise FileNotFoundError(f"{path}: is a folder in the scene {scene}; give that folder instead")

@@ -25,7 +25,7 @@ class ObservedPoints(NamedTuple):
         return int(self.pixels.nbytes + self.depths.nbytes)
 
     def scaled(self, factor: float) -> "ObservedPoints":
-        """Return the points in a world that is `factor` times as large, if they are not too near or far then."""
+        """Return the points in a world that is `factor` times as large, without those that are then too near or far."""
         depths = (self.depths * np.float64(factor)).astype(np.float32)
         is_usable = _are_usable(depths)
         return ObservedPoints(self.pixels[is_usable], depths[is_usable])
@@ -91,6 +91,7 @@ def check_observed_points(points: ObservedPoints, size: tuple[int, int], what: s
 
 def stacked_points(points: list[ObservedPoints | None], size: tuple[int, int], length: int) -> ObservedPoints:
     """Return the points of V views of a size (H, W) as arrays [V, length], padded as `ObservedPoints` says."""
+    # Padding continues the order past the image: training.terms.points_loss promises JAX sorted, unique indices.
     pixels = np.tile(np.arange(length, dtype=np.int32) + np.int32(size[0] * size[1]), (len(points), 1))
     depths = np.zeros(pixels.shape, np.float32)
     for row, own in enumerate(points):

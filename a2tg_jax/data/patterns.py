@@ -73,7 +73,7 @@ def mosaic(rng: np.random.Generator, side: int, ring: int) -> np.ndarray:
     y, x = (np.indices((side, side), np.float32) + 0.5) - side / 2
     radius, angle = np.hypot(x, y) / ring, np.arctan2(y, x) / (2 * np.pi) + 0.5
     index = radius.astype(int)
-    sectors = 6 * np.maximum(index, 1)
+    sectors = 6 * np.maximum(index, 1)  # 2πr ≈ 6r: stones of ring r are nearly square.
     along = angle * sectors
     stone = np.minimum(along.astype(int), sectors - 1)
     palette = np.stack([CREAM, INK, CORAL, TEAL, GOLD])
@@ -85,7 +85,7 @@ def mosaic(rng: np.random.Generator, side: int, ring: int) -> np.ndarray:
     shade = rng.uniform(0.92, 1.05, (index.max() + 1, sectors.max())).astype(np.float32)[index, stone]
     to_edge = np.minimum(radius - index, index + 1 - radius) * ring
     along_edge = np.minimum(along - stone, stone + 1 - along) * (2 * np.pi * radius * ring / sectors)
-    grout = np.clip(np.minimum(to_edge, along_edge) - 0.6, 0, 1)[..., None]
+    grout = np.clip(np.minimum(to_edge, along_edge) - 0.6, 0, 1)[..., None]  # 0.6 texels, then a soft edge.
     return palette[kind] * shade[..., None] * grout + GROUT * (1 - grout)
 
 
@@ -130,7 +130,7 @@ def planks(rng: np.random.Generator, side: int, width: int, length: int) -> np.n
     """Return a square floor of boards along the columns, `width` × `length` texels each, in two kinds of wood."""
     row, column = np.indices((side, side))
     board = row // width
-    shifted = column + (board * 577) % length
+    shifted = column + (board * 577) % length  # A prime step, so that joints do not line up.
     shades = rng.uniform(0, 1, (board.max() + 1, shifted.max() // length + 1)).astype(np.float32)
     shade = shades[board, shifted // length]
     u, v = coordinates(side, side)
@@ -164,7 +164,7 @@ def _text_mask(text: str, rows: int, columns: int, height: float, *, repeat: boo
     canvas = Image.new("L", (columns, rows))
     draw = ImageDraw.Draw(canvas)
     left, top, right, bottom = font.getbbox(text)
-    y = (rows - (bottom - top)) / 2 - top
+    y = (rows - (bottom - top)) / 2 - top  # Glyphs begin `top` below the position of the text.
     x = 0.0 if repeat else (columns - (right - left)) / 2 - left
     while x < columns:
         draw.text((x, y), text, fill=255, font=font, stroke_width=max(1, round(height / 40)), stroke_fill=255)

@@ -1,7 +1,7 @@
 """Captures of phones, whose cameras and depth maps are ARKit's, read as frames of `transforms.json`.
 
 Polycam's raw data are keyframes with a JSON file each (<https://github.com/PolyCam/polyform>). Record3D's are images
-named by number beside metadata with all poses.
+named by number, next to metadata with all poses.
 """
 
 import functools
@@ -88,12 +88,12 @@ def _points_of(base: Path, frame: dict[str, Any], file: Path, count: int) -> tup
         sure, _ = read_grey(confidence)
         is_measured &= (sure >= LEAST_CONFIDENCE) if sure.shape == depth.shape else True
     rows, columns = np.nonzero(is_measured)
-    chosen = np.random.default_rng(0).permutation(len(rows))[:count]
+    chosen = np.random.default_rng(0).permutation(len(rows))[:count]  # The same in every run.
     photograph = read_pixels(base / frame["file_path"])
     x = (columns[chosen] + 0.5) / depth.shape[1]
     y = (rows[chosen] + 0.5) / depth.shape[0]
     colors = photograph[(y * photograph.shape[0]).astype(int), (x * photograph.shape[1]).astype(int), :3]
-    ahead = depth[rows, columns][chosen] / 1000.0
+    ahead = depth[rows, columns][chosen] / 1000.0  # From mm to the m of poses.
     with np.errstate(all="ignore"):  # Cameras are checked later, points beyond all bounds are left out.
         right = (x * frame["w"] - frame["cx"]) / frame["fl_x"] * ahead
         down = (y * frame["h"] - frame["cy"]) / frame["fl_y"] * ahead
@@ -114,6 +114,7 @@ def _within_border(pixels: np.ndarray) -> np.ndarray:
 def record3d(path: Path) -> Callable[[], Frames] | None:
     """Return the function that reads Record3D's frames in a folder; None if there are none."""
     for file in (path / name for name in METADATA):
+        # The name alone says little.
         if is_regular(file) and b'"poses"' in read_regular(file, MOST_BYTES):
             return functools.partial(_record3d_frames, file)
     return None
@@ -133,6 +134,7 @@ def _record3d_frames(file: Path) -> Frames:
         [image for image in base.glob("*") if image.suffix.lower() in PHOTO_SUFFIXES and image.stem.isdecimal()]
         for base in (file.parent / name for name in IMAGE_FOLDERS)
     ]
+    # Reversed, because a dict keeps the last: of 0.jpg and 0.png the first by name.
     images = {int(image.stem): image for image in sorted(next(filter(None, numbered), []), reverse=True)}
     frames = []
     for number, image in sorted(images.items()):

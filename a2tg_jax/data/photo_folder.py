@@ -33,6 +33,7 @@ CAMERA_PICTURE = "cameras.png"
 LISTS = (".a2tg-run", ".a2tg-frames")
 """Lists of what runs and renders wrote into a folder, a name a line, after its checksum if it has one."""
 MOST_LIST_BYTES = 1 << 26
+# "masked" is left out: a masked photograph is one.
 NOT_PHOTOGRAPHS = re.compile(
     r"(?<![a-z])(mask(?!ed)[a-z]*|(mattes?|segmentations?|depths?|depthmaps?|normals|confidences?)(?![a-z]))",
     re.IGNORECASE,
@@ -42,7 +43,7 @@ THUMBNAIL = 32
 SMALLER_TOLERANCE, EQUAL_TOLERANCE = 2.0, 0.5
 """Largest mean difference in grey levels of thumbnails between a photograph and its copy, smaller or of its size.
 
-Copies at 1/4 differ by up to 1.2, and neighbouring frames of six captures by at least 2.4.
+Copies at 1/4 differ by up to 1.2, neighbouring frames of six captures by at least 2.4.
 """
 FOUND_BY: tuple[tuple[str, str], ...] = (
     ("*.psx", "is a project of Metashape: File > Export > Export Cameras as Agisoft XML, beside a folder images"),
@@ -93,6 +94,7 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
     names = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
     kinds = {
         "written by a2tg": _written(folder, names),
+        # Such as @eaDir, Synology's folder of thumbnails.
         "in hidden folders": {name for name in names if any(part[0] in ".@" for part in name.split("/")[:-1])},
         "masks or depth maps": _masks(names),
     }
@@ -117,6 +119,7 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
 
 
 def _files_below(folder: Path) -> Iterator[Path]:
+    # macOS puts ._0.jpg, which is no picture, next to 0.jpg on disks of other systems.
     return (file for file in folder.rglob("*") if file.name[0] != "." and file.is_file())
 
 
@@ -139,6 +142,7 @@ def told_of_capture(path: Path) -> str | None:
     """Return what a file or folder of another program is and what to do with it, or None if it is unknown."""
     if not path.is_dir():
         return next((told for pattern, told in FOUND_BY if "/" not in pattern and path.match(pattern)), None)
+    # min, because glob has no fixed order.
     found = ((min(path.glob(pattern), default=None), told) for pattern, told in FOUND_BY)
     return next((f"{first.relative_to(path).as_posix()} {told}" for first, told in found if first is not None), None)
 
@@ -150,6 +154,7 @@ def _written(folder: Path, names: Sequence[str]) -> set[str]:
         if file.name in LISTS and is_regular(file):
             place = PurePosixPath(file.parent.relative_to(folder).as_posix())
             lines = read_regular(file, MOST_LIST_BYTES).decode(errors="replace").splitlines()
+            # As sha256sum writes lines: checksum, two spaces, name.
             found |= {str(place / line.rpartition("  ")[2]) for line in lines}.intersection(names)
     return found
 
@@ -190,6 +195,7 @@ def _copies(folder: Path, names: Sequence[str]) -> set[str]:
     def is_copy(name: str, larger: str) -> bool:
         """Return whether two pictures have the same aspect, up to a pixel of rounding, and show the same."""
         (size, grey), (larger_size, larger_grey) = pictures[name], pictures[larger]
+        # A side rounded by a pixel changes w·H - h·W by H or W.
         if abs(size[0] * larger_size[1] - size[1] * larger_size[0]) > sum(larger_size):
             return False
         tolerance = EQUAL_TOLERANCE if size == larger_size else SMALLER_TOLERANCE

@@ -78,7 +78,7 @@ class Photo(NamedTuple):
     depths: Path | None = None
     """Depth map that the scene names."""
     counted: Counted | None = None
-    """What finds the pixels that count, for photographs without a mask."""
+    """Function that finds the pixels that count, for photographs without a mask."""
     panorama: int | None = None
     """Number of the panorama that it was cut from."""
 
@@ -115,7 +115,7 @@ def read_photos(
       options: of `load_scene`.
       place: path of the scene in messages.
       root: the scene's folder, which has no smaller copies: its siblings are other scenes.
-      how_to_remove: function from the name of an image to what removes it from the scene.
+      how_to_remove: function from an image name to advice on removing it from the scene.
     """
     found = _find_files(photos, options.downscale, place, root, how_to_remove)
     names: dict[Path, str] = {}
@@ -135,11 +135,13 @@ def read_photos(
     facts = divided(options.division, told, own_share, place)
     # All of them are read here if there is one process.
     others = [number for number in range(len(found)) if number not in read]
+    # Decided before the threads start: their order is not fixed.
     fitting = options.shelf.fitting([math.prod(facts[number].shape) for number in others])
 
     def of_another(number: int, fits: bool) -> Shot:
         own, stored = found[number], facts[number].stored
         again, shot = _read(own, options, None if fits else facts[number])
+        # In object storage, the size alone would be another request.
         if fits or not is_remote(own.file):
             size = again.stored if fits else picture_size(own.file)
             if size != stored:
@@ -181,13 +183,13 @@ def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple
         full = stored
         if downscale < options.downscale:  # The file is a smaller copy, and the full image may be missing.
             full = options.downscale * stored[0], options.downscale * stored[1]
-            # Of stores, the size would be another request for each photograph.
+            # In object storage, each size would be another request.
             if not is_remote(file) and (original := find_image(*photo.image)) is not None:
                 full = picture_size(original)
         lens = lens(full)
     (width, height), (camera_width, camera_height) = stored, lens.size
     ratio = (width * camera_height) / (height * camera_width)
-    if abs(ratio - 1) > max(MAX_ASPECT_ERROR, 1 / min(stored)):
+    if abs(ratio - 1) > max(MAX_ASPECT_ERROR, 1 / min(stored)):  # Or a pixel of the shorter side.
         is_turned = (height, width) == lens.size
         advice = "write it turned as EXIF says (magick mogrify -auto-orient FILE), or " if is_turned else ""
         raise ValueError(
@@ -214,6 +216,7 @@ def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple
         if options.alpha == "mask" and pixels.shape[2] == 4:
             is_opaque = pixels[..., 3] == 255
             counts = is_opaque if counts is None else is_opaque & counts
+            # A view would keep the alpha channel in memory.
             pixels, is_stored = np.ascontiguousarray(pixels[..., :3]), False
         facts = _Facts(stored, pixels.shape, is_stored, None if counts is None else Mask.of(counts))
         picture = options.shelf.keep(pixels, file, None if is_stored else view)
@@ -340,6 +343,7 @@ def _read_mask(
     if size not in (stored, lens.size):
         told = "x".join(map(str, size)), "x".join(map(str, stored))
         raise ValueError(f"{file}: is {told[0]}, but its photograph is {told[1]}; a mask must be of the same size")
+    # Pillow takes no [H, W, 1]. Resampled, only 255 from nothing but 255 stays 255.
     planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
     planes, _ = lens.view_pixels(planes, downscale)
     return np.asarray(resize_pixels(planes, *view_size)[..., 0] == 255)
@@ -380,9 +384,10 @@ def read_depths(file: str | os.PathLike[str]) -> np.ndarray:
             values = read_npy(file)
         except Unreachable:
             raise
-        except Exception as error:  # what a damaged file raises goes from SyntaxError to struct.error
+        except Exception as error:  # Damaged files raise anything from SyntaxError to struct.error.
             reason = shortened(str(error) or type(error).__name__)
             raise ValueError(f"{file}: cannot be read as a depth map ({reason}); replace or remove it") from error
+        # With the axis of a batch or a channel, such as [1, H, W].
         values = values.reshape([side for side in values.shape if side != 1]) if values.ndim > 2 else values
     else:
         levels, largest = read_grey(file)

@@ -50,7 +50,7 @@ class Picture:
     shape: tuple[int, ...]
     """[H, W, 3] or, with straight alpha, [H, W, 4]."""
     read: Callable[[], np.ndarray]
-    """The pixels; not to be written to."""
+    """Function that returns the pixels; do not write to them."""
     is_held: bool = False
     """Whether they are in memory."""
     dtype: DTypeLike = np.uint8
@@ -81,6 +81,7 @@ class Picture:
 
     def __reduce__(self) -> Any:
         """Pickle the pixels; of a photograph that is read unchanged from its file, only the place."""
+        # `view` is a local function, which pickle cannot write.
         if isinstance(self.read, _FileRead) and self.read.view is None:
             return Picture, tuple(getattr(self, field.name) for field in dataclasses.fields(self))
         return Picture.of, (self.read(),)
@@ -132,6 +133,7 @@ class Mask:
     def read(self) -> np.ndarray:
         """Return [H, W] bool."""
         bits = np.frombuffer(zlib.decompress(self.data), np.uint8)
+        # packbits filled up the last byte.
         return np.unpackbits(bits, count=self.shape[0] * self.shape[1]).view(bool).reshape(self.shape)
 
 
@@ -166,7 +168,7 @@ class DepthMap:
 
     def read(self) -> np.ndarray:
         """Return [H, W] float32, NaN where unknown, its largest magnitude 1 (scales are unknown anyway)."""
-        values = np.array(self.load(), np.float32)
+        values = np.array(self.load(), np.float32)  # A copy, written to below.
         values[~np.isfinite(values)] = np.nan
         largest = np.nanmax(np.abs(values), initial=0.0)
         return values / largest if largest > 0 else values
@@ -259,14 +261,14 @@ class Shelf:
                 file.seek(start)
                 file.write(np.ascontiguousarray(pixels).data)
                 file.flush()
-                self._end += pixels.nbytes
+                self._end += pixels.nbytes  # After the write: the next one replaces one that failed.
         except OSError as error:
             advice = "make room there, name another place in XDG_CACHE_HOME, or use a larger downscale"
             raise OSError(f"{folder}: cannot keep the scene's photographs ({error.strerror}): {advice}") from error
 
         def read() -> np.ndarray:
             again = np.empty(shape, np.uint8)
-            with self._lock:
+            with self._lock:  # Pictures share the position in the file.
                 file.seek(start)
                 file.readinto(again)  # type: ignore[attr-defined]
             return again

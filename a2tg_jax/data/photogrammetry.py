@@ -2,8 +2,8 @@
 
 Metashape writes one XML file (File > Export > Export Cameras). Its lenses follow the manual's appendix on camera
 models: a projection onto the plane z = 1 (frame), or onto radii θ (equidistant fisheye) or 2·sin(θ/2) (equisolid
-fisheye) for a ray at the angle θ, then Brown's distortion. RealityScan (RealityCapture) writes an XMP file beside each
-photograph.
+fisheye) for a ray at the angle θ, then Brown's distortion. RealityScan (RealityCapture) writes an XMP file next to
+each photograph.
 """
 
 import functools
@@ -43,7 +43,7 @@ PROJECTIONS = {
 }  # fmt: skip
 """Projections that are read, by the type of a sensor."""
 LARGEST_MISFIT = 0.05
-"""Largest difference in pixels between an equisolid fisheye and the polynomial that stands for it."""
+"""Largest difference in pixels between an equisolid fisheye and its polynomial approximation."""
 NUM_ANGLES = 200
 """Number of angles at which they are compared."""
 HEAD_BYTES = 1 << 16
@@ -65,7 +65,7 @@ def metashape(path: Path) -> Callable[[], Frames] | None:
 
 
 def _metashape_frames(file: Path) -> Frames:
-    """Return the frames of Metashape's cameras. A PLY file beside them, if it is the only one, holds their points."""
+    """Return the frames of Metashape's cameras. A PLY file next to them, if it is the only one, has their points."""
     frames, lacking = [], []
     folder, images = file.parent, file.parent / "images"
     below: dict[str, set[Path]] = defaultdict(set)  # Images in all folders below, with and without suffix.
@@ -115,8 +115,9 @@ def _posed_cameras(file: Path) -> list[tuple[str, Element, np.ndarray]]:
             world = worlds.get(posed.get("component_id"))
             own = _numbers_in(pose.text, 16, file).reshape(4, 4) @ offset
             world = of_chunk if world is None else world
-            if world is not None:  # The rotation keeps the scale 1.
+            if world is not None:
                 own = world @ own
+                # s·R has the determinant s³; poses are rigid. rigid_viewmat reports a scale of 0.
                 own[:3, :3] /= np.cbrt(abs(np.linalg.det(world[:3, :3]))) or 1.0
             found.append((label, sensor, own))
     by_offset = "have no own pose, such as {}: placed by their sensors' offsets from the master, in units of its pose"
@@ -141,7 +142,7 @@ def _offset(sensor: Element, master: Element | None, file: Path) -> np.ndarray |
     if from_sensor is None and (from_master is None or sensor.get("master_id") is not None):
         return None
     offset: np.ndarray = np.linalg.inv(np.eye(4) if from_master is None else from_master)
-    return offset if from_sensor is None else offset @ from_sensor
+    return offset if from_sensor is None else offset @ from_sensor  # From sensor to rig to master.
 
 
 def _world(part: Element, file: Path) -> np.ndarray | None:
@@ -172,6 +173,7 @@ def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
         advice = "cut panoramas into views with a2tg sfm" if kind == "spherical" else UNDISTORTED
         raise ValueError(f"{what}: is of a sensor of type {shortened(kind)}, which is not read; {advice}")
     with_focal = [part for part in sensor.iter("calibration") if part.find("f") is not None]
+    # A sensor may have its initial calibration as well; poses belong to the adjusted one.
     calibration = min(with_focal, key=lambda part: part.get("class") != "adjusted", default=None)
     if calibration is None:
         raise ValueError(f"{what}: is of a sensor without a calibration; {UNDISTORTED}")
@@ -185,9 +187,11 @@ def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
         return float(_numbers_in(calibration.findtext(name, "0"), 1, what)[0])
 
     higher = HIGHER_TERMS[projection]
+    # Skew is b2·y, where y goes up to height / f.
     if any(map(read, higher)) or abs(read("b2")) * height / max(read("f"), 1.0) > LARGEST_SKEW:
         told = ", ".join(higher)
         raise ValueError(f"{what}: its {projection} lens has {told} or b2, which are not supported; {UNDISTORTED}")
+    # Metashape's manual: u = w/2 + cx + x·(f + b1) + y·b2, v = h/2 + cy + y·f.
     lens: dict[str, Any] = {
         "w": int(width), "h": int(height), "fl_x": read("f") + read("b1"), "fl_y": read("f"),
         "cx": width / 2 + read("cx"), "cy": height / 2 + read("cy"),
@@ -203,11 +207,13 @@ def _equidistant_terms(lens: dict[str, Any], what: str) -> dict[str, float]:
     """Return k1 to k4 of the equidistant fisheye nearest to an equisolid one with its own k1 to k4, up to
     `LARGEST_MISFIT`."""
     farthest = np.hypot(max(lens["cx"], lens["w"] - lens["cx"]), max(lens["cy"], lens["h"] - lens["cy"]))
+    # Inverse of r = 2·sin(θ/2) at the farthest corner.
     widest = min(2 * np.arcsin(min(farthest / max(lens["fl_y"], 1.0) / 2, 1.0)), np.pi / 2)
-    angles = np.linspace(0, widest, NUM_ANGLES + 1)[1:]
+    angles = np.linspace(0, widest, NUM_ANGLES + 1)[1:]  # At 0 both radii are 0.
     radii = 2 * np.sin(angles / 2)
     distorted = radii * (1 + sum(lens[f"k{power}"] * radii ** (2 * power) for power in range(1, 5)))
     powers = angles[:, None] ** (2 * np.arange(1, 5))
+    # θ·(1 + Σ k_p·θ^2p) is linear in k_p.
     terms, *_ = np.linalg.lstsq(angles[:, None] * powers, distorted - angles, rcond=None)
     misfit = lens["fl_y"] * np.abs(angles * (1 + powers @ terms) - distorted).max()
     if not misfit <= LARGEST_MISFIT:  # Also for NaN.
@@ -226,7 +232,7 @@ def realityscan(path: Path) -> Callable[[], Frames] | None:
 
 
 def _realityscan_frames(path: Path, files: list[Path]) -> Frames:
-    """Return the frames of XMP files, each beside its image. The only PLY file in the folder holds the points."""
+    """Return the frames of XMP files, each next to its image. The only PLY file in the folder has the points."""
     frames, lacking = [], []
     for file in files:
         image = find_image(file.parent, file.stem)
@@ -239,7 +245,7 @@ def _realityscan_frames(path: Path, files: list[Path]) -> Frames:
             if element.tag.startswith(XCR):
                 values[element.tag.removeprefix(XCR)] = element.text or ""
         pose = np.eye(4)
-        pose[:3, :3] = _numbers_in(values.get("Rotation"), 9, file).reshape(3, 3).T
+        pose[:3, :3] = _numbers_in(values.get("Rotation"), 9, file).reshape(3, 3).T  # Stored from world to camera.
         pose[:3, 3] = _numbers_in(values.get("Position"), 3, file)
         lens = _xcr_lens(values, *picture_size(image), file)
         frames.append({**lens, "file_path": image.relative_to(path).as_posix(), "transform_matrix": pose @ OPENGL})
@@ -272,7 +278,7 @@ def _xcr_lens(values: dict[str, str], width: int, height: int, file: Path) -> di
 
 
 def _with_points(file: Path, frames: list[dict[str, Any]]) -> Frames:
-    """Return frames with poses as lists, and the points of the only PLY file beside `file`, if it is near them."""
+    """Return frames with poses as lists, and the points of the only PLY file next to `file`, if they are near."""
     poses = np.stack([frame["transform_matrix"] for frame in frames])
     middle = np.median(poses[:, :3, 3], axis=0)
     farthest = FARTHEST_POINTS * np.linalg.norm(poses[:, :3, 3] - middle, axis=1).max()
@@ -295,7 +301,7 @@ def _with_points(file: Path, frames: list[dict[str, Any]]) -> Frames:
 
 
 def _read_xml(file: Path) -> Element:
-    """Return the root of an XML file. Declarations of entities, which can grow without end, are refused."""
+    """Return the root of an XML file. Entity declarations, which can expand without limit, are rejected."""
     data = read_regular(file, MOST_BYTES)
     try:
         if b"<!ENTITY" in data or b"<!DOCTYPE" in data:

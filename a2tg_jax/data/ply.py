@@ -1,4 +1,4 @@
-"""PLY files of strangers: their header and tables, and points with colours from them."""
+"""Untrusted PLY files: their header and tables, and points with colours from them."""
 
 import os
 from collections.abc import Iterable, Mapping
@@ -19,7 +19,7 @@ PLY_TYPES = dict(zip(OLD_TYPES + NEW_TYPES, NUMPY_TYPES * 2, strict=True))
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 LONGEST_LINE, MOST_LINES, MOST_DIGITS = 4096, 10_000, 20
 OFFSET = "offset"
-"""First word of the comment that says what positions are relative to."""
+"""First word of the comment with the origin of positions."""
 COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Names of colours, in order of preference."""
 SH_DEGREE0 = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -49,7 +49,7 @@ class PlyFile:
             words = line.decode("ascii", "replace").split()
             if words == ["end_header"]:
                 return
-            if not line.endswith(b"\n"):
+            if not line.endswith(b"\n"):  # The end of the file, or a line that is too long.
                 break
             match words:
                 case ["format", encoding, *_]:
@@ -65,6 +65,7 @@ class PlyFile:
                     self.counts[name], self.fields[name] = int(number), {}
                 case ["property", kind, field] if name and kind in PLY_TYPES and field not in self.fields[name]:
                     self.fields[name][field] = PLY_TYPES[kind]
+                # A list, an unknown type or a second one of its name; an error only if the element is read.
                 case ["property", *_]:
                     self._unreadable.setdefault(name, shortened(" ".join(words[1:])))
                 case ["comment", *text]:
@@ -72,14 +73,14 @@ class PlyFile:
         raise ValueError(f"{path}: its PLY header does not end")
 
     def require(self, element: str, names: Iterable[str], wanted: str) -> None:
-        """Raise ValueError unless an element can be read, and has some properties of what is wanted."""
+        """Raise ValueError unless an element can be read and has the named properties."""
         if element in self._unreadable:
             raise ValueError(f"{self.path}: cannot read the {element} property '{self._unreadable[element]}'")
         if missing := [name for name in names if name not in self.fields[element]]:
             raise ValueError(f"{self.path}: has no attribute {', '.join(missing)}; {wanted} is expected")
 
     def require_vertices(self, names: Iterable[str], wanted: str) -> None:
-        """Raise ValueError unless vertices come first, can be read, and have some properties of what is wanted."""
+        """Raise ValueError unless vertices come first, can be read and have the named properties."""
         if [*self.counts][:1] != ["vertex"] or not self.encoding:
             found = shortened([*self.counts])
             raise ValueError(f"{self.path}: vertices must be the first element of the PLY; it has {found}")
@@ -116,13 +117,13 @@ class PlyFile:
 
     @property
     def offset(self) -> np.ndarray:
-        """[3] float64 what positions are relative to: zeros without the comment "offset X Y Z"."""
+        """[3] float64 origin of positions: zeros without the comment "offset X Y Z"."""
         for word, *numbers in filter(None, self.comments):
             if word == OFFSET and len(numbers) == 3:
                 try:
                     return np.array([float(number) for number in numbers])
                 except ValueError:
-                    continue  # Words of another program.
+                    continue  # A comment of another program.
         return np.zeros(3)
 
 
@@ -145,6 +146,7 @@ def read_ply_points(path: Path) -> PointCloud:
         ply = PlyFile(file, path)
         ply.require_vertices("xyz", "a PLY file of points")
         vertices = ply.read("vertex")
+    # In map coordinates, float32 has steps of half a metre.
     points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=-1) + ply.offset
     return PointCloud(points, _colors(vertices, ply.fields["vertex"]))
 
@@ -153,6 +155,7 @@ def _colors(vertices: np.ndarray, fields: Mapping[str, str]) -> np.ndarray:
     names = next((names for names in (*COLORS, SH_DEGREE0) if set(names).issubset(fields)), None)
     if names is None or not len(vertices):
         return np.full((len(vertices), 3), 128, np.uint8)
+    # NaN as uint8 is undefined.
     given = np.nan_to_num(np.stack([vertices[name] for name in names], axis=-1).astype(np.float64))
     if names == SH_DEGREE0:
         colors = 0.5 + SH_C0 * given

@@ -56,7 +56,7 @@ class Disc:
 class Tube:
     """A vertical cylinder without caps, seen from the outside or, as a room's wall, from the inside.
 
-    u runs from left to right as one sees it, v downwards.
+    u runs from left to right as seen, v downwards.
     """
 
     center: Vector
@@ -113,7 +113,7 @@ class Ball:
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """A cube standing upright, turned about the vertical; its image holds the faces +x, +y, -x, -y, +z side by side."""
+    """An upright cube, turned about the vertical; its image holds the faces +x, +y, -x, -y, +z side by side."""
 
     center: Vector
     half_side: float
@@ -131,7 +131,7 @@ class Block:
         entry, leaving = np.float32(NEAR), np.float32(np.inf)
         start, step = self.axes @ (origins - column(self.center)), self.axes @ directions
         for position, speed in zip(start, step, strict=True):
-            inverse = 1 / np.where(np.abs(speed) < 1e-9, np.float32(1e-9), speed)
+            inverse = 1 / np.where(np.abs(speed) < 1e-9, np.float32(1e-9), speed)  # No 1 / 0 for a ray along a face.
             middle, reach = -position * inverse, np.abs(inverse)
             entry, leaving = np.maximum(entry, middle - reach), np.minimum(leaving, middle + reach)
         return np.where((entry < leaving) & (entry > NEAR), entry, np.float32(np.inf))
@@ -139,8 +139,9 @@ class Block:
     def locate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, y, z = self.axes @ (points - column(self.center))
         face = np.argmax(np.stack([x, y, -x, -y, z]), axis=0)
+        # The inverse of `rights` and `downs` in place.
         along, down = np.choose(face, [y, -x, -y, x, x]), np.where(face == 4, -y, -z)
-        inside = np.float32(0.9999)
+        inside = np.float32(0.9999)  # 1 would be on the next face of the image.
         return (face + np.clip(0.5 + 0.5 * along, 0, inside)) / 5, np.clip(0.5 + 0.5 * down, 0, inside)
 
     def place(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +172,7 @@ def nearest_hits(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (t, index of the shape), both [P], of the first hit of each ray; t is infinite if it misses all."""
     nearest = np.full(directions.shape[1], np.inf, np.float32)
-    index = np.zeros(directions.shape[1], np.int8)
+    index = np.zeros(directions.shape[1], np.int8)  # For up to 127 shapes.
     for number, shape in enumerate(shapes):
         t = shape.hit(origins, directions)
         index[t < nearest] = number
@@ -189,7 +190,7 @@ def trace_rays(
     t, index = nearest_hits([surface.shape for surface in surfaces], origin, directions)
     points = origin + t * directions
     colors = np.zeros((len(t), 3), np.uint8)
-    index[~np.isfinite(t)] = -1
+    index[~np.isfinite(t)] = -1  # nearest_hits has 0 there, which is a shape.
     for number, surface in enumerate(surfaces):
         hits = np.flatnonzero(index == number)
         rows, columns = surface.image.shape[:2]
@@ -229,10 +230,11 @@ def light(colored: list[tuple[ParametricSurface, np.ndarray]], rng: np.random.Ge
         rows, columns = (max(2, -(-size // TEXELS_PER_SAMPLE)) for size in colors.shape[:2])
         u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
         points, normals = (x.astype(np.float32) for x in shape.place(u.ravel(), v.ravel()))
-        points = points + np.float32(1e-3) * normals
+        points = points + np.float32(1e-3) * normals  # Off the surface, which would shade itself.
         # Of the sky, the share of the cosine-weighted hemisphere with nothing nearer than SKY_REACH.
         sky = np.zeros(points.shape[1], np.float32)
         for offset in _unit_vectors(rng, NUM_SKY_RAYS):
+            # The sum of a normal and a random unit vector is distributed by the cosine; 0.999 keeps it from 0.
             directions = normals + np.float32(0.999) * offset[:, None]
             directions /= np.linalg.norm(directions, axis=0)
             sky += nearest_hits(shapes, points, directions)[0] > SKY_REACH
@@ -241,7 +243,7 @@ def light(colored: list[tuple[ParametricSurface, np.ndarray]], rng: np.random.Ge
         for offset in _unit_vectors(rng, NUM_LAMP_RAYS):
             towards = LAMP + np.float32(LAMP_RADIUS) * offset[:, None] - points
             cosine = (towards * normals).sum(axis=0) / np.linalg.norm(towards, axis=0)
-            is_free = nearest_hits(shapes, points, towards)[0] > 1
+            is_free = nearest_hits(shapes, points, towards)[0] > 1  # The lamp is at 1.
             lamp += np.maximum(cosine, 0) * is_free
         coarse = SKY_LIGHT * (sky / NUM_SKY_RAYS)
         coarse = coarse + LAMP_LIGHT * (lamp / NUM_LAMP_RAYS)

@@ -47,9 +47,9 @@ class View:
     depth: DepthMap | None = None
     """Depth map for `loss.depth_weight`, or an array [H, W] of floats; None without one."""
     panorama: int | None = None
-    """Number of the panorama that it was cut from; None of a photograph. Its views are held out together."""
+    """Number of the panorama that it was cut from; None for a photograph. Its views are held out together."""
     points: ObservedPoints | None = None
-    """Points of the reconstruction that it observed, for `loss.points_weight`; None if they are not known."""
+    """Points of the reconstruction that it observed, for `loss.points_weight`; None if unknown."""
 
     def __post_init__(self) -> None:
         """Convert arrays to pictures, masks and depth maps.
@@ -61,6 +61,7 @@ class View:
         for field, kind in (("picture", Picture), ("mask", Mask), ("depth", DepthMap)):
             value = getattr(self, field)
             try:
+                # The dataclass is frozen.
                 object.__setattr__(self, field, None if value is None and field != "picture" else kind.of(value))
             except ValueError as error:
                 raise ValueError(f"view {self.name}: {error}") from error
@@ -235,6 +236,7 @@ def view_image(view: View, background: Sequence[float] | np.ndarray | None = Non
 def scene_name(folder: Path | str) -> str:
     """Return the end of a folder's path or URL, from the last name that says more than "scene" or "colmap" does."""
     is_url = isinstance(folder, str) or is_remote(folder)
+    # As in a path, the first part is the root, which is no name.
     parts = ("", *str(folder).split("/")[2:]) if is_url else Path(folder).resolve().parts
     told = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]
     return "/".join(parts[told[-1] if told else -1 :])

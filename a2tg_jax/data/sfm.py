@@ -77,11 +77,11 @@ def run_sfm(
       seed: random seed of COLMAP, at least 0.
       camera_model: COLMAP's name of the camera model to estimate; the FISHEYE models are for action cameras.
       matching: pairs of photographs to match; "auto" takes all pairs of up to 200, and neighbours by name of more.
-      frames: largest number of frames to take from each video. The sharpest are taken, evenly along the camera's way.
+      frames: largest number of frames to take from each video. The sharpest are taken, evenly along the camera path.
       panorama: pictures to cut into perspective views: "auto" takes those twice as wide as high whose edges join,
         "yes" all that are twice as wide as high.
       progress: show progress bars.
-      on_note: takes lines about what was found among the photographs.
+      on_note: function that receives lines about what was found among the photographs.
 
     Returns:
       Counts of photographs, registered ones and points, and the reprojection error.
@@ -103,6 +103,7 @@ def run_sfm(
             raise FileExistsError(f"{existing}: exists already; choose another output folder or remove it")
     if out.is_file():
         raise FileExistsError(f"{out} is a file; choose a folder for the scene")
+    # The temporary folder is in `out`, so results are moved on one disk, without a copy.
     with _new_folder(out), tempfile.TemporaryDirectory(dir=out, prefix="sfm-") as folder, _quiet():
         work = Path(folder)
         staged = stage(sources, work, frames=frames, panorama=panorama, progress=progress, tell=on_note)
@@ -125,7 +126,7 @@ def run_sfm(
         with _clock("undistorting", progress):
             chosen, undistorted = work / "chosen", work / "undistorted"
             chosen.mkdir()
-            model.write(chosen)
+            model.write(chosen)  # undistort_images takes folders.
             pycolmap().undistort_images(undistorted, chosen, staged.folder)
             (out / "sparse").mkdir()
             shutil.move(undistorted / "sparse", out / "sparse" / "0")
@@ -141,7 +142,7 @@ def list_photos(database: Path, staged: Staged, camera_model: str) -> None:
     Listing the images first numbers them by name; otherwise the threads of the extraction do, by chance.
     """
     colmap = pycolmap()
-    database.touch()
+    database.touch()  # import_images rejects a path without a file.
     for group in staged.all_groups:
         reader = colmap.ImageReaderOptions(camera_model=camera_model)
         if group.focal is not None:
@@ -253,7 +254,7 @@ def _new_folder(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     try:
         yield
-    except BaseException:
+    except BaseException:  # Ctrl-C as well.
         with suppress(OSError):
             for path in made:
                 path.rmdir()

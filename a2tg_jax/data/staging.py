@@ -37,7 +37,7 @@ FIELD_OF_VIEW = np.deg2rad(100.0)
 """Field of view of each square view of a panorama; with the headings below no direction is left out."""
 AROUND = 6
 """Number of views around the horizon; one view up and one down join them."""
-ROWS_AT_ONCE = 128
+ROWS_AT_ONCE = 128  # Rays of a whole view would take many times its memory.
 SEAM_TOLERANCE, LEAST_SEAM = 2.0, 3.0
 """Largest step of brightness over the seam, in steps of neighbouring columns and in grey levels above that."""
 
@@ -105,7 +105,7 @@ def stage(
       frames: largest number of frames to take from each video.
       panorama: which pictures are cut into views.
       progress: show progress bars.
-      tell: takes lines about what was found.
+      tell: function that receives lines about what was found.
     """
     folder = work / "photos"
     files: list[tuple[int, Path, str]] = []
@@ -124,7 +124,7 @@ def stage(
     for _, file, name in files:
         try:
             name.encode()
-        except UnicodeEncodeError:  # Bytes that are no UTF-8 are surrogates in Python's names of files.
+        except UnicodeEncodeError:  # Names have surrogates for bytes that are not UTF-8.
             told = os.fsencode(file).decode(errors="backslashreplace")
             raise ValueError(f"{told}: its name is not UTF-8, as COLMAP needs it; rename the photograph") from None
 
@@ -182,6 +182,7 @@ def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
 
     def wanted_name(photo: _Photo) -> str:
         """Return a photograph's name in the folder: with another suffix if its own does not suit the file there."""
+        # save_upright writes JPEG and PNG only.
         suits = (".jpg", ".jpeg", ".png") if photo.facts.is_turned else COLMAP_SUFFIXES
         if photo.facts.format in COLMAP_FORMATS and Path(photo.name).suffix.lower() in suits:
             return photo.name
@@ -191,8 +192,9 @@ def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
         target.parent.mkdir(parents=True, exist_ok=True)
         if photo.facts.format in COLMAP_FORMATS and not photo.facts.is_turned:
             try:
+                # Whether os.link follows symbolic links depends on the system.
                 os.link(photo.file.resolve(), target)
-            except FileExistsError:
+            except FileExistsError:  # It is an OSError, but nothing may be replaced.
                 raise
             except OSError:  # The file system has no links.
                 shutil.copyfile(photo.file, target)
@@ -262,6 +264,7 @@ def directions() -> tuple[Direction, ...]:
 
 def view_size(width: int) -> tuple[int, float]:
     """Return (side, focal length) in pixels of the views of a panorama, which keep its resolution at their middle."""
+    # A panorama has width / 2π pixels per radian, the focal length of a view that is as fine in its middle.
     side = 2 * round(width / (2 * np.pi) * np.tan(FIELD_OF_VIEW / 2))
     return side, side / (2 * np.tan(FIELD_OF_VIEW / 2))
 
@@ -275,6 +278,7 @@ def cut_view(panorama: np.ndarray, direction: Direction) -> np.ndarray:
     for top in range(0, side, ROWS_AT_ONCE):
         rows = view[top : top + ROWS_AT_ONCE]
         x, y = np.meshgrid(np.arange(side) + 0.5 - side / 2, np.arange(top, top + len(rows)) + 0.5 - side / 2)
+        # Rows times R are Rᵀ times columns: from the view to the panorama.
         rays = np.stack([x, y, np.full_like(x, focal)], -1) @ direction.rotation
         longitude = np.arctan2(rays[..., 0], rays[..., 2])
         latitude = np.arctan2(-rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
@@ -289,6 +293,7 @@ def is_panorama(pixels: np.ndarray) -> bool:
     """Return whether a picture [H, W, C] is twice as wide as high, and its right edge continues at its left edge."""
     if pixels.shape[1] != 2 * pixels.shape[0]:
         return False
+    # The first step is across the seam, the others are for comparison.
     columns = pixels[:, [-1, 0, 1, 2, 3]].astype(np.float32)
     steps = np.abs(np.diff(columns, axis=1)).mean(axis=(0, 2))
     return bool(steps[0] <= SEAM_TOLERANCE * steps[1:].mean() + LEAST_SEAM)

@@ -53,8 +53,8 @@ def synthetic_scene(
     """Make the built-in scene: pinhole views on a closed curve over an arc, and points on the surfaces they see.
 
     Args:
-      seed: of patterns, light and points; the arrangement is always the same.
-      num_views: at least 2.
+      seed: random seed for patterns, light and points; the arrangement is always the same.
+      num_views: number of views, at least 2.
       width, height: size of the images in pixels, before `downscale`.
       num_points: points sampled evenly over the images, instead of a sparse reconstruction; at least 2.
       downscale: k >= 1; images have 1/k of the size.
@@ -87,6 +87,7 @@ def synthetic_scene(
         xy, depths = pinhole_pixels(own, K), own[:, 2]
         rays = _directions(shot.viewmat, K, *xy.T)
         hits, _ = nearest_hits([surface.shape for surface in surfaces], _center(shot.viewmat), rays)
+        # Rays have z = 1 in the camera, so hits are depths.
         is_seen = depths <= (1 + SAME_SURFACE) * hits
         points = observed_points(xy[is_seen], depths[is_seen], shot.picture.size)
         shots[index] = dataclasses.replace(shot, points=points)
@@ -116,7 +117,7 @@ def still_life(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.nda
 
 def camera_path(num_views: int) -> np.ndarray:
     """Return camera centres [V, 3] evenly along a closed figure of eight in front of the target, above its height."""
-    phase = 2 * np.pi * (np.arange(num_views) + 0.5) / num_views  # half a step beside the crossing
+    phase = 2 * np.pi * (np.arange(num_views) + 0.5) / num_views  # half a step off the crossing
     azimuth = -0.5 * np.pi + np.deg2rad(40.0) * np.sin(phase)
     elevation = np.deg2rad(26.0) + np.deg2rad(11.0) * np.sin(2 * phase + 0.6)
     outward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -141,6 +142,7 @@ def render(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, width: i
     image = np.empty((width * height, 3), np.uint8)
     for candidates, is_member in groups:
         directions = _directions(viewmat, K, x[is_member], y[is_member])
+        # Rays are linear in x and y, so one shift serves all pixels.
         shifts = _directions(viewmat, K, *(K[:2, 2:] + SAMPLE_OFFSETS)) - _directions(viewmat, K, *K[:2, 2:])
         samples = [trace_rays(candidates, center, directions + shift[:, None])[0] for shift in shifts.T]
         image[is_member] = np.rint(np.sum(samples, axis=0, dtype=np.uint16) / len(samples))
@@ -180,7 +182,7 @@ def exact_depths(scene: Scene) -> list[np.ndarray]:
 def _exact_hits(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield centre [3, 1], rays [3, P] with z = 1, and depths t [P] of the pixels of each training view, in the
     original world."""
-    shapes = [shape for shape, _ in still_life(np.random.default_rng(0))]
+    shapes = [shape for shape, _ in still_life(np.random.default_rng(0))]  # Only patterns depend on the seed.
     inverse = scene.transform.inverse()
     for camera in (view.camera for view in scene.train):
         viewmat = inverse.apply_to_viewmat(np.asarray(camera.viewmat, np.float64))

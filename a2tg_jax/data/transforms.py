@@ -30,7 +30,7 @@ from a2tg_jax.host.text import shortened
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
 POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
-"""Names of the points of nerfstudio and of 3DGS beside a transforms file, in order of preference."""
+"""Names of point files of nerfstudio and 3DGS next to a transforms file, in order of preference."""
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "ply_file_path")
 SPLIT_KEYS = ("train_filenames", "test_filenames", "val_filenames")
 PRISM_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")
@@ -120,7 +120,7 @@ def _points_beside(file: Path, *metas: dict[str, Any]) -> PointCloud | None:
 def _read_json(file: Path) -> dict[str, Any]:
     data = read_regular(file, MOST_BYTES)
     try:
-        meta: dict[str, Any] = parse_json(data, allow_nan=True)  # Numbers are looked at where they are used.
+        meta: dict[str, Any] = parse_json(data, allow_nan=True)  # Numbers are checked where they are used.
     except ValueError as error:
         raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
     _check_meta(file, meta)
@@ -139,6 +139,7 @@ def _check_meta(file: Path, meta: object) -> None:
             raise ValueError(f"{file}: frame {number} must be an object; got {shortened(values)}")
         for key in FILE_KEYS:
             name = values.get(key)
+            # All but images may be empty or null, which means none.
             if ((key == "file_path" and key in values) or name) and not (isinstance(name, str) and name):
                 raise ValueError(f"{file}: {key} must be the name of a file; got {shortened(name)}")
             if name:
@@ -165,6 +166,7 @@ def _read_shots(
         folder, name = file.parent, frame["file_path"]
         path, images, what = folder / name, folder / "images", f"{file}: {name}"
         lens: Lens | Callable[[tuple[int, int]], Lens] = functools.partial(_lens, frame, what, options.lens)
+        # Otherwise the lens needs the full image's size, once that is found.
         if frame.get("w") and frame.get("h"):
             lens = _lens(frame, what, options.lens, (0, 0))
         mask, depths = (folder / frame[key] if frame.get(key) else None for key in ("mask_path", "depth_file_path"))
@@ -221,6 +223,7 @@ def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int])
     elif terms["k4"] != 0:
         raise ValueError(f"{what}: has k4 with a perspective camera; only k1, k2, k3, p1 and p2 are read there")
     else:
+        # k4 to k6 of FULL_OPENCV are in a denominator, which is 1 with zeros.
         model, distortion = "FULL_OPENCV", [*(terms[key] for key in PRISM_KEYS[:5]), 0.0, 0.0, 0.0]
     params = [fx, fy, number("cx", width / 2), number("cy", height / 2), *distortion]
     return checked_lens(pycolmap().Camera(model=model, width=width, height=height, params=params), what, use)

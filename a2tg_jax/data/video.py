@@ -1,4 +1,4 @@
-"""Photographs from a video: frames that are sharp and apart from each other, turned as the video is shown.
+"""Photographs from a video: sharp, well-spaced frames, turned as players show them.
 
 A first pass scores small greyscale frames, a second one writes the chosen ones.
 """
@@ -44,6 +44,7 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
         sharpness.append(float(laplace(_grey(frame, SHARPNESS_WIDTH).astype(np.float32)).var()))
         small = _grey(frame, MOTION_WIDTH)
         moved = LEAST_MOTION if seen is None else motion(seen, small)
+        # `seen` is the last frame that moved, so that slow motion adds up.
         if moved >= LEAST_MOTION:
             seen, path = small, path + moved
         places.append(path)
@@ -51,6 +52,7 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
         raise ValueError(f"{video}: has no frames that can be decoded; convert it with ffmpeg to MP4 first")
     chosen = set(choose_frames(np.array(sharpness), np.array(places), count).tolist())
     folder.mkdir(parents=True)
+    # Decoded again, because all frames would not fit into memory.
     for number, frame in enumerate(_frames(video, "writing frames", progress)):
         if number in chosen:
             pixels = _as_shown(frame.to_ndarray(format="rgb24"), _display_matrix(frame))
@@ -65,10 +67,11 @@ def choose_frames(sharpness: np.ndarray, places: np.ndarray, count: int) -> np.n
 
     Args:
       sharpness: [T] score of each frame.
-      places: [T] length of the camera's way until each frame; it does not grow while the camera is still.
+      places: [T] length of the camera path up to each frame, constant while the camera is still.
       count: number of intervals, at least 1.
     """
     way = places - places[0]
+    # The last frame is in the last interval. 1e-12 is for a camera that stands still.
     interval = np.minimum((way * (count / max(way[-1], 1e-12))).astype(int), count - 1)
     order = np.lexsort((-sharpness, interval))  # By interval, the sharpest first.
     is_first = np.diff(interval[order], prepend=-1) > 0
@@ -83,6 +86,7 @@ def motion(before: np.ndarray, after: np.ndarray) -> float:
     """
     before, after = before.astype(np.float32), after.astype(np.float32)
     slope = sum(float(np.abs(part).mean()) for part in np.gradient(before))
+    # Blank frames have no slope.
     return float(np.abs(after - before).mean() / max(slope, 1.0) / before.shape[1])
 
 
@@ -110,7 +114,7 @@ def _frames(video: Path, phase: str, progress: bool) -> Iterator[Any]:
 def _grey(frame: Any, width: int) -> np.ndarray:
     """Return a frame as greyscale of at most a width, [h, w] uint8."""
     width = min(width, frame.width)
-    height = max(2, round(frame.height * width / frame.width))
+    height = max(2, round(frame.height * width / frame.width))  # np.gradient needs two rows.
     return frame.reformat(width=width, height=height, format="gray").to_ndarray()
 
 

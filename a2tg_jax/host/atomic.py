@@ -35,11 +35,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         for partial, whole in _left_over_once(path.absolute().parent).items():
             if whole == path.absolute() and time.time() - partial.stat().st_mtime > STALE_SECONDS:
                 partial.unlink()
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")  # os.replace cannot move between disks.
     try:
         with named_if_full(path):
             yield temporary
-            with open(temporary, "rb+") as file:
+            with open(temporary, "rb+") as file:  # Windows flushes only what is open for writing.
                 os.fsync(file.fileno())
             os.replace(temporary, path)
             flush_folder(path.parent)

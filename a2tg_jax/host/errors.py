@@ -1,4 +1,4 @@
-"""Messages of errors that a user can do something about."""
+"""Messages for errors that a user can fix."""
 
 import contextlib
 import errno
@@ -32,7 +32,8 @@ def error_text(error: Exception, less_memory: str) -> str | None:
     inodes = room = ""
     path = Path(error.filename).absolute()
     with contextlib.suppress(OSError):
+        # The file's folder may be missing.
         free = shutil.disk_usage(next(above for above in (path, *path.parents) if above.is_dir())).free
-        if error.errno == errno.ENOSPC:
+        if error.errno == errno.ENOSPC:  # Free bytes say nothing about a quota.
             inodes, room = " or has no inodes left" if free > PLENTY else "", f", {free / 1e6:.1f} MB are free"
     return f"{error.filename}: the disk is full{inodes}{room}: make room, or write to another disk"

@@ -33,7 +33,9 @@ class _WithFields:
             self._whole = self._text  # The parser reads this docstring, too.
             bases = [base for base in reversed(owner.__mro__) if base.__module__.startswith("a2tg_jax.")]
             params = [param for base in bases for param in parse_from_object(base).params]
+            # Bases come first: the text of a subclass replaces theirs.
             fields = {p.arg_name: inspect.cleandoc(p.description or "") for p in params if p.args[0] == "attribute"}
+            # Names are indented by 2, further lines by 4.
             lines = [textwrap.indent(f"{name}: {text}", "    ")[2:] for name, text in fields.items()]
             self._whole = "\n".join([inspect.cleandoc(self._text), *(["", "Attributes:", *lines] if lines else [])])
         return self._whole

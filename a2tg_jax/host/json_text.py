@@ -38,6 +38,7 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
     """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     _check_size(data, MOST_BYTES)
+    # Brackets in texts count as well: a bound that needs no parsing.
     if (found := data.count(b"[") + data.count(b"{")) > MOST_BRACKETS:
         raise ValueError(f"it has {found:,} brackets; {MOST_BRACKETS:,} are the most that is read")
 
@@ -48,11 +49,12 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
         return value
 
     def integer(digits: str) -> int:
+        # int takes quadratic time, and has its own error from 4,300 digits on.
         if len(digits) > MOST_DIGITS:
             raise ValueError(f"a number of {len(digits)} digits is too large")
         return int(digits)
 
-    text = data.decode("utf-8-sig", "surrogatepass")
+    text = data.decode("utf-8-sig", "surrogatepass")  # json rejects a byte order mark.
     return _parsed(lambda: json.loads(text, parse_constant=number, parse_int=integer, parse_float=number))
 
 
@@ -95,8 +97,9 @@ def _check_size(data: bytes, most: int) -> None:
 
 def _parsed(parse: Callable[[], Any]) -> Any:
     """Return a parsed value. Raises ValueError if its lists and mappings are nested more than `DEEPEST` deep."""
-    with contextlib.suppress(RecursionError):
+    with contextlib.suppress(RecursionError):  # json and tomllib recurse.
         value = parse()
+        # Level by level, because a recursive walk might overflow the stack itself.
         level = [value]
         for _ in range(DEEPEST):
             lists = [list(held.values()) if isinstance(held, dict) else held for held in level]

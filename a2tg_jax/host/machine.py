@@ -40,6 +40,7 @@ def set_num_threads(num_threads: int | None) -> None:
       ValueError: if the number is not a positive integer.
     """
     global _chosen
+    # isinstance would accept True.
     if num_threads is not None and (type(num_threads) is not int or num_threads < 1):
         raise ValueError(f"num_threads must be a positive integer or None; got {num_threads!r}")
     _chosen = num_threads
@@ -77,6 +78,7 @@ def control_groups(root: Path, controller: str) -> list[Path]:
         return []
     folders: list[Path] = []
     for _, controllers, path in (line.split(":", 2) for line in lines if line.count(":") >= 2):
+        # Version 2 has one hierarchy, which is listed without controllers.
         if not controllers or controller in controllers.split(","):
             top = root / "sys/fs/cgroup" / controllers
             here = top / path.lstrip("/")
@@ -94,12 +96,12 @@ def cpu_quota(root: Path = Path("/")) -> float:
                 quota, period = (folder / "cpu.max").read_text().split()
             else:  # version 1
                 quota, period = ((folder / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
-            quotas += [int(quota) / int(period)] if int(quota) > 0 else []
+            quotas += [int(quota) / int(period)] if int(quota) > 0 else []  # -1 is no limit.
     return min(quotas)
 
 
 def memory_limit(root: Path = Path("/")) -> int:
-    """Return the total bytes of memory that this process may use: its own, and what is free now (host).
+    """Return the total bytes of memory that this process may use: its own plus what is free now (host).
 
     Limits of control groups count. A group's file cache counts as free.
     """
@@ -108,6 +110,7 @@ def memory_limit(root: Path = Path("/")) -> int:
         with contextlib.suppress(OSError, ValueError):  # a file of the other version, or "max"
             room = int((folder / limit).read_text()) - int((folder / usage).read_text())
             stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+            # The kernel drops inactive file cache on demand. Version 1 has the sums over subgroups in total_*.
             left.append(room + int(stat.get("total_inactive_file", stat.get("inactive_file", 0))))
     return int(psutil.Process().memory_info().rss) + max(0, min(left))
 
@@ -199,6 +202,7 @@ def default_platform() -> str:
     """Return JAX's platform of the device on which new arrays are placed ("cpu" or "gpu")."""
     import jax
 
+    # jax.default_device may name another one than the first.
     (device,) = jax.numpy.zeros(()).devices()
     return device.platform
 

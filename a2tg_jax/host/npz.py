@@ -39,6 +39,7 @@ def read_npz(
                     name = entry.filename.removesuffix(".npy")
                     if not is_wanted(name):
                         continue
+                    # Over all entries: many that are within the bound add up.
                     room -= entry.file_size
                     if name in arrays:
                         raise ValueError(f"{name} occurs twice")
@@ -66,6 +67,7 @@ def _read_array(file: IO[bytes], name: str, size: int) -> np.ndarray:
     """Return one array. Its entry must hold exactly its bytes after the header."""
     dtype, is_fortran, shape = _read_header(file, name)
     left = size - file.tell()
+    # Python's integers do not overflow, NumPy's would.
     if math.prod(shape) * dtype.itemsize != left:
         raise ValueError(f"{name} claims the shape {shape} of {dtype}, but has {left} bytes")
     flat = np.empty(math.prod(shape), dtype)
@@ -84,13 +86,15 @@ def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype, bool, tuple[int,
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"{name} is of the version {version} of .npy, which is not supported")
+    # https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html
     length = int.from_bytes(file.read(2 if version == (1, 0) else 4), "little")
     if length > LONGEST_HEADER:
         raise ValueError(f"{name} has a header of {length} bytes")
     header: Any = ast.literal_eval(file.read(length).decode())
     dtype, shape = np.dtype(header["descr"]), header["shape"]
-    if dtype.kind not in "biuf" or dtype.itemsize > 8 or dtype.shape:
+    if dtype.kind not in "biuf" or dtype.itemsize > 8 or dtype.shape:  # Arrays of objects are pickles.
         raise ValueError(f"{name} must be of plain numbers; got {dtype}")
+    # True is no size. NumPy before 2.0 has at most 32 dimensions.
     if type(shape) is not tuple or not all(type(side) is int and side >= 0 for side in shape) or len(shape) > 32:
         raise ValueError(f"{name} has no shape")
     return dtype, header["fortran_order"] is True, shape

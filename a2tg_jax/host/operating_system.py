@@ -25,7 +25,7 @@ def try_lock(number: int) -> bool:
     Returns:
       False if another process has the lock. True if this one has it, or if the file system has no locks.
     """
-    refusal = PermissionError if sys.platform == "win32" else BlockingIOError
+    refusal = PermissionError if sys.platform == "win32" else BlockingIOError  # EACCES and EWOULDBLOCK.
     try:
         if sys.platform == "win32":
             import msvcrt
@@ -37,7 +37,7 @@ def try_lock(number: int) -> bool:
 
             fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        return not isinstance(error, refusal)
+        return not isinstance(error, refusal)  # Otherwise there are no locks.
     return True
 
 
@@ -63,7 +63,7 @@ def signal_handlers_kept() -> Iterator[None]:
     before = {}
     for signum in signal.valid_signals() if sigaction else ():
         handler = ctypes.create_string_buffer(HANDLER_SIZE)
-        if sigaction(int(signum), None, handler) == 0:
+        if sigaction(int(signum), None, handler) == 0:  # Without a new action it only reads.
             before[int(signum)] = handler
     try:
         yield
@@ -102,6 +102,7 @@ def own_output_only() -> None:
     def moved(stream: TextIO, number: int) -> TextIO:
         stream.flush()
         kept = os.fdopen(os.dup(number), "w", buffering=1, encoding=stream.encoding, errors=stream.errors)
+        # C++ writes to the descriptors 1 and 2, not to Python's streams.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, number)
         os.close(nowhere)
@@ -131,4 +132,4 @@ def cuda_of_driver() -> tuple[int, int] | None:
         ctypes.CDLL(library).cuDriverGetVersion(ctypes.byref(number))
     except (OSError, AttributeError):
         return None
-    return number.value // 1000, number.value % 1000 // 10
+    return number.value // 1000, number.value % 1000 // 10  # 13020 is 13.2.

@@ -1,4 +1,4 @@
-"""Untrusted files: only regular files up to a largest size are opened.
+"""Untrusted files: only regular files up to a size limit are opened.
 
 Links are followed if they lead to a regular file: reading a device never ends, and a pipe waits for a writer. Remote
 files (`host.remote_files`) are fetched into temporary files.
@@ -54,6 +54,7 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTE
     """
     if is_remote(path):
         return fetched(path, most_bytes)
+    # Opening alone can have effects on a device.
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise ValueError(_refusal(path))
     # A pipe may have replaced it meanwhile; opening does not wait for its writer.
@@ -68,6 +69,7 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTE
 def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:
     """Read the bytes of a regular file, up to its size when opened. Errors as in `open_regular`."""
     with open_regular(path, most_bytes) as file:
+        # A file may grow beyond the bound while it is read.
         return file.read(os.fstat(file.fileno()).st_size)
 
 

@@ -1,4 +1,4 @@
-"""Files in object storage and in whatever else fsspec supports, as paths of universal_pathlib.
+"""Files in object storage and anything else that fsspec supports, as paths of universal_pathlib.
 
 Such a path has pathlib's methods and is annotated as `Path`. Each request to a store takes a while, so every folder is
 listed once, and files are fetched whole. Failed requests are repeated. URLs must not contain secrets, because the run
@@ -65,11 +65,12 @@ class Entry(NamedTuple):
 Listing = dict[str, Entry]
 _listings: dict[tuple[Any, str], Listing] = {}
 """Entries of folders by name, by file system and path."""
-_lock = threading.RLock()
+_lock = threading.RLock()  # listed calls itself for a parent (_may_exist).
 
 
 def is_remote(path: object) -> bool:
-    """Return whether a path is one of universal_pathlib that the operating system does not know."""
+    """Return whether a path is one of universal_pathlib that the operating system cannot open."""
+    # universal_pathlib has os.PathLike for local paths only.
     return not isinstance(path, str | os.PathLike)
 
 
@@ -146,7 +147,7 @@ def located(path: str | os.PathLike[str] | RemotePath) -> Path:
         found = UPath(url)
         _ = found.fs, found.path  # The file system is made now, with its errors.
     except ImportError as error:
-        package = getattr(error.__cause__ or error, "name", None)
+        package = getattr(error.__cause__ or error, "name", None)  # fsspec's own error has no name.
         advice = f": pip install {package}" if package in LIBRARIES else ""
         raise ValueError(f"{url}: {error}{advice}") from None
     except Exception as error:
@@ -157,7 +158,7 @@ def located(path: str | os.PathLike[str] | RemotePath) -> Path:
 def check_reachable(folder: Path) -> None:
     """List a folder again, in one attempt, so that a mistake in a URL or in credentials is reported at once."""
     _listings.clear()
-    cast(Any, folder).fs.invalidate_cache()
+    cast(Any, folder).fs.invalidate_cache()  # fsspec keeps listings as well.
     if not listed(folder, pauses=()):
         raise FileNotFoundError(f"{folder}: no such scene folder, or it is empty")
 
@@ -206,6 +207,7 @@ def fetched(path: Any, most_bytes: int) -> BufferedReader:
         for start in range(0, size, PIECE):
             end = start + PIECE if start + PIECE < size else size + 1  # One byte more shows whether the file is longer.
             file.write(_retried(path, functools.partial(path.fs.cat_file, path.path, start=start, end=end)))
+        # The size was not listed, or is too small: read to the end.
         if not size or file.tell() > size:
             _retried(path, lambda: _stream(path, file, most_bytes))
         if file.tell() > most_bytes:
@@ -237,7 +239,7 @@ def _key(folder: Any) -> tuple[Any, str]:
 
 def _may_exist(folder: Any) -> bool:
     """Return False if a folder is below a listed one and in no listing; some stores refuse to list such a folder."""
-    if ".." in folder.parts:
+    if ".." in folder.parts:  # Parents by name are not the real ones.
         return True
     is_below = any(_key(parent) in _listings for parent in folder.parents if _key(parent) != _key(folder))
     return not is_below or folder.name in listed(folder.parent)

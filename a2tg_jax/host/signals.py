@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: orderly ends of a program.
+"""Ctrl-C, SIGTERM and SIGHUP: orderly shutdown of a program.
 
 Python ignores exceptions in callbacks of the garbage collector, and JAX has such a callback. A signal that comes while
 one runs is therefore sent again.
@@ -68,6 +68,7 @@ def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
             raise Stopped(number)
 
     default = (signal.default_int_handler, signal.SIG_DFL)
+    # _Heard: a handler of an outer block.
     own = tuple(n for n in numbers if (old := signal.getsignal(n)) in default or isinstance(old, _Heard))
     with _handled_by(note, own):
         try:
@@ -92,7 +93,7 @@ class _Heard:
         while above is not None:
             if above.f_code in callbacks:
                 again = threading.Timer(SOON, _send, (number,))
-                again.daemon = True
+                again.daemon = True  # The process may end first.
                 again.start()
                 return
             above = above.f_back
@@ -114,6 +115,7 @@ def _handled_by(handler: Callable[..., object], numbers: tuple[int, ...]) -> Ite
     before: dict[int, object] = {}
     if threading.current_thread() is threading.main_thread():
         before = {number: signal.getsignal(number) for number in numbers}
+        # None: a handler that C code installed, which Python could not restore.
         before = {number: old for number, old in before.items() if old not in (signal.SIG_IGN, None)}
     for number in before:
         signal.signal(number, _Heard(handler))

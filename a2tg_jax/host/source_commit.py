@@ -15,6 +15,7 @@ def source_commit() -> str | None:
     when it installed from a repository (direct_url.json, PEP 610); None if neither is known."""
     try:
         if (CHECKOUT / ".git").exists():
+            # --exclude=* leaves out tags, whose names would be printed.
             command = ["git", "-C", str(CHECKOUT), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty"]
             done = subprocess.run(command, capture_output=True, text=True, timeout=GIT_SECONDS, check=True)
             return done.stdout.strip()

@@ -36,7 +36,7 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
 
     if num_threads is not None:
         machine.set_num_threads(num_threads)
-    machine.num_threads()
+    machine.num_threads()  # Raises if the number in the environment is wrong.
     features = processor_features()
     add_xla_flags(cpu_flags(features, jax.__version_info__[:2]))
     if use_cache and jax.config.values["jax_compilation_cache_dir"] is None:

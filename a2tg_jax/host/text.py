@@ -41,8 +41,9 @@ def in_bytes(num: float) -> str:
     """Return a number of bytes with three digits in bytes, kB, MB or GB (10^9 bytes)."""
     size, text = float(num), counted(round(num), "byte")
     for unit in ("kB", "MB", "GB"):
-        if size < 999.5:
+        if size < 999.5:  # 999.5 is printed as 1,000.
             break
         size /= 1e3
+        # Numbers are rounded up to 10.0 from 9.995 on, and to 100 from 99.95 on: three digits in any case.
         text = f"{size:,.{2 if size < 9.995 else 1 if size < 99.95 else 0}f} {unit}"
     return text
