@@ -86,8 +86,8 @@ class Lens:
     def view_pixels(self, pixels: np.ndarray, downscale: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Return the pixels [h', w', C] of a photograph's view, and their K [3, 3].
 
-        The photograph, [h, w, C] uint8, is of the calibrated size, perhaps scaled. Unless kept, it is undistorted before
-        it is downscaled, which keeps it sharp.
+        The photograph, [h, w, C] uint8, is of the calibrated size, perhaps scaled. Unless kept, it is undistorted
+        before it is downscaled, which keeps it sharp.
         """
         new_size, K = self.view_of((pixels.shape[1], pixels.shape[0]), downscale)
         if not (self.is_kept or self.is_pinhole):
