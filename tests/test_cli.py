@@ -606,3 +606,12 @@ def test_doctor_compares_the_compositors(capsys, monkeypatch):
     assert "but slowly: native is not available" in doctor._verdict("cpu", {"native": "…"}, has_driver=False)
     monkeypatch.setattr(doctor, "_compare", lambda available: float("inf"))
     assert "the compositors differ by inf" in fails(capsys, "doctor")
+
+
+def test_help_into_a_closed_pipe_ends_in_silence():
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "a2tg_jax", "--help"]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (141, "")

@@ -69,13 +69,13 @@ def main(argv: Sequence[str] | None = None) -> int:
       if the pipe that reads the output is closed.
     """
     name, *arguments = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
-    if name in ("-h", "--help", "--version"):
-        print(version("a2tg-jax") if name == "--version" else OVERVIEW)
-        return 0
-    if name not in COMMANDS:
+    if name not in (*COMMANDS, "-h", "--help", "--version"):
         near = did_you_mean(name, COMMANDS)
         return _fail(f"there is no command {name!r}{near or ';'} the commands are {', '.join(COMMANDS)}")
     try:
+        if name not in COMMANDS:
+            print(version("a2tg-jax") if name == "--version" else OVERVIEW, flush=True)
+            return 0
         with warnings.catch_warnings(), signals.raised():
             warnings.showwarning = _show_warning
             configure_cpu()
