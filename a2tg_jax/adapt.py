@@ -23,7 +23,7 @@ from a2tg_jax.parallel.sharded_rows import on_host
 from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures, checked_sizes
 
 Axes = Literal["paper", "authors"]
-"""Whose choice of the axis that a thin Gaussian doubles."""
+"""Rule for the axis that a thin Gaussian doubles."""
 PAPER_ITERATIONS = 30_000
 PAPER_INTERVAL, SHORT_INTERVAL = 1 / 60, 0.15
 """Shares of a stage between two upscalings: the paper's 500 of 30,000 iterations, and a longer one for short stages, in
@@ -124,7 +124,7 @@ class Upscale(HostEvent):
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
         if self.select == "budget":
             return max(num_bytes, self._budget_bytes)
-        # Most who grow have grown before; how many pass a threshold is not known.
+        # Most of those that grow have grown before; how many will pass a threshold is unknown.
         share = self.fraction if self.select == "fraction" else USUAL_SHARE
         # Each time doubles both sides at most.
         texels = min(4.0 ** len(self.iterations(num_iterations)), self.cap**2)

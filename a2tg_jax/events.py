@@ -209,7 +209,7 @@ class Event:
         return num
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
-        """Return the bytes that it leaves of a model of `num` Gaussians, about, for forecasts (host)."""
+        """Return the approximate bytes of a model of `num` Gaussians after the event, for forecasts (host)."""
         return num_bytes
 
 
@@ -238,7 +238,7 @@ class HostEvent(Event):
         raise NotImplementedError(f"{type(self).__name__} must define iterations(num_iterations)")
 
     def num_programs(self, num_iterations: int) -> int:
-        """Return the number of programs compiled because of it, about, for forecasts (host).
+        """Return roughly how many programs are compiled because of it, for forecasts (host).
 
         The default is one each time before the end of the stage. Override it if shapes stay (`keep_rows`).
         """

@@ -42,7 +42,7 @@ class Model:
     gaussians: Gaussians
     """Allocated rows, of which the first `num_live` exist."""
     appearance: Appearance = Appearance()
-    """What the Gaussians show; plain Gaussians by default."""
+    """Appearance of the Gaussians; plain by default."""
     num_live: Array | None = None
     """int32 number of rows that exist; None if all do."""
     background: Color = static(default=BLACK)

@@ -67,7 +67,7 @@ class Appearance:
     """[N, D] numbers to show instead of all colour, residuals of textures included, D >= 1, of either sign; None
     otherwise."""
     max_alpha: float | None = static(default=None)
-    """Upper limit of alpha, in (0, 1); None: the one of the texture's options, or 0.99."""
+    """Upper limit of alpha, in (0, 1); None: the limit in the texture's options, or 0.99."""
 
     # For subclasses: class attributes.
 
@@ -157,8 +157,7 @@ class Appearance:
         return self
 
     def project(self) -> Self:
-        """Return the appearance with arrays of the subclass moved to where they are allowed, after an update;
-        traceable."""
+        """Return the appearance with arrays of the subclass projected onto their ranges after an update; traceable."""
         return self
 
     def rates(self, rate: object) -> Any:
@@ -373,7 +372,7 @@ def allocate_appearance(template: A, key: Array, gaussians: Gaussians) -> A:
 
 
 def projected(appearance: A) -> A:
-    """Return the appearance with all numbers moved to where they are allowed, after an update; traceable."""
+    """Return the appearance with all numbers projected onto their ranges after an update; traceable."""
     parts: Any = {name: part.project() for name, part in _parts_of(appearance).items()}
     return dataclasses.replace(appearance, **parts).project()
 
@@ -388,7 +387,7 @@ def count_floats(appearance: Appearance, num: int) -> int:
 
 
 def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
-    """Raise ValueError, naming the field, unless the arrays of an appearance are there and fit the Gaussians (host)."""
+    """Raise ValueError, naming the field, unless the arrays of an appearance exist and fit the Gaussians (host)."""
     kind, dtypes = type(appearance).__name__, " or ".join(FLOATS)
     check_arrays_given(appearance)
     for path, leaf in jax.tree_util.tree_leaves_with_path(partition(appearance)[0]):

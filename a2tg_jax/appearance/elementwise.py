@@ -1,7 +1,7 @@
 """The element-wise functions of an appearance, composed with its parts, as compositors trace and compile them.
 
 They are called with scalars, or with arrays that broadcast: K numbers of the splat, C values of its texture, and u, v.
-`check_shading` names the appearance, what it returned and what was wanted.
+Errors of `check_shading` name the appearance, its result and the requirement.
 """
 
 import dataclasses
@@ -153,7 +153,7 @@ def check_shading(static: StaticShading, arguments: Arguments) -> None:
     """Raise unless the element-wise functions of an appearance take scalars and return what the compositor needs.
 
     Raises:
-      ValueError: if a result has another form than it must have.
+      ValueError: if a result has the wrong form.
       Exception: what the appearance's own code raises, with a note that names it and the arguments.
     """
     name, functions, num_colors = static.name, arguments.of(()), arguments.num_colors

@@ -34,7 +34,7 @@ class Part:
         raise NotImplementedError
 
     def project(self) -> Self:
-        """Return the part with its numbers moved to where they are allowed, after an update; traceable."""
+        """Return the part with its numbers projected onto their ranges after an update; traceable."""
         return self
 
     def rates(self, rate: object) -> Any:

@@ -104,7 +104,7 @@ def event_budget(total_bytes: float, current_bytes: float, event_index: int, num
     """Return the bytes that event j = `event_index` of m may add: 1/(m - j + 1) of the unspent memory budget, rounded
     down.
 
-    Both numbers of bytes are those that reports give (`measure.metrics.parameter_bytes`).
+    Both numbers of bytes are counted as in reports (`measure.metrics.parameter_bytes`).
 
     Raises:
       ValueError: if the budget is already exceeded or the event does not exist.

@@ -29,7 +29,7 @@ LEAST_FACING = 0.5
 """Smallest median cosine between optical axes and the directions to the subject."""
 LARGEST_ELEVATION = np.radians(80)  # a camera straight above has no level horizon (`looking`)
 FEWEST = 4
-"""Smallest number of cameras whose right axes say more than their mean up."""
+"""Smallest number of cameras whose right axes are trusted over their mean up."""
 LEAST_SPREAD = 0.025
 """Smallest second eigenvalue of the right axes' moments: headings that spread by 9°."""
 LARGEST_RATIO = 0.25
@@ -73,7 +73,7 @@ def vertical_of(viewmats: np.ndarray) -> np.ndarray:
 
 def central_camera(viewmats: np.ndarray) -> int:
     """Return the index of the camera [V, 4, 4] whose axis passes nearest to the subject and which is nearest to the
-    median camera; both count alike."""
+    median camera, with equal weight."""
     centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
     subject = nearest_point(centers, axes)
     misses = np.linalg.norm(np.cross(subject - centers, axes), axis=1)

@@ -29,7 +29,7 @@ LARGEST_OFFSET = 100.0
 MAX_SKEW = 1e-2
 """Largest deviation of a rotation from an orthonormal matrix that still passes as rounding."""
 MAX_DRIFT = 5e-2
-"""Largest deviation of a rendered camera's rotation from an orthonormal matrix, such as gradient steps leave."""
+"""Largest deviation of a rendered camera's rotation from an orthonormal matrix, as left by gradient steps."""
 LARGEST_COORDINATE = LARGEST_NUMBER
 """Largest coordinate of a camera or a point, in any world."""
 

@@ -18,7 +18,7 @@ from a2tg_jax.core.gaussians import Gaussians, rotation_columns
 FILTER_VARIANCE = 0.5
 """Variance in pixels² of the low-pass filter: ρ₂ = 2·|(x, y) − c|²."""
 NEAR_PLANE = 0.2
-"""Default depth from which splats are drawn."""
+"""Default smallest depth at which splats are drawn."""
 POLYGON_SIDES = 8  # its corners are 8 % outside the disc, 1 / cos(π/8)
 BOUND_SLACK = 1e-2
 """Margin of every bound for rounding, in squared pixels."""
@@ -54,7 +54,7 @@ def homographies(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
 
 
 class Outline(NamedTuple):
-    """Outline of all that a splat shows: an ellipse, or a circle around the mean, which the low-pass filter reaches.
+    """Outline of all that a splat draws: an ellipse, or a circle around the mean, which the low-pass filter reaches.
 
     Inside the ellipse, (x − e)ᵀS⁻¹(x − e) <= 1 with S = [[xx, xy], [xy, yy]]. Lengths are in pixels.
     """

@@ -37,7 +37,7 @@ def at_least(x: Array, least: float) -> Array:
 
 
 def within(x: Array, least: float, most: float) -> Array:
-    """Return x clipped to [least, most], with derivative 1 on both bounds, as `at_least` has it."""
+    """Return x clipped to [least, most], with derivative 1 on both bounds, as in `at_least`."""
     return jnp.where(x > most + _rounding_of(x), jnp.asarray(most, x.dtype), at_least(x, least))
 
 

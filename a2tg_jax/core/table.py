@@ -45,7 +45,7 @@ class Shape(NamedTuple):
 
 @pytree
 class Table:
-    """Blocks of all Gaussians, by size. A subclass says how a block changes its size, and what padding holds.
+    """Blocks of all Gaussians, by size. A subclass defines how blocks are resized and what padding contains.
 
     Its floats are differentiable; `partition` keeps its integers from `jax.grad`.
     """
@@ -80,8 +80,8 @@ class Table:
 
     @classmethod
     def allocate(cls, sizes: ArrayLike, values: Sequence[float], dtype: DTypeLike = jnp.float32) -> Self:
-        """Return blocks of the given sizes [N, D] that hold the C `values` everywhere (host); one of sides 0 takes no
-        bytes."""
+        """Return blocks of the given sizes [N, D] that hold the C `values` everywhere (host); one with sides of 0
+        takes no bytes."""
         places, capacities = plan_places(np.asarray(sizes))
         value, shapes = jnp.asarray(values, dtype), zip(capacities, places.bucket_sizes, strict=True)
         buckets = [jnp.broadcast_to(value, (capacity, *size, len(values))) for capacity, size in shapes]
@@ -304,7 +304,7 @@ def plan_places(
 
 
 class Resized(NamedTuple):
-    """Result of `resize`: a table of the given class, and the moments with their tables rebuilt as it was."""
+    """Result of `resize`: a table of the given class, and the moments with their tables rebuilt likewise."""
 
     table: Any
     moments: Any
@@ -322,7 +322,7 @@ def resize(
     in the table and 0 in moments.
 
     Moments are any pytree, such as the state of Adam: all tables in it of the same class are rebuilt, other leaves
-    stay. Of blocks that are not `kept` [N] they become 0. `known` and `room` are as for `plan_places`.
+    stay. They become 0 for blocks that are not `kept` [N]. `known` and `room` are as for `plan_places`.
     """
     places, capacities = plan_places(sizes, known, like=table.bucket, room=room)
     ends = [(on_host(own.bucket), on_host(own.row)) for own in (table, places)]

@@ -56,7 +56,7 @@ class CloneSplitPrune(StepEvent):
 
     cap: int = static(default=500_000)
     """Largest number of Gaussians and of allocated rows; a memory_budget replaces it. Beyond it the largest
-    gradients go first and the others are counted."""
+    gradients have priority, and the others are counted."""
     threshold: float = 2e-4
     """Smallest average gradient that is densified, by the position on the screen in units of half an image. With a
     memory_budget the largest gradients are densified, however small."""

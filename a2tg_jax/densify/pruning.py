@@ -94,11 +94,11 @@ class Contributions(NamedTuple):
 
 
 def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contributions:
-    """Return how much each of N Gaussians shows, and in how many views it shows at least `least` pixels (host).
+    """Return how much each of N Gaussians contributes, and in how many views by at least `least` pixels (host).
 
     Spare rows show nothing. Of the views, at least one, only cameras and masks are used. The devices over which the
-    model's rows are spread draw each view together. If they are of several processes, all of these call it, and get the
-    numbers of the first one, since GPUs may round sums differently each time.
+    model's rows are spread draw each view together. If they belong to several processes, all of these call it, and get
+    the first one's numbers, since GPUs may round sums differently each time.
     """
     if not views:
         raise ValueError("views must hold at least one view; got none")
@@ -142,7 +142,7 @@ def _jitted() -> jax.stages.Wrapped:
 def _weights(
     model: Model, cameras: Camera, rays: Array | None, counted: Array, least: Array, settings: RenderSettings
 ) -> tuple[Array, Array]:
-    """Return the sums over views of one size and lens, and the numbers of views with at least so much. A picture is
+    """Return the sums over views of one size and lens, and the numbers of views with at least `least`. A picture is
     linear in the colours, so this is a backward pass of ones."""
     nothing = jnp.zeros_like(model.gaussians.means)
 

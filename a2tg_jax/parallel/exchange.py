@@ -3,8 +3,8 @@
 N rows of splats are sharded over D devices, N/D each. G views are drawn at once, where G divides D. Each image is cut
 into D/G bands of whole rows of tiles, one for each device, with about as many pairs in each (`ImageBands`). By one
 `all_to_all` every device sends to every other one the splats that reach its band, a fixed number of rows; JAX
-transposes it, which brings the gradients back. A splat that reaches two bands travels twice. The pixels then go to the
-devices that an even cut of the image gives them to, because JAX divides arrays evenly; mostly that is a few rows to the
+transposes it, which brings the gradients back. A splat that reaches two bands travels twice. The pixels then move to
+the devices that have them in an even cut of the image, because JAX divides arrays evenly; usually only a few rows go to
 neighbours.
 
 The received rows keep the order of the model, so that a band is composited as it is on one device.
@@ -378,7 +378,8 @@ def value_and_grad_of_views(
 def map_views(function: Callable[[Any], tuple[Any, Any]], views: object, num_at_once: int) -> tuple[Any, Any]:
     """Return what `jax.lax.map` does, of a function of G views [G, ...] at a time, where G divides V.
 
-    Each of the G groups of devices draws V/G views in a row, whose photographs alone it needs (`sharding_of_batch`).
+    Each of the G groups of devices draws V/G views, one after the other, and needs only their photographs
+    (`sharding_of_batch`).
     The function returns results of the views, which come back as [V, ...], and results that they share, [V/G, ...].
     """
     # Group g draws the g-th part of the views, a view a round: `lax.map` goes along the rounds.

@@ -68,7 +68,7 @@ def exchange_with_room(
     exchange: Exchange, rooms: Sequence[RoomOfView], growth: float, *, num: int, num_live: int, capacity: int,
     tile_size: int,
 ) -> Exchange:  # fmt: skip
-    """Return the exchange with room for views once all `num` rows, of which `num_live` exist, are there (host).
+    """Return the exchange with room for views once all `num` rows, of which `num_live` exist now, are in use (host).
 
     The room is a multiple of the present rooms of some views; the capacity is the number of pairs of an image.
     """

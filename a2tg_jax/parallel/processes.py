@@ -1,7 +1,7 @@
 """Several processes that train one scene together: they join by `jax.distributed`, watch each other, and leave.
 
-They watch each other over TCP: each reports regularly, and notices who has ended or fallen silent. The first
-process has a connection to every other one, and reports whom it has lost. Everything runs in threads, because a
+They watch each other over TCP: each sends heartbeats, and detects when another one has ended or fallen silent. The
+first process has a connection to every other one, and reports each loss. Everything runs in threads, because a
 training waits for a lost process inside XLA and cannot be interrupted there.
 """
 
@@ -25,13 +25,13 @@ from a2tg_jax.host.operating_system import own_output_only, wait_in_abort
 from a2tg_jax.host.text import shortened
 
 BEATS = 5
-"""Number of signs of life within the time after which a silent process is lost."""
+"""Number of heartbeats within the time after which a silent process is lost."""
 GRACE = 2.0
 """Seconds in which a process that fails with the others can report its own error."""
 INTERRUPTED_GRACE = 300.0
 """Seconds in which a process that is interrupted with the others can write its last checkpoint."""
 LOOK_SECONDS = 0.1
-"""Seconds between two looks at who has arrived."""
+"""Interval in seconds at which new connections are polled."""
 ALIVE, BYE, FAILED, INTERRUPTED, OTHER_LOST, QUIT = b".", b"b", b"f", b"i", b"l", b"q"
 """Kinds of messages; a text follows FAILED and OTHER_LOST."""
 

@@ -1,7 +1,7 @@
-"""Who holds which rows: arrays whose rows are spread over the devices of a mesh, and those that every device has.
+"""Placement of arrays: rows spread over the devices of a mesh, or everything on every device.
 
 An array has its mesh in its sharding. A `Mesh | None` says where new arrays go; None is one device, where all arrays
-stay as they are. On the host, arrays are read by `on_host` and written by `placed_like`, one at a time, so that a
+stay unchanged. On the host, arrays are read by `on_host` and written by `placed_like`, one at a time, so that a
 change takes a share of the memory of each device. All processes make the same calls.
 """
 

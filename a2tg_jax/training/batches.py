@@ -114,7 +114,7 @@ class BatchOrder:
 
 
 class BatchPlan(NamedTuple):
-    """Place of the photographs during training."""
+    """Where the photographs are kept during training."""
 
     is_resident: bool
     """All of them stay on the device, with the rays of their lenses."""

@@ -159,7 +159,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; an older file of that name is replaced once the new one is whole."""
+    """Write a checkpoint; an older file of that name is replaced once the new one is complete."""
     state, model = checkpoint.state, checkpoint.state.model
     header = {
         "system": system_to_dict(checkpoint.system),

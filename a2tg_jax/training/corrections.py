@@ -62,7 +62,7 @@ class Correction:
         return None
 
     def project(self, rows: Array) -> Array:
-        """Return the rows of all views [V, ...], projected to where they belong after a step; traced."""
+        """Return the rows of all views [V, ...], projected onto their allowed values after a step; traced."""
         return rows
 
 

@@ -104,7 +104,7 @@ def fit(
       on_log: called with each new row of the history, every 10 iterations: a dictionary of numbers, with the names of
         the columns of `History.to_dict`.
       progress: show a progress bar.
-      is_stopped: called between steps and after the last. If it returns True, `on_checkpoint` is called a last time and
+      is_stopped: called between steps and after the last. If it returns True, `on_checkpoint` is called once more and
         `Interrupted` is raised. The first Ctrl-C does the same, unless the program handles it.
       session: what trainings of this process share, compiled shapes and devices; None: a new one.
 

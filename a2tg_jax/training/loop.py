@@ -99,7 +99,7 @@ def are_events_decided_by_host(state: TrainState) -> bool:
 
 
 class Session:
-    """Shapes that steps are compiled for, which trainings of one session prefer, and the devices that they use.
+    """Shapes that steps are compiled for, which trainings of one session reuse, and their devices.
 
     `fit` makes a new session unless you pass one. Pass the same session to all trainings of a sweep. No result depends
     on the shapes; on several devices sums have another order, so that last digits differ.
@@ -127,7 +127,7 @@ class Session:
         """Mesh over which rows are spread; None: one device."""
         processes = num_processes(self.mesh)
         self.devices = Devices(self.num_devices // processes, processes)
-        """Their numbers."""
+        """Numbers of devices of a process and of processes."""
         self.shapes: set[Shape] = set()
         """Shapes of textures."""
         self.capacities: dict[Hashable, set[int]] = {}
@@ -387,7 +387,7 @@ class StageRun:
         return dataclasses.replace(settings, capacity=self.capacities[size], exchange=self.exchanges.get(size))
 
     def _capacity(self, size: Size, pairs: float) -> int:
-        """Return a capacity for a number of pairs in views of a size, one that the session has if possible."""
+        """Return a capacity for a number of pairs in views of a size, if possible one of the session's."""
         stage = self.stage.name, self.stage.appearance, self.state.model.gaussians.num
         return self.session.capacity((*stage, *size), capacity_for(int(pairs)))
 

@@ -162,7 +162,7 @@ class System:
 
     @property
     def initial_bytes(self) -> float:
-        """Bytes of a Gaussian that training starts from, with what the first stage shows of it."""
+        """Bytes of a Gaussian that training starts from, with its appearance in the first stage."""
         return bytes_per_gaussian(self.initial_sh_degree, self.stages()[0].floats_shown(self.initial_sh_degree))
 
     @property

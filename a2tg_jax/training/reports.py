@@ -295,7 +295,7 @@ class StageEffects:
         return [time for time in event.iterations(end) if iteration <= time < end]
 
     def warn_of_never(self) -> None:
-        """Warn of events none of whose times is in the stage."""
+        """Warn of events that never happen within the stage."""
         end = self._stage.iterations
         for event in self._stage.events:
             if isinstance(event, StepEvent):

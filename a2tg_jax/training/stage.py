@@ -78,7 +78,7 @@ class LossTerm(Protocol):
 
     One that reads the render's depth, normal or distortion has `has_geometry = True`; one that reads the depth maps of
     the photographs has `has_depths = True`, and one that reads the reconstruction's points has `has_points = True`.
-    The history records it by its `name`, or its class's. One of several summands may have a method `parts` with
+    The history records it by its `name`, or its class's. A term of several summands may have a method `parts` with
     the same arguments, which returns them by name.
     """
 

@@ -127,7 +127,7 @@ class Attempt(NamedTuple):
     """State after the step, with the status of the state before."""
     info: EventInfo
     is_finite: Array
-    """Whether all numbers are: losses, gradients, and what projections and events made of Adam's results."""
+    """Whether all of these are finite: losses, gradients, and the results of Adam, projections and events."""
 
 
 @functools.cache
@@ -178,7 +178,7 @@ def attempt(
     settings: StepSettings, stage: Stage, clock: Clock, state: TrainState, photographs: Photographs,
     views: Array | None, scene_scale: Array, key: Array, rows: Array | None = None,
 ) -> Attempt:  # fmt: skip
-    """Return the outcome of one iteration. Arguments as of `train_step`, none of them donated."""
+    """Return the outcome of one iteration. Same arguments as `train_step`; none is donated."""
     iteration, model = state.iteration + 1, state.model
     num_keys = sum(event.num_keys for event in stage.events if isinstance(event, StepEvent))
     # By iteration, so that repeated and resumed steps draw the same numbers.

@@ -1,7 +1,7 @@
 """Loss terms: a stage minimises their weighted sum.
 
 A term is a frozen dataclass registered as a pytree, whose numbers are traced; `Term` makes one of any function.
-Here are the terms of the paper and its baselines, one that leaves out what moves, and priors of depth.
+Here are the terms of the paper and its baselines, one that ignores what moves, and depth priors.
 """
 
 import functools
@@ -151,7 +151,7 @@ class RobustPhotometric:
     factor: float = 4.0
     """Least residual of what is left out, as a multiple of the photograph's median."""
     start: float = 0.25
-    """Share of the stage after which something is left out; before, much is outlying that is not learned yet."""
+    """Share of the stage after which something is left out; before, what is not learned yet would be."""
     has_ssim: bool = static(default=True)
     """Whether to compute SSIM. Without it, images smaller than its window can be trained on."""
 
