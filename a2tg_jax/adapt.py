@@ -139,7 +139,7 @@ class Upscale(HostEvent):
         present = BYTES_PER_TEXEL * textures.count_elements(model.num)
         left = self._budget_bytes - num_bytes + present
         room = most_textures(textures.sizes, left, self.cap)
-        # So much padding costs more than to compile a step each time textures grow.
+        # Too many bytes of padding: steps are compiled again when textures grow.
         if BYTES_PER_TEXEL * room.num_elements > MOST_ROOM * self._budget_bytes:
             return model, moments
         rebuilt = reallocate(textures, textures.sizes, moments, room=room)

@@ -272,6 +272,7 @@ def iterations_at(fractions: tuple[float, ...], num_iterations: int, *, with_end
     if not is_inside or list(fractions) != sorted(set(fractions)):
         wanted = "fractions above 0, up to 1" if with_end else "fractions between 0 and 1"
         raise ValueError(f"at must be ascending {wanted}; got {shortened(fractions)}")
+    # Iterations count from 1: at 0 the event would never happen.
     return tuple(dict.fromkeys(max(1, round(fraction * num_iterations)) for fraction in fractions))
 
 

@@ -311,7 +311,7 @@ class Mcmc(StepEvent):
     def _move(model: Model, moments: AdamState, plan: Callable[..., Moves]) -> tuple[Model, AdamState, MoveInfo]:
         num_live = model.live_count
         moves = plan(model.appearance.opacities(model.gaussians), num_live)
-        # Shared before they are copied, so that copies have their share too.
+        # Shared before they are copied, so that copies get the shared values.
         gaussians, appearance = model.appearance.share(model.gaussians, moves.num_shares)
         num_live = num_live + moves.info.num_added
         shared = dataclasses.replace(model, gaussians=gaussians, appearance=appearance, num_live=num_live)

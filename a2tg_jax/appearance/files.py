@@ -41,6 +41,7 @@ def arrays_of(appearance: Appearance, sh_degree: int) -> dict[str, np.ndarray]:
         arrays |= {"degrees": degrees.astype(np.uint8), "base_degree": np.asarray(sh_degree, np.uint8)}
         for band in range(sh_degree + 1, MAX_DEGREE + 1):
             first, last = (NUM_BASES[degree] - NUM_BASES[sh_degree] for degree in (band - 1, band))
+            # Rows of the Gaussians that have the band, in their order.
             arrays[f"band_{band}"] = dense[degrees >= band, first:last]
     if appearance.exponents is not None:
         arrays["shapes"] = np.asarray(appearance.exponents.shapes)

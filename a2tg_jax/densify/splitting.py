@@ -88,6 +88,7 @@ def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: A
     The order of log-weights plus Gumbel noise equals successive draws without replacement (Yellott, 1977). Only the
     entries of targets have a meaning, if there are any hosts.
     """
+    # From 100,000 points: 26.0 dB, and 15.1 with replacement (docs/reliability.md).
     noisy = jnp.log(weights) + jax.random.gumbel(key, weights.shape, weights.dtype)
     order = jnp.argsort(jnp.where(is_host, -noisy, jnp.inf)).astype(jnp.int32)
     place = jnp.cumsum(is_target, dtype=jnp.int32) - 1
@@ -103,7 +104,7 @@ def split_rows(
     pixels, found = state.pixels[moves.rows], state.gradients
     total = found.total / moves.num_shares.astype(found.total.dtype)
     gradients = GradientStatistics(total[moves.rows], found.views[moves.rows])
-    # Halves count as 1.6 times smaller until a view shows them.
+    # On the screen, halves are 1.6 times smaller as well.
     state = SplitStatistics(gradients, jnp.where(is_split, pixels / SPLIT_SHRINK, pixels))
     moments = clear_moments(model, moments, is_split)
     num_live = model.live_count + moves.info.num_added

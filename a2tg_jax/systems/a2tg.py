@@ -53,7 +53,7 @@ class A2tg(TwoStages):
                     "memory_budget and texture.budget_mb both say how much memory there is: give one of them"
                 )
             budget = megabytes_of(self.memory_budget)
-            # The official preset has a threshold, which another rule refuses.
+            # Thresholds belong to another rule, and custom ones would be rejected.
             texture = dataclasses.replace(texture, select="budget", threshold=None, budget_mb=budget)
         # Up to half of the largest texture, if there is a time to grow.
         texels = min(BUDGET_TEXELS, (1 + texture.cap**2) / 2) if texture.iterations(self.stage2_iterations) else 1

@@ -66,13 +66,13 @@ class Bytewise(TwoStages):
     a view_dependence_share of 0.23 is better."""
     exponents: LimitExponents = LimitExponents()
     """Lower limit of the exponents of kernels; 0: no limit."""
-    view_dependence_share: float = 0.1
+    view_dependence_share: float = 0.1  # the best with shapes of kernels (docs/results-appendix.md)
     """Share of the bytes for view dependence; 0: none."""
     view_dependence_rate: float = 2e-3
     """Adam's learning rate of the coefficients above base_degree."""
     view_dependence: AdaptDegrees = AdaptDegrees()
     """Spherical harmonics above base_degree, in the second stage."""
-    texture_share: float = 0.02
+    texture_share: float = 0.02  # 0 to 0.05 differ by hundredths of a dB (docs/results-appendix.md)
     """Share of the bytes for textures; 0: none."""
     texel_rate: float = 2.5e-3
     """Adam's learning rate of the texels; textures of one texel are not trained."""

@@ -270,6 +270,7 @@ class System:
         """
         check_config(self)
         for name, value in flatten_config(self).items():
+            # Types were checked; infinity and NaN are floats too.
             held = value if isinstance(value, tuple) else (value,)
             if not all(math.isfinite(number) for number in held if isinstance(number, float)):
                 wanted = "finite numbers" if isinstance(value, tuple) else "a finite number"
@@ -343,6 +344,7 @@ class System:
         """Return the paths of the options that limit the number of Gaussians without a memory budget."""
         events = [event for stage in self.stages() for event in stage.events if event.limited_by]
         paths = dict.fromkeys(f"{self.path_of(event)}.{event.limited_by}" for event in events)
+        # An event that is no option has no path, but its class's name.
         return tuple(path for path in paths if path in flatten_config(self))
 
     def limits(self) -> tuple[str, ...]:

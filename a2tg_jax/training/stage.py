@@ -217,6 +217,7 @@ class Stage:
                             "other static()"
                         )
         check_pytree(f"{where} appearance", self.appearance)
+        # Two rows are enough to learn whether there are arrays.
         few = allocate_appearance(self.appearance, jax.random.key(0), no_rows(2, 1))
         if self.appearance_rate is None and jax.tree.leaves(few):
             raise ValueError(
@@ -241,6 +242,7 @@ class Stage:
             per_iteration=1.0 / self.iterations,
             log_decay=math.log(self.rates.means_final_factor),
             sh_interval=max(1, round(self.iterations / 30)),  # 1,000 of 30,000 iterations in 3DGS
+            # What is always due needs no condition in the step.
             times=tuple(None if times == EVERY_ITERATION else times for times in times),
         )
 

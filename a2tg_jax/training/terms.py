@@ -88,7 +88,7 @@ class Term:
     @property
     def name(self) -> str:
         """Name in the history: the function's."""
-        return getattr(self.function, "__name__", type(self.function).__name__).strip("<>")
+        return getattr(self.function, "__name__", type(self.function).__name__).strip("<>")  # of <lambda>
 
 
 @pytree
