@@ -316,7 +316,7 @@ def test_a_lack_of_memory_is_one_line(model, tmp_path, monkeypatch, capsys):
         raise MemoryError
 
     monkeypatch.setattr(meshing, "extract_mesh", without_memory)
-    message = "the memory does not suffice: lower --resolution, --radius, --max-memory or --texture-size"
+    message = "not enough memory: lower --resolution, --radius, --max-memory or --texture-size"
     test_mistakes_of_the_command(model, tmp_path, monkeypatch, capsys, "mesh cameras.npz", message)
 
 

@@ -522,11 +522,11 @@ def test_errors_of_training_come_with_advice(tmp_path, monkeypatch, capsys):
 
 
 LACKS = {
-    "the memory does not suffice (RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.): ": jax.errors.JaxRuntimeError(
+    "not enough memory (RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.): ": jax.errors.JaxRuntimeError(
         "RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes."
     ),
-    "the memory does not suffice (Unable to allocate 9 B): ": MemoryError("Unable to allocate 9 B"),
-    "the memory does not suffice: ": MemoryError(),
+    "not enough memory (Unable to allocate 9 B): ": MemoryError("Unable to allocate 9 B"),
+    "not enough memory: ": MemoryError(),
 }
 
 

@@ -56,7 +56,7 @@ class Shot:
     picture: Picture
     mask: Mask | None = None
     rays: np.ndarray | None = None
-    """[H, W, 2] rays of the pixels, as `Camera.rays` has them, NaN where there is none; None for a pinhole."""
+    """[H, W, 2] rays of the pixels, as in `Camera.rays`, NaN where there is none; None for a pinhole."""
     depth: DepthMap | None = None
     panorama: int | None = None
     points: ObservedPoints | None = None
@@ -150,7 +150,7 @@ class Sight(NamedTuple):
 
     @staticmethod
     def of(viewmat: np.ndarray, K: np.ndarray, size: tuple[int, ...], rays: ArrayLike | None) -> "Sight":
-        """Return what a view of (height, width) shows, with `rays` as `Camera.rays` has them."""
+        """Return what a view of (height, width) shows, with `rays` as in `Camera.rays`."""
         if rays is None:
             return Sight(viewmat, K, np.zeros(2), np.array(size[::-1], np.float64))
         # NaN: pixels without a ray.

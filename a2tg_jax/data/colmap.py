@@ -225,7 +225,7 @@ def _find_photos(path: Path, model: Path, images: Sequence[ImageRecord], downsca
     """
     model = model.resolve()
     bases = [path.resolve(), model, *model.parents[:2]]  # sparse/0 is two below the scene.
-    bases += [base.parent for base in bases if base.name == "colmap"]  # as nerfstudio has it: colmap/sparse/0
+    bases += [base.parent for base in bases if base.name == "colmap"]  # nerfstudio's colmap/sparse/0
 
     def holds_some(folder: Path) -> bool:
         return any(on_disk(folder, image.name.replace("\\", "/")) for image in images[:TRIED_NAMES])

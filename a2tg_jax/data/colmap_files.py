@@ -163,7 +163,7 @@ class _Binary:
     def cameras(self) -> tuple[int, Any]:
         number, model = self.take("Ii")
         if model not in _camera_models():
-            raise self.error(f"has the model {model}, which COLMAP does not have")
+            raise self.error(f"has the camera model {model}, which is none of COLMAP's")
         name, count = _camera_models()[model]
         width, height, *params = self.take(f"2Q{count}d")
         return number, pycolmap().Camera(model=name, width=width, height=height, params=params)
@@ -205,7 +205,7 @@ def _whole(word: bytes) -> int:
     """Return a whole number of at least 0, which may be written like 96.0."""
     number = int(word) if word.isdigit() else float(word)  # A float would round ids above 2^53.
     if not 0 <= number <= NO_POINT or number != int(number):  # NaN fails as well.
-        raise ValueError(f"{shortened(word.decode(errors='replace'))} is no whole number of at least 0")
+        raise ValueError(f"{shortened(word.decode(errors='replace'))} is not a whole number of at least 0")
     return int(number)
 
 

@@ -14,7 +14,7 @@ def pycolmap() -> ModuleType:
     """Return the module pycolmap, imported at its first use because that takes a third of a second.
 
     zlib must be loaded before it: otherwise Python's own zlib (np.savez_compressed, gzip, PNG) crashes on its next use
-    with "free(): invalid pointer" (pycolmap 4.2.1). Its import also installs glog's handlers of signals, which print a
+    with "free(): invalid pointer" (pycolmap 4.2.1). Its import also installs glog's signal handlers, which print a
     C++ stack at SIGTERM; the handlers from before are restored. Photographs are read by several threads, of which only
     one may import it.
     """

@@ -93,9 +93,9 @@ def divided(
 
 @contextlib.contextmanager
 def sharing_errors(division: Division | None) -> Iterator[None]:
-    """Raise an error of one process, the first that has one, in all processes of a division (None: one).
+    """Raise the error of the first process that has one in all processes of a division (None: one).
 
-    Each enters the block, and uses the division within it only.
+    All of them enter the block, and use the division only within it.
     """
     if division is None:
         yield

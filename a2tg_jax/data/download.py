@@ -80,9 +80,9 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
       Whether there was anything to do.
 
     Raises:
-      OSError: if the address cannot be read or the disk has no room; what came stays, and the next call continues.
+      OSError: if the address cannot be read or the disk has no room; the next call continues with the bytes so far.
       FileExistsError: if another file has the name of one in the archive, and was not left by an earlier call.
-      ValueError: if the checksum is another, the archive is damaged, or it would write outside its folder.
+      ValueError: if the checksum differs, the archive is damaged, or it would write outside its folder.
     """
     file = scenes / "archives" / archive.url.partition("?")[0].rpartition("/")[2]
     done, begun = (file.with_name(f"{file.name}.{state}") for state in ("unpacked", "unpacking"))
@@ -109,7 +109,7 @@ def fetch(archive: Archive, scenes: Path, *, progress: bool = True) -> bool:
 def _download(archive: Archive, file: Path, progress: bool) -> None:
     """Download a file, from where an earlier attempt stopped, and continue when the connection breaks."""
     partial = file.with_name(f"{file.name}.partial")
-    # The server's name (ETag) of the version of which a part has come.
+    # The ETag of the version that the partial file is from.
     version = partial.with_name(f"{partial.name}.etag")
     if archive.num_bytes is not None:  # The archive and what is unpacked from it are on the disk at once.
         _check_room(file.parent, 2 * archive.num_bytes - _size(partial), archive.url)
@@ -130,7 +130,7 @@ def _download(archive: Archive, file: Path, progress: bool) -> None:
             break
     if total is not None and _size(partial) > total:
         partial.unlink()
-        raise OSError(f"{archive.url}: more bytes were there than it has; they were deleted, call again")
+        raise OSError(f"{archive.url}: has more bytes on disk than on the server; they were deleted, call again")
     if total is not None and _size(partial) < total:
         raise OSError(f"{archive.url}: {_size(partial):,} of {total:,} bytes came; call again to continue")
     partial.replace(file)
@@ -138,7 +138,7 @@ def _download(archive: Archive, file: Path, progress: bool) -> None:
 
 
 def _receive(url: str, partial: Path, version: Path, progress: bool) -> int | None:
-    """Receive what is missing of a file. Return its size if the server says it."""
+    """Receive the missing part of a file. Return its size if the server reports it."""
     have = _size(partial)
     request = urllib.request.Request(url)
     if have:

@@ -37,7 +37,7 @@ _LOCK = threading.Lock()
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lens:
-    """A calibrated camera of any COLMAP model. Pixel centres are at +0.5, as COLMAP has them."""
+    """A calibrated camera of any COLMAP model. Pixel centres are at +0.5, as in COLMAP."""
 
     camera: Any
     """pycolmap.Camera, at the size it was calibrated for."""
@@ -126,7 +126,7 @@ class Lens:
         return np.asarray(self.camera.img_from_cam(points)) * np.divide(size, self.size)
 
     def rays(self, width: int, height: int) -> np.ndarray | None:
-        """Return the rays [height, width, 2] of views of a size, as `Camera.rays` has them; NaN where there is none.
+        """Return the rays [height, width, 2] of views of a size, as in `Camera.rays`; NaN where there is none.
 
         None for a pinhole, or if photographs are undistorted. Raise ValueError if almost no pixel has a ray.
         """

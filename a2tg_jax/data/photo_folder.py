@@ -160,7 +160,7 @@ def _written(folder: Path, names: Sequence[str]) -> set[str]:
 
 
 def _masks(names: Sequence[str]) -> set[str]:
-    """Return the pictures in folders of masks and the like, and the ones with such names next to a photograph."""
+    """Return the pictures in folders called masks, depths etc., and those called so next to a photograph."""
     pictures = set(names)
     known = pictures | {str(PurePosixPath(name).with_suffix("")) for name in names}
     found = set()

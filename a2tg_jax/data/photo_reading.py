@@ -4,7 +4,7 @@ One process reads all photographs, so that a broken one is found before training
 share, plus as many others as its memory has room for. The rest is read when it is first drawn.
 
 Next to the folder `images` may be
- - `masks` with NAME.EXT.png (as COLMAP has them), NAME.png or NAME.EXT for NAME.EXT. Black, or transparent, excludes a
+ - `masks` with NAME.EXT.png (as in COLMAP), NAME.png or NAME.EXT for NAME.EXT. Black, or transparent, excludes a
    pixel; everything else keeps it, as with COLMAP and nerfstudio;
  - `depths` with NAME.npy or NAME.png. What they hold is an option of the training (`training.depth_prior`). They are
    read when a training needs them;
@@ -351,7 +351,7 @@ def _read_mask(
 
 def find_depths(images: Path, name: str) -> Path | None:
     """Return the depth map of an image below a folder: NAME.npy, NAME.png, NAME.EXT.npy or NAME.EXT.png in the sibling
-    folder `depths`; None without one.
+    folder `depths`; None if there is none.
     """
     stems = str(Path(name).with_suffix("")), name
     return on_disk(images.with_name(DEPTHS), *(stem + suffix for suffix in (".npy", ".png") for stem in stems))

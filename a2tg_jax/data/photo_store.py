@@ -207,7 +207,7 @@ class Shelf:
         Args:
           pixels: the pixels.
           source: image file that they come from.
-          view: function that made them of the pixels in the file; None: they are exactly these.
+          view: function that made them from the pixels in the file; None: they are exactly these.
         """
         with self._lock:
             # Smaller pictures may still fit after a larger one did not.

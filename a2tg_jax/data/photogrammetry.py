@@ -133,7 +133,7 @@ def _offset(sensor: Element, master: Element | None, file: Path) -> np.ndarray |
     neither's place in the rig. A sensor without a place is the origin of the rig."""
 
     def in_rig(part: Element) -> np.ndarray | None:
-        """Return the rigid motion [4, 4] from a sensor's frame to its rig's; None without one."""
+        """Return the rigid motion [4, 4] from a sensor's frame to its rig's; None if it has none."""
         if part.find("rotation") is None and part.find("translation") is None:
             return None
         return rigid_viewmat(_motion(part, file), f"{file}: sensor {part.get('id')}")
@@ -166,7 +166,7 @@ def _motion(part: Element, file: Path) -> np.ndarray:
 
 
 def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
-    """Return the adjusted intrinsics of a sensor as `transforms.json` has them. P1 and P2 are OpenCV's p2 and p1."""
+    """Return the adjusted intrinsics of a sensor as in `transforms.json`. P1 and P2 are OpenCV's p2 and p1."""
     kind = sensor.get("type", "frame")
     projection = PROJECTIONS.get(kind)
     if projection is None:

@@ -45,7 +45,7 @@ class View:
     mask: Mask | None = None
     """Mask of the pixels that count in losses and metrics, or an array [H, W] bool; None counts all."""
     depth: DepthMap | None = None
-    """Depth map for `loss.depth_weight`, or an array [H, W] of floats; None without one."""
+    """Depth map for `loss.depth_weight`, or an array [H, W] of floats; None if there is none."""
     panorama: int | None = None
     """Number of the panorama that it was cut from; None for a photograph. Its views are held out together."""
     points: ObservedPoints | None = None

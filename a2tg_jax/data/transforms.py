@@ -40,7 +40,7 @@ PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "R
 
 
 class Frames(NamedTuple):
-    """Frames as `transforms.json` has them, made of files of another program."""
+    """Frames as in `transforms.json`, made from another program's files."""
 
     file: Path
     """File that messages name; paths of images start from its folder."""
@@ -102,7 +102,7 @@ def load_frames(made: Frames, options: Options) -> Scene:
 
 
 def check_images(file: Path, frames: Sequence[object], lacking: Sequence[str], nothing: str) -> None:
-    """Raise ValueError with a text if there are no frames, and warn of cameras without an image, given by name."""
+    """Raise ValueError(nothing) if there are no frames, and warn of the cameras `lacking` an image."""
     if not frames:
         raise ValueError(nothing)
     if lacking:

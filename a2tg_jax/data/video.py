@@ -81,8 +81,8 @@ def choose_frames(sharpness: np.ndarray, places: np.ndarray, count: int) -> np.n
 def motion(before: np.ndarray, after: np.ndarray) -> float:
     """Return how far the picture moved between two small greyscale frames [h, w], as a share of the width.
 
-    The change of brightness over time, divided by that over space, is the speed along the gradient. Beyond a few pixels
-    it saturates, and it is then large enough.
+    The change of brightness over time divided by its change over space is the speed along the gradient. Beyond a few
+    pixels it saturates, at a value that is large enough.
     """
     before, after = before.astype(np.float32), after.astype(np.float32)
     slope = sum(float(np.abs(part).mean()) for part in np.gradient(before))

@@ -24,7 +24,8 @@ def error_text(error: Exception, less_memory: str) -> str | None:
     is_of_device = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
     if is_of_device or isinstance(error, MemoryError):
         details = shortened(str(error), 120)
-        return f"the memory does not suffice{f' ({details})' if details else ''}: {less_memory}"
+        # Not "out of memory": cli.main prints a first word that was typed as an option as --out.
+        return f"not enough memory{f' ({details})' if details else ''}: {less_memory}"
     if not (isinstance(error, OSError) and error.errno in NO_ROOM):
         return str(error) if isinstance(error, ValueError | OSError) else None
     if not isinstance(error.filename, str | os.PathLike):

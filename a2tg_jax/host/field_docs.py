@@ -8,7 +8,7 @@ _known: set[str] = set()
 
 
 def list_fields() -> None:
-    """Add the docstrings of fields to each class of this package that was imported so far."""
+    """Add the docstrings of fields to each class of this package imported so far."""
     for name in {name for name in sys.modules if name.startswith("a2tg_jax.")} - _known:
         _known.add(name)
         if name.startswith("a2tg_jax.cli."):

@@ -40,7 +40,7 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
     _check_size(data, MOST_BYTES)
     # Brackets in texts count as well: a bound that needs no parsing.
     if (found := data.count(b"[") + data.count(b"{")) > MOST_BRACKETS:
-        raise ValueError(f"it has {found:,} brackets; {MOST_BRACKETS:,} are the most that is read")
+        raise ValueError(f"it has {found:,} brackets; the limit is {MOST_BRACKETS:,}")
 
     def number(digits: str) -> float:
         value = float(digits)
@@ -92,7 +92,7 @@ def parse_toml(data: bytes) -> dict[str, Any]:
 
 def _check_size(data: bytes, most: int) -> None:
     if len(data) > most:
-        raise ValueError(f"it has {len(data):,} bytes; {most:,} are the most that is read")
+        raise ValueError(f"it has {len(data):,} bytes; the limit is {most:,}")
 
 
 def _parsed(parse: Callable[[], Any]) -> Any:

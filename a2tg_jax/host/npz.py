@@ -85,7 +85,7 @@ def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype, bool, tuple[int,
     """Return the dtype of one array, whether it is in Fortran order, and its shape."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
-        raise ValueError(f"{name} is of the version {version} of .npy, which is not supported")
+        raise ValueError(f"{name} is .npy version {version}, which is not supported")
     # https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html
     length = int.from_bytes(file.read(2 if version == (1, 0) else 4), "little")
     if length > LONGEST_HEADER:

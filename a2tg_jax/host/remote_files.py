@@ -92,7 +92,7 @@ def path_here(text: str) -> Path | None:
         return None
     host, _, path = place.partition("/")
     if host.lower() not in ("", "localhost") or not path:
-        raise ValueError(f"{text}: is no file of this machine; write file:///full/path")
+        raise ValueError(f"{text}: is not a file on this machine; write file:///full/path")
     return Path(urllib.request.url2pathname(f"/{path}"))
 
 
