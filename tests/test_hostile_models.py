@@ -123,7 +123,7 @@ def test_models_that_no_camera_sees(tmp_path, change, message):
     ("change", "message"),
     [
         (with_number("appearance/shapes", np.nan), "must be finite"),
-        (with_number("appearance/shapes", 1e30), "must lie within"),
+        (with_number("appearance/shapes", 1e30), "must be within"),
         (with_array("appearance/shapes", lambda x: x[1:]), r"shapes must be \[12\], one for each Gaussian"),
         (with_array("appearance/shapes", lambda x: x[:, None]), r"shapes must be floats \[N\]"),
         (with_array("appearance/shapes", lambda x: x.astype(int)), r"shapes must be floats \[N\]"),
@@ -201,9 +201,9 @@ def test_files_with_numbers_that_are_too_large(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(ply, "check_model", lambda model: None)
         save_ply(tmp_path / "g.ply", gaussians)
-    refused(load_ply, tmp_path / "g.ply", r"gaussians\.means must lie within ±1e\+12; got")
+    refused(load_ply, tmp_path / "g.ply", r"gaussians\.means must be within ±1e\+12; got")
     for save, name in ((save_model, "m.npz"), (save_compact, "m.a2tgz"), (save_ply, "m.ply"), (save_gltf, "m.glb")):
-        with pytest.raises(ValueError, match=r"gaussians\.means must lie within ±1e\+12; got"):
+        with pytest.raises(ValueError, match=r"gaussians\.means must be within ±1e\+12; got"):
             save(tmp_path / name, Model(gaussians))
         assert not (tmp_path / name).exists()
 

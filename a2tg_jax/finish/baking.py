@@ -40,11 +40,11 @@ MOST_GROWTH = 2.0
 """Largest ratio of the bytes after baking to those before."""
 ITERATIONS = 500
 MOST_VIEWS = 12
-"""Largest number of views, evenly chosen, by which it is judged where texels and spherical harmonics matter."""
+"""Largest number of views, evenly chosen, for measuring where texels and spherical harmonics matter."""
 LEAST_ALPHA, MOST_ALPHA = 1 / 255, 0.99
-"""Alphas of splats: fainter ones are left out, others are at most this opaque."""
+"""Limits of a splat's alpha: fainter splats are dropped, others clipped."""
 SAME_PSNR = 38.0
-"""PSNR in dB against the whole model above which higher degrees of spherical harmonics are left out."""
+"""PSNR in dB against the full model above which higher degrees of spherical harmonics are dropped."""
 
 
 def bake(
@@ -58,12 +58,12 @@ def bake(
     """Return a plain model that looks like a textured one (host).
 
     Args:
-      model: of any appearance. Textures become a splat per texel or fewer; of other appearances the Gaussians are
-        taken, those nearest to kernels of other shapes.
+      model: model of any appearance. Textures become a splat per texel or fewer; other appearances are reduced to
+        their Gaussians, or the ones nearest to their kernels.
       cameras: views that the new model is trained on.
-      growth: largest ratio of the bytes of all floats to the model's. If the Gaussians differ in their degree,
-        the common one is lowered until one splat for each fits.
-      iterations: of training on pictures of the model; 0: none.
+      growth: largest ratio of the bytes of all floats to the model's. If Gaussians differ in degree, the common
+        degree is lowered until one splat for each fits.
+      iterations: number of iterations on pictures of the model; 0: no training.
       progress: show a progress bar.
 
     Raises:
@@ -81,8 +81,8 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
     """Return a plain model with a splat per texel or fewer, without training. Arguments as in `bake`."""
 
     def fitting(highest: int) -> tuple[int, int]:
-        """Return the highest degree with which a splat for each Gaussian stays within the growth, and how many do."""
-        # Degree 0 always does: no Gaussian of the model takes less.
+        """Return the highest degree at which a splat for each Gaussian is within the growth, and how many are."""
+        # Degree 0 always fits: no Gaussian of the model is smaller.
         for degree in range(highest, -1, -1):
             most = int(growth * model.num_bytes / (BYTES_PER_FLOAT * floats_per_gaussian(degree)))
             if most >= model.num or degree == 0:
@@ -116,12 +116,12 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
 
 
 def as_plain(gaussians: Gaussians, model: Model) -> Model:
-    """Return a plain model of Gaussians with background and origin of another."""
+    """Return a plain model with another model's background and origin."""
     return Model(gaussians, background=model.background, origin=model.origin)
 
 
 def least_degree(model: Model, cameras: Sequence[Camera]) -> int:
-    """Return the lowest degree of spherical harmonics with which pictures stay about the same (host)."""
+    """Return the lowest degree of spherical harmonics at which pictures stay about the same (host)."""
     highest = model.gaussians.sh_degree if model.appearance.bands is None else MAX_DEGREE
     wanted = list(pictures(model, cameras)) if highest else []
     for degree in range(highest):
@@ -170,7 +170,7 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
     shown = np.asarray(parents.opacities, np.float64)[:, None, None] * texels[..., 3] * falloff
     # Overlapping alphas multiply as 1 − alpha: their optical depths −log(1 − alpha) add up.
     depths = -np.log1p(-np.clip(shown, 0, MOST_ALPHA))
-    # Each Gaussian reaches the centres of the others: the inverse of these shares, axis by axis, gives its own depth.
+    # Each Gaussian reaches the others' centres: the inverse of these shares, axis by axis, gives its own depth.
     unmixed = [
         np.linalg.inv(np.exp(-0.5 * ((means[:, None] - means[None, :]) / widths[None, :]) ** 2))
         for means, widths in (v, u)
@@ -202,10 +202,10 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
 def distill(
     model: Model, wanted: Model, cameras: Sequence[Camera], *, iterations: int, progress: bool = False
 ) -> Model:
-    """Return a plain model after training on pictures of another one in its world; the number of Gaussians stays.
+    """Return a plain model trained on pictures of another model in its world; the number of Gaussians stays.
 
-    Both are drawn over black or white, whichever is nearer to the other model's background. Each iteration draws one of
-    the cameras' views.
+    Both are rendered over black or white, whichever is nearer to the other model's background. Each iteration renders
+    one view.
     """
     highest = model.gaussians.sh_degree
     behind: Background = "white" if np.mean(wanted.background) > 0.5 else "black"
@@ -236,6 +236,6 @@ def pictures(model: Model, cameras: Sequence[Camera], background: Color | None =
 
 
 def likeness(found: Iterable[np.ndarray], wanted: Iterable[np.ndarray]) -> float:
-    """Return the PSNR in dB of pictures against others, from the mean of their squared errors; at most 100."""
+    """Return the PSNR in dB between pictures, from the mean of their squared errors; at most 100."""
     error = np.mean([np.mean((x - y) ** 2) for x, y in zip(found, wanted, strict=True)])
     return -10 * math.log10(max(float(error), 1e-10))

@@ -1,7 +1,7 @@
 """Smallest file of a model within a loss, from the cost in dB of each choice of bits.
 
-A loss is a function of a model: its distance in dB below the original model. It is measured on photographs or, without
-them, estimated from the difference of the renders.
+A loss is a function of a model: how many dB it is below the original model. It is measured on photographs or, without
+them, estimated from differences between renders.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ LADDER: Ladder = MappingProxyType(
 ASSUMED_PSNR = 30.0
 """Assumed PSNR in dB of a model on missing photographs."""
 LEAST_LOSS = 1e-4
-"""Difference in dB below which losses are noise and count as this one."""
+"""Smaller differences in dB are noise and count as this one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,7 @@ def loss_on_views(
     background: Color | None = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
 ) -> Loss:
-    """Return the PSNR that models lose against the given one, as a mean over the photographs of some views."""
+    """Return the loss of PSNR of models against the given one, as a mean over the photographs of views."""
     check_is_model(model)
     check_are_views(views, "loss_on_views(model, scene.train)")
     background = model.background if background is None else background
@@ -114,11 +114,11 @@ def loss_beside_renders(
 def _drawing(
     model: Model, cameras: Sequence[Camera], background: ArrayLike | None, settings: RenderSettings
 ) -> Callable[[Model], Iterator[np.ndarray]]:
-    """Draw models like the given one for cameras, clipped to [0, 1]."""
+    """Return a function that renders models like the given one for cameras, clipped to [0, 1]."""
     if not cameras:
         raise ValueError("there are no views to measure a loss on")
     options: dict[str, Any] = {"background": background, "settings": settings, "has_geometry": False}
-    # Programs compile once, while twice the capacity of the given model suffices.
+    # With twice the given model's capacity, programs usually compile once.
     capacities = {size: 2 * num for size, num in Renderer(model, cameras=cameras, **options).capacities.items()}
 
     def draw(other: Model) -> Iterator[np.ndarray]:
@@ -168,11 +168,11 @@ def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDE
 
 
 class TooMuchLostError(ValueError):
-    """No file loses as little as allowed."""
+    """No file is within the allowed loss."""
 
 
 def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trials: Sequence[Trial]) -> Trial:
-    """Return the smallest file within a loss by the first measure, found greedily (host).
+    """Return the smallest file within a loss by the first measure, by greedy search (host).
 
     Start from the finest choices. Take the step with the most bytes saved per loss while the sum of the separate losses
     stays within the limit. Then undo the last steps until the file itself is within it, and finally try single steps.
@@ -202,7 +202,7 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
         raise TooMuchLostError(f"max_loss must be {least}: the finest choices lose that; got {max_loss}")
 
     def next_step(group: str) -> tuple[int, Precision]:
-        """Return what the next smaller step of a group saves, and its precision; nothing if there is none."""
+        """Return the bytes that a group's next smaller step saves, and its precision; 0 if there is none."""
         own = by_size[group]
         at = [trial.precision for trial in own].index(getattr(found.choices, group))
         return own[at].num_bytes - own[max(at - 1, 0)].num_bytes, own[max(at - 1, 0)].precision

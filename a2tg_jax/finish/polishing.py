@@ -1,8 +1,8 @@
 """Best colours for given shapes: least squares over the parameters in which a picture is linear.
 
-A picture is linear in the RGB texels, and in the spherical harmonics of those Gaussians whose colour is not cut off at
-0. With positions, rotations, scales, opacities and alpha textures fixed, the squared error over all views is quadratic
-in them. A few steps of conjugate gradients on J d = photograph − picture come near its minimum: J draws a change of
+A picture is linear in the RGB texels, and in the spherical harmonics of Gaussians whose colour is not clipped at 0.
+With positions, rotations, scales, opacities and alpha textures fixed, the squared error over all views is quadratic in
+them. A few steps of conjugate gradients on J d = photograph − picture come near its minimum: J draws a change of
 colours, and its transpose is the backward pass.
 """
 
@@ -55,11 +55,11 @@ def polish(
     """Return the model with colours that lower the squared error over the views.
 
     Args:
-      model: of Gaussians with or without textures of signed RGB, exponents and bands.
+      model: Gaussians with or without textures of signed RGB, exponents and bands.
       views: training views.
       num_steps: number of steps of conjugate gradients; each draws every view forwards and backwards. Few steps
         regularise, many overfit the training views.
-      ridge: weight of the squared changes besides the squared error, summed over pixels.
+      ridge: weight of the squared changes, against squared errors summed over pixels.
       background: [3] colour; None is the model's own.
 
     Raises:
@@ -102,7 +102,7 @@ def _solve(
     nothing = jax.tree.map(jnp.zeros_like, colors_of(model))
 
     def pulled(residual: Callable[[Camera, Targets], Array]) -> Colors:
-        """Return the sum over all views of the transpose of `draw_change`, of the weighted images of a function."""
+        """Return the transpose of `draw_change`, summed over all views, of a function's weighted images."""
         total: Colors = nothing
         for group in groups:
 

@@ -5,8 +5,8 @@ A texture is halved along the side where its pairs of texels differ less, weight
 Changing texels by δ then changes the squared error by about Σ h·δ².
 
 `shrink_textures` takes rounds of the cheapest steps per byte, as many as a loss of PSNR on given views allows. Textures
-of one texel, which are only another colour and opacity, merge into their Gaussians. `fewest_texels` takes as many steps
-as a number of texels needs.
+of one texel are only another colour and opacity: they merge into their Gaussians. `fewest_texels` shrinks to a number
+of texels.
 """
 
 import dataclasses
@@ -33,11 +33,11 @@ from a2tg_jax.renderer import plan_render
 from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, Textures
 
 LEAST_OPACITY = 1e-4
-"""Largest opacity of a Gaussian after absorbing a texel's alpha: its logit must be finite."""
+"""Smallest opacity after absorbing a texel's alpha, and distance of the largest from 1: logits must be finite."""
 LEAST_SAVED = 0.005
 """Smallest share of a model's bytes that a round must save for another one."""
 LEAST_WEIGHT = 1e-9
-"""Visibility of texels in no view; it keeps means finite."""
+"""Visibility of texels that no view shows; it keeps means finite."""
 
 
 def shrink_textures(
@@ -46,7 +46,7 @@ def shrink_textures(
     """Return the model with smaller textures and as many Gaussians as before (host).
 
     Args:
-      model: with textures of signed RGB.
+      model: model with textures of signed RGB.
       views: views to measure the loss on, such as the training views.
       max_loss: largest loss of PSNR in dB, as a mean over the views.
       background: [3] colour; None is the model's own.
@@ -187,10 +187,10 @@ def texel_weights(model: Model, cameras: Sequence[Camera], background: ArrayLike
 
 
 def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Group]:
-    """Return textures that have `most` texels at most in all, at least one each, a table for each size (host).
+    """Return textures with at most `most` texels in total, at least one each, in a table for each size (host).
 
-    Each texture has a row of halvings down to one texel; the halvings of all rows that change least per texel saved are
-    taken. Empty textures become a neutral texel. Weights are as `texel_weights` returns them.
+    Each texture has a sequence of halvings down to one texel; those that change least per texel saved are taken. Empty
+    textures become a neutral texel. Weights are as `texel_weights` returns them.
     """
     start: list[Group] = []
     for (ids, texels), (_, squares) in zip(textures.groups(), weights.groups(), strict=True):
@@ -209,7 +209,7 @@ def fewest_texels(textures: Textures, weights: Textures, most: int) -> list[Grou
         for ids, texels in tables:
             for chosen, halved, cost in _halved_table(ids, texels):
                 saved = texels[0, ..., 0].size - halved[0, ..., 0].size
-                # A step that follows a costlier one is never taken before it.
+                # A step counts at least as much as the one before it, so that it never comes first.
                 least[chosen] = np.maximum(least[chosen], cost / saved)
                 smaller.append((chosen, halved))
                 steps.append((chosen, np.full(len(chosen), number), least[chosen], np.full(len(chosen), saved)))
@@ -253,7 +253,7 @@ def _halved(
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
     """Halve textures [n, Tv, Tu, 4] along the axis where that costs less; an odd last texel stays.
 
-    Yields, for each axis that was chosen, the indices, weighted means of pairs, sums of their weights, and costs.
+    Yields, for each chosen axis, the indices, weighted means of pairs, sums of their weights, and costs.
     """
     choices = []
     for axis in axes if len(ids) else ():

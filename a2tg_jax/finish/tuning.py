@@ -1,9 +1,8 @@
-"""Training of a finished model while its numbers are rounded to the grids of a compact file: fewer bits then suffice.
+"""Training of a finished model with its numbers rounded to the grids of a compact file: fewer bits then suffice.
 
 Rounding all numbers in each step, with gradients that pass straight through, helps little: numbers whose optimum is
-between two steps jump from one to the other until the end. Here more and more numbers stay rounded. Those that are not
-yet rounded follow exact gradients and make up for it. The file keeps the grids of the training: it holds the tuned
-model up to the last digit of a float32.
+between two steps jump between them until the end. Here more and more numbers stay rounded, and the others compensate by
+exact gradients. The file uses the grids of the training: it holds the tuned model up to the last digit of a float32.
 """
 
 import dataclasses
@@ -35,20 +34,20 @@ from a2tg_jax.training.corrections import Correction
 
 ITERATIONS = 1000
 LAST_ROUNDED = 0.95
-"""Share of a training after which all numbers are rounded."""
+"""Share of the training after which all numbers are rounded."""
 KEY_OF_TIMES = 0x6121D
 RATE_OF_MEANS = 0.3
-"""Factor of the means' learning rate, which has decayed by the time a model is finished."""
+"""Factor of the means' learning rate, which has decayed when a model is finished."""
 FIRST_TOLERANCE = 0.5
-"""Loss in dB before tuning that is tried first."""
+"""Loss in dB before tuning for the first try."""
 MOST_TUNINGS = 4
-"""Largest number of times that a model is tuned."""
+"""Largest number of tunings."""
 COARSER: Mapping[str, tuple[int, ...]] = {
     "means": (8, 9), "log_scales": (3,), "quats": (3, 4), "opacities": (2,), "sh_0": (3,), "texels": (2,),
     "shapes": (1, 2),
 }  # fmt: skip
 TUNED_LADDER: Ladder = MappingProxyType({group: (*COARSER.get(group, ()), *steps) for group, steps in LADDER.items()})
-"""Candidate precisions of each group of a model that is tuned, from coarse to fine."""
+"""Candidate precisions of each group of a tuned model, from coarse to fine."""
 
 
 # Rounding to the grids of a file, as writing and reading it does (`io.compact`), but traced and with rows in order
@@ -64,7 +63,7 @@ class Steps(NamedTuple):
 
     @classmethod
     def of(cls, ends: Sequence[float], bits: int) -> Self:
-        """Return 2^bits steps between two ends, or one if the ends are equal; centre and spread may come before."""
+        """Return 2^bits steps between two ends, or one if they are equal; centre and spread may precede them."""
         *contraction, low, high = ends
         last = (1 << bits) - 1
         # Size 1 instead of 0: it divides.
@@ -101,14 +100,14 @@ class GridRounding:
         return cls(steps)
 
     def __call__(self, model: Model) -> Model:
-        """Return the model that the file holds, its rows in their order; traced."""
+        """Return the model in the file, its rows in the given order; traced."""
         gaussians, shown, steps = model.gaussians, model.appearance, self.steps
 
         def nearest(name: str, values: Array) -> Array:
             return steps[name].nearest(values) if name in steps else values
 
         def bands(blocks: Array, first: int) -> Array:
-            """Round blocks [M, K, 3] of the bands from degree `first` on, each by itself."""
+            """Round blocks [M, K, 3] of the bands from degree `first` on, each on its own grid."""
             rounded, start = [blocks[:, :0]], 0
             for degree in range(first, MAX_DEGREE + 1):
                 if start < blocks.shape[1]:
@@ -144,7 +143,7 @@ class GridRounding:
 
 
 def _xyz(quats: Array) -> Array:
-    """Return the last three numbers [N, 3] of rotations as unit quaternions of which no w is negative."""
+    """Return x, y, z [N, 3] of rotations as unit quaternions with w ≥ 0."""
     unit = normalize(quats)
     return unit[:, 1:] * jnp.where(unit[:, :1] < 0, -1, 1)
 
@@ -157,10 +156,10 @@ def _with_w(xyz: Array) -> Array:
 
 @pytree
 class GradualRounding(StepEvent):
-    """Rounding of more and more numbers, each from a random time on, until all of them are rounded.
+    """Rounding of more and more numbers, each from a random time on, until all are rounded.
 
-    A number is rounded after every later iteration as well, so that it leaves its step of the grid only if an update is
-    larger than half a step.
+    From then on a number is rounded after every iteration, so that it only leaves its step if an update is larger than
+    half a step.
     """
 
     rounding: GridRounding
@@ -183,7 +182,7 @@ class GradualRounding(StepEvent):
 
 def partly_rounded(rounding: GridRounding, model: Model, is_rounded: Model) -> Model:
     """Return a model of `half_turned` with some numbers rounded, given bools in the shapes of its floats; traced. w of
-    a quaternion follows from its other numbers."""
+    a quaternion follows from x, y, z."""
     (rounded, _), (before, rest) = partition(rounding(model)), partition(model)
     chosen: Model = jax.tree.map(jnp.where, is_rounded, rounded, before)
     # Rounded and exact x, y, z may be mixed in one quaternion: w must follow from the mixture.
@@ -230,17 +229,17 @@ def tune_compact(
     corrections stay as they are. Groups kept as floats are trained without rounding.
 
     Args:
-      model: result of the system's last stage, with the corrections that it learned, which a compact file drops.
-      scene: its training views are trained on.
-      system: which trained the model.
+      model: result of the system's last stage, with its learned corrections, which a compact file drops.
+      scene: scene with the training views.
+      system: system that trained the model.
       choices: bits of each group.
-      iterations: at least 1; 19 of 20 go by before all numbers are rounded.
+      iterations: number of iterations, at least 1; all numbers are rounded in the last twentieth.
       progress: show a progress bar.
-      title: of the progress bar; None: "tuning".
+      title: title of the progress bar; None: "tuning".
 
     Raises:
-      ValueError: if the model shows something else than that stage, or what a compact file cannot hold, or has none of
-        the corrections that the stage learned.
+      ValueError: if the model's appearance is not that stage's or does not fit a compact file, or the stage's learned
+        corrections are missing.
       DivergedError: if the loss or a gradient is not finite, or the loss explodes.
     """
     stage = system.stages()[-1]
@@ -295,7 +294,7 @@ class _OneStage(System):
 
 @functools.cache
 def _held(kind: type[Correction]) -> type[Correction]:
-    """Return a subclass of a correction whose rows no longer change."""
+    """Return a subclass of a correction with constant rows."""
 
     @pytree
     class Held(kind):  # type: ignore[misc, valid-type]
@@ -314,7 +313,7 @@ class TunedFiles(NamedTuple):
     tried: list[Trial]  # All files of tuned models.
     chosen: Trial | None = None  # The smallest one within the loss; None if there is none.
     tuned: Tuned | None = None  # The model of that file.
-    diverged: str | None = None  # Error that ended the search; None: it came to its end.
+    diverged: str | None = None  # Error that ended the search; None: the search was completed.
 
 
 Tune = Callable[[Model, CompactChoices, int], Tuned]
@@ -324,12 +323,12 @@ Tune = Callable[[Model, CompactChoices, int], Tuned]
 def smallest_tuned(
     model: Model, losses: Sequence[Loss], max_loss: float, trials: Sequence[Trial], tune: Tune
 ) -> TunedFiles:
-    """Search the smallest file of a tuned model within a loss (host).
+    """Search for the smallest file of a tuned model within a loss (host).
 
-    Choices that lose more before tuning are tuned for, `MOST_TUNINGS` times. That loss is doubled as long as the tuned
-    model stays within `max_loss`; from the first time on that it does not, the loss falls or grows by a factor of √2.
-    Each tuning starts from the one before, so that what was too much once may be tried again. The search ends early if
-    a tuning diverges or even the finest choices lose more, and keeps what was found before.
+    Up to `MOST_TUNINGS` times, choices that lose more before tuning are tuned. That loss doubles while the tuned model
+    stays within `max_loss`; after the first failure, it falls or grows by a factor of √2. Each tuning starts from the
+    previous one, so that failed choices may be tried again. The search ends early, with the best file so far, if a
+    tuning diverges or even the finest choices lose more.
 
     Losses are in dB, by the first measure, of the tuned model's file against `model`. Trials are results of
     `measure_choices`, such as with `TUNED_LADDER`.

@@ -49,11 +49,10 @@ def write_archive(
 def read_archive(
     path: str | os.PathLike[str], *, format: str = FORMAT, names: Collection[str] | None = None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the header and the arrays that `write_archive` was given; `names` selects arrays. FileNotFoundError: there
-    is no such file. ValueError: it is not such an archive, is damaged, lacks one of the names, or is of another
-    version."""
+    """Return the header and the arrays of `write_archive`; `names` selects arrays. FileNotFoundError: there is no such
+    file. ValueError: it is not such an archive, is damaged, lacks one of the names, or has another version."""
     path = Path(path)
-    # A run folder in the place of its model is a likely mistake.
+    # Naming a run folder instead of its model is a likely mistake.
     if is_folder(path):
         found = sorted(path.glob("models/*.npz"))
         raise ValueError(f"{path}: is a folder; name a file{f', such as {found[0]}' if found else ''}")

@@ -1,8 +1,8 @@
-"""Columns of numbers as small integers and coded bytes, and back.
+"""Columns of numbers as small integers and compressed bytes, and back.
 
 Numbers become even steps between two ends, positions steps along a Z curve, and both become planes of one byte each,
-which lossless coders from established libraries make smaller. `ColumnReader` finds the named columns of a
-`ColumnWriter`, and unpacks no more than it may, whatever the bytes claim.
+which established libraries compress without loss. `ColumnReader` reads the named columns of a `ColumnWriter`, and
+never unpacks more than its limit, whatever the bytes claim.
 
 All arrays are numpy's, on the host; C columns of n numbers are [C, n]. A precision is a number of bits or a float type.
 """
@@ -29,7 +29,7 @@ MOST_BITS = 16
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 LEAST_OPACITY = 1e-7
 LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
-"""Bounds of the bytes that a file may unpack to: a multiple of its own, and further ones."""
+"""A file may unpack to this multiple of its own bytes, plus these bytes."""
 ZSTD_LEVEL = 19  # Higher levels are zstd's "ultra", whose windows cost readers more memory.
 LZMA_FILTERS = [
     {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 20}
@@ -43,7 +43,7 @@ LONGEST_WEBP_SIDE = 16_383  # 14 bits in WebP's header.
 
 
 def room_of(num_bytes: int) -> int:
-    """Return how many bytes a file of this size may unpack to."""
+    """Return the number of bytes that a file of this size may unpack to."""
     return FREE_ROOM + LARGEST_RATIO * num_bytes
 
 
@@ -74,7 +74,7 @@ def encode(coder: str, planes: np.ndarray) -> bytes:
 
 def decode(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarray:
     """Return the planes [num_planes, length] of uint8 that `encode` was given. ValueError: the bytes are damaged, or
-    hold more or less than that."""
+    of another length."""
     size = num_planes * length
     # `encode` wrote no bytes for these.
     if size == 0:
@@ -97,13 +97,13 @@ def _decoded(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarra
     if coder in ("lzma", "deflate"):
         is_lzma = coder == "lzma"
         stream: Any = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=LZMA_FILTERS) if is_lzma else zlib.decompressobj()
-        found = stream.decompress(data, size + 1)  # One byte more shows that there is too much.
+        found = stream.decompress(data, size + 1)  # One more byte reveals excess data.
         if not stream.eof or stream.unused_data:
             raise ValueError("it does not end where it should")
         return np.frombuffer(found, np.uint8)
     if coder == "zstd":
         announced = zstandard.get_frame_parameters(data).content_size
-        if announced != size:  # The library would allocate what the frame says.
+        if announced != size:  # The library would allocate this many bytes.
             raise ValueError(f"its frame is of {announced} bytes")
         return np.frombuffer(zstandard.ZstdDecompressor().decompress(data, allow_extra_data=False), np.uint8)
     num, height, width = _webp_shape(num_planes, length)
@@ -151,7 +151,7 @@ def ends_of(values: np.ndarray, bits: int) -> Ends:
 
 
 def _short(value: Any) -> float:
-    """Return the float of fewest digits that is the same float32."""
+    """Return the float with the fewest digits that rounds to the same float32."""
     return float(str(np.float32(value)))
 
 
@@ -207,7 +207,7 @@ def with_w(xyz: np.ndarray) -> np.ndarray:
 
 
 class AxisSteps(NamedTuple):
-    """Even steps of asinh((x − centre) / spread): they grow with the distance, so that far positions cost no bits."""
+    """Even steps of asinh((x − centre) / spread), which grow with the distance, so that far positions cost few bits."""
 
     centre: float
     spread: float
@@ -238,7 +238,7 @@ class AxisSteps(NamedTuple):
 
 
 def morton(codes: np.ndarray, bits: int) -> np.ndarray:
-    """Return [n] places along the Z curve of codes [3, n]: their bits by turns, x lowest; int64."""
+    """Return [n] places along the Z curve of codes [3, n]: their bits interleaved, x lowest; int64."""
     key = np.zeros(codes.shape[1], np.int64)
     for bit in range(bits):
         for axis in range(3):
@@ -296,11 +296,11 @@ def from_planes(planes: np.ndarray, num_columns: int) -> np.ndarray:
 
 
 class ColumnWriter:
-    """Writer of coded columns, one after the other.
+    """Writer of compressed columns, in sequence.
 
     Args:
       coder: of all parts.
-      ends: ends of groups kept in bits; ends of other groups follow from their numbers.
+      ends: given ends of groups in bits; others follow from the numbers.
     """
 
     def __init__(self, coder: Choice, ends: Mapping[str, Sequence[float]] = MappingProxyType({})):
@@ -339,8 +339,7 @@ class ColumnWriter:
         self.planes(name, to_planes(indices, max(count - 1, 0).bit_length()))
 
     def numbers(self, name: str, values: np.ndarray, precision: Precision, *, is_color: bool = False) -> None:
-        """Write floats [C, n]. The three columns of colours are red, green, blue. ValueError: float16 cannot hold
-        them."""
+        """Write floats [C, n]; columns of colours are red, green, blue. ValueError: they overflow float16."""
         if not isinstance(precision, int):
             self.planes(name, to_byte_planes(_finite(name, np.asarray(values), precision)))
             return
@@ -363,7 +362,7 @@ class ColumnWriter:
 
 
 class ColumnReader:
-    """Reads what a `ColumnWriter` wrote; parts of one name in their order.
+    """Reader of a `ColumnWriter`'s parts, in order for each name.
 
     Args:
       body: the coded bytes.
@@ -420,7 +419,7 @@ class ColumnReader:
     def indices(self, name: str, length: int, count: int) -> np.ndarray:
         if count == 0 and length:
             raise ValueError(f"{name} are of a table that is empty")
-        self._take_room(name, length)  # A table of one row has no bytes, but the indices take memory.
+        self._take_room(name, length)  # A table of one row has no bytes, but its indices take memory.
         num_planes = num_bytes_of(max(count - 1, 0).bit_length())
         indices: np.ndarray = from_planes(self.planes(name, num_planes, length), 1)[0]
         if length and indices.max() >= count:
@@ -436,7 +435,7 @@ class ColumnReader:
             planes = self.planes(name, num_columns * dtype.itemsize, length)
             return _finite(name, from_byte_planes(planes, num_columns, dtype))
         ends = Ends(*self._ends(name, 2))
-        if ends.low == ends.high:  # There are no bytes, but the numbers take memory.
+        if ends.low == ends.high:  # No bytes, but the numbers take memory.
             self._take_room(name, num_columns * length)
             self.planes(name, 0, length)
             return np.full((num_columns, length), ends.low, np.float32)

@@ -1,7 +1,7 @@
-"""Compact scene files, *.a2tgz: a model in few bytes, with a chosen number of bits for each group of numbers.
+"""Compact scene files, *.a2tgz: a small file of a model, with a chosen number of bits for each group of numbers.
 
 docs/formats.md describes the file. Rows come back in the order of a Z curve through the means, with quaternions of unit
-length; the model shows the same up to rounding. Files for browsers (`io.web_scene`) have a coder that browsers decode,
+length; the model looks the same up to rounding. Files for browsers (`io.web_scene`) have a coder that browsers decode,
 and several chunks of rows, the most visible first, so that a page draws while it loads.
 """
 
@@ -52,10 +52,10 @@ from a2tg_jax.texture import MAX_SIDE
 # As in PNG: CR LF shows a transfer as text, 0x1A ends a listing on Windows.
 MAGIC = b"a2tgz\r\n\x1a"
 VERSION, OLD_VERSIONS = 3, (1, 2)
-"""Version 1 and 2, without and with shapes of kernels, had one chunk, a header in zstd, and a table for each property
-of the parts."""
+"""Versions 1 and 2, without and with kernel shapes, had one chunk, a zstd header, and a table for each property of the
+parts."""
 HEAD = struct.Struct("<8sHIII")
-"""Magic, version, bytes of the header as coded and as text, checksum of all that follows."""
+"""Magic, version, header bytes as coded and as text, checksum of everything that follows."""
 ORIGIN_DTYPES = {
     "viewmats": "f8", "Ks": "f8", "sizes": "i4", "is_test": "u1", "scale": "f8", "rotation": "f8", "translation": "f8",
 }  # fmt: skip
@@ -71,7 +71,7 @@ class CompactChoices:
     """
 
     means: Precision = 14
-    """Precision of each axis; bits have steps that grow with the distance from the middle."""
+    """Precision of each axis; with bits, steps grow with the distance from the median."""
     log_scales: Precision = 8
     quats: Precision = 8
     """Precision of each of three numbers."""
@@ -126,18 +126,18 @@ def save_compact(
     choices: CompactChoices = DEFAULT_CHOICES,
     grids: Grids | None = None,
 ) -> None:
-    """Write a model's live rows, its appearance and its origin in few bytes.
+    """Write a model's live rows, appearance and origin as a small file.
 
     Args:
       path: the file, conventionally *.a2tgz; an existing one is replaced once the new one is complete.
       model: of Gaussians with or without textures, exponents and bands.
       choices: precision of its numbers.
-      grids: grids of the groups kept in bits, with which the model was tuned (`tune_compact`); None: those between the
-        smallest and the largest of the model's own numbers.
+      grids: grids of the groups in bits for which the model was tuned (`tune_compact`); None: from the smallest to the
+        largest of the model's own numbers.
 
     Raises:
-      ValueError: if the model shows anything else, has a number that is not finite or too large, or a
-        choice cannot be.
+      ValueError: if the model has another appearance or a number that is not finite or too large, or a choice is
+        invalid.
     """
     check_suffix(path, "save_compact")
     check_is_model(model)
@@ -165,14 +165,14 @@ def encode_model(
     order: np.ndarray | None = None,
     page: Mapping[str, object] | None = None,
 ) -> bytes:
-    """Return the bytes of `save_compact`. Raises as it does.
+    """Return the bytes that `save_compact` writes. Raises the same errors.
 
     Args:
-      model: as there; with grids as `half_turned` gives it, with numbers that may have changed since.
-      choices: as there.
-      grids: as there (`grids_of`); numbers beyond their ends are cut to them.
-      order: indices [N] of existing rows, for chunks that can be drawn one after the other; None for a single chunk.
-      page: entry of the header for the viewer.
+      model: as in `save_compact`; with grids, a model of `half_turned` whose numbers may have changed since.
+      choices: as in `save_compact`.
+      grids: as in `save_compact` (`grids_of`); numbers beyond their ends are clipped.
+      order: indices [N] of existing rows, for chunks that are drawn as they arrive; None for a single chunk.
+      page: header entry for the viewer.
     """
     choices.check()
     check_gaussians(model.gaussians, "model.gaussians")
@@ -185,7 +185,7 @@ def encode_model(
     order = np.arange(num) if order is None else order
     # Means kept as floats still need an order along the curve.
     bits = choices.means if isinstance(choices.means, int) else MOST_BITS
-    # With the grids of a tuned model: its numbers lie on these steps, and others would round them again.
+    # With the grids of a tuned model, whose numbers are on these steps: others would round them again.
     known = np.reshape((grids or {}).get("means", ()), (-1, 4)).tolist()
     axes = [AxisSteps(*own) for own in known] or [AxisSteps.of(x, bits) for x in rows.means.T]
     keys = morton(np.stack([axis.codes(x, bits) for axis, x in zip(axes, rows.means.T, strict=True)]), bits)
@@ -214,7 +214,7 @@ def encode_model(
                 ends.setdefault(name, ends_of(values, precision))
 
     def encoded(coder: Choice) -> tuple[bytes, int]:
-        """Return the file and the number of bytes it unpacks to."""
+        """Return the file and the number of bytes that it unpacks to."""
         writer = ColumnWriter(coder, ends)
         if model.origin is not None:
             header["origin"] = {"names": list(model.origin.names)}
@@ -231,12 +231,12 @@ def encode_model(
         return framed(header | {"parts": writer.parts, "ends": writer.ends}, writer.body), writer.num_unpacked
 
     data, num_unpacked = encoded(choices.coder)
-    # Where numbers are so alike that the file would be taken for a bomb, it is not coded.
+    # Very repetitive numbers are not coded: readers would take the file for a decompression bomb.
     return data if num_unpacked <= room_of(len(data)) else encoded("none")[0]
 
 
 def _write(writer: ColumnWriter, rows: Rows, choices: CompactChoices, header: Mapping[str, Any]) -> None:
-    """Write all of a chunk but its means."""
+    """Write everything in a chunk except its means."""
     writer.indices("degrees", np.searchsorted(header["degrees"], rows.degrees), len(header["degrees"]))
     if rows.sizes is not None:
         # A pair of sides as one number, which orders pairs as np.unique does.
@@ -264,14 +264,14 @@ def _columns(rows: Rows, choices: CompactChoices) -> Iterator[tuple[str, np.ndar
 
 
 def half_turned(model: Model) -> Model:
-    """Return the model that its file without rounding holds: its rows along a Z curve, and splats half-turned."""
+    """Return the model as its file without rounding has it: rows along a Z curve, splats half-turned."""
     # An uncoded float32 file does all that writing does except rounding.
     exact = CompactChoices(coder="none").keeping(dict.fromkeys(GROUPS, "float32"))
     return decode_model(encode_model(model, exact))
 
 
 def grids_of(model: Model, choices: CompactChoices) -> Grids:
-    """Return the grids of a file of these choices, for each group kept in bits of which the model has numbers."""
+    """Return the grids of a file with these choices, for each group in bits that the model has."""
     # Ends do not depend on the coder, and none is the fastest.
     header, _ = unframed(encode_model(model, dataclasses.replace(choices, coder="none")))
     return {name: tuple(ends) for name, ends in header["ends"].items()}
@@ -282,7 +282,7 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
     with reading(where):
         header, body = unframed(data)
         choices = config_from_dict(CompactChoices, header["choices"], "choices").check()
-        # Only this package's own classes can be named, so that a file imports nothing.
+        # Only classes of this package can be named, so that a file imports nothing.
         appearance = appearance_from_dict(header["appearance"])
         check_encodable(appearance)
         reader = ColumnReader(body, header["parts"], header["ends"], room_of(len(data)))
@@ -306,7 +306,7 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
 
 
 def bytes_by_part(data: bytes) -> dict[str, int]:
-    """Return how many bytes each part of a whole file takes, the header included."""
+    """Return the bytes of each part of a file, header included."""
     header, body = unframed(data)
     found = {"header": len(data) - len(body)}
     for name, _, length in header["parts"]:
@@ -323,7 +323,7 @@ def framed(header: Mapping[str, object], body: bytes) -> bytes:
 
 
 def unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the header and the body of a whole file."""
+    """Return the header and the body of a file."""
     if len(data) < HEAD.size or data[: len(MAGIC)] != MAGIC:
         raise ValueError("is not a compact scene of a2tg-jax")
     _, version, num_coded, num_text, checksum = HEAD.unpack_from(data)
@@ -348,7 +348,7 @@ def unframed(data: bytes) -> tuple[dict[str, Any], bytes]:
 def _rows_of(
     reader: ColumnReader, num: int, header: Mapping[str, Any], choices: CompactChoices, appearance: Appearance
 ) -> Rows:
-    """Return the tables of a chunk, of no more rows than the file can hold."""
+    """Return the tables of a chunk; the reader limits their size by the file's."""
     base, table = header["base_degree"], header["degrees"]
     if type(base) is not int or not 0 <= base <= MAX_DEGREE:
         raise ValueError(f"must have a base degree in 0..{MAX_DEGREE}; got {base!r}")
@@ -359,7 +359,7 @@ def _rows_of(
     # Splats of an appearance with bands may have any degree up to the highest, however low the base is.
     highest = MAX_DEGREE if appearance.bands is not None else base
     if not set(table) <= set(range(base, highest + 1)):
-        raise ValueError(f"degrees must lie in {base}..{highest}; got {table}")
+        raise ValueError(f"degrees must be in {base}..{highest}; got {table}")
     degrees = np.asarray(table, np.int64)[reader.indices("degrees", num, len(table))]
     bands = []
     for degree in range(highest + 1):
@@ -372,7 +372,7 @@ def _rows_of(
     if "sizes" in header:
         pairs = header["sizes"]
         if not all(type(side) is int and 0 <= side <= MAX_SIDE for size in pairs for side in size):
-            raise ValueError(f"texture sides must lie in 0..{MAX_SIDE}; got {pairs}")
+            raise ValueError(f"texture sides must be in 0..{MAX_SIDE}; got {pairs}")
         if any(len(size) != 2 for size in pairs):
             raise ValueError(f"texture sides must be pairs; got {pairs}")
         sizes = np.asarray(pairs, np.int64).reshape(-1, 2)[reader.indices("sizes", num, len(pairs))]

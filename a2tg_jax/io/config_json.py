@@ -31,7 +31,7 @@ def config_from_dict(
       kind: the dataclass.
       data: an entry per field. A field that has a default may be missing.
       where: name of this place in errors, such as the name of the file.
-      given: values of fields that are not among the data.
+      given: values of fields that `data` lacks.
 
     Raises:
       ValueError: if a field is missing or unknown, or has a value of another type; the field is named.
@@ -66,8 +66,7 @@ def changed_config(config: ConfigT, changes: Mapping[str, object], where: str) -
 def check_config(config: Any, prefix: str = "") -> None:
     """Raise ValueError, naming the field, if a group, number, text or choice of a dataclass is of another type.
 
-    Fields of other types are not checked, nor dataclasses whose annotations cannot be resolved, such as classes within
-    a function.
+    Fields of other types are not checked, nor dataclasses with unresolvable annotations, such as local classes.
     """
     try:
         hints = typing.get_type_hints(type(config))
@@ -104,7 +103,7 @@ def flatten_config(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def _is_plain(hint: object) -> bool:
-    """Return whether a type is one of numbers, texts and choices, None, or a union or tuple of them."""
+    """Return whether a type is a number, text, choice or None, or a union or tuple of these."""
     if typing.get_origin(hint) is typing.Literal or hint is ...:
         return True
     parts = typing.get_args(hint)
@@ -165,7 +164,7 @@ def _as(hint: Any, value: object) -> Any:
 
 
 def _type_name(hint: Any) -> str:
-    """Return a type as a user reads it; a tuple is a list, as files have it."""
+    """Return a type in words; tuples are lists, as in files."""
     origin, inner = typing.get_origin(hint), [item for item in typing.get_args(hint) if item is not ...]
     if origin is typing.Literal:
         return f"one of {', '.join(map(str, inner))}"

@@ -94,8 +94,8 @@ def format_of(path: str | os.PathLike[str]) -> FileFormat:
 
 
 def writer_of(path: str | os.PathLike[str]) -> Writer:
-    """Return the function that writes a file, chosen by its suffix, once it is sure to have what it needs. ValueError:
-    the suffix is unknown, an optional library is missing, or the format can only be read."""
+    """Return the function that writes a file, by its suffix, after importing what it needs. ValueError: the suffix is
+    unknown, an optional library is missing, or the format is read-only."""
     found = format_of(path)
     if found.save is None:
         raise ValueError(f"{shortened(os.fspath(path))}: {found.name} files can be read, but not written")
@@ -107,7 +107,7 @@ def writer_of(path: str | os.PathLike[str]) -> Writer:
 def load_splats(path: str | os.PathLike[str]) -> Model:
     """Read a model from a file of any format that is known by its suffix, such as *.npz, *.ply, *.spz or *.sog.
 
-    Ellipsoids of files of 3DGS become flat, with a warning if that changes them.
+    Ellipsoids of 3DGS files become flat, with a warning if that changes them.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -118,7 +118,7 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
 
 
 def save_splats(path: str | os.PathLike[str], model: Model) -> None:
-    """Write a model in the format of the suffix. Formats of other programs hold its Gaussians in the original world.
+    """Write a model in the format of the suffix. Other programs' formats hold its Gaussians in the original world.
 
     Raises:
       ValueError: if the suffix is unknown, an optional library is missing, or the format cannot hold the model.
@@ -143,19 +143,19 @@ def file_bytes(path: Path) -> int:
 
 
 def _bakeable(model: Model) -> str:
-    """Return in words what a model shows besides plain splats that baking turns into these; "" if nothing."""
+    """Describe what a model shows that baking turns into plain splats; "" if nothing."""
     has_textures, has_shapes = model.textures is not None, model.appearance.exponents is not None
     found = " and ".join(["textures"] * has_textures + ["shapes of kernels"] * has_shapes)
     return f"{found} (bake turns them into plain splats)" if found else ""
 
 
 def unseen_elsewhere(model: Model, path: str | os.PathLike[str]) -> str:
-    """Return in words what a file of some suffix keeps of a model and other programs do not show; "" if nothing."""
+    """Describe what a file keeps of a model, by its suffix, but other programs do not show; "" if nothing."""
     return _bakeable(model) if format_of(path).has_extension else ""
 
 
 def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
-    """Return in words what a file of some suffix does not keep of a model."""
+    """Describe what a file, by its suffix, does not keep of a model."""
     into, shown, origin, lost = format_of(path), model.appearance, model.origin, list[str]()
     if not into.keeps_appearance:
         lost += [found for found in [_bakeable(model)] if found]

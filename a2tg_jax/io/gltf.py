@@ -1,9 +1,8 @@
 """glTF files of splats: KHR_gaussian_splatting, as *.glb, or *.gltf with a *.bin.
 
 Splats are points of a mesh: means, rotations, scales, opacities and spherical harmonics are its attributes. They stay
-in the model's world; the matrix of their node leads to glTF's, which has +y up. Textures, degrees and kernels of splats
-are in the extension A2TG_splat_textures; programs without it show the plain splats. docs/formats.md describes
-both.
+in the model's world; their node's matrix maps it to glTF's world, which has +y up. Textures, degrees and kernels are in
+the extension A2TG_splat_textures; programs without it show plain splats. docs/formats.md describes both.
 """
 
 import os
@@ -41,7 +40,7 @@ DESCRIBED = {
     "sortingMethod": "cameraDistance",
 }
 OWN = "a2tg"
-"""Name of what the extras of splats keep of their model."""
+"""Key in the extras of splats for what belongs to their model."""
 TexelKind = Literal["float32", "uint8"]
 OPTIONS = {"uv": "uv", "outside": "outside", "rgb": "rgb", "alpha": "alpha", "maxAlpha": "max_alpha"}
 """Names of the options that say how textures are shown, and their fields."""
@@ -60,7 +59,7 @@ def coefficient(degree: int, order: int) -> str:
 def save_gltf(
     path: str | os.PathLike[str], model: Model, *, textures: bool = True, texels: TexelKind = "float32"
 ) -> None:
-    """Write a model's live rows as splats of glTF, with its appearance and its origin.
+    """Write a model's live rows as glTF splats, with its appearance and origin.
 
     Args:
       path: the file. *.gltf has its numbers in a *.bin of the same name, any other name is one *.glb. Existing ones are
@@ -71,7 +70,7 @@ def save_gltf(
       texels: their type in the file, "float32" exactly or "uint8" in a quarter of the bytes.
 
     Raises:
-      ValueError: if the model has no Gaussians, shows what the extension cannot hold, or has a number that is not
+      ValueError: if the model has no Gaussians, an appearance that the extension cannot hold, or a number that is not
         finite or too large.
     """
     if texels not in get_args(TexelKind):
@@ -126,7 +125,7 @@ def save_gltf(
 
 
 def _extension_of(builder: Builder, model: Model, kind: TexelKind) -> dict[str, Any]:
-    """Add what splats show to a file, and return the object of the extension; an empty one if it is nothing."""
+    """Add the appearance of splats to a file, and return the extension's object; empty for plain splats."""
     described: dict[str, Any] = {}
     rows, appearance = rows_of_model(model), model.appearance
     if appearance.texture_options is not None and rows.sizes is not None and rows.texels is not None:
@@ -157,13 +156,13 @@ def _extension_of(builder: Builder, model: Model, kind: TexelKind) -> dict[str, 
 def load_gltf(path: str | os.PathLike[str]) -> Model:
     """Return the model of a *.glb or *.gltf of splats, float32, of this program or another.
 
-    All splats of the scene make one model. Files of `save_gltf` bring textures, degrees and origin along, and the
-    model back in its world. Splats of other programs are turned so that +z is up. The thinnest axis of ellipsoids
-    becomes the normal, with a warning if that changes much.
+    All splats of the scene become one model. Files of `save_gltf` restore textures, degrees and origin, in the model's
+    world. Splats of other programs are rotated so that +z is up. The thinnest axis of an ellipsoid becomes its normal,
+    with a warning if that changes much.
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is not glTF 2.0, is damaged, holds no splats, or needs an extension that is not known here.
+      ValueError: if it is not glTF 2.0, is damaged, holds no splats, or needs an unsupported extension.
     """
     check_suffix(path, "load_gltf")
     with reading(path):
@@ -222,15 +221,15 @@ def _splats(document: Document, attributes: Mapping[str, object]) -> others.Elli
 
 
 def _shown(document: Document, described: Mapping[str, Any], splats: others.Ellipsoids) -> tuple[Appearance, Rows, int]:
-    """Return the template, the tables and the degree of all splats, from the object of the extension. ValueError: a
-    field is missing, out of range, or does not fit the others."""
+    """Return the template, the tables and the common degree of splats, from the extension's object. ValueError: a field
+    is missing, out of range, or contradicts the others."""
     num, highest = splats.sh.shape[:2]
     base_degree = sh_degree = NUM_BASES.index(highest)
     has_textures, has_degrees, has_shapes = (name in described for name in ("sizes", "degrees", "shapes"))
     names = {field: described[name] for name, field in OPTIONS.items() if name in described}
     options = config_from_dict(TextureOptions, names, EXTENSION)
     if not 0 < options.max_alpha < 1:
-        raise ValueError(f"{EXTENSION}.maxAlpha must lie in (0, 1); got {options.max_alpha!r}")
+        raise ValueError(f"{EXTENSION}.maxAlpha must be in (0, 1); got {options.max_alpha!r}")
     appearance = appearance_for(options, has_textures=has_textures, has_degrees=has_degrees, has_shapes=has_shapes)
 
     def integers(name: str, kind: str, most: int) -> np.ndarray:
@@ -248,7 +247,7 @@ def _shown(document: Document, described: Mapping[str, Any], splats: others.Elli
         least, most = int(degrees.min(initial=sh_degree)), int(degrees.max(initial=0))
         if type(base_degree) is not int or not 0 <= base_degree <= least or most > sh_degree:
             raise ValueError(
-                f"{EXTENSION}.degrees must lie from baseDegree to the {sh_degree} of the splats; got {least}..{most} "
+                f"{EXTENSION}.degrees must range from baseDegree to the {sh_degree} of the splats; got {least}..{most} "
                 f"and {shortened(base_degree)}"
             )
     if has_shapes:
@@ -270,7 +269,7 @@ def _shown(document: Document, described: Mapping[str, Any], splats: others.Elli
 
 
 def _texels(document: Document, described: Mapping[str, Any], count: int) -> np.ndarray:
-    """Return the texels [T, 4] of all textures, of which `count` must be there."""
+    """Return the `count` texels [T, 4] of all textures."""
     if described.get("extent", EXTENT) != EXTENT:
         raise ValueError(f"{EXTENSION}.extent must be {EXTENT}; got {shortened(described['extent'])}")
     texels = np.zeros((0, 4), np.float32)
@@ -287,11 +286,11 @@ def _texels(document: Document, described: Mapping[str, Any], count: int) -> np.
 
 
 def _kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_described: bool) -> Appearance:
-    """Return the appearance that a model had, with options of its training, if it shows the same.
+    """Return the appearance of the saved model, with its training options, if it looks the same.
 
     Args:
-      kept: what the extras keep.
-      shown: what the file says without these.
+      kept: contents of the extras.
+      shown: appearance by the rest of the file.
       is_described: whether the file has the extension.
     """
     if "appearance" not in kept:

@@ -1,7 +1,7 @@
-"""glTF 2.0 as a container of numbers: a builder of files, and a reader of strangers' files.
+"""glTF 2.0 as a container of numbers: a builder of files, and a reader of untrusted files.
 
 A file is one *.glb, or a *.gltf with buffers in further files or embedded. Reading takes no more memory than a file
-can hold.
+justifies.
 """
 
 import base64
@@ -33,9 +33,9 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 512
 SIDES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MOST_STRIDE = 252  # glTF 2.0, bufferView.byteStride.
 LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
-"""Bounds of the bytes of numbers, as float32, in a file: a multiple of its own bytes, and further bytes."""
+"""A file may hold numbers that take this multiple of its own bytes as float32, plus these bytes."""
 LONGEST_NAME = 255
-"""Bytes that the name of a buffer may have."""
+"""Largest number of bytes in a buffer's name."""
 
 
 # Writing
@@ -53,13 +53,13 @@ class Builder:
     def add(
         self, values: np.ndarray, *, normalized: bool = False, has_bounds: bool = False, is_attribute: bool = True
     ) -> int:
-        """Add numbers [n] or [n, 2 to 4] of a type of glTF, and return the index of their accessor.
+        """Add numbers [n] or [n, 2 to 4] of a glTF type, and return the index of their accessor.
 
         Args:
           values: the numbers, at least one row.
           normalized: integers encode numbers in [0, 1] or [-1, 1].
-          has_bounds: the accessor says the smallest and the largest of each column.
-          is_attribute: they are an attribute of a mesh.
+          has_bounds: the accessor has the minimum and the maximum of each column.
+          is_attribute: the numbers are an attribute of a mesh.
         """
         columns = values.reshape(len(values), -1)
         code = next(code for code, name in COMPONENTS.items() if np.dtype(name) == values.dtype.newbyteorder("<"))
@@ -76,7 +76,7 @@ class Builder:
         return len(self.accessors) - 1
 
     def add_bytes(self, data: bytes, **options: object) -> int:
-        """Add bytes, such as an image, and return the index of their buffer view, which has these options."""
+        """Add bytes, such as an image, and return the index of their buffer view with these options."""
         self._views.append({"buffer": 0, "byteOffset": self._num_bytes, "byteLength": len(data), **options})
         # glTF aligns accessors to their component size, at most 4 bytes.
         self._pieces.append(data + bytes(-len(data) % 4))
@@ -86,10 +86,10 @@ class Builder:
     def save(self, path: Path, described: Mapping[str, object]) -> None:
         """Write the file, *.gltf with a *.bin, any other name as one *.glb.
 
-        Older files are replaced once the new ones are whole. `described` is the JSON without accessors and buffers.
+        Existing files are replaced once the new ones are complete. `described` is the JSON minus accessors and buffers.
 
         Raises:
-          ValueError: if these are more bytes than a *.glb holds.
+          ValueError: if a *.glb cannot hold this many bytes.
         """
         buffer: dict[str, Any] = {"byteLength": self._num_bytes}
         whole = {**described, "accessors": self.accessors, "bufferViews": self._views, "buffers": [buffer]}
@@ -119,8 +119,8 @@ class Builder:
 
 
 class Document:
-    """A file that was read: its JSON, and the numbers of its accessors. FileNotFoundError: there is no such file.
-    ValueError: it is not glTF 2.0, or is damaged."""
+    """A file's JSON, and the numbers of its accessors. FileNotFoundError: there is no such file. ValueError: it is not
+    glTF 2.0, or is damaged."""
 
     def __init__(self, path: str | os.PathLike[str]):
         self.path = Path(path)
@@ -136,7 +136,7 @@ class Document:
         self._room = FREE_ROOM + LARGEST_RATIO * len(data)
 
     def entry(self, kind: str, index: object) -> dict[str, Any]:
-        """Return an object of one of the lists of the file, such as "nodes"."""
+        """Return an object of one of the file's lists, such as "nodes"."""
         entries = self.json.get(kind, [])
         if type(index) is not int or not isinstance(entries, list) or not 0 <= index < len(entries):
             raise ValueError(f"has no {kind}[{shortened(index)}]")
@@ -145,8 +145,8 @@ class Document:
         return entries[index]
 
     def numbers(self, index: object, kind: str, what: str) -> np.ndarray:
-        """Return the numbers of an accessor as float32 [n, columns]; integers that are normalised become fractions.
-        ValueError, naming it `what`: there is none, it is of another kind, or reaches beyond its buffer."""
+        """Return the numbers of an accessor as float32 [n, columns]; normalised integers become fractions.
+        ValueError, naming it `what`: it is missing, of another kind, or exceeds its buffer."""
         accessor = self.entry("accessors", index)
         if accessor.get("type") != kind or accessor.get("componentType") not in COMPONENTS:
             found = f"{accessor.get('type')} of {accessor.get('componentType')}"
@@ -166,7 +166,7 @@ class Document:
         first = start + _count(accessor, "byteOffset", what, 0)
         if count and first + stride * (count - 1) + size > start + length:
             raise ValueError(f"{what} has {count} entries, but its buffer is too short for them")
-        # Several accessors may name the same bytes, each of which takes room for itself.
+        # Several accessors may share bytes, but each one's numbers take memory.
         if 4 * count * columns > self._room:
             raise ValueError(f"{what} would take {4 * count * columns} bytes, which the file is too small for")
         self._room -= 4 * count * columns
@@ -178,7 +178,7 @@ class Document:
         return values
 
     def _buffer(self, index: Any, what: str) -> bytes:
-        """Return the bytes of a buffer, which are read once."""
+        """Return the bytes of a buffer; each is read once."""
         described = self.entry("buffers", index)
         length = _count(described, "byteLength", what)
         if index not in self._buffers:
@@ -192,7 +192,7 @@ class Document:
         return self._buffers[index]
 
     def _read(self, uri: Any) -> bytes:
-        """Return the bytes of a buffer outside the file, which must lie in its folder, or embedded in its JSON."""
+        """Return the bytes of a buffer that is a file in the same folder, or embedded in the JSON."""
         if not isinstance(uri, str):
             raise ValueError("the uri of a buffer is no text")
         if uri.startswith("data:"):
@@ -219,7 +219,7 @@ def buffer_files(path: Path) -> list[Path]:
 
 
 def _named_file(path: Path, uri: str) -> Path:
-    """Return the file of a buffer. Raises ValueError if it is missing or does not lie in the folder of the glTF."""
+    """Return the file of a buffer. Raises ValueError if it is missing or outside the glTF's folder."""
     name = urllib.parse.unquote(uri, errors="strict")
     if len(name.encode("utf-8", "surrogatepass")) > LONGEST_NAME:
         raise ValueError(f"its buffer has too long a name ({shortened(uri)})")
@@ -227,7 +227,7 @@ def _named_file(path: Path, uri: str) -> Path:
     folder = path.parent.resolve()
     file = (folder / name).resolve() if "://" not in uri else None
     if file is None or not file.is_relative_to(folder):
-        raise ValueError(f"its buffer {shortened(uri)} does not lie in the folder of the file")
+        raise ValueError(f"its buffer {shortened(uri)} is not in the folder of the file")
     if not is_regular(file):
         raise ValueError(f"its buffer {shortened(uri)} is missing")
     return file
@@ -259,7 +259,7 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
 
 
 def _count(described: Mapping[str, object], name: str, what: str, default: int | None = None) -> int:
-    """Return a field that is a whole number, not negative."""
+    """Return a field that is a non-negative integer."""
     value = described.get(name, default)
     # Not isinstance, for true is an int; 2^53 is where JSON's numbers stop being exact.
     if type(value) is not int or not 0 <= value < 1 << 53:
@@ -276,7 +276,7 @@ def mesh_nodes(document: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]
     Without scenes, all nodes are in the scene.
 
     Raises:
-      ValueError: if a node is missing, occurs twice, or its transform is no numbers.
+      ValueError: if a node is missing or occurs twice, or its transform is not numeric.
     """
     if document.json.get("scenes"):
         roots = _indices(document.entry("scenes", document.json.get("scene", 0)), "nodes")
@@ -287,7 +287,7 @@ def mesh_nodes(document: Document) -> Iterator[tuple[dict[str, Any], np.ndarray]
         roots = [index for index in range(len(nodes)) if index not in children]
     seen: set[int] = set()
     waiting = [(index, np.eye(4)) for index in reversed(roots)]
-    while waiting:  # No recursion: a file may nest nodes deeper than Python calls functions.
+    while waiting:  # No recursion: a file may nest nodes deeper than Python's call stack.
         index, parent = waiting.pop()
         node = document.entry("nodes", index)
         # Nodes are a forest in glTF; a cycle would never end.

@@ -1,7 +1,7 @@
-"""Models on disk: Gaussians, what they show and where they were trained, in one archive, without padding.
+"""Models on disk: Gaussians, appearance and origin in one archive, without padding.
 
-The header names the class of the appearance and holds its options. Reading a file imports nothing: a class that is not
-this package's must be passed, or its module be imported already.
+The header has the appearance's class and options. Reading a file imports nothing: other packages' classes must be
+passed, or their modules be imported already.
 """
 
 import dataclasses
@@ -37,11 +37,11 @@ ORIGIN_KINDS: dict[str, tuple[str, str, Any]] = {
     "sizes": ("iu", "integers", np.int64),
     "is_test": ("b", "bool", np.bool_),
 }
-"""Kinds of arrays of an origin that are no floats, in words, and their type."""
+"""Kinds of an origin's arrays that are not floats, in words, and their type."""
 
 
 def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, object] | None = None) -> None:
-    """Write a model's live rows, its appearance and its origin.
+    """Write a model's live rows, appearance and origin.
 
     Args:
       path: the file, conventionally *.npz; an existing one is replaced once the new one is complete.
@@ -49,8 +49,8 @@ def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, 
       header: JSON-able values to store with it; `read_archive_header` returns them.
 
     Raises:
-      ValueError: if the suffix is another format's, if `load_model` would refuse the model, as it does numbers that
-        are not finite, or if the options of the appearance cannot be written as JSON.
+      ValueError: if the suffix is another format's, the model is invalid (such as by numbers that are not finite), or
+        the appearance's options cannot be written as JSON.
     """
     model = live_model(path, model, "save_model")
     arrays = {name: np.asarray(getattr(model.gaussians, name)) for name in FIELDS}
@@ -70,11 +70,11 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
 
     Args:
       path: the file.
-      appearances: classes of appearances that are not this package's.
+      appearances: appearance classes of other packages.
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is not a model, is damaged, is of another version, or shows a class that is not known here.
+      ValueError: if it is not a model, is damaged, has another version, or an appearance of an unknown class.
     """
     check_suffix(path, "load_model")
     header, arrays = read_archive(path, format=FORMAT)
@@ -93,8 +93,8 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
 
 
 def number_in_file(path: str | os.PathLike[str]) -> int:
-    """Return the number of Gaussians in a file of `save_model`, without reading more than their means.
-    FileNotFoundError: there is no such file. ValueError: it is not a model, is damaged, or is of another version."""
+    """Return the number of Gaussians in a model file, by reading only their means. FileNotFoundError: there is no such
+    file. ValueError: it is not a model, is damaged, or has another version."""
     # SH are most of a model's bytes.
     means = read_archive(path, format=FORMAT, names=("means",))[1]["means"]
     check_shape(f"{os.fspath(path)}: means", means, ("N", 3))
@@ -106,11 +106,11 @@ def number_in_file(path: str | os.PathLike[str]) -> int:
 
 PART_CLASSES: dict[str, type] = {"texture": Texture, "exponents": Exponents, "bands": Bands}
 OLD_PARTS: dict[str, Any] = {"Shaped": {"exponents": Exponents()}, "Banded": {"bands": Bands()}}
-"""Wrappers of version 0.2, and the parts that took their place."""
+"""Wrappers of version 0.2, and the parts that replace them."""
 
 
 def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
-    """Return the class and options of an appearance, and the options of its parts."""
+    """Return the class and options of an appearance and of its parts."""
     kind = type(appearance)
     parts = {name: _options_of(part) for name in PARTS if (part := getattr(appearance, name)) is not None}
     described = {
@@ -131,7 +131,7 @@ def appearance_to_dict(appearance: Appearance) -> dict[str, Any]:
 
 
 def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[Appearance]] = ()) -> Appearance:
-    """Return the template that `appearance_to_dict` described, or version 0.2. ValueError: its class is unknown."""
+    """Return the template that `appearance_to_dict` or version 0.2 described. ValueError: its class is unknown."""
     name, options, module = data["name"], data["options"], data["module"]
     is_own = module.partition(".")[0] == __name__.partition(".")[0]
     if is_own and "parts" not in data:
@@ -141,7 +141,7 @@ def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[App
             return Appearance(texture=config_from_dict(Texture, options, "options of Textured", given={"texels": None}))
         if name == "Plain":
             return appearance_for(config_from_dict(TextureOptions, options, "options of Plain"), has_textures=False)
-    # The class was passed, or is this package's, or of a module that is already imported.
+    # The class was passed, is this package's, or is in a module that is already imported.
     found: Any = next((kind for kind in appearances if kind.__qualname__ == name), None)
     if found is None and is_own:
         found = getattr(built_in, name, None)
@@ -149,7 +149,7 @@ def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[App
         found = getattr(sys.modules.get(module), name, None)
     if not (isinstance(found, type) and issubclass(found, Appearance)):
         raise ValueError(
-            f"shows the appearance {name} of the module {module}, which is not known here: import that module first, "
+            f"shows the appearance {name} of the module {module}, which is unknown: import that module first, "
             f"or pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
         )
     return _appearance_of(found, data)

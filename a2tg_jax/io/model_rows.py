@@ -1,7 +1,7 @@
-"""A model as plain tables of numbers, in the order of a Z curve, and the model again.
+"""A model as plain tables of numbers in Z-curve order, and back.
 
-Neighbouring rows are near each other in space, so that their numbers are alike. Each splat is turned by half about one
-of its axes if that makes its rotation smaller, and its texture is mirrored along: it looks the same.
+Neighbouring rows are near each other in space, so that their numbers are similar. Each splat is turned by half about
+one of its axes if that makes its rotation smaller, and its texture is mirrored with it: it looks the same.
 """
 
 import dataclasses
@@ -52,7 +52,7 @@ class Rows:
     sizes: np.ndarray | None
     """Sizes [N, 2] of their textures, (Tv, Tu); None without textures."""
     texels: np.ndarray | None
-    """Texels [T, 4], one texture after the other, each row by row."""
+    """Texels [T, 4], texture by texture, each row by row."""
     shapes: np.ndarray | None = None
     """Shapes [N] of their kernels; None if all are Gaussians."""
 
@@ -60,7 +60,7 @@ class Rows:
 def check_encodable(
     appearance: Appearance, file: str = "a compact file", instead: str = "save_model keeps any model"
 ) -> None:
-    """Raise ValueError, saying what to do instead, unless a file can hold what splats show."""
+    """Raise ValueError, with the alternative, unless a file can hold an appearance."""
     if not appearance.is_portable:
         raise ValueError(
             f"model shows {in_words(appearance)}: {file} holds Gaussians with or without textures, exponents and "
@@ -69,7 +69,7 @@ def check_encodable(
 
 
 def rows_of_model(model: Model) -> Rows:
-    """Return the tables of a model of which all rows exist, in its order. Raises as `check_model`."""
+    """Return the tables of a model without unused rows, in its order. Raises as `check_model`."""
     check_model(model)
     gaussians, shown = model.gaussians, arrays_of(model.appearance, model.gaussians.sh_degree)
     sh = np.asarray(gaussians.sh)
@@ -91,7 +91,7 @@ def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:
     Args:
       rows: the splats.
       order: indices [N].
-      turns: turn splats by half if that makes their rotations smaller; else w only becomes positive.
+      turns: turn splats by half if that makes their rotations smaller; otherwise only make w positive.
     """
     quats = rows.quats[order]
     quats, axis = nearest_half_turn(quats) if turns else (with_positive_w(quats), np.zeros(len(order), np.int64))
@@ -113,7 +113,7 @@ def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:
 
 
 def joined_rows(parts: Sequence[Rows]) -> Rows:
-    """Return the splats of all parts, of which each has the same tables."""
+    """Return the splats of all parts, which have the same tables."""
     if len(parts) == 1:
         return parts[0]
     values = {field.name: [getattr(part, field.name) for part in parts] for field in dataclasses.fields(Rows)}
@@ -138,9 +138,9 @@ def _texels(sizes: np.ndarray, order: np.ndarray, axis: np.ndarray) -> np.ndarra
 
 
 def nearest_half_turn(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit quaternions [n, 4] after a half-turn about an own axis, so that w is largest and not negative.
+    """Return unit quaternions [n, 4] after a half-turn about one of their axes, so that w is largest and not negative.
 
-    A flat Gaussian is the same after half a turn about any of its axes; what is shown on it is mirrored along.
+    A flat Gaussian is the same after half a turn about any of its axes; its texture is mirrored.
 
     Returns:
       The quaternions, float64, and [n] the axis about which each was turned: 0 is none, 1 to 3 are u, v and the normal.
@@ -153,7 +153,7 @@ def nearest_half_turn(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_positive_w(quats: np.ndarray) -> np.ndarray:
-    """Return the same rotations as unit quaternions [n, 4], float64, of which no w is negative."""
+    """Return the same rotations as unit quaternions [n, 4], float64, with w ≥ 0."""
     quats = np.asarray(quats, np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1.0), [1.0, 0.0, 0.0, 0.0])
@@ -165,9 +165,9 @@ def model_of(rows: Rows, base_degree: int, appearance: Appearance, origin: Origi
 
     Args:
       rows: the tables.
-      base_degree: of the spherical harmonics that all Gaussians have.
-      appearance: template of what they show.
-      origin: where it was trained.
+      base_degree: degree of the spherical harmonics that all Gaussians have.
+      appearance: template of the appearance.
+      origin: origin of the model.
       background: RGB behind all splats.
 
     Raises:

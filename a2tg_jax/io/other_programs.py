@@ -1,8 +1,8 @@
 """Models as files of other programs hold them: ellipsoids in a world with other axes, and numbers of limited range.
 
-A model's own world has +z up, and lengths in which its cameras are 1 away. A file's world has the lengths of the
-original one, and the up axis of its format; the model keeps its place in it. Positions that a format would
-round too far, such as map coordinates, are relative to an offset.
+A model's world has +z up, and its cameras at a distance of about 1. A file's world has the original lengths and its
+format's up axis; the model keeps its place in it. Positions that a format would round too far, such as map coordinates,
+are relative to an offset.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from a2tg_jax.model import Model, concatenate
 
 Up = Literal["y", "z"]
 Kind = str
-"""gaussforge's name of a format, such as "spz"; "ply" is every one with positions in float32."""
+"""gaussforge's name of a format, such as "spz"; "ply" stands for all with float32 positions."""
 UPRIGHT: Mapping[Up, np.ndarray] = {
     # (x, y, z) → (x, z, −y): a quarter turn about x.
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
@@ -41,11 +41,11 @@ THICKNESS = 1e-3
 """Ratio of a flat Gaussian's third scale in a file to its shorter one."""
 # Turns by 120° and −120° about (1, 1, 1), and none.
 AXES_TO_NORMAL = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]], np.float32)
-"""Row k: the rotation (wxyz) of the axes among themselves that makes the k-th the third."""
+"""Row k: the rotation (wxyz) that permutes the axes so that the k-th becomes the third."""
 SAME_PLACE = 1e-5
-"""Largest difference of the numbers of two similarities that are taken for one."""
+"""Largest difference of numbers between two similarities that count as equal."""
 SAME_SCALE = 1e-3
-"""Largest difference of the scales of the axes of a transform, relative to the largest."""
+"""Largest relative difference between the axis scales of a transform."""
 MOST_PARTS = 256
 """Largest number of sets of splats in one file."""
 
@@ -54,7 +54,7 @@ MOST_PARTS = 256
 
 
 class Ellipsoids(NamedTuple):
-    """N ellipsoids in activated numbers; float32 on the host."""
+    """N ellipsoids with activated numbers; float32 on the host."""
 
     means: np.ndarray
     """[N, 3]."""
@@ -74,19 +74,19 @@ class WorldGaussians(NamedTuple):
     gaussians: Gaussians
     """Their means are relative to the offset."""
     offset: np.ndarray
-    """[3] float64 whole numbers, zeros where the format holds the positions as they are."""
+    """[3] float64 whole numbers; zeros if the format can hold the positions."""
     means: np.ndarray
     """[N, 3] float64 positions, without the offset."""
 
 
 def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False) -> Gaussians:
-    """Return the Gaussians of a model without what they show, in the model's world.
+    """Return the Gaussians of a model without its appearance, in the model's world.
 
-    They are opaque by themselves, and have all spherical harmonics of the model.
+    They have their own opacities, and all spherical harmonics of the model.
 
     Args:
       gaussians: as in `save_ply`.
-      keeps_shapes: the file keeps the shapes of kernels besides. If not, each kernel becomes the nearest Gaussian.
+      keeps_shapes: the file also keeps kernel shapes. If not, each kernel becomes the nearest Gaussian.
     """
     if isinstance(gaussians, Model):
         model = gaussians.live
@@ -104,7 +104,7 @@ def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False)
 def world_gaussians(
     gaussians: Gaussians | Model, transform: Similarity | None = None, kind: Kind = "ply"
 ) -> WorldGaussians:
-    """Return the Gaussians of a model without what they show, in the original world; arguments as in `save_ply`."""
+    """Return the Gaussians of a model without its appearance, in the original world; arguments as in `save_ply`."""
     plain = plain_gaussians(gaussians)
     if transform is None and isinstance(gaussians, Model) and gaussians.origin is not None:
         transform = gaussians.origin.transform
@@ -120,9 +120,9 @@ def world_gaussians(
 
 
 def splats_of(model: Model, *, keeps_shapes: bool = False) -> Ellipsoids:
-    """Return the splats of a model of which all rows exist, with a third axis of a thousandth of the shorter.
+    """Return the splats of a model without unused rows, with a third axis of a thousandth of the shorter.
 
-    If splats differ in degree, coefficients go up to the highest of these. `keeps_shapes` is as in
+    If splats differ in degree, coefficients go up to the highest degree. `keeps_shapes` is as in
     `plain_gaussians`.
     """
     gaussians = plain_gaussians(model, keeps_shapes=keeps_shapes)
@@ -140,7 +140,7 @@ def splats_of(model: Model, *, keeps_shapes: bool = False) -> Ellipsoids:
 
 
 def third_log_scales(log_scales: np.ndarray) -> np.ndarray:
-    """Return the logarithms [N, 1] of third scales: of flat Gaussians [N, 2], a thousandth of the shorter one."""
+    """Return the logarithms [N, 1] of third scales, a thousandth of the shorter of [N, 2]."""
     return log_scales.min(axis=1, keepdims=True) + np.log(THICKNESS)
 
 
@@ -156,9 +156,9 @@ def linear_colors(colors: np.ndarray) -> np.ndarray:
 def gaussians_of(
     splats: Ellipsoids, path: str | os.PathLike[str], *, is_flat: bool, keeps_all: bool = False
 ) -> Gaussians:
-    """Return the Gaussians of the splats of a file, of which the third axis is the normal if it `is_flat`.
+    """Return the Gaussians of a file's splats, whose third axis is the normal if the file `is_flat`.
 
-    Else the thinnest axis becomes the normal. Splats with numbers that are not finite are left out with a warning,
+    Otherwise the thinnest axis becomes the normal. Splats with numbers that are not finite are dropped with a warning,
     unless `keeps_all`.
     """
     # A textured file has tables by row: none can be left out.
@@ -200,7 +200,7 @@ def whole_rows(name: str, scales: np.ndarray, *columns: np.ndarray) -> np.ndarra
 def flat_rows(
     name: str, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, logits: np.ndarray, sh: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Return the same columns of `whole_rows` alone, with two log-scales: three are `flattened`."""
+    """Return the columns of `whole_rows` only, with two log-scales: three are `flattened`."""
     kept = whole_rows(name, log_scales, means, quats, logits, sh)
     means, quats, log_scales, logits, sh = (values[kept] for values in (means, quats, log_scales, logits, sh))
     if log_scales.shape[1] == 3:
@@ -211,11 +211,11 @@ def flat_rows(
 def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return quaternions [N, 4] and log-scales [N, 2] of ellipsoids [N, 3], with the thinnest axis as the normal.
 
-    The axes are moved around in their cycle, so that the rotation stays one; of two equally thin the later goes. A
-    warning that some ellipsoids are not flat names the file.
+    The axes are permuted cyclically, which keeps the rotation proper; of two equally thin axes the later is dropped. A
+    warning about ellipsoids that are not flat names the file.
     """
     if len(log_scales):
-        # A file that rounds scales gives all flat Gaussians one third scale, its smallest, and most are far wider.
+        # In a file that rounds scales, all flat Gaussians have one third scale, its smallest; most are far wider.
         others, third = log_scales[:, :2], log_scales[:, 2]
         if third.min() == third.max() <= others.min() and third[0] < np.median(others) + np.log(0.1):
             return quats, others
@@ -240,7 +240,7 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
 
 
 def degree_to_read(degree: int, name: str) -> int:
-    """Return the degree to read of the spherical harmonics of a file, at most 3. Warn if the file's is higher."""
+    """Return the SH degree to read from a file, at most 3. Warn if the file's is higher."""
     if degree > HIGHEST_DEGREE:
         message = f"{name}: has SH of degree {degree}; degree {HIGHEST_DEGREE} is read, and what is above it left out"
         warnings.warn(message, stacklevel=4)
@@ -251,7 +251,7 @@ def degree_to_read(degree: int, name: str) -> int:
 
 
 def upright(origin: Origin | Similarity | None, up: Up) -> Similarity:
-    """Return the similarity from the world of a model, given its origin or transform, to a file's with this axis up."""
+    """Return the similarity from a model's world, given its origin or transform, to a file's with this axis up."""
     transform = origin.transform if isinstance(origin, Origin) else origin
     return Similarity(1.0 if transform is None else 1.0 / float(transform.scale), UPRIGHT[up], np.zeros(3))
 
@@ -265,8 +265,8 @@ def matrix_of(similarity: Similarity) -> np.ndarray:
 
 
 def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
-    """Return the similarity that a matrix [4, 4] for columns is. ValueError, naming it `what`: it mirrors, shears, or
-    scales axes differently."""
+    """Return a matrix [4, 4] for columns as a similarity. ValueError, naming it `what`: it mirrors, shears, or scales
+    axes differently."""
     # Column norms of s·R are all s.
     scales = np.linalg.norm(matrix[:3, :3], axis=0)
     largest = float(scales.max())
@@ -283,9 +283,9 @@ def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
 def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
     """Return the parts of a file as one model in its own world, which has +z up (host).
 
-    A part stays as it is where its file places it as it was written. Else it moves, and its origin along. Positions
-    that float32 would round too far there, as in map coordinates, are relative to an offset, which the origin of a
-    model without one then has.
+    A part that its file places where it was written does not change. Otherwise it moves together with its origin.
+    Positions that float32 would round too far, as in map coordinates, are relative to an offset, which becomes the
+    origin of a model without one.
 
     Args:
       parts: models as the file holds them, and the matrices from there to the world of the file.
@@ -326,14 +326,14 @@ def origin_to_json(origin: Origin) -> dict[str, Any]:
 
 SPZ_STEP = 2.0**-12  # 24-bit fixed point with 12 fractional bits.
 SPZ_REACH = 2048 - SPZ_STEP
-"""Largest coordinate of SPZ, which wraps those beyond."""
+"""Largest coordinate of SPZ; larger ones wrap around."""
 SOG_LEVELS = 2**16 - 1  # Positions have 16 bits an axis.
 MOST_ROUNDING = 0.1
 """Largest rounding of a typical position by a format, in scales of its Gaussian, without a warning."""
 MOST_SINGLE_ROUNDING = 0.01
 """Largest rounding of a typical position by float32, in scales of its Gaussian, that keeps the origin."""
 SLACK = 1e-3
-"""Part of a range that numbers may leave it by without being counted."""
+"""Share of a range by which numbers may exceed it without being counted."""
 
 
 RANGES = {
@@ -343,17 +343,17 @@ RANGES = {
     ".splat": (0.5 / SH_C0, math.inf, -math.inf, math.inf),
     ".ksplat": (0.5 / SH_C0, math.inf, -math.inf, math.inf),
 }
-"""Largest coefficients of degree 0 and above it, least and largest log-scale that a format holds; it cuts others."""
+"""Largest coefficients of degree 0 and above, smallest and largest log-scale of a format; others are clipped."""
 OFFSET_PLACES = {
     "ply": "the comment 'offset' in the file says so; a2tg convert --float64 keeps world coordinates",
     "compressed.ply": "the comment 'offset' in the file says so",
     "sog": "'offset' in its meta.json says so",
 }
-"""Where a file says what its positions are relative to, by gaussforge's name of its format."""
+"""Where a file has the offset of its positions, by gaussforge's name of its format."""
 
 
 def offset_for(kind: Kind, means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
-    """Return whole numbers [3] to subtract from positions [N, 3] so that a format can hold them; zeros if it can now.
+    """Return whole numbers [3] to subtract from positions [N, 3] so that a format can hold them; zeros if it can.
 
     Positions are float64, and they and the log-scales [N, 2] are in the original world.
     """
@@ -361,7 +361,7 @@ def offset_for(kind: Kind, means: np.ndarray, log_scales: np.ndarray) -> np.ndar
         return np.zeros(3)
 
     def excess(positions: np.ndarray) -> float:
-        """Return the rounding of a typical position as a multiple of what is allowed."""
+        """Return the rounding of a typical position as a multiple of the largest allowed."""
         single = np.abs(positions - positions.astype(np.float32)).max(axis=1)
         by_format = np.median(_rounding(kind, positions) / scales) / MOST_ROUNDING
         return float(max(np.median(single / scales) / MOST_SINGLE_ROUNDING, by_format))
@@ -398,7 +398,7 @@ def warn_of_offset(kind: Kind, offset: np.ndarray, path: str | os.PathLike[str])
 
 
 def offset_words(offset: np.ndarray) -> list[str]:
-    """Return the three numbers of an offset as text that a float64 is read back from."""
+    """Return the three numbers of an offset as text that reads back to the same float64."""
     return [repr(float(value)).removesuffix(".0") for value in offset]
 
 
@@ -436,7 +436,7 @@ def _rounding(kind: Kind, means: np.ndarray) -> np.ndarray:
 
 
 def cut_numbers(name: str, model: Model) -> list[str]:
-    """Return in words how many Gaussians a format, by its name, cuts the colours and the scales of."""
+    """Describe how many Gaussians have colours or scales that a format, by its name, clips."""
     if name not in RANGES:
         return []
     gaussians = world_gaussians(model).gaussians

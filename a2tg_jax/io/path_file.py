@@ -18,7 +18,7 @@ LARGEST_SIDE, MOST_VIEWS = 16384, 10_000
 
 def load_views(path: Path) -> list[Camera]:
     """Return the cameras of a file, in the world of the viewed model, float32. FileNotFoundError: there is no such
-    file. ValueError, naming the file: it holds anything else."""
+    file. ValueError, naming the file: it is invalid."""
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such path; the viewer's 'Save path' makes one")
     try:

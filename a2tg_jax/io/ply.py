@@ -1,12 +1,11 @@
 """PLY files of Gaussians with the attribute names of 2DGS, and a third scale for programs made for 3DGS.
 
-Written are x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 scale_2 rot_0..3, little-endian float32:
+Files have x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0 scale_1 scale_2 rot_0..3, little-endian float32:
 opacities as logits, scales as logarithms, quaternions wxyz. f_rest lists the coefficients of degree 1 to 3 channel by
 channel: all of red, then green, then blue. scale_2 belongs to the axis along the normal; files of 2DGS lack it. The
-comment "SplatRenderMode: 2dgs" says that splats are flat. What splats show besides has no place in this format:
-textures, movable kernels and billboards, and with them the colours and opacities that they carry, are lost;
-`save_model` keeps all. Positions that float32 would round too far, such as map coordinates, are relative to an offset:
-"comment offset X Y Z".
+comment "SplatRenderMode: 2dgs" says that splats are flat. The format has no place for other appearances: textures,
+movable kernels and billboards, with their colours and opacities, are lost; `save_model` keeps all. Positions that
+float32 would round too far, such as map coordinates, are relative to an offset: "comment offset X Y Z".
 
 SuperSplat packs a Gaussian into sixteen bytes, within the bounds of its chunk of 256. Elements: `chunk` (float: bounds
 of positions, log-scales and, in newer files, colours), `vertex` (four uint: position and scale in 11, 10 and 11 bits;
@@ -58,23 +57,21 @@ def save_ply(
     """Write Gaussians with the attributes of 2DGS, normals along the splats' own, and a third scale.
 
     If float32 would round positions in the original world, as in map coordinates, they are relative to whole numbers
-    near the scene's middle. A warning and the comment "offset X Y Z" in the file say these.
+    near the scene's middle, which a warning and the comment "offset X Y Z" in the file name.
 
     Args:
-      path: the file; an older one is replaced once the new one is whole.
-      gaussians: N Gaussians; or a model, of which the Gaussians that exist are written, without what they show;
+      path: the file; an existing one is replaced once the new one is complete.
+      gaussians: N Gaussians; or a model, whose live Gaussians are written, without their appearance;
         their opacities are `Appearance.opacities`, for movable kernels and billboards have their own. Kernels of other
         shapes become the nearest Gaussians.
-      transform: `scene.transform`, which led from the original world to the world of the Gaussians; given, they are
-        brought back to the original world first, SH included. None writes Gaussians as they are, and brings those of a
-        model back to the original world of its origin, if it has one.
-      third_scale: write scale_2, a thousandth of the shorter scale, which programs for 3DGS need. False leaves it out,
-        as 2DGS does.
+      transform: `scene.transform`, from the original world to the Gaussians' world; they are written in the original
+        world, SH rotated. None leaves Gaussians unchanged; a model with an origin is written in its original world.
+      third_scale: write scale_2, a thousandth of the shorter scale, which programs for 3DGS need. False omits it, as
+        2DGS does.
       float64: write x, y and z as float64, and never relative to an offset.
 
     Raises:
-      ValueError: if a field of the Gaussians has another shape than it must have, or `load_ply` would refuse them, as
-        it does numbers that are not finite.
+      ValueError: if a field of the Gaussians has the wrong shape, or a number that is not finite or too large.
     """
     check_suffix(path, "save_ply")
     found = others.world_gaussians(gaussians, transform)
@@ -88,15 +85,15 @@ def save_ply(
 def encode_ply(
     gaussians: Gaussians, third: np.ndarray | None, offset: np.ndarray | None = None, means: np.ndarray | None = None
 ) -> bytes:
-    """Return a PLY file of Gaussians. ValueError: `load_ply` would refuse them.
+    """Return a PLY file of Gaussians. ValueError: they are invalid.
 
     Args:
       gaussians: N Gaussians.
-      third: logarithms [N, 1] of third scales; None leaves these out.
-      offset: [3] what the means are relative to, for a comment.
+      third: logarithms [N, 1] of third scales; None omits them.
+      offset: [3] origin of the means, for a comment.
       means: [N, 3] to write as float64 instead of the Gaussians' own.
     """
-    # A file that this program refuses to read must not be written.
+    # Never write a file that `load_ply` rejects.
     check_model(Model(gaussians))
     sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
     # [N, K, 3] to channel by channel, as 3DGS writes f_rest.
@@ -125,20 +122,20 @@ def encode_ply(
 
 
 def offset_comment(offset: np.ndarray) -> str:
-    """Return the line of a header that says what positions are relative to; "" for zeros."""
+    """Return the header line with the offset of positions; "" for zeros."""
     return f"comment {OFFSET} {' '.join(others.offset_words(offset))}\n" if offset.any() else ""
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a PLY file of 2DGS, of a program that uses its attribute names, or as SuperSplat packs it.
 
-    A file of map coordinates (`save_ply`) is read relative to whole numbers that a warning names; `load_splats` keeps
-    these in the model's origin. So are positions in float64 that float32 would round too far.
+    Positions of map coordinates (`save_ply`), and float64 positions that float32 would round too far, are relative to
+    whole numbers that a warning names; `load_splats` keeps these in the model's origin.
 
-    Text and binary files of either byte order are read, and colours red, green, blue where f_dc_* are missing. They
-    have the SH degree of the file. Degrees above 3 are left out with a warning, and so are Gaussians with numbers that
-    are not finite; further attributes are ignored.
-    The third scale (scale_2) of a file that says that its splats are flat is dropped. Any other holds ellipsoids: the
+    Text and binary files of either byte order are read, and colours red, green, blue where f_dc_* are missing. SH
+    keep the file's degree. Degrees above 3 are dropped with a warning, and so are Gaussians with numbers that are not
+    finite; other attributes are ignored.
+    The third scale (scale_2) of a file that marks its splats as flat is dropped. Other files have ellipsoids: the
     thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more than a thousandth
     of the others.
 
@@ -158,7 +155,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def load_ply_model(path: str | os.PathLike[str]) -> Model:
-    """Return the Gaussians of `load_ply` as a model, whose origin has the offset of the positions if there is one."""
+    """Return the Gaussians of `load_ply` as a model, with the offset of the positions, if any, in its origin."""
     path = Path(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such PLY file")
@@ -169,7 +166,7 @@ def load_ply_model(path: str | os.PathLike[str]) -> Model:
 def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     """Read Gaussians from an open PLY file, as `load_ply_model` does; messages name the path.
 
-    If the splats are not known to be flat, the header may say so.
+    Splats are flat if `is_flat` or the header says so.
     """
     ply = PlyFile(file, path)
     # A packed file begins with its chunks.
@@ -195,7 +192,7 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
 
 
 def _vertices(ply: PlyFile) -> np.ndarray:
-    """Return the vertices, structured, with the attributes that 2DGS gives them."""
+    """Return the vertices, structured, with 2DGS's attributes."""
     fields = ply.fields.get("vertex", {})
     has_colors = set(COLORS) <= set(fields) and not set(SH_DEGREE0) & set(fields)
     wanted = (*MEANS, *(COLORS if has_colors else SH_DEGREE0), "opacity", *SCALES, *QUATS)

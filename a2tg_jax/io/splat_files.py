@@ -1,17 +1,17 @@
-"""Files of other programs' splats: SPZ, SOG, compressed PLY and .splat by the library gaussforge, and .ksplat.
+"""Splat files of other programs: SPZ, SOG, compressed PLY and .splat by the library gaussforge, and .ksplat.
 
-Gaussians pass to gaussforge through a PLY file in memory. Rows are written in the order of a Z curve, and all with one
-third scale, the smallest: formats that round scales by a table then spend one entry on it. What a format can say of
-flat splats is added to its file. gaussforge 0.6 writes the spherical harmonics of compressed PLY in another order than
-it reads them. Here they have the order that SuperSplat reads. Its .ksplat files are empty for GaussianSplats3D.
+Gaussians reach gaussforge as a PLY file in memory. Rows are in Z-curve order, and all have one third scale, the
+smallest: formats that round scales by a table then spend one entry on it. If a format can mark splats as flat, its
+file does. gaussforge 0.6 writes the spherical harmonics of compressed PLY in another order than it reads them; here
+they have SuperSplat's order. GaussianSplats3D finds no splats in its .ksplat files.
 
 A *.ksplat of GaussianSplats3D, version 0.1, is a header of 4096 bytes, then one of 1024 for each section, then the
 sections. Splats are rows of fixed size: position, scales, rotation (wxyz), colour of degree 0 and opacity in a byte
 each, and spherical harmonics, degree by degree and within each channel by channel. Compression level 0 has floats.
 Level 1 has halves, and positions as 16 bits around the centre of a bucket; level 2 is level 1 with spherical harmonics
 in bytes. A section of level 1 or 2 begins with the lengths of its partially filled buckets and the centres of all
-buckets. Its splats are in the order of the buckets, the full ones first. Level 0 is written, up to degree 2, beyond
-which GaussianSplats3D does not go.
+buckets. Its splats are in bucket order, full buckets first. Files are written at level 0, up to degree 2, the most that
+GaussianSplats3D reads.
 """
 
 import contextlib
@@ -50,8 +50,8 @@ MOST_HEADER_BYTES = 1 << 24
 def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
     """Write the Gaussians of a model, in its original world, in the format of the suffix.
 
-    Positions that the format would round too far are relative to whole numbers, which a warning says, and compressed
-    PLY and SOG too. If it rounds them by a tenth of a typical scale even so, another warning says this.
+    Positions that the format would round too far are relative to whole numbers, which a warning names, as do the files
+    of compressed PLY and SOG. Another warning follows if rounding still exceeds a tenth of a typical scale.
 
     Raises:
       ValueError: if gaussforge is not installed or cannot write them, there are none, or the format cannot hold their
@@ -71,7 +71,7 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
     gaussians = gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]
     third = others.third_log_scales(np.asarray(gaussians.log_scales)).min(axis=0, keepdims=True, initial=0.0)
     if kind == "compressed.ply":
-        # gaussforge takes the order channel by channel of SH above degree 0 for the order coefficient by coefficient.
+        # gaussforge mistakes channel-by-channel SH above degree 0 for coefficient-by-coefficient.
         sh = np.asarray(gaussians.sh)
         rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, sh.shape[1] - 1, 3)
         gaussians = dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], rest], axis=1)))
@@ -85,7 +85,7 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
 def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
     """Read Gaussians from a file, in its world. Ellipsoids are flattened as `load_ply` does, with a warning.
 
-    If positions of a SOG file are relative to an offset, the model's origin has this.
+    The model's origin has the offset of a SOG file, if there is one.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -132,7 +132,7 @@ def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
 
 
 def _marked(data: bytes, kind: str, offset: np.ndarray) -> bytes:
-    """Return a file that says that its splats are flat, and what they are relative to, if its format can."""
+    """Return a file with marks for flat splats and for the offset, if its format has them."""
     if kind == "compressed.ply":
         # Comments of a PLY follow its format line.
         return data.replace(b" 1.0\n", f" 1.0\ncomment {FLAT_MARK}\n{offset_comment(offset)}".encode(), 1)
@@ -169,7 +169,7 @@ KSPLAT_DEGREE = 2
 def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
     """Write the Gaussians of a model, in its original world, at compression level 0, with degrees up to 2.
 
-    Positions that float32 would round too far are relative to whole numbers, which a warning says.
+    Positions that float32 would round too far are relative to whole numbers, which a warning names.
 
     Raises:
       ValueError: if there are none, or they would not load.
@@ -200,8 +200,8 @@ def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
 
 def load_ksplat(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians of any compression level, in the world of the file. Ellipsoids are flattened as in `load_ply`.
-    FileNotFoundError: there is no such file. ValueError: it is no such file, is cut off, contradicts itself, or holds
-    no splats."""
+    FileNotFoundError: there is no such file. ValueError: it is no such file, is cut off, inconsistent, or has no
+    splats."""
     data = existing_bytes(path, "file")
     with reading(path):
         with np.errstate(over="ignore", invalid="ignore"):  # What is not finite is left out.

@@ -1,10 +1,10 @@
-"""Gaussians from checkpoints of PyTorch (*.pt, *.ckpt, *.pth), without PyTorch and without running what they pickle.
+"""Gaussians from PyTorch checkpoints (*.pt, *.ckpt, *.pth), without PyTorch and without running pickled code.
 
-Since PyTorch 1.6 a checkpoint is a zip: a pickle that refers to storages, and one entry of plain numbers for each. The
+Since PyTorch 1.6 a checkpoint is a zip: a pickle that refers to storages, and an entry of plain numbers for each. The
 pickle may name the functions that make tensors, ordered dictionaries and NumPy scalars, and nothing else.
 
-Read are the checkpoints of gsplat ({"splats": …}), of Nerfstudio's splatfacto ("…gauss_params.means", …), and of the
-programs of 3DGS and 2DGS ((parameters, iteration)).
+It reads checkpoints of gsplat ({"splats": …}), of Nerfstudio's splatfacto ("…gauss_params.means", …), and of the
+3DGS and 2DGS programs ((parameters, iteration)).
 """
 
 import collections
@@ -36,7 +36,7 @@ STORAGES = {
 MOST_PICKLE_BYTES = 1 << 20
 MOST_ENTRIES = 10_000
 MOST_NODES = 10_000
-"""Largest number of values in the dictionaries of a checkpoint; one that is referred to twice counts twice."""
+"""Largest number of values in a checkpoint's dictionaries; one with two references counts twice."""
 DEEPEST = 5
 """Largest depth of dictionaries that are searched for tensors."""
 MOST_SIDES = 4
@@ -48,7 +48,7 @@ TUPLE_2DGS = {"means": 1, "sh0": 2, "shN": 3, "scales": 4, "quats": 5, "opacitie
 # 3DGS has active_sh_degree at place 0, then the parameters, then statistics and the optimiser.
 TUPLE_LENGTH = 12
 COEFFICIENTS = (1, 4, 9, 16, 25)
-"""Numbers of coefficients by degree of the spherical harmonics; gsplat trains degree 4, too."""
+"""Numbers of coefficients by degree of the spherical harmonics; gsplat also trains degree 4."""
 
 
 def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
@@ -116,11 +116,11 @@ KNOWN: dict[str, Callable[..., Any]] = {
     "_codecs.encode": _Ignored,
     "torch.device": _Ignored,
 }
-"""Names that a pickle may hold, and the functions called instead."""
+"""Names that a pickle may refer to, and the functions called instead."""
 
 
 class _Unpickler(pickle.Unpickler):
-    """Unpickler that calls nothing but `KNOWN`."""
+    """Unpickler that only calls `KNOWN`."""
 
     def find_class(self, module: str, name: str) -> Any:
         if module == "torch" and name in STORAGES:
@@ -132,7 +132,7 @@ class _Unpickler(pickle.Unpickler):
                 f"pickles {shortened(full)}, which could run any code; save a dictionary of tensors alone, or export a "
                 "PLY"
             )
-        return functools.partial(KNOWN[full])  # What a pickle sets on it, it sets on no other.
+        return functools.partial(KNOWN[full])  # Attributes that a pickle sets affect no other.
 
     def persistent_load(self, pid: Any) -> _Storage:
         # ("storage", type, key, device, number of elements).
@@ -161,7 +161,7 @@ def _unpickled(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
     data = start(pickled, MOST_PICKLE_BYTES + 1)
     if len(data) > MOST_PICKLE_BYTES:
         raise _Refused(f"has a pickle of more than {MOST_PICKLE_BYTES:,} bytes")
-    # The unpickler makes room for a memo of any index that a pickle names.
+    # The unpickler allocates a memo for any index in a pickle.
     for opcode, argument, _ in pickletools.genops(data):
         if opcode.name.endswith("PUT") and isinstance(argument, int) and argument > len(data):
             raise _Refused("has a damaged pickle: its memo is longer than the pickle")
@@ -176,7 +176,7 @@ def _tensors_of(value: object) -> dict[str, _Tensor]:
         found = {name: parts[place] for name, place in TUPLE_2DGS.items()} if len(parts) >= TUPLE_LENGTH - 1 else {}
     else:
         own = dict[str, _Tensor]()
-        # A pickle may refer to one dictionary from many places, so that a walk would never end.
+        # A dictionary with many references would make the walk take forever.
         for index, (name, node) in enumerate(_nodes(value)):
             if index >= MOST_NODES:
                 raise _Refused(f"has dictionaries of more than {MOST_NODES:,} values")
@@ -194,7 +194,7 @@ def _tensors_of(value: object) -> dict[str, _Tensor]:
 
 
 def _nodes(value: Any, name: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
-    """Yield a value and all those in its nested dictionaries, with the last parts of their dotted names."""
+    """Yield a value and all values in its nested dictionaries, with the last parts of their dotted names."""
     yield name, value
     if isinstance(value, Mapping) and depth < DEEPEST:
         for key, own in value.items():
@@ -202,7 +202,7 @@ def _nodes(value: Any, name: str = "", depth: int = 0) -> Iterator[tuple[str, An
 
 
 def _array(tensor: _Tensor, archive: zipfile.ZipFile, folder: str) -> np.ndarray:
-    """Return the numbers of a tensor, which must lie within its storage."""
+    """Return the numbers of a tensor. Raises `_Refused` if it exceeds its storage."""
     storage, size = tensor.storage, tensor.size
     numbers = (tensor.offset, *size, *tensor.stride)
     if len(size) > MOST_SIDES or any(type(number) is not int or number < 0 for number in numbers):

@@ -1,8 +1,7 @@
 """OpenUSD files of splats: particle fields with a kernel of planar Gaussians, as *.usdz, *.usdc or *.usda.
 
-A ParticleField of USD 26.03 or later whose kernel is ParticleFieldKernelGaussianSurfletAPI holds exactly these
-Gaussians: the kernel is in the plane of the first two axes. It cannot hold textures. The library usd-core reads
-and writes the files.
+The kernel ParticleFieldKernelGaussianSurfletAPI of USD 26.03 is exactly this package's Gaussian: it is in the plane of
+the first two axes. It cannot hold textures. The library usd-core reads and writes the files.
 """
 
 import json
@@ -34,7 +33,7 @@ def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = F
     """Write a model's live rows as a particle field of OpenUSD, without textures, and with its origin.
 
     Args:
-      path: the file, *.usdz, *.usdc or *.usda; *.usd is as *.usdc. An older one is replaced once the new one is whole.
+      path: the file, *.usdz, *.usdc or *.usda; *.usd is a *.usdc. An existing one is replaced once complete.
       model: any model; its splats are as plain as `save_ply` makes them.
       ellipsoids: write a ParticleField3DGaussianSplat with a thin third axis, for programs that draw only these.
 
@@ -117,8 +116,8 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
 def load_usd(path: str | os.PathLike[str]) -> Model:
     """Return the model of the particle fields of an OpenUSD file, float32, of this program or another.
 
-    Files of `save_usd` bring the origin along, and the model back in its world. Fields of other programs are turned so
-    that +z is up, in metres. The thinnest axis of ellipsoids becomes the normal, with a warning if that changes much.
+    Files of `save_usd` restore the origin and the model's world. Fields of other programs are rotated so that +z is up,
+    in metres. The thinnest axis of an ellipsoid becomes its normal, with a warning if that changes much.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -167,7 +166,7 @@ def _model_of(usd: object, prim: Any, path: Path) -> Model:
 def _splats(usd: Any, prim: Any, path: Path) -> others.Ellipsoids:
     """Return the numbers of a particle field.
 
-    Attributes that are too long are cut, and those that are missing or too short have the values of the schema.
+    Attributes that are too long are cut; missing or too short ones have the schema's defaults.
     """
     means = _numbers(usd, prim, "positions", 3)
     if means is None:
@@ -191,7 +190,7 @@ def _splats(usd: Any, prim: Any, path: Path) -> others.Ellipsoids:
 
 
 def _numbers(usd: Any, prim: Any, name: str, columns: int, wanted: int | None = None) -> np.ndarray | None:
-    """Return the `wanted` first rows [n, columns] of an attribute, in floats or else in halves; None if it has none."""
+    """Return the first `wanted` rows [n, columns] of an attribute of floats, else halves; None if it is missing."""
     # The schema's half attributes end in h; floats win if both are authored.
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
         values = attribute.Get(usd.Usd.TimeCode.EarliestTime()) if attribute else None

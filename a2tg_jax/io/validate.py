@@ -1,6 +1,6 @@
 """Checks that a file holds a valid model: shapes, dtypes, ranges, finite numbers. On the host, with numpy.
 
-Native loops trust the layout of their arrays, so the loaders of models and of checkpoints come through here first.
+Native loops rely on the layout of their arrays, so all loaded models and checkpoints pass these checks first.
 """
 
 import contextlib
@@ -25,12 +25,12 @@ from a2tg_jax.model import Model, check_is_model
 
 LARGEST_LOG_SCALE = math.log(LARGEST_NUMBER)
 LONGEST_REASON = 500
-"""Largest number of characters of an error about a file, whose own text may be long."""
+"""Largest number of characters of an error that quotes a file."""
 FUNCTIONS = {
     ".npz": "model", ".a2tgz": "compact", ".ply": "ply", ".glb": "gltf", ".gltf": "gltf",
     ".usdz": "usd", ".usdc": "usd", ".usda": "usd", ".usd": "usd",
 }  # fmt: skip
-"""Names of public functions, without save_ and load_, by the suffix of their files."""
+"""Names of public functions, without save_ and load_, by file suffix."""
 
 
 def check_suffix(path: str | os.PathLike[str], function: str) -> None:
@@ -46,8 +46,8 @@ def check_suffix(path: str | os.PathLike[str], function: str) -> None:
 
 
 def live_model(path: str | os.PathLike[str], model: Model, function: str) -> Model:
-    """Return the model of existing rows that a function such as "save_gltf" writes to a file. ValueError: the suffix is
-    another format's, or the value is no model that can be loaded again."""
+    """Return the live rows of a model for a function such as "save_gltf". ValueError: the suffix is of another format,
+    or the model is invalid."""
     check_suffix(path, function)
     check_is_model(model)
     check_gaussians(model.gaussians, "model.gaussians")
@@ -57,7 +57,7 @@ def live_model(path: str | os.PathLike[str], model: Model, function: str) -> Mod
 
 
 def existing_bytes(path: str | os.PathLike[str], what: str) -> bytes:
-    """Return the bytes of a regular file. FileNotFoundError: there is no such file, which is `what`."""
+    """Return the bytes of a regular file. FileNotFoundError, calling it `what`: there is none."""
     if not is_regular(path):
         raise FileNotFoundError(f"{os.fspath(path)}: no such {what}")
     return read_regular(path, MOST_ARRAY_BYTES)
@@ -65,7 +65,7 @@ def existing_bytes(path: str | os.PathLike[str], what: str) -> bytes:
 
 @contextlib.contextmanager
 def reading(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn errors in what a file says into one ValueError that names it."""
+    """Turn errors about a file's content into one ValueError that names it."""
     where = os.fspath(path)
     try:
         yield
@@ -83,8 +83,8 @@ def reading(path: str | os.PathLike[str]) -> Iterator[None]:
 def check_model(model: Model) -> None:
     """Raise ValueError, naming the field, unless a model can be rendered and trained.
 
-    All fields have their shapes and one dtype, all numbers are finite, what is shown has a row for each Gaussian, and
-    rows of textures and of coefficients lie within their tables.
+    All fields have their shapes and one dtype, all numbers are finite, the appearance has a row for each Gaussian, and
+    rows of textures and coefficients are within their tables.
     """
     gaussians = model.gaussians
     check_gaussians(gaussians)
@@ -105,7 +105,7 @@ def check_model(model: Model) -> None:
 
 
 def check_origin(origin: Origin) -> None:
-    """Raise ValueError, naming the field, unless all cameras and the world of an origin are such."""
+    """Raise ValueError, naming the field, unless the cameras and the transform of an origin are valid."""
     cameras = zip(origin.names, origin.viewmats, origin.Ks, origin.sizes.tolist(), strict=True)
     for name, viewmat, K, (width, height) in cameras:
         check_calibration(viewmat, K, width, height, f"origin, camera {shortened(name)}")
@@ -139,7 +139,7 @@ def check_bounded(name: str, tree: object) -> None:
         values = np.asarray(leaf)
         if np.issubdtype(values.dtype, np.floating) and (large := values[np.abs(values) > LARGEST_NUMBER]).size:
             label = f"{name}{jax.tree_util.keystr(path)}"
-            raise ValueError(f"{label} must lie within ±{LARGEST_NUMBER:g}; got {large[0]:g}")
+            raise ValueError(f"{label} must be within ±{LARGEST_NUMBER:g}; got {large[0]:g}")
 
 
 def check_count(name: str, value: object, most: int) -> None:

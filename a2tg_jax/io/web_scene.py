@@ -1,7 +1,7 @@
 """Compact scenes for browsers: decoded by the browser itself, most visible rows first, so that a page draws early.
 
-A page embeds such a file, or fetches it as it arrives. It costs bytes: the coder is deflate, numbers have 8 bits and
-means 16, and chunks are sorted by visibility. Textures are kept as they are seen, for display and not for training on.
+A page embeds such a file, or reads it while it arrives. This costs bytes: the coder is deflate, numbers have 8 bits and
+means 16, and chunks are sorted by visibility. Textures are stored as displayed, not for further training.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ SCALE_RANGE = 16.0
 NEAREST = 1e-3
 """Distance from a camera, in units of the median, below which a row does not count for more."""
 MOST_CAMERAS = 16
-"""Largest number of cameras that decide which rows show most."""
+"""Largest number of cameras for ranking rows by visibility."""
 
 
 def encode_web_scene(
@@ -34,14 +34,14 @@ def encode_web_scene(
     """Return the bytes of a compact file that the viewer shows.
 
     Args:
-      model: of Gaussians with or without textures, exponents and bands.
-      title: what the page is called.
-      note: what the viewer says about the scene.
-      near_plane: hits nearer than this do not show.
+      model: Gaussians with or without textures, exponents and bands.
+      title: title of the page.
+      note: text about the scene in the viewer.
+      near_plane: distance below which hits are ignored.
       coder: deflate, or none for a scene that is viewed once.
 
     Raises:
-      ValueError: if the model shows anything else, has more rows than a file may hold, or a number that is not finite.
+      ValueError: if the model has another appearance, too many rows, or a number that is not finite.
     """
     check_gaussians(model.gaussians, "model.gaussians")
     check_encodable(model.appearance, "a file for browsers")
@@ -71,7 +71,7 @@ def encode_web_scene(
 
 
 def importance(model: Model) -> np.ndarray:
-    """Return [N] opacity times the area that cameras see, on average; without cameras times the area itself."""
+    """Return [N] opacity times the mean area in the cameras' views; without cameras, times the area itself."""
     gaussians, origin = model.gaussians, model.origin
     # log s_u + log s_v.
     log_areas = np.asarray(gaussians.log_scales, np.float64).sum(axis=1)

@@ -1,7 +1,7 @@
 """Alignment of test views before they are scored: their colours by least squares, their poses by descent.
 
-A model that was trained with exposures or refined poses lacks those of a test photograph. As is the custom, these few
-numbers are fitted to the test photograph itself, with the model held.
+A model trained with exposures or refined poses has none for a test photograph. As is customary, these few numbers are
+fitted to the test photograph itself, with the model fixed.
 """
 
 import dataclasses
@@ -30,12 +30,12 @@ from a2tg_jax.training.losses import SSIM_WINDOW, photometric_loss
 NUM_STEPS = 100
 FIRST_RATE = 2e-3
 LAST_RATE = 2e-5
-"""Learning rate in radians and units of the normalised world, which falls exponentially: 2.5° in all steps together."""
+"""Learning rates in radians and units of the normalised world, falling exponentially: 2.5° over all steps."""
 HEAD_ROOM = 1.5  # Moved cameras list other splats than planned.
 
 
 def color_fit(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None) -> np.ndarray:
-    """Return the affine map of colours [3, 4] = [A | b] of least squared error |A·image + b − target|² (host).
+    """Return the affine colour map [3, 4] = [A | b] that minimises |A·image + b − target|² (host).
 
     Args:
       image: [H, W, 3] a render.
@@ -43,10 +43,10 @@ def color_fit(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None
       mask: [H, W] bool, the pixels that count; None: all.
 
     Returns:
-      float64. Where an image of few colours leaves it open, the smallest such numbers.
+      float64. The smallest solution if an image of few colours leaves it open.
 
     Raises:
-      ValueError: if the shapes differ, the mask holds no bools, or a colour that counts is not finite.
+      ValueError: if the shapes differ, the mask is not boolean, or a colour that counts is not finite.
     """
     check_shape("image", image, ("H", "W", 3))
     check_shape("target", target, np.shape(image))
@@ -72,15 +72,15 @@ def align_poses(
 ) -> tuple[View, ...]:
     """Return the views with cameras from which the model looks most like their photographs (host).
 
-    Adam descends the photometric loss by a twist of the camera in its own frame; the best step of each view is kept,
-    so that no loss becomes worse.
+    Adam minimises the photometric loss over a twist of the camera in its own frame; each view keeps its best step, so
+    that no loss increases.
 
     Args:
       views: views near their true poses.
       model: the model, which stays fixed.
       background: [3] colour; None is the model's own.
       settings: static options without a capacity.
-      num_steps: number of Adam's steps.
+      num_steps: number of Adam steps.
 
     Raises:
       ValueError: if an argument is of another kind, or there are no views.
@@ -109,7 +109,7 @@ def _descent(
     gaussians: Gaussians, appearance: Appearance, camera: Camera, target: Array, mask: Array | None, background: Array,
     settings: RenderSettings, num_steps: int,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return the twist of least loss among those that Adam comes to, and whether a render needs more capacity."""
+    """Return the twist with the smallest loss on Adam's path, and whether a render needs more capacity."""
     # SSIM needs a whole window.
     ssim_weight = 0.2 if min(target.shape[:2]) >= SSIM_WINDOW else 0.0
     shown = target if mask is None else jnp.where(mask, target, 0.0)

@@ -35,20 +35,20 @@ class ViewMetrics:
     ssim: float
     """Structural similarity, at most 1; higher is better."""
     lpips: float | None
-    """Lower is better; None where no weights were given."""
+    """Lower is better; None without weights."""
     flat_psnr: float
     """PSNR of the best flat colour instead of the render, in dB."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """Quality of all the views, and the speed at which they are drawn."""
+    """Quality of all views, and rendering speed."""
 
     per_view: tuple[ViewMetrics, ...]
     lpips_network: str | None
-    """The network of the LPIPS figures, which cannot be compared with another's; None where there are none."""
+    """Network of the LPIPS figures, which are not comparable with another's; None without LPIPS."""
     frames_per_second: float
-    """Median over all the views evaluated together, compiled and warm."""
+    """Median over all views evaluated together, compiled and warm."""
     renders: tuple[np.ndarray, ...]
     """Images of the first `num_renders` views, uint8 [H, W, 3]."""
 
@@ -111,13 +111,13 @@ def evaluate(
       background: RGB behind the Gaussians, and behind photographs with an alpha channel; None is the model's own, or
         black.
       lpips_weights: a weights file for LPIPS; None leaves it out.
-      num_renders: number of first views whose images are returned.
-      fit_colors: map the colours of a render to its photograph by least squares (`measure.alignment.color_fit`), for
+      num_renders: number of views, from the first, whose images are returned.
+      fit_colors: map each render's colours to its photograph by least squares (`measure.alignment.color_fit`), for
         photographs of unknown exposure.
 
     Raises:
       ValueError: if there are no views, or a model is given with textures.
-      FileNotFoundError: if `lpips_weights` is not there.
+      FileNotFoundError: if `lpips_weights` does not exist.
     """
     check_are_views(views, "evaluate(scene.test, model)")
     if not views:

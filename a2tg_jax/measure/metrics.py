@@ -1,7 +1,7 @@
-"""Metrics: PSNR, SSIM, LPIPS on images clipped to [0, 1], and the bytes of its parameters.
+"""Metrics: PSNR, SSIM and LPIPS on images clipped to [0, 1], and the bytes of a model's parameters.
 
-Images are [H, W, 3] floats, a mask is [H, W] bool, True where a pixel counts: where one does not, both images are
-black. LPIPS takes its network from a weights file, which this package does not contain.
+Images are [H, W, 3] floats. A mask is [H, W] bool, True where a pixel counts; elsewhere both images are black. LPIPS
+takes its network from a weights file, which this package does not contain.
 """
 
 import dataclasses
@@ -59,7 +59,7 @@ def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
     similarity = losses.mean_ssim(*_clip_pair(image, target, mask))
     if mask is None:
         return similarity
-    # Windows in which nothing counts are equal, and count 1 each.
+    # Windows without such pixels are equal, and count 1 each.
     window = (losses.SSIM_WINDOW, losses.SSIM_WINDOW)
     counts = jnp.asarray(mask).astype(similarity.dtype)
     # The windows of `mean_ssim`: VALID, stride 1.
@@ -70,7 +70,7 @@ def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LpipsWeights:
-    """A feature network and the linear layers that weigh its channels (LPIPS v0.1)."""
+    """A feature network and the linear layers that weight its channels (LPIPS v0.1)."""
 
     network: str
     """"alex" or "squeeze"; figures of different networks are not comparable."""
@@ -141,7 +141,7 @@ def parameter_bytes(gaussians: Gaussians, textures: Textures | None = None) -> i
 
 def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[Array, Array]:
     """Return both images in [0, 1], and black where pixels do not count."""
-    # Arrays of other libraries and nested lists become arrays of JAX; the check reports all else.
+    # Other libraries' arrays and nested lists become JAX arrays; the check reports anything else.
     image, target = (
         jnp.asarray(value) if hasattr(value, "__array__") or type(value) in (list, tuple) else value
         for value in (plain_array("image", image), plain_array("target", target))
@@ -166,7 +166,7 @@ def _load_lpips(path: Path) -> LpipsWeights:
         raise ValueError(f"{path} is not an .npz archive of LPIPS weights ({error})") from error
     # Only SqueezeNet has fire modules.
     network = "squeeze" if "features.3.squeeze.weight" in arrays else "alex"
-    # The network is tried by shapes alone.
+    # By shapes only: nothing is computed.
     image = jax.ShapeDtypeStruct((1, LPIPS_MIN_SIDE, LPIPS_MIN_SIDE, 3), jnp.float32)
     try:
         features = jax.eval_shape(functools.partial(_FEATURES[network], arrays), image)

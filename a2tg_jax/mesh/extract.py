@@ -1,4 +1,4 @@
-"""Extraction of a mesh from a model: depths of views, their fusion, marching cubes, and cleaning (host)."""
+"""Mesh extraction from a model: depths of views, their fusion, marching cubes, and cleaning (host)."""
 
 import dataclasses
 import time
@@ -32,18 +32,18 @@ RADII = 2.0
 """Default radius, in median distances of the cameras from the centre."""
 LEAST_WEIGHT = 0.05
 MOST_CLUSTERS, LEAST_FACES = 50, 50
-"""Default of the connected parts that are kept, as in 2DGS."""
+"""Default number and size of the connected parts to keep, as in 2DGS."""
 BRICK = 16
-"""Blocks along a side of a brick, for which marching cubes run at once."""
+"""Blocks along a side of a brick; marching cubes run brick by brick."""
 SAME = 1e-3
-"""Distance in voxels of vertices that two bricks share."""
+"""Largest distance in voxels between two bricks' copies of a shared vertex."""
 
 
 class NoSurfaceError(ValueError):
-    """The views have no surface within the space, or all its parts are small."""
+    """The views show no surface within the space, or only small parts."""
 
     def __init__(self, radius: float, num_dropped: int, least_faces: int):
-        """Keep the radius in units of the model's world, and how many parts had fewer than the least faces."""
+        """Keep the radius in units of the model's world, and the number of parts below `least_faces`."""
         self.radius, self.num_dropped, self.least_faces = radius, num_dropped, least_faces
         advice = "raise the resolution, or lower least_faces" if num_dropped else "give a larger radius, or unbounded"
         super().__init__(f"{self.reason()}: {advice}")
@@ -97,27 +97,27 @@ def extract_mesh(
     """Return the surface of a model as triangles, by fusion of rendered depths and marching cubes (2DGS).
 
     The depths of each view are fused into a truncated signed distance function on sparse voxels. A depth is the mean of
-    the splats that a ray meets, and counts less where they are apart. Small connected parts are removed.
+    the splats on a ray, with less weight if they are far apart. Small connected parts are removed.
 
         result = a2tg.extract_mesh(model, resolution=256)
         a2tg.save_mesh("scene.glb", result.mesh, model.origin.transform)
 
     Args:
       model: a model of any appearance.
-      cameras: the views to fuse; None takes the training views that the model was trained on.
+      cameras: the views to fuse; None takes the model's training views.
       resolution: number of voxels along the radius, 512 by default.
       voxel: side of a voxel in units of the model's world, instead of the resolution.
       center, radius: the space to fuse, in the model's world; None is the point nearest to all optical axes, and twice
-        the median distance of the cameras from there.
+        the cameras' median distance from it.
       unbounded: extend the space beyond the radius, with voxels that grow in proportion to their distance.
-      least_weight: voxels of no larger weight have no surface. One view of a sharp depth has a weight of 1.
-      most_clusters, least_faces: largest number of connected parts to keep, and smallest number of triangles of one.
+      least_weight: voxels up to this weight have no surface. One view with a sharp depth has a weight of 1.
+      most_clusters, least_faces: largest number of connected parts to keep, and smallest number of triangles in one.
       max_bytes: memory budget of the voxels. Extraction also needs memory for one view and for the mesh.
       settings: static options of the renderer.
       progress: show a progress bar.
 
     Returns:
-      The mesh in the world of the model, with colours of its vertices, and figures of the extraction.
+      The mesh in the world of the model, with vertex colours, and figures of the extraction.
 
     Raises:
       ValueError: if the model is empty or has no cameras, if an argument is out of its range, if the voxels need more
@@ -136,7 +136,7 @@ def extract_mesh(
         raise ValueError(f"most_clusters must be at least 1; got {most_clusters}")
     renderer, depths_of = Renderer(model, cameras=cameras, settings=settings), jax.jit(rendered_depth)
     own_center, own_radius = common_sphere([camera.viewmat for camera in cameras])
-    if not own_radius:  # Cameras at one place look at the median depth of the first.
+    if not own_radius:  # Cameras in one place: the centre is at the median depth of the first.
         depth = np.asarray(depths_of(renderer(cameras[0]), cameras[0]).depth)
         middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
         own_center, own_radius = own_center + middle * np.asarray(cameras[0].viewmat, float)[2, :3], RADII * middle
@@ -170,11 +170,11 @@ def training_cameras(model: Model) -> list[Camera]:
 
 
 def check_lengths(resolution: int | None, voxel: float | None, radius: float | None) -> None:
-    """Raise ValueError unless numbers of the space are positive, and at most one says their size."""
+    """Raise ValueError unless the lengths are positive, and at most one gives the voxel size."""
     if resolution is not None and voxel is not None:
-        raise ValueError("resolution and voxel both say the size of voxels; give one of them")
+        raise ValueError("resolution and voxel both set the size of voxels; give one of them")
     if resolution is not None and not 1 <= resolution <= 100_000:
-        raise ValueError(f"resolution must lie in 1..100000 voxels along the radius; got {resolution}")
+        raise ValueError(f"resolution must be in 1..100000 voxels along the radius; got {resolution}")
     for name, value in (("voxel", voxel), ("radius", radius)):
         if value is not None and not 0 < value < np.inf:
             raise ValueError(f"{name} must be positive and finite; got {value}")
@@ -196,8 +196,8 @@ def common_sphere(viewmats: ArrayLike) -> tuple[np.ndarray, float]:
 
 
 def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh:
-    """Return the surface of fused views where the mean signed distance is zero, with colours. Voxels of no larger
-    weight than the least are unknown, and their cells have no surface."""
+    """Return the surface of fused views where the mean signed distance is zero, with colours. Voxels up to the least
+    weight are unknown, and their cells have no surface."""
     parts = list(_parts(grid, least_weight))
     if not parts:
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
@@ -206,7 +206,7 @@ def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh
     vertices = np.concatenate([vertices for vertices, _, _ in parts])
     faces = np.concatenate([faces + start for (_, faces, _), start in zip(parts, starts, strict=True)])
     colors = np.concatenate([colors for _, _, colors in parts])
-    # Vertices that two bricks share become one, and faces between such vertices vanish.
+    # Vertices shared by two bricks are merged, and faces that collapse are dropped.
     side = BRICK * SIDE
     # Only vertices on the faces of bricks can be shared: the tree stays small.
     on_border = np.flatnonzero((np.abs(vertices - side * np.rint(vertices / side)) < SAME).any(axis=1))
@@ -228,7 +228,7 @@ def _parts(grid: BlockGrid, least_weight: float) -> Iterator[tuple[np.ndarray, n
     from skimage import measure
 
     marching_cubes: Any = measure.marching_cubes
-    # The cells at a brick's end need the first voxels of the next bricks.
+    # The last cells of a brick need the first voxels of the next ones.
     blocks = np.stack(np.meshgrid(*[np.arange(BRICK + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     for brick in np.unique(grid.coordinates // BRICK, axis=0):
         rows = grid.find(brick * BRICK + blocks)
@@ -239,7 +239,7 @@ def _parts(grid: BlockGrid, least_weight: float) -> Iterator[tuple[np.ndarray, n
         # 1, a truncation in front of any surface, where nothing is known.
         mean = np.where(known, grid.distance[rows] / np.where(known, weight, 1.0), 1.0)
         distance, is_known = _dense(mean.astype(np.float32), found, 1.0), _dense(known, found, False)
-        for axis in range(3):  # A cell is known if its eight corners are, and is named by its last corner.
+        for axis in range(3):  # A cell is known if its eight corners are; the mask has it at its last corner.
             is_known &= np.roll(is_known, 1, axis)
             is_known[(slice(None),) * axis + (0,)] = False
         # scikit-image raises if the level is outside of the range.

@@ -18,7 +18,7 @@ from a2tg_jax.mesh.triangles import Mesh
 SUFFIXES = (".glb", ".ply", ".obj")
 JPEG_QUALITY = 92
 FAR = 100.0
-"""Distance from the origin, in extents, from which on positions are relative to the middle, as float32 needs."""
+"""Distance from the origin, in extents, beyond which positions are relative to the middle, for float32."""
 
 
 def check_mesh_suffix(path: str | os.PathLike[str], name: str = "path") -> None:
@@ -28,7 +28,7 @@ def check_mesh_suffix(path: str | os.PathLike[str], name: str = "path") -> None:
 
 
 def mesh_files(path: str | os.PathLike[str], *, has_texture: bool) -> list[Path]:
-    """Return the files that `save_mesh` writes for a path, that one first."""
+    """Return the files that `save_mesh` writes for a path, the path first."""
     path = Path(path)
     beside = (".mtl", ".png") if has_texture and path.suffix.lower() == ".obj" else ()
     return [path, *(path.with_suffix(suffix) for suffix in beside)]
@@ -37,13 +37,13 @@ def mesh_files(path: str | os.PathLike[str], *, has_texture: bool) -> list[Path]
 def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | None = None) -> list[Path]:
     """Write a mesh as GLB, PLY or OBJ, by the suffix of the path.
 
-    GLB holds the texture or linear colours of vertices, unlit, as the photographs show them. PLY holds colours of
-    vertices, and no texture. OBJ has its texture in NAME.png and its material in NAME.mtl. PLY and OBJ files are in
-    the original world, map coordinates without rounding. GLB is upright, with +y up and the original lengths, like the
-    splats of `save_gltf`; for map coordinates, the extras of its node have the transform.
+    GLB holds the texture or linear vertex colours, unlit, as in the photographs. PLY holds vertex colours and no
+    texture. OBJ has its texture in NAME.png and its material in NAME.mtl. PLY and OBJ files are in the original world,
+    with exact map coordinates. GLB is upright, with +y up and the original lengths, like splats of `save_gltf`; for map
+    coordinates, its node's extras have the transform.
 
     Args:
-      path: the file; an older one is replaced once the new one is whole.
+      path: the file; an existing one is replaced once the new one is complete.
       mesh: a mesh.
       transform: transform from the original world to the mesh's world, such as `model.origin.transform`. None writes
         the mesh unchanged, in each format.
@@ -122,9 +122,9 @@ def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
 
 def _save_glb(path: Path, mesh: Mesh, transform: Similarity | None) -> None:
     """Write a GLB file of a mesh, unlit."""
-    # With a transform, the node leads to the upright world that `save_gltf` places splats in, and its extras have the
-    # transform if the original world is far from there. Without, positions far from the origin are relative to the
-    # translation of the node.
+    # With a transform, the node maps to the upright world of `save_gltf`, and its extras have the transform if the
+    # original world is far from there. Without one, positions far from the origin are relative to the node's
+    # translation.
     builder = Builder()
     node: dict[str, Any] = {"name": "mesh", "mesh": 0}
     middle = _middle(mesh.vertices) if transform is None else np.zeros(3)

@@ -1,8 +1,8 @@
 """Fusion of rendered depths into sparse voxels: truncated signed distances, their mean over the views, and colours.
 
 A render has the sums Σ w·z and Σ w·z² of its splats, so that a depth is a mean with a spread. At an edge, or in a cloud
-of splats, the spread is large, and the mean is between surfaces. A view therefore counts where it faces the surface
-and its depths are sure. The distance is measured from the surface's plane, by the normal of the render.
+of splats, the spread is large, and the mean is between surfaces. A view therefore has most weight where it faces the
+surface and its depths are certain. Distances are from the surface's plane, by the render's normal.
 """
 
 from typing import NamedTuple
@@ -23,11 +23,11 @@ TRUNCATION = 5.0
 SURE = 0.5
 """Spread of a depth, in truncations, that halves its weight."""
 OFFSETS = np.linspace(-TRUNCATION, TRUNCATION, 5).tolist()
-"""Places along a ray around its depth, in voxels, whose blocks exist."""
+"""Offsets from a depth along its ray, in voxels, at which blocks are made."""
 FARTHEST = 1e3
 """Largest distance from the centre in an unbounded space, in radii."""
 LEAST_FACING = 0.1
-"""Smallest cosine between a ray and a normal; smaller ones count as this."""
+"""Smallest cosine between a ray and a normal; smaller ones are raised to it."""
 LEAST_ALPHA = 0.5
 """Smallest alpha of a pixel that has a depth."""
 SIDE = 8
@@ -40,14 +40,14 @@ LOCAL = np.stack(np.meshgrid(*[np.arange(SIDE, dtype=np.int32)] * 3, indexing="i
 LIMIT = 1 << 20
 """Bound of block coordinates: three of them fit into a key of 63 bits."""
 NOWHERE = -(2**31)
-"""Coordinate of blocks of pixels without a depth, beyond the bound."""
+"""Block coordinate of pixels without a depth, out of bounds."""
 CHUNK = 64
-"""Blocks that are fused at a time: few, so that they stay in the cache."""
+"""Blocks fused at a time: few, so that they stay in the cache."""
 
 
 @pytree
 class Space:
-    """The space that voxels divide: even within a radius, and coarser with the distance beyond.
+    """The space divided into voxels: even within a radius, and coarser with the distance beyond.
 
     Voxel i [3] is at y = voxel·i, relative to the centre. Within the radius R, x = y. Beyond it, an unbounded space has
     |x| = R·exp(|y|/R - 1) in the same direction: voxels grow in proportion to their distance, as pixels do.
@@ -95,14 +95,14 @@ class Space:
 
 
 class GridFullError(ValueError):
-    """The memory budget has no room for the voxels."""
+    """The voxels exceed the memory budget."""
 
 
 class BlockGrid:
     """Truncated signed distances and colours of voxels, with their weights, in blocks of 8 × 8 × 8 near surfaces.
 
     A block has integer coordinates [3]: its voxels are 8·block to 8·block + 7. Memory is reserved for as many blocks as
-    the budget has room for, and used as blocks are made.
+    fit the budget, and used as blocks are made.
     """
 
     def __init__(self, max_bytes: int):
@@ -127,8 +127,8 @@ class BlockGrid:
         return np.asarray([self._rows.get(key, -1) for key in _keys_of(blocks).tolist()], np.int64)
 
     def allocate(self, blocks: np.ndarray) -> np.ndarray:
-        """Return the rows of the different blocks among blocks [P, 3], after making new ones; far ones are left out.
-        GridFullError: the memory budget has no room for them."""
+        """Return the rows of the distinct blocks among blocks [P, 3], after making new ones; far ones are dropped.
+        GridFullError: they exceed the memory budget."""
         if len(blocks):  # Neighbouring pixels mostly repeat a block, and sorting is slow.
             blocks = blocks[np.r_[True, (blocks[1:] != blocks[:-1]).any(axis=1)]]
         keys = np.unique(_keys_of(blocks[((blocks > -LIMIT) & (blocks < LIMIT)).all(axis=1)]))
@@ -143,7 +143,7 @@ class BlockGrid:
 
 
 def _keys_of(blocks: np.ndarray) -> np.ndarray:
-    """Return [B] int64 names of blocks [B, 3], different for different ones."""
+    """Return a unique int64 key [B] for each of the blocks [B, 3]."""
     x, y, z = blocks.astype(np.int64).T + LIMIT
     # LIMIT makes each coordinate positive, below 2^21.
     return x << 42 | y << 21 | z
@@ -178,8 +178,7 @@ def rendered_depth(output: RenderOutput, camera: Camera) -> RenderedDepth:
 
 
 def fuse(grid: BlockGrid, depths: RenderedDepth, space: Space) -> None:
-    """Fuse one view into the blocks within a truncation of its depths. GridFullError: the grid's memory budget has no
-    room for the blocks."""
+    """Fuse one view into the blocks within a truncation of its depths. GridFullError: they exceed the memory budget."""
     # On the host: how many blocks there are depends on values.
     rows = grid.allocate(np.asarray(jax.jit(_blocks_near)(depths, space)))
     arrays: tuple[np.ndarray, ...] = grid.distance, grid.weight, grid.color, grid.color_weight
@@ -209,7 +208,7 @@ def _fused(voxels: list[Array], blocks: Array, depths: RenderedDepth, space: Spa
     distance, weight, color, color_weight = voxels
     points = space.positions((blocks[:, None] * SIDE + LOCAL[None]).reshape(-1, 3))
     truncation = TRUNCATION * space.voxel * space.scale(points)
-    # Written out: XLA is tens of times slower at products of many rows with a 3 × 3 matrix.
+    # Written out: XLA is tens of times slower at multiplying many rows by a 3 × 3 matrix.
     viewmat, K = depths.camera.viewmat, depths.camera.K
     across, down, z = (
         row[0] * points[:, 0] + row[1] * points[:, 1] + row[2] * points[:, 2] + row[3] for row in viewmat[:3]
@@ -242,7 +241,7 @@ def _depths_at(depth: Array, x: Array, y: Array, truncation: Array) -> tuple[Arr
     """Return the depth at points [P] of an image, and whether there is one.
 
     Inverse depths of a plane are linear in the image: they are interpolated where four pixels have depths that differ
-    by less than the truncation. Elsewhere the nearest pixel counts.
+    by less than the truncation. Elsewhere the nearest pixel's depth is taken.
     """
     height, width = depth.shape
     flat = depth.reshape(-1)
@@ -262,7 +261,7 @@ def _depths_at(depth: Array, x: Array, y: Array, truncation: Array) -> tuple[Arr
 
 
 def _pixels(x: Array, y: Array, height: int, width: int) -> Array:
-    """Return the indices [P] of the pixels at points, or of the nearest at the border."""
+    """Return the indices [P] of the pixels at points, clamped to the border."""
     column = jnp.clip(jnp.floor(x), 0, width - 1).astype(jnp.int32)
     row = jnp.clip(jnp.floor(y), 0, height - 1).astype(jnp.int32)
     return row * width + column

@@ -12,13 +12,13 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.mesh.triangles import Mesh
 
 POWER = 6
-"""Power of cosine over distance that weighs a view: the higher, the more the best view decides."""
+"""Power of cosine over distance in a view's weight: the higher, the more the best view dominates."""
 LEAST_FACING = 0.15
-"""Smallest cosine between the normal and the direction to a camera whose view shows a texel."""
+"""Smallest cosine between a texel's normal and the direction to a camera that shows it."""
 HIDDEN = 0.01
-"""Distance behind the mesh, in units of its depth, from which on a texel is hidden."""
+"""Distance behind the mesh, in units of its depth, beyond which a texel is hidden."""
 CHUNK = 1 << 20
-"""Texels that are projected at a time, and pixels that are tested at a time."""
+"""Texels projected at a time, and pixels tested at a time."""
 PADDING = 2
 """Texels between charts."""
 SMALLEST_SIDE, LARGEST_SIDE = 16, 8_192
@@ -32,9 +32,9 @@ Picture = tuple[Camera, np.ndarray, np.ndarray | None]
 def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -> Mesh:
     """Return the mesh with a texture atlas filled from pictures.
 
-    A texel takes the weighted mean of the pictures that show it. The weight is (cosine·focal length/distance)⁶, so that
-    near views from the front decide. Hidden texels are found by drawing the mesh into each view. Texels that no view
-    shows keep the colours of the vertices.
+    A texel is the weighted mean of the pictures that show it. The weight is (cosine·focal length/distance)⁶, so that
+    near, frontal views dominate. Hidden texels are found by rasterizing the mesh in each view. Texels that no view
+    shows keep the vertices' colours.
 
     Args:
       mesh: a mesh in the world of the cameras.
@@ -69,7 +69,7 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
 def check_texture(size: int) -> ModuleType:
     """Return the library xatlas. ValueError: it is not installed, or the side of an atlas is out of range."""
     if not SMALLEST_SIDE <= size <= LARGEST_SIDE:
-        raise ValueError(f"texture_size must lie in {SMALLEST_SIDE}..{LARGEST_SIDE} texels; got {size}")
+        raise ValueError(f"texture_size must be in {SMALLEST_SIDE}..{LARGEST_SIDE} texels; got {size}")
     try:
         return importlib.import_module("xatlas")
     except ImportError:
@@ -82,7 +82,7 @@ class Texels(NamedTuple):
     place: np.ndarray  # [T] number in the atlas, row by row from the top.
     position: np.ndarray  # [T, 3] float32 position in the world.
     normal: np.ndarray  # [T, 3] float32 unit normal of the face.
-    color: np.ndarray  # [T, 3] float32 colour in [0, 1] between the colours of the vertices; grey without them.
+    color: np.ndarray  # [T, 3] float32 interpolated vertex colour in [0, 1]; grey without vertex colours.
 
 
 def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Texels]:
@@ -113,8 +113,8 @@ def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Texels]:
 def _seen(
     texels: Texels, camera: Camera, picture: np.ndarray, mask: np.ndarray | None, depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the texels visible in a view, as indices [S], its weights [S] for them, and its colours [S, 3]. Texels
-    farther than the drawn mesh's depth [H, W] are hidden."""
+    """Return the texels visible in a view, as indices [S], and their weights [S] and colours [S, 3] there. Those beyond
+    the mesh's depth [H, W] are hidden."""
     viewmat, K = np.asarray(camera.viewmat, np.float32), np.asarray(camera.K, np.float32)
     at = texels.position @ viewmat[:3, :3].T + viewmat[:3, 3]
     # In camera axes: distance times the cosine between normal and the direction to the camera.
@@ -171,7 +171,7 @@ def _draw(points: np.ndarray, depths: np.ndarray, width: int, height: int) -> Ra
         along, across = b - a, c - a
         place = np.stack([pixels % width, pixels // width], -1) + np.float32(0.5) - a
         area = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):  # Triangles without an area have NaN, and no pixels.
+        with np.errstate(divide="ignore", invalid="ignore"):  # Triangles without area become NaN and cover no pixels.
             second = (place[:, 0] * across[:, 1] - place[:, 1] * across[:, 0]) / area
             third = (along[:, 0] * place[:, 1] - along[:, 1] * place[:, 0]) / area
             own = np.stack([1 - second - third, second, third], -1)  # Barycentric coordinates.
@@ -197,7 +197,7 @@ def _candidates(points: np.ndarray, width: int, height: int) -> Iterator[tuple[n
     low, span = low[order].astype(np.int64), (high[order] - low[order] + 1).astype(np.int64)
     areas = span.prod(axis=1)
     ends = np.cumsum(areas)
-    # Chunks of whole faces, so that arrays stay bounded however large the faces are drawn.
+    # Chunks of whole faces, so that arrays stay bounded, however large faces are in the image.
     start = done = 0
     while start < len(order):
         # At least one face, even if it alone exceeds the chunk.

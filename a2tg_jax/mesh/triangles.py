@@ -15,7 +15,7 @@ from a2tg_jax.core.similarity import Similarity
 LEAST_FACES = 4
 """Smallest number of faces to simplify to: a closed mesh has four."""
 MOST_POINTS = 200_000_000
-"""Largest number of points of a sample, of 24 bytes each and as much again while they are drawn."""
+"""Largest number of sampled points, of 24 bytes each, twice that during sampling."""
 CHUNK = 1 << 20
 """Points that are placed at a time."""
 
@@ -52,7 +52,7 @@ class Mesh:
 
     @property
     def face_normals(self) -> np.ndarray:
-        """[F, 3] normals of the faces, of twice the length of their areas."""
+        """[F, 3] face normals, whose lengths are twice the areas."""
         a, b, c = self.corners.transpose(1, 0, 2)
         return np.cross(b - a, c - a)
 
@@ -62,11 +62,11 @@ class Mesh:
         return float(np.linalg.norm(self.face_normals, axis=1).sum() / 2)
 
     def transform(self, similarity: Similarity) -> "Mesh":
-        """Return the same mesh in the world that `similarity` leads to."""
+        """Return the mesh in the world that `similarity` maps to."""
         return dataclasses.replace(self, vertices=similarity.apply(np.asarray(self.vertices, np.float64)))
 
     def with_faces(self, chosen: np.ndarray) -> "Mesh":
-        """Return the mesh of some faces, by a mask [F] or indices, without the vertices that no face needs."""
+        """Return the mesh of some faces, by a mask [F] or indices, without unused vertices."""
         kept, inverse = np.unique(self.faces[chosen], return_inverse=True)
         faces = inverse.reshape(-1, 3).astype(np.int32)
         colors, uv = (None if rows is None else rows[kept] for rows in (self.colors, self.uv))
@@ -78,8 +78,7 @@ class Mesh:
 
 
 def largest_clusters(mesh: Mesh, most: int, least_faces: int) -> tuple[Mesh, int]:
-    """Return the mesh of its largest connected parts, at most `most` of at least `least_faces` faces each, and the
-    number of parts that are left out."""
+    """Return the largest connected parts, up to `most` with at least `least_faces` faces, and the number of others."""
     if not mesh.num_faces:
         return mesh, 0
     a, b, c = mesh.faces.T
@@ -109,7 +108,7 @@ def check_simplifying(num_faces: int) -> ModuleType:
 
 
 def simplify_mesh(mesh: Mesh, num_faces: int) -> Mesh:
-    """Return a mesh of about `num_faces` triangles, by quadric decimation; the same if it has no more.
+    """Return a mesh of about `num_faces` triangles, by quadric decimation; unchanged if it has no more.
 
     Raises:
       ValueError: if fast-simplification is not installed, the number is less than 4, or no face would be left.
@@ -160,13 +159,13 @@ def surface_distance(
     """Compare the points of a surface with points of its reference.
 
     Args:
-      points: [P, 3] points on the surface, such as `sample_surface` gives.
+      points: [P, 3] points on the surface, such as from `sample_surface`.
       reference: [R, 3] points on the true surface.
-      threshold: largest distance that counts as met, for precision, recall and F-score.
-      most: distances beyond it are left out of the means, as DTU's evaluation does with 20 mm.
+      threshold: largest distance that counts as a match, for precision, recall and F-score.
+      most: larger distances are left out of the means, as in DTU's evaluation with 20 mm.
 
     Returns:
-      The distances; infinite means and shares of 0 if one of the two has no points.
+      The distances; infinite means and shares of 0 if either has no points.
     """
     if not len(points) or not len(reference):
         return SurfaceDistance(np.inf, np.inf, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Compression of a model: the smallest compact file within a loss, and a table of the choices tried."""
+"""Compression of a model to the smallest compact file within a loss, with a table of the choices tried."""
 
 import functools
 import math
@@ -46,11 +46,11 @@ def compress(
 ) -> str:
     """Write the smallest compact file of a model within a given loss, and return a table of the choices tried.
 
-    Losses are in PSNR on the training views of a run. Without photographs they are estimated from renders, for a model
-    with `ASSUMED_PSNR`.
+    Losses are in PSNR on a run's training views. Without photographs they are estimated from renders, for a model of
+    `ASSUMED_PSNR`.
 
     Args:
-      source: a run folder, whose last model is taken; or a model, *.npz.
+      source: a run folder, for its last model; or a model, *.npz.
       out: the file, *.a2tgz; None: next to the model. Files that this function did not write into the run's folder
         need `overwrite`.
       max_loss: largest loss in dB.
@@ -112,7 +112,7 @@ def compress(
 
 
 def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: Iterable[str]) -> list[str]:
-    """Return the lines of a table of all choices tried, and the bits of the tuned files and the chosen one."""
+    """Return lines: a table of all choices tried, then the bits of the tuned files and the chosen one."""
     named = [(f"{trial.group} {trial.precision}", trial) for trial in trials]
     named += [(f"tuned {number}", trial) for number, trial in enumerate(found.tried, 1)]
     named.append(("chosen", chosen))
@@ -130,7 +130,7 @@ def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: 
 
 
 def _smaller(model: Model, untuned: Trial | None, found: TunedFiles, max_loss: float) -> tuple[Trial, bytes]:
-    """Return the smaller of the file without tuning and the tuned one. Raises TooMuchLostError if both are missing."""
+    """Return the smaller of the untuned and the tuned file. Raises TooMuchLostError if there is neither."""
     tuned = found.chosen
     if found.tuned is not None and tuned is not None and (untuned is None or tuned.num_bytes < untuned.num_bytes):
         return tuned, found.tuned.data

@@ -49,9 +49,9 @@ def convert(
     float64: bool = False,
     overwrite: bool = False,
 ) -> str:
-    """Write a run's model `name`, or a file of any known format, in the format of another suffix, and return a summary.
+    """Write a run's model `name`, or a file of any known format, in another suffix's format, and return a summary.
     `baking` turns textured splats into plain ones (None: no baking); `float64` is as in `save_ply`. Raises ValueError
-    or OSError if a format is unknown, or the source cannot be read or the file not be written."""
+    or OSError if a format is unknown, or a file cannot be read or written."""
     writer_of(out)  # Baking takes minutes.
     if float64 and format_of(out).save is not save_ply:
         raise ValueError(f"`float64` needs an OUT that ends in .ply and is not packed; got {out}")
@@ -110,7 +110,7 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
 
 
 def cameras_apart(origin: Origin) -> tuple[list[Camera], list[Camera]]:
-    """Return the training cameras and the held-out ones. If all are held out, all are used for training."""
+    """Return the training cameras and the held-out ones. If all are held out, all count as training cameras."""
     cameras = list(zip(origin.cameras, origin.is_test, strict=True))
     training, held_out = ([camera for camera, is_test in cameras if is_test == kind] for kind in (False, True))
     return (training, held_out) if training else (held_out, [])
@@ -123,8 +123,7 @@ def check_ply(out: Path) -> None:
 
 
 def export_ply(source: Source, out: Path, *, float64: bool = False) -> str:
-    """Write the Gaussians of a model as programs for 3DGS read them (`save_ply`), and return a summary, with what PLY
-    does not keep."""
+    """Write a model's Gaussians for 3DGS programs (`save_ply`), and return a summary and what PLY does not keep."""
     out.parent.mkdir(parents=True, exist_ok=True)
     save_ply(out, source.model, float64=float64)
     lines = [f"file: {out}: {source.model.num:,} Gaussians"]

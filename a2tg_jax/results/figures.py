@@ -1,4 +1,4 @@
-"""Figures of a run for its report (curves, texture sizes, pictures of the model), and a plot of a scene's cameras.
+"""Figures for a run's report (curves, texture sizes, pictures of the model), and a plot of a scene's cameras.
 
 They use matplotlib's object interface, without windows or global state.
 """
@@ -35,7 +35,7 @@ COLORS = ("#4477aa", "#cc3311", "#777777", "#228833", "#aa3377", "#ccaa33", "#66
 RUNNING_MEANS = 10
 """Number of running-mean windows in a stage; each covers a tenth."""
 MOST_POINTS = 4000
-"""Points of a curve; a running mean takes the square of their number in time."""
+"""Points of a curve; the time of a running mean grows with their square."""
 CURVES = (
     ("loss", "Loss"),
     ("psnr", "Training PSNR (dB)"),
@@ -50,7 +50,7 @@ DEPTH_RANGE = 5, 95
 DEPTH_STOPS = 5
 """Number of depths in the legend."""
 NUM_CHECKERS = 60
-"""Squares across a picture where nothing is hit."""
+"""Squares across a picture's empty parts."""
 FLIGHT_FRAMES, FLIGHT_PER_SECOND, FLIGHT_SIDE = 60, 15, 480
 MOST_CLOUD_POINTS = 20_000
 """Largest number of points drawn."""
@@ -119,7 +119,7 @@ def write_figures(
 
 
 def save_figure(path: Path, figure: Figure) -> None:
-    """Write a PNG on white, whole or not at all."""
+    """Write a PNG on white, atomically."""
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
@@ -299,7 +299,7 @@ def flight(model: Model, settings: RenderSettings) -> bytes | None:
     for camera in smooth_path(cameras, FLIGHT_FRAMES):
         scale = min(1.0, FLIGHT_SIDE / max(camera.width, camera.height))
         path.append(resize_camera(camera, *(max(1, round(scale * side)) for side in (camera.width, camera.height))))
-    # Room for splats is planned from some of the cameras; it grows where another one needs more.
+    # Capacity is planned from some of the cameras, and grows if another needs more.
     renderer = Renderer(model, cameras=path[::10], settings=settings, has_geometry=False)
     buffer = io.BytesIO()
     pictures = (Image.fromarray(to_uint8(renderer(camera).color)) for camera in path)
@@ -321,7 +321,7 @@ def save_camera_picture(scene: Path, path: Path) -> None:
     up = up / max(float(np.linalg.norm(up)), 1e-9)
     right = rotations[:, 0].mean(axis=0)
     right = right - up * (right @ up)
-    if np.linalg.norm(right) < 1e-6:  # Cameras all around have no common right side.
+    if np.linalg.norm(right) < 1e-6:  # Cameras in a ring have no common right side.
         right = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     right = right / np.linalg.norm(right)
     axes = np.stack([right, np.cross(up, right), up])

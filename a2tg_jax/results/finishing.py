@@ -40,7 +40,7 @@ class Measured:
 def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_weights: Path | None = None) -> str:
     """Finish the last model of a run's main system, evaluate it in a new run folder, and return a table of the steps.
 
-    Choices depend on training views only. If the same finishing was killed in that folder, it continues: with the
+    Choices depend on training views only. If the same finishing was killed in that folder, it resumes: with the
     evaluation if the model was written, otherwise from the beginning.
 
     Raises:
@@ -51,7 +51,7 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     options.check()
     record, planned = finished_stage(source)
     path, run = source.model(planned.name), RunFolder(out)
-    # The checksum ties finish.json to the very model: a run trained again is another source.
+    # The checksum ties finish.json to this model: a run trained again is another source.
     origin = {"source": str(source.path.resolve()), "model": planned.name, "sha256": sha256_of(path)}
     content = {**origin, **dataclasses.asdict(options)}
     _is_written(run, content)
@@ -93,8 +93,8 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
 
 
 def _is_written(run: RunFolder, content: Mapping[str, object]) -> bool:
-    """Return whether a process was killed in a folder after the same finishing, as finish.json says, had written its
-    model. Otherwise the folder must be free, unless the same finishing was begun there."""
+    """Return whether the same finishing (by finish.json) was killed in a folder after writing its model. Otherwise the
+    folder must be free, unless the same finishing was begun there."""
     # A report is the last file of an evaluation: with one, the folder holds a finished run.
     is_begun = not run.report.is_file() and run.finish.name in run.written() and is_regular(run.finish)
     with contextlib.suppress(ValueError):

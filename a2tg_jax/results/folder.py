@@ -1,10 +1,10 @@
 """The run folder: its layout, and which existing files and folders may be replaced.
 
     RUN/
-      .a2tg-run                  the marker: this program made the folder, and what it wrote there
+      .a2tg-run                  the marker: a list of the files that this program wrote there
       run.toml                   the scene, the system with every number, the systems compared (`results.record`)
       checkpoints/NAME-*.npz     the newest two of the stage that is being trained, to resume from
-      models/NAME.npz            what each finished stage left behind, with cameras, world and background
+      models/NAME.npz            the model of each finished stage, with cameras, world and background
       corrections/NAME.json      exposure and pose of each training view, if they were learned
       history/NAME.csv           loss, PSNR, Gaussians, MB over the iterations
       tensorboard/events.*       the same for TensorBoard, with --tensorboard
@@ -13,7 +13,7 @@
       figures/                   curves, texture resolutions, some textures, depth, normals, a flight
       point_cloud.ply            the Gaussians in the original world
       viewer.html                the model in a browser, on one page
-      report.html                all of it on one page
+      report.html                everything on one page
       finish.json                the run that a2tg finish started from, and its options
       diverged/NAME-*.npz        checkpoint before a step whose numbers were not finite
       .a2tg-old/                 the run that this one replaces, until this one has its report
@@ -46,7 +46,7 @@ MARKER = "a2tg-jax run"
 DAMAGED = ".damaged"
 OLD = ".a2tg-old"
 EXPORTS = (".a2tgz", ".glb")
-"""Suffixes of files that `a2tg compress` and `a2tg mesh` write into a run folder, which the run does not need."""
+"""Suffixes of optional files that `a2tg compress` and `a2tg mesh` write into a run folder."""
 IN_USE = "is not empty; add `resume` to continue it, `overwrite` to start again, or choose another `out`"
 """Error text of training for a folder that already holds a run."""
 MOST_NAMES = 100_000
@@ -83,7 +83,7 @@ class RunFolder:
         if not lines:
             return
         self.path.mkdir(parents=True, exist_ok=True)
-        # Names reach the disk before their files, so a crash never leaves a file that the run does not list.
+        # Names reach the disk before their files, so that a crash never leaves an unlisted file.
         with named_if_full(self.marker), open(self.marker, "a", encoding="utf-8") as file:
             file.writelines(lines if os.fstat(file.fileno()).st_size else [f"{MARKER}\n", *lines])
             file.flush()
@@ -91,7 +91,7 @@ class RunFolder:
 
     def written(self) -> list[str]:
         """Return the paths listed in the marker, relative to the folder; none without a marker. Raises ValueError if it
-        is not this program's, or lists more than `MOST_NAMES` files."""
+        is not a run's marker, or lists more than `MOST_NAMES` files."""
         if not is_regular(self.marker) or not self.marker.stat().st_size:
             return []
         data = read_regular(self.marker, MOST_MARKER_BYTES)
@@ -132,7 +132,7 @@ class RunFolder:
 
     @property
     def has_progress(self) -> bool:
-        """Whether a training left a checkpoint, a model or the state before a divergence."""
+        """Whether there is a checkpoint, a model or the state before a divergence."""
         files = self.own_files(self.written())
         return any(path.parent.name in ("checkpoints", "models", "diverged") for path in files)
 
@@ -162,7 +162,7 @@ class RunFolder:
         for path in old if keep else [*old, *self.checkpoints(name, DAMAGED)]:
             path.unlink()
         if not keep:
-            with contextlib.suppress(OSError):  # There may be other stages' checkpoints in it.
+            with contextlib.suppress(OSError):  # Other stages' checkpoints may be in it.
                 (self.path / "checkpoints").rmdir()
 
 
@@ -177,7 +177,7 @@ def check_free(path: Path, *, overwrite: bool = False, in_use: str = IN_USE) -> 
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"{path} is a file; choose another folder with `out`")
     run = RunFolder(path)
-    # A process that was killed early leaves a marker, a record or partial files: nothing that could be lost.
+    # A process killed early leaves a marker, a record or partial files: nothing worth keeping.
     unused = {run.marker.name, run.record.name} if run.marker.is_file() else set()
     unused |= {partial.name for partial, whole in left_over(path).items() if whole.name in run.written()}
     if not path.is_dir() or all(entry.name in unused for entry in path.iterdir()):
@@ -197,7 +197,7 @@ def open_run(path: Path) -> RunFolder:
 
 
 def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
-    """Return the command line that continues a training on these devices; None: on those of its newest checkpoint."""
+    """Return the command line that continues a training on these devices; None: its newest checkpoint's devices."""
     if devices is None:
         devices = ALONE
         # By time: checkpoints of several stages do not sort by name.
@@ -224,11 +224,11 @@ def remove_if_empty(folder: Path, root: Path) -> None:
 
 @contextlib.contextmanager
 def claimed(run: RunFolder) -> Iterator[None]:
-    """Keep other processes from training and measuring in a run folder, which is made if it does not exist.
+    """Lock a run folder against training and measuring by other processes; it is made if it does not exist.
 
-    The lock is the operating system's, on the marker, and ends with the process. Some file systems have no locks.
-    Partial files of a killed process are removed, and a run that it was about to replace is put back. Raises
-    FileExistsError if another process has claimed it, and ValueError if the marker is not this program's.
+    The operating system locks the marker until the process ends. Some file systems have no locks. Partial files of a
+    killed process are removed, and a run that it was replacing is restored. Raises FileExistsError if another process
+    has claimed the folder, and ValueError if the marker is not a run's.
     """
     run.written()
     run.path.mkdir(parents=True, exist_ok=True)
@@ -254,37 +254,37 @@ def opened(path: Path) -> Iterator[RunFolder]:
     """Claim an existing run folder. Raises FileNotFoundError if there is none, and as `claimed`."""
     run = RunFolder(path)
     if not is_regular(run.marker):
-        open_run(path)  # A process that was killed in its first moments left a marker, but no record.
+        open_run(path)  # A process killed at its start left a marker, but no record.
     with claimed(run):
         yield open_run(path)
 
 
 # Replacement of a run. The old one is kept in RUN/.a2tg-old, which is a run folder, until the new one has its report.
-# Until the new one has a checkpoint, the old one can be put back. Its record moves first and returns last, so a folder
-# without a record is one in which a process was killed between two of the files.
+# Until the new one has a checkpoint, the old one can be restored. Its record is moved first and moved back last, so a
+# folder without a record is one in which a process was killed between two moves.
 
 
 def old_run(run: RunFolder) -> RunFolder | None:
-    """Return the run that this one is about to replace, or None."""
+    """Return the run that this one replaces, or None."""
     old = RunFolder(run.path / OLD)
     return old if old.path.is_dir() else None
 
 
 def set_aside(run: RunFolder) -> None:
-    """Move the files of a run to RUN/.a2tg-old. If an earlier run is still there, because its replacement never ended,
-    that one is kept and this one is deleted."""
+    """Move the files of a run to RUN/.a2tg-old. If an earlier run is still there, whose replacement never finished, it
+    is kept and this one is deleted."""
     if old_run(run) is None:
         _move(run, RunFolder(run.path / OLD), is_record_first=True)
     run.clear()
 
 
 def put_back_old(run: RunFolder) -> bool:
-    """Put back the run that this one replaces, unless this one has a checkpoint or a model. Return whether it was."""
+    """Restore the run that this one replaces, unless this one has a checkpoint or a model. Return whether it did."""
     old = old_run(run)
     if old is None:
         return False
     if not old.own_files(old.written()):
-        drop_old(run)  # A process was killed before it moved the first file.
+        drop_old(run)  # A process was killed before the first move.
         return False
     is_moving = not run.record.is_file()
     if run.has_progress and not is_moving:
@@ -325,7 +325,7 @@ def _move(source: RunFolder, target: RunFolder, *, is_record_first: bool) -> Non
 def check_output(path: Path) -> None:
     """Raise ValueError if a file or folder cannot be made, naming the obstacle.
 
-    New folders on more than one level outside the current folder, such as at a misspelt drive, are reported on stderr.
+    Several levels of new folders outside the current one, such as on a misspelt drive, are reported on stderr.
     """
     place = Path(os.path.abspath(path))
     missing = [folder for folder in (place, *place.parents) if not folder.exists()]
@@ -352,8 +352,8 @@ def check_apart(out: Path, other: Path) -> None:
 
 
 def check_new(path: Path, option: str, *, overwrite: bool) -> None:
-    """Raise if a file must not be replaced, naming it and the option that it comes from: FileExistsError if it exists
-    and `overwrite` is not set, ValueError if a run, and no export, wrote it into its folder."""
+    """Raise if a file must not be replaced, naming it and its option: FileExistsError if it exists and `overwrite` is
+    not set, ValueError if it belongs to a run and is no export."""
     if not path.is_file():
         return
     run = _run_that_wrote(path)
@@ -364,7 +364,7 @@ def check_new(path: Path, option: str, *, overwrite: bool) -> None:
 
 
 def check_export(path: Path, default: Path, option: str, *, overwrite: bool) -> None:
-    """Call `check_new`, unless the path is the default and the same command wrote it into a run folder before."""
+    """Call `check_new`, unless the path is the default and an earlier call wrote it into a run folder."""
     if path.resolve() != default.resolve() or _run_that_wrote(path) is None:
         check_new(path, option, overwrite=overwrite)
 
@@ -377,7 +377,7 @@ def _run_that_wrote(path: Path) -> Path | None:
 
 
 def check_not_source(files: Iterable[Path], source: Path, option: str) -> None:
-    """Raise ValueError if one of the files to write is the file that is read, naming it and its option."""
+    """Raise ValueError, naming the file and its option, if a file to write is the source."""
     for file in files:
         if file.exists() and source.exists() and file.samefile(source):
             raise ValueError(f"{file} is the model itself; choose another {option}")
@@ -397,7 +397,7 @@ def write_json(path: Path, data: object) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file. Raises ValueError if it is damaged, or too large for one of this program's."""
+    """Return the content of a JSON file. Raises ValueError if it is damaged or too large."""
     data = read_regular(path, MOST_BYTES)
     try:
         return parse_json(data, allow_nan=True)  # The PSNR of equal images is infinite.

@@ -31,17 +31,17 @@ from a2tg_jax.training.cost import (
 )
 
 REPORT = 290 * MB
-"""Bytes that evaluation, figures and the report compile and import."""
+"""Bytes of programs and imports for evaluation, figures and the report."""
 EVALUATION_PER_PIXEL = 150
-"""Bytes of a view that is rendered, with depth and normals, compared and drawn."""
+"""Bytes per pixel for rendering, comparing and drawing a view, with depth and normals."""
 KEPT_STATES = 3
 """Number of checkpoints on disk while a new one is written."""
 PICTURE_PER_PIXEL = 2
 """Bytes on disk of each picture of a sheet."""
 LONG = 10_000
-"""Iterations of a system that take hours on CPUs."""
+"""Number of iterations beyond which CPUs take hours."""
 QUICK_SIDE = 640
-"""Longer side of the photographs, in pixels, with which the preset quick takes minutes on two cores."""
+"""Longer side of photographs, in pixels, up to which the preset quick takes minutes on two cores."""
 OPTIONS = {
     "photographs": ("downscale", "batch_size"),
     "model": ("memory_budget", "sh_degree"),
@@ -49,7 +49,7 @@ OPTIONS = {
     "pixels": ("downscale",),
     "corrections": ("corrections.grid.size", "downscale"),
 }
-"""Options to change, by what needs most of the memory; those that limit the number of Gaussians come before."""
+"""Options to change, by the largest part of the memory; limits of the number of Gaussians precede them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +63,7 @@ class RunForecast:
     limits: tuple[str, ...] = ()
     """Options that limit the number of Gaussians."""
     whole: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Bytes that one of several devices must have room for, by stage (`StageForecast.whole_bytes`)."""
+    """Bytes that must fit on one of several devices, by stage (`StageForecast.whole_bytes`)."""
 
     @property
     def peak(self) -> tuple[str, Bytes]:
@@ -94,8 +94,7 @@ class RunForecast:
         )
 
     def check_one_device(self, limit: float) -> None:
-        """Raise ValueError if one of several devices has no room for the whole finished model and its share of the
-        state."""
+        """Raise ValueError if the finished model and a device's share of the state do not fit on it."""
         phase, needed = max(self.whole.items(), key=lambda item: item[1], default=("", 0.0))
         if needed > limit:
             raise ValueError(
@@ -122,7 +121,7 @@ class RunForecast:
 
 
 def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_devices: int = 1) -> RunForecast:
-    """Return a forecast of the bytes that a run will take (host; nothing is compiled). `num_given` is the number of
+    """Return a forecast of a run's memory and disk space (host; nothing is compiled). `num_given` is the number of
     Gaussians of the file that replaces the main system's first stage; memory is the sum over all devices."""
     # On accelerators programs and photographs take the host's memory, not the device's.
     is_host = default_platform() == "cpu"
@@ -130,12 +129,12 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     for chain in plan.chains.values():
         num = num_given if chain[0] == plan.main[0] else None
         stages |= zip(chain, forecast_stages(scene, plan[chain[-1]].system, num, num_devices), strict=True)
-    # Programs stay in memory once they are compiled, so each stage adds to those before it.
+    # Compiled programs stay in memory, so each stage adds to the ones before.
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
     for name, stage in stages.items():
         if stage.is_trained:
             resident += FURTHER_STAGE + FURTHER_PROGRAM * (stage.num_programs - 1)
-            # A step is compiled before its gradients and pixels take memory.
+            # Compilation ends before gradients and pixels take memory: the larger of both counts.
             compiling = max(COMPILER - stage.bytes.gradients - stage.bytes.pixels, 0)
             phases[name] = stage.bytes._replace(program=(resident + compiling) if is_host else 0)
     model_bytes = [stage.model_bytes for stage in stages.values()]
@@ -163,7 +162,7 @@ def print_forecast(
     scene: Scene, record: RunRecord, max_memory: int | None, num_devices: int = 1, num_given: int | None = None,
     out: Path | None = None,
 ) -> None:  # fmt: skip
-    """Print the forecast of a run, for at most `max_memory` bytes (None: what the machine has available). `out` is the
+    """Print the forecast of a run, for at most `max_memory` bytes (None: what is available). `out` is the
     folder of a new run, whose disk must have room for it; None for a resumed run. Raises ValueError if the run cannot
     fit, naming the options to change. Other arguments as in `forecast_run`."""
     found, limit = forecast_run(scene, record.plan, num_given, num_devices), allowed_memory(max_memory, num_devices)

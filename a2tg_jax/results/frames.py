@@ -1,6 +1,6 @@
 """Frames of a finished run, and a video: its test views, or a path past the cameras, an orbit or saved views.
 
-The folder has a list of the files that renders wrote. No other file is replaced without `overwrite`, or deleted.
+The folder has a list of rendered files. No other file is replaced without `overwrite`, or deleted.
 """
 
 import contextlib
@@ -35,7 +35,7 @@ LIST = ".a2tg-frames"
 """Name of the list."""
 MOST_BYTES = 1 << 26
 FRAME_NAME = "frame_%04d.png"
-"""File name of a flight's frame by its number, as Python and ffmpeg write it."""
+"""File name of a flight's frame by its number, in Python's and ffmpeg's format."""
 FRAME = re.compile(r"frame_\d{4,}\.png")
 
 
@@ -47,7 +47,7 @@ class FrameFolder:
 
     @property
     def listed(self) -> list[str]:
-        """Names of the files that renders wrote."""
+        """Names of rendered files."""
         if not is_regular(self.path / LIST):
             return []
         # surrogateescape: names of views may be bytes of any encoding.
@@ -55,7 +55,7 @@ class FrameFolder:
         return list(dict.fromkeys(lines))
 
     def check(self, names: Iterable[str], *, overwrite: bool) -> None:
-        """Raise FileExistsError if a file exists that no render wrote, unless `overwrite` is set."""
+        """Raise FileExistsError if an unlisted file exists, unless `overwrite` is set."""
         for name in set(names) - set(self.listed):
             check_new(self.path / name, "`out`", overwrite=overwrite)
 
@@ -105,13 +105,13 @@ def render_frames(
     """Write one PNG per frame and return their paths. The photographs are not needed.
 
     The folder gets frame_0000.png … of a path, or NAME.png of the test views. Files of earlier renders are replaced,
-    and frames of a longer path deleted; other files only with `overwrite`.
+    and frames of a longer path deleted; other files need `overwrite`.
 
     Args:
-      route: the test views, a smooth path past all cameras, an orbit around the subject, or a path through the views of
+      route: the test views, a smooth path past all cameras, an orbit around the subject, or a path through the views in
         a file that the viewer saved.
       name: model to render; None: the last one of the run's main system.
-      size: width and height of the frames, to which views of another aspect are cropped; None: the cameras' sizes.
+      size: width and height of the frames, views being cropped to their aspect; None: the cameras' sizes.
 
     Raises:
       ValueError, OSError: if that stage is not finished, there are no such views or path, or a file is in the way.
@@ -148,7 +148,7 @@ def video_name() -> str:
 
 
 def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER_SECOND) -> Path:
-    """Make a video of frame_0000.png … in their folder, with ffmpeg or, without it, as an animated WebP, which loops.
+    """Make a video of frame_0000.png … in their folder: an MP4 with ffmpeg, otherwise a looping animated WebP.
     Raises ValueError if ffmpeg fails."""
     path, program = frames[0].with_name(video_name()), shutil.which("ffmpeg")
 
@@ -177,7 +177,7 @@ def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER
 
 
 def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tuple[str, Camera]]:
-    """Return file names and cameras of the frames; frames of a path are named as `write_video` expects."""
+    """Return file names and cameras of the frames; frames of a path have the names that `write_video` expects."""
 
     def numbered(path: Sequence[Camera]) -> Iterator[tuple[str, Camera]]:
         return ((FRAME_NAME % index, camera) for index, camera in enumerate(path))

@@ -18,10 +18,10 @@ from a2tg_jax.training import History
 from a2tg_jax.training.checkpoint import TERM
 
 NAMES = tuple(History.empty().to_dict())
-"""Columns of each file; loss terms follow, such as loss_l1."""
+"""Columns of each file; loss terms such as loss_l1 follow."""
 INTEGERS = ("stage", "iteration", "num_gaussians")
 LARGEST = 1e15
-"""Largest number in a history; larger ones would overflow the integers and axes made from them."""
+"""Largest number in a history; larger ones would overflow integers and axes."""
 MOST_BYTES = 1 << 26
 """Largest file; about a million rows."""
 LIBRARY = "tensorboardX"
@@ -44,7 +44,7 @@ def read_history(path: Path) -> History:
             first = file.readline().rstrip("\r\n").split(",")
             terms = first[len(NAMES) :]
             if tuple(first[: len(NAMES)]) != NAMES or not all(name.startswith(TERM) for name in terms):
-                raise ValueError(f"has the columns {shortened(', '.join(first))}; {', '.join(NAMES)} are wanted")
+                raise ValueError(f"has the columns {shortened(', '.join(first))}; {', '.join(NAMES)} are expected")
             if len({*terms}) < len(terms):
                 raise ValueError(f"has a column twice: {shortened(', '.join(terms))}")
             with warnings.catch_warnings():
@@ -52,7 +52,7 @@ def read_history(path: Path) -> History:
                 # comments=None: "#" in a damaged file is an error, not a comment.
                 values = np.loadtxt(file, delimiter=",", comments=None, ndmin=2)
             if values.size and values.shape[1] != len(first):
-                raise ValueError(f"has rows of {values.shape[1]} numbers; {len(first)} are wanted")
+                raise ValueError(f"has rows of {values.shape[1]} numbers; {len(first)} are expected")
             values = values.reshape(-1, len(first))
             # PSNR of equal images is infinite.
             is_large = np.abs(values[:, [name != "psnr" for name in first]]) > LARGEST
@@ -71,7 +71,7 @@ def check_tensorboard() -> None:
 
 
 class EventWriter:
-    """Writer of a stage's history for TensorBoard. Each call adds the rows that the last one did not have."""
+    """Writer of a stage's history for TensorBoard. Each call adds the rows since the last one."""
 
     def __init__(self, run: RunFolder, name: str):
         self._run, self._name = run, name

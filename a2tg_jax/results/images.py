@@ -26,7 +26,7 @@ CHECKER = (0.75, 0.55)
 """Greys of `checkered`."""
 MARGIN, CAPTION_HEIGHT = 6, 22
 FONT = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
-"""Font of captions; Pillow's own lacks × and ²."""
+"""Font of captions; Pillow's default lacks × and ²."""
 LONGEST_STEM = 190
 """Largest number of bytes of a view's name in a file name; file systems allow 255, partial files' names are longer."""
 LONGEST_SIDE = 1280
@@ -52,7 +52,7 @@ def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> tuple[slice, slice]:
-    """Return the square, a quarter of the shorter side, in which the squared error falls most from `before` to `after`.
+    """Return the square, a quarter of the shorter side, where the squared error falls most from `before` to `after`.
 
     Squares whose error stays above the picture's mean are left out, unless all are.
     """
@@ -61,7 +61,7 @@ def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> t
     errors = [np.sum((image.astype(np.float32) - target) ** 2, axis=-1) for image in (before, after)]
 
     def in_squares(error: np.ndarray) -> np.ndarray:
-        # The origin moves each window from around its pixel to below and right of it: the pixel is the corner.
+        # The origin shifts each window so that its pixel is the upper left corner, not the centre.
         means: np.ndarray = uniform_filter(error, size=side, mode="constant", origin=-(side // 2))
         return means[: max(1, height - side + 1), : max(1, width - side + 1)]
 
@@ -90,8 +90,8 @@ def side_by_side(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image
 def picture_names(view_names: Iterable[str]) -> dict[str, str]:
     """Return file names of the views' pictures, unique regardless of case; folders become part of the name.
 
-    Long names are cut and end in a hash. Where two names would be the same, as for a/b.png and a_b.jpg, the later in
-    sorted order gets a number.
+    Long names are cut and end in a hash. If two names would be equal, as for a/b.png and a_b.jpg, the later in sorted
+    order gets a number.
     """
     names: dict[str, str] = {}
     taken: set[str] = set()
@@ -121,7 +121,7 @@ def write_png(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -
 
 
 def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
-    """Return an image as a data: URI, enlarged `zoom` times without smoothing, and reduced if it is very large."""
+    """Return an image as a data: URI, enlarged `zoom` times without smoothing, and reduced if very large."""
     picture = Image.fromarray(np.ascontiguousarray(image))
     # NEAREST: pixels of a crop stay visible.
     picture = picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)

@@ -17,8 +17,8 @@ SPLITS = ("test", "validation", "train")
 
 
 def describe_run(run: RunFolder) -> str:
-    """Return the scene, the systems, and the progress, model and metrics of each stage as text. Damaged metrics and
-    models are named. Raises ValueError if run.toml is damaged."""
+    """Return scene, systems, and each stage's progress, model and metrics as text. Damaged metrics and models are
+    named. Raises ValueError if run.toml is damaged."""
     facts, old = run_facts(run), old_run(run)
     stages, damage = facts["stages"], facts["damage"]
     compared = f", compared with {', '.join(facts['compare'])}" if facts["compare"] else ""
@@ -34,7 +34,7 @@ def describe_run(run: RunFolder) -> str:
     if not facts["is_finished"]:
         lines.append(f"training is not finished; continue with: {resuming_command(run)}")
     if is_regular(run.finish):
-        lines.append(f"finished {run.finish} says from which run and how")
+        lines.append(f"finished {run.finish} has its source and options")
     if old is not None:
         lines.append(f"replaces a run that is kept in {old.path} until this one has its report")
     return "\n".join(lines)

@@ -36,7 +36,7 @@ TEXTURED_FACES = 100_000
 GRID_FULL = "lower `resolution` or `radius`, or raise `max_memory`"
 NO_SURFACE = "give a larger `radius`, or `unbounded`"
 SMALL_PARTS = "raise `resolution` or lower `voxel`, or train longer or from more views"
-"""Advice of the command line for each kind of error."""
+"""Advice on the command line for each kind of error."""
 TextureSource = Literal["none", "renders", "photographs"]
 
 
@@ -74,10 +74,10 @@ class MeshOptions:
         return TEXTURED_FACES if self.faces is None and self.texture != "none" else self.faces
 
     def check(self, out: Path) -> None:
-        """Raise ValueError before anything is computed if an option is invalid or a library is missing."""
+        """Raise ValueError if an option is invalid or a library is missing, before any computation."""
         check_mesh_suffix(out, "`out`")
         if self.resolution is not None and self.voxel is not None:
-            raise ValueError("`resolution` and `voxel` both say the size of voxels: leave one out")
+            raise ValueError("`resolution` and `voxel` both set the size of voxels: leave one out")
         check_lengths(self.resolution, self.voxel, self.radius)
         if self.clusters < 1:
             raise ValueError(f"clusters must be at least 1; got {self.clusters}")
@@ -122,7 +122,7 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
             progress=True,
         )
     except GridFullError as error:
-        # The library's advice names its arguments; the command's options are called otherwise.
+        # The library's advice names its arguments; the command's options have other names.
         raise ValueError(f"{str(error).partition(': ')[0]}: {GRID_FULL}") from None
     except NoSurfaceError as error:
         raise ValueError(f"{error.reason(scale)}: {SMALL_PARTS if error.num_dropped else NO_SURFACE}") from None
@@ -146,8 +146,8 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
 
 
 def _photographs(source: Source, origin: Origin) -> Iterator[Picture]:
-    """Return an iterator over the photographs of the training views. Raises ValueError at once if they are missing, or
-    distorted by their lens."""
+    """Return an iterator over the photographs of the training views. Raises ValueError, before iteration, if they are
+    missing, or distorted by their lens."""
     scene = source.load_scene()
     if scene is None:
         raise ValueError(

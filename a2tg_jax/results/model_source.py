@@ -1,5 +1,5 @@
-"""Models to show, export, mesh, render or compress: the last of a run, another of its stages, or a file; and the splats
-of a file as the first stage of a run."""
+"""Models to show, export, mesh, render or compress: a run's last model or another stage's, or a file; and splats of a
+file as the first stage of a run."""
 
 import dataclasses
 import functools
@@ -33,7 +33,7 @@ from a2tg_jax.training.start import new_appearance
 
 SHOWN = f"a run folder, or a file *{', *'.join(FORMATS)}"
 MOST_LISTED = 5
-"""Largest number of run folders that a message lists."""
+"""Largest number of run folders in a message."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,22 +54,22 @@ class Source:
 
     @functools.cached_property
     def near_plane(self) -> float:
-        """Distance of the near plane; small for files whose world has an unknown size."""
+        """Distance of the near plane; small for files of unknown scale."""
         if (self.model.origin is not None and self.model.origin.names) or not self.model.num:
             return self.settings.near_plane
         means = np.asarray(self.model.live.gaussians.means, np.float64)
-        # The radius that holds three quarters of the Gaussians.
+        # The radius that contains three quarters of the Gaussians.
         radius = np.quantile(np.linalg.norm(means - np.median(means, axis=0), axis=1), 0.75)
         # 2 % of the scene: the default 0.2 is made for worlds with cameras at 1.
         return min(self.settings.near_plane, 0.02 * float(max(radius, 1e-6)))
 
     @functools.cached_property
     def encoded(self) -> bytes:
-        """Scene for browsers. Raises ValueError if they cannot show it."""
+        """Scene for browsers. Raises ValueError if it cannot be shown there."""
         return encode_web_scene(self.model, title=self.title, note=self.note, near_plane=self.near_plane)
 
     def load_scene_or_warn(self) -> Scene | None:
-        """Return the scene; None if the photographs are missing or, with a warning, if they cannot be read."""
+        """Return the scene; None if the photographs are missing or, with a warning, unreadable."""
         try:
             return self.load_scene()
         except (OSError, ValueError) as error:
@@ -78,7 +78,7 @@ class Source:
 
 
 def finished_stage(run: RunFolder, name: str | None = None) -> tuple[RunRecord, PlannedStage]:
-    """Return the record of a run and one of its stages; None: the last one of its main system. Raises ValueError or
+    """Return the record of a run and one of its stages; None: its main system's last. Raises ValueError or
     FileNotFoundError if there is no such stage, or it is not finished."""
     record = read_record(run)
     plan = record.plan
@@ -128,7 +128,7 @@ def settings_of(system: System) -> RenderSettings:
 
 
 def _run_at(folder: Path) -> RunFolder:
-    """Return the run folder, or raise FileNotFoundError with what the folder holds instead."""
+    """Return the run folder, or raise FileNotFoundError with what the folder is instead."""
     if is_regular(RunFolder(folder).record):
         return open_run(folder)
     # A scene folder is a likely mistake.
@@ -146,11 +146,11 @@ def _run_at(folder: Path) -> RunFolder:
 
 
 def check_init(file: Path, out: Path, system: System) -> Model:
-    """Return the splats of a file that can replace the first stage of a run, with a warning about what is left out.
+    """Return a file's splats to replace the first stage of a run, with a warning about what is dropped.
 
-    The file is of any format that `load_splats` reads: plain splats in the original world of the photographs, or a
-    model. Raises ValueError if there is no such file, the folder holds a run, or the splats exceed the system's memory
-    budget."""
+    The file is of any format that `load_splats` reads: plain splats in the photographs' original world, or a model.
+    Raises ValueError if there is no such file, the folder holds a run, or the splats exceed the system's memory budget.
+    """
     if not is_regular(file):
         raise ValueError(f"init: there is no file {file}")
     format_of(file)
@@ -187,7 +187,7 @@ def write_first_stage(run: RunFolder, record: RunRecord, splats: Model, scene: S
     # File → original world → the scene's normalised one.
     to_scene = scene.transform if splats.origin is None else splats.origin.transform.inverse().then(scene.transform)
     gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=shapes is not None), to_scene)
-    # Spherical harmonics are cut off, or filled with zeros, to the degree that training begins with.
+    # Spherical harmonics are cut or zero-padded to the degree at which training begins.
     sh = np.zeros((gaussians.num, NUM_BASES[system.initial_sh_degree], 3), np.float32)
     num = min(sh.shape[1], gaussians.sh.shape[1])
     sh[:, :num] = np.asarray(gaussians.sh)[:, :num]
@@ -196,6 +196,6 @@ def write_first_stage(run: RunFolder, record: RunRecord, splats: Model, scene: S
     if shapes is not None:
         shown = shown.with_shapes(shapes)
     model = Model(gaussians, shown, background=BACKGROUNDS[system.background], origin=origin_of_scene(scene))
-    # No system in the header: none has trained it, so that resuming compares no options.
+    # No system in the header: none trained it, so that resuming has no options to compare.
     save_model(run.own(run.model(planned.name)), model, {"init": record.init})
     write_history(run.own(run.history(planned.name)), History.empty())

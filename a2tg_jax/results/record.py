@@ -1,6 +1,6 @@
-"""Record of a run (the scene, a system with all its options, systems to compare), and the plan of its stages.
+"""Record of a run (scene, system with all its options, systems to compare), and the plan of its stages.
 
-The record is kept as run.toml. A configuration file has the same keys; missing ones take the command line's values:
+The record is kept as run.toml. A configuration file has the same keys; missing ones have the command line's defaults:
 
     scene = "../scenes/fox"              # relative to the file's folder; or s3://bucket/fox, or "synthetic"
     downscale = 2
@@ -49,7 +49,7 @@ OnNan = Literal["stop", "restore"]
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Largest number of iterations between checkpoints."""
 STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
-"""Options of every system that reach training only through its stages."""
+"""Options of every system that affect training only through its stages."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,8 +79,8 @@ class RunRecord:
 
     @property
     def systems(self) -> dict[str, System]:
-        """Main system and then the compared ones, by label. Raises ValueError if a system is not found, two have one
-        label, or an option of a compared one is wrong."""
+        """Main system and then the compared ones, by label. Raises ValueError if a system is not found, two have the
+        same label, or a compared one's option is invalid."""
         found = {label_of(self.system): self.options}
         for name in self.compare:
             if label_of(name) in found:
@@ -121,7 +121,7 @@ class RunRecord:
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, path=path), init=init)
 
     def with_system(self, name: str, preset: str | None) -> "RunRecord":
-        """Return the record of another system or preset. Raises ValueError if there is no such system or preset."""
+        """Return the record with another system or preset. Raises ValueError if there is no such system or preset."""
         options = chosen_system(name, preset)
         return dataclasses.replace(self, system=name, preset=preset, options=options, compare_options={})
 
@@ -137,15 +137,15 @@ def label_of(name: str) -> str:
 
 
 def chosen_system(name: str, preset: str | None = None) -> System:
-    """Return a system by name, with the options of a preset. Options that an instance sets itself take precedence.
+    """Return a system by name, with the options of a preset. Options set by an instance take precedence.
     Raises ValueError if there is no such system or preset."""
     found = find_system(name)
     return found if preset is None else changed_config(type(found).preset(preset), differences(found), name)
 
 
 def compared_system(name: str, other: System, preset: str | None = None) -> System:
-    """Return a system by name with the options of another that have the same names; all others come from the preset, if
-    it has one of that name. Options that an instance sets itself take precedence. Raises ValueError if there is no such
+    """Return a system by name, with another's options where names match and its own preset's otherwise, if it has that
+    preset. Options set by an instance take precedence. Raises ValueError if there is no such
     system."""
     found = find_system(name)
     kind = type(found)
@@ -154,16 +154,16 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
 
 
 def scene_place(scene: str, folder: Path = Path()) -> str:
-    """Return the place of a scene (URL or path) as run.toml keeps it: a URL, or a full path without links. Relative
-    paths start from a folder. Raises ValueError if a URL holds a secret, or names no place."""
+    """Return the place of a scene as in run.toml: a URL, or a full path without links. Relative paths start from a
+    folder. Raises ValueError if a URL is invalid or holds a secret."""
     here = path_here(scene)
     # Unlike Path.resolve, realpath accepts circular links.
     return checked_url(scene) if here is None else os.path.realpath(folder / here)
 
 
 def read_run_file(path: Path) -> RunRecord:
-    """Read a configuration file, in which the scene may be missing. Relative paths in it start from its folder. Raises
-    FileNotFoundError if there is no such file, and ValueError, naming file and key, if it is no TOML, or a key is
+    """Read a configuration file, which may lack the scene. Relative paths in it start from its folder. Raises
+    FileNotFoundError if there is no such file, and ValueError, naming file and key, if it is not TOML, or a key is
     unknown or of another type."""
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such configuration file")
@@ -177,7 +177,7 @@ def read_run_file(path: Path) -> RunRecord:
             raise ValueError(f"{where} {shortened(key)} is an unknown key{did_you_mean(key, KEYS)}")
     if not isinstance(table.get("scene", ""), str):
         raise ValueError(f"{where} scene must be str; got {shortened(table['scene'])}")
-    table.pop("version", None)  # For people: errors name the version that reads the file.
+    table.pop("version", None)  # For people only: errors name the version that reads the file.
     source = {name: table.pop(key) for key, name in SCENE_KEYS.items() if key in table}
     scene = config_from_dict(SceneSource, source, where)
     # The options' class depends on system and preset, so they are read last.
@@ -194,7 +194,7 @@ def read_run_file(path: Path) -> RunRecord:
 def write_record(run: RunFolder, record: RunRecord) -> None:
     """Write run.toml with every option, so that later versions with other defaults repeat the same run."""
     preset, scene, compared = chosen_system(record.system, record.preset), config_to_dict(record.scene), {}
-    for name in record.compare:  # Options that they do not take from the main system, and those that were given.
+    for name in record.compare:  # Options not taken from the main system, and given ones.
         start = compared_system(name, record.options, record.preset)
         own = own_options(record.systems[label_of(name)], record.options)
         compared[name] = _without_none(merged(own, record.compare_options.get(name, {})), config_to_dict(start))
@@ -243,8 +243,8 @@ def read_record(run: RunFolder) -> RunRecord:
 
 
 def contradictions(asked: RunRecord, kept: RunRecord) -> list[str]:
-    """Return the options, named as in run.toml, in which a record differs from the record of the run to resume, except
-    those that may differ: the path of the scene, the systems to compare and `on_nan`."""
+    """Return the options, named as in run.toml, in which a record differs from the run to resume. The scene's path, the
+    systems to compare and `on_nan` may differ."""
     before, now = (
         {"system": one.system, "preset": one.preset, "init": one.init, **flatten_config(one.scene)}
         | flatten_config(one.options)
@@ -254,7 +254,7 @@ def contradictions(asked: RunRecord, kept: RunRecord) -> list[str]:
 
 
 def repeating_command(run: RunFolder) -> str:
-    """Return the command line that repeats a run, and its finishing if it was finished."""
+    """Return the command line that repeats a run, and its finishing, if any."""
     is_finished, again = is_regular(run.finish), f"{run.path}-again"
     trained = f"{run.path}-trained" if is_finished else again
     training = shlex.join(["a2tg", "train", "--config", str(run.record), "--out", trained])
@@ -269,7 +269,7 @@ def repeating_command(run: RunFolder) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class FinishOptions:
-    """Options of `a2tg finish`, as finish.json of a finished run keeps them."""
+    """Options of `a2tg finish`, as in a finished run's finish.json."""
 
     max_loss: float = 0.02
     """Largest loss of PSNR in dB by smaller textures, on training views; 0 leaves textures unchanged."""
@@ -299,7 +299,7 @@ def read_finish(run: RunFolder) -> FinishOptions:
 
 @dataclasses.dataclass(frozen=True)
 class PlannedStage:
-    """Stage of a system, shared by all systems that begin in the same way."""
+    """Stage of a system, shared by all systems with the same beginning."""
 
     name: str
     """Name of its files, columns and captions, unique in the run."""
@@ -336,7 +336,7 @@ class RunPlan:
         return next(iter(self.chains.values()))
 
     def __getitem__(self, name: str) -> PlannedStage:
-        """Return the stage of a name. Raises ValueError if the run has none."""
+        """Return the stage of this name. Raises ValueError if there is none."""
         for planned in self.stages:
             if planned.name == name:
                 return planned
@@ -349,8 +349,8 @@ class RunPlan:
 
 
 def plan_run(systems: Mapping[str, System]) -> RunPlan:
-    """Return the stages of systems by label, the main one first. Two systems share their stages up to the first one
-    that differs. Raises ValueError if two stages would have one name."""
+    """Return the stages of systems by label, the main one first. Two systems share their stages up to the first that
+    differs. Raises ValueError if two stages would have the same name."""
     planned: list[PlannedStage] = []
     chains: dict[str, tuple[str, ...]] = {}
     for label, system in systems.items():
@@ -378,7 +378,7 @@ def plan_run(systems: Mapping[str, System]) -> RunPlan:
 
 
 def common_options(system: System) -> list[Any]:
-    """Return the options that training reads from the system itself."""
+    """Return the options that training reads from the system directly."""
     return [getattr(system, each.name) for each in dataclasses.fields(System) if each.name not in STAGE_OPTIONS]
 
 

@@ -33,11 +33,11 @@ WAYS = {
 }
 """Titles of metrics up to exposure and pose, by the suffix of a split in metrics.json: test_color_fit, …"""
 EQUAL_BYTES = 0.01
-"""Largest relative difference of two sizes that are called equal."""
+"""Largest relative difference between sizes that count as equal."""
 CROP_ZOOM = 3
 HIGHER_IS_BETTER = ("PSNR", "SSIM", "frames a second")
 LOWER_IS_BETTER = ("LPIPS", "memory")
-"""Words in the names of metrics whose best value is highlighted."""
+"""Words in the names of metrics whose best values are highlighted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +79,7 @@ class RunResult:
     models: Mapping[str, ModelResult]
     """Results by the names of their stages."""
     is_lpips_kept: bool = False
-    """Whether LPIPS was kept from an earlier measurement of the same models."""
+    """Whether LPIPS is from an earlier measurement of the same models."""
 
     @property
     def main(self) -> str:
@@ -184,12 +184,12 @@ def summary_table(result: RunResult, names: Sequence[str]) -> tuple[list[str], l
 
 
 def summary_text(result: RunResult, width: int | None = None) -> str:
-    """Return the summary table, warnings and gains as text. Models that do not fit next to each other in `width`
+    """Return the summary table, warnings and gains as text. Models that do not fit side by side in `width`
     characters (None: the terminal's width) follow below."""
     titles, rows = summary_table(result, list(result.models))
     names, *columns = zip(titles, *rows, strict=True)
     width = width or shutil.get_terminal_size().columns
-    # Columns go into as many blocks as the width needs; each repeats the names of the rows.
+    # Columns wrap into blocks, each of which repeats the names of the rows.
     blocks = [[names]]
     for column in columns:
         if len(blocks[-1]) > 1 and max(map(len, aligned([*blocks[-1], column]))) > width:
@@ -211,7 +211,7 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
 
 
 def bytes_compared(result: RunResult, name: str) -> str:
-    """Return the bytes of the main model compared with another's, for the line about its gain."""
+    """Return the bytes of the main model against another's, for the line about its gain."""
     own, other = result.models[result.main].num_bytes, result.models[name].num_bytes
     if abs(own - other) <= EQUAL_BYTES * other:
         return f"at equal bytes ({megabytes(own)} MB)"
@@ -221,7 +221,7 @@ def bytes_compared(result: RunResult, name: str) -> str:
 
 
 def learning_lines(result: RunResult) -> list[str]:
-    """Return a warning for each finished model that does not beat one flat colour per view on its training views."""
+    """Return a warning for each finished model that is no better than one flat colour per training view."""
     return [
         f"{name} did not learn: {measured.train.psnr:.1f} dB on its training views, where one flat colour per view "
         f"reaches {measured.train.flat_psnr:.1f} dB"
@@ -302,7 +302,7 @@ def write_report(
 
     loader = PackageLoader("a2tg_jax.results")
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    # The browser accepts only this style and script, by their hashes, so no text from a scene can act as one.
+    # Browsers accept only this style and script, by hash, so that no text from a scene can act as one.
     # Pictures are data: URIs, so that the page is one file.
     policy, inlined = "default-src 'none'; img-src data:", {}
     for name, suffix in (("style", "css"), ("script", "js")):
@@ -355,7 +355,7 @@ def _best(row: Sequence[str]) -> list[int]:
     is_higher = any(word in row[0] for word in HIGHER_IS_BETTER)
     if not is_higher and not any(word in row[0] for word in LOWER_IS_BETTER):
         return []
-    # Cells are compared as shown: values that round to the same text are equally good.
+    # Cells are compared as printed: values that round to the same text are equally good.
     values = {at: float(cell.replace(",", "")) for at, cell in enumerate(row[1:], 1) if cell}
     best = max(values.values()) if is_higher else min(values.values())
     found = [at for at, value in values.items() if value == best]
@@ -363,7 +363,7 @@ def _best(row: Sequence[str]) -> list[int]:
 
 
 def _views(result: RunResult, names: Sequence[str], split: str) -> Table:
-    """Return PSNR and SSIM of each view and model, with the model's size next to its name."""
+    """Return PSNR and SSIM of each view and model, with model sizes in the titles."""
     sizes = [f"{name} ({megabytes(result.models[name].num_bytes)} MB)" for name in names]
     # Views come in one order for all models.
     found = zip(*(result.models[name].splits[split].per_view for name in names), strict=True)

@@ -1,9 +1,9 @@
 """Evaluation of a run's finished models: metrics, pictures, figures, point cloud, report.
 
-A photograph's exposure and the exact pose of its camera cannot be learned from other photographs. Runs that learn them
-for the training views are therefore scored twice: directly, and up to exposure and pose. `color_fit`: each render's
-colours are mapped to the photograph's by the least-squares affine map. `aligned`: test cameras are moved to where the
-model looks most like the photograph (`measure.alignment.align_poses`), training cameras to where training moved them.
+A photograph's exposure and exact camera pose cannot be learned from other photographs. Runs that learn them for the
+training views are therefore scored twice: directly, and up to exposure and pose. `color_fit`: each render's colours are
+mapped to the photograph's by least squares (affine). `aligned`: test cameras move to where the model looks most like
+the photograph (`measure.alignment.align_poses`), training cameras to their learned poses.
 """
 
 import dataclasses
@@ -108,8 +108,8 @@ def check_weights(lpips_weights: Path | None) -> None:
 
 
 def check_held_out(model: Model, scene: Scene, path: Path) -> None:
-    """Raise ValueError if the model in a file was trained on views that its scene now holds out, which would make their
-    metrics too good. The views of a model without an origin are unknown, and it passes."""
+    """Raise ValueError if a file's model was trained on views that its scene now holds out, which would flatter their
+    metrics. A model without an origin, whose views are unknown, passes."""
     if model.origin is None:
         return
     trained = {name for name, is_test in zip(model.origin.names, model.origin.is_test, strict=True) if not is_test}
@@ -123,8 +123,8 @@ def check_held_out(model: Model, scene: Scene, path: Path) -> None:
 
 
 def finished_stages(run: RunFolder, plan: RunPlan) -> list[str]:
-    """Return the names of the stages that have their models. Raises FileNotFoundError if there are none, or a model is
-    missing from which a later stage was trained."""
+    """Return the names of the stages with models. Raises FileNotFoundError if there are none, or the model from which a
+    later stage was trained is missing."""
     names = [name for name in plan.names if run.model(name).is_file()]
     if not names:
         raise FileNotFoundError(f"{run.path} has no finished stage yet; continue with: {resuming_command(run)}")
@@ -154,9 +154,9 @@ def _evaluations(
     model: Model, scene: Scene, plan: RunPlan, system: System, lpips_weights: Path | None, held_out: HeldOut
 ) -> dict[str, Evaluation]:
     """Return the metrics of a model by split. All models of a run get metrics up to exposure and pose if any of its
-    systems learns these."""
+    systems learns them."""
     settings = settings_of(system)
-    # Test and training views are measured together, so that each size compiles once.
+    # Together, so that each image size compiles once.
     measure = functools.partial(evaluate, settings=settings, lpips_weights=lpips_weights)
     both = measure((*scene.test, *scene.train), model)
     splits: dict[str, tuple[View, ...]] = {held_out: scene.test} if scene.test else {}
@@ -176,7 +176,7 @@ def _evaluations(
 
 
 def _with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dict[str, ModelResult]:
-    """Return the metrics with the LPIPS of metrics.json for every model file that has not changed since."""
+    """Return the metrics with the LPIPS of metrics.json for every model file that is unchanged."""
 
     def merged(found: Evaluation, kept: Mapping[str, Mapping[str, float]]) -> Evaluation:
         per_view = tuple(dataclasses.replace(view, lpips=float(kept[view.name]["lpips"])) for view in found.per_view)
@@ -192,14 +192,14 @@ def _with_kept_lpips(run: RunFolder, measured: Mapping[str, ModelResult]) -> dic
                 changed[name] = dataclasses.replace(found, splits=splits)
         return changed
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return dict(measured)  # None was measured, or it cannot be read.
+        return dict(measured)  # Never measured, or unreadable.
 
 
 def _write_sheets(run: RunFolder, result: RunResult, models: Mapping[str, Model], scene: Scene) -> list[Comparison]:
     """Write a sheet of photograph, renders and error for each view, and return some for the report. Only one view's
     pictures are in memory at a time."""
     views, names = scene.test or scene.train, [*(result.compared or result.before), result.main]
-    # With the cameras of `evaluate`, nothing is compiled again.
+    # The cameras of `evaluate`, so that nothing compiles again.
     cameras = [view.camera for view in (*scene.test, *scene.train)]
     renderers = [
         Renderer(models[name], cameras=cameras, settings=settings_of(result.plan[name].system), has_geometry=False)

@@ -1,7 +1,7 @@
-"""Runs in their folders: begun or resumed, trained stage after stage with checkpoints, and measured.
+"""Runs in their folders: begun or resumed, trained stage by stage with checkpoints, and measured.
 
 If several processes train a run, the first one decides and writes files. Before each stage it sends the others the
-checkpoint or model that the stage starts from, so that they need no file of the run folder.
+checkpoint or model to start from, so that they need no access to the run folder.
 """
 
 import contextlib
@@ -66,13 +66,13 @@ from a2tg_jax.training.start import check_loss_data, check_start
 LESS_MEMORY = (
     "close other programs, or start another run with a larger `downscale`, or a smaller `memory_budget` or `batch_size`"
 )
-"""Advice of the command line for trainings that have run out of memory."""
+"""Advice on the command line for trainings that run out of memory."""
 MOST_RESTORED = 5
-"""Largest number of times a diverged stage is restored, each time with another order of the views."""
+"""Largest number of restorations of a diverged stage, each with another order of the views."""
 DIFFERING = ("options", "`devices`", "views, cameras or points")
-"""Facts that several processes compare with the first one."""
+"""Facts that processes compare with the first one's."""
 Watched = Callable[[Scene], AbstractContextManager[Watch]]
-"""Function that gives the watcher of a scene's training."""
+"""Function that returns the watcher of a scene's training."""
 
 
 def unseen(scene: Scene) -> AbstractContextManager[Watch]:
@@ -82,7 +82,7 @@ def unseen(scene: Scene) -> AbstractContextManager[Watch]:
 
 @dataclasses.dataclass(frozen=True)
 class RunOptions:
-    """Options of how a run is carried out. The model does not depend on them, except for last bits on other devices."""
+    """Options of a run's execution. The model does not depend on them, except for last bits on other devices."""
 
     overwrite: bool = False
     """Replace the run that is in the folder; it is deleted once the new run has its report."""
@@ -151,8 +151,8 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
 
 
 def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options: RunOptions) -> RunResult:
-    """Train and measure. Errors and signals come with advice on how to continue; a run that this one replaces is put
-    back if there is no checkpoint yet."""
+    """Train and measure. Errors and signals come with advice on how to continue; a replaced run is restored if there is
+    no checkpoint yet."""
 
     def advice() -> str:
         if put_back_old(run):
@@ -239,7 +239,7 @@ def _train_stage(
 
     def keep(checkpoint: Checkpoint) -> None:
         if checkpoint.iteration == 0:
-            return  # The stage would begin with the same state again.
+            return  # The stage's start gives the same state.
         if events is not None:
             events.add(checkpoint.history)
         save_checkpoint(run.own(run.checkpoint(planned.name, checkpoint.iteration)), checkpoint)
@@ -250,7 +250,7 @@ def _train_stage(
         resume = _newest_checkpoint(run, planned)
         if events is not None and resume is not None:
             events.skip(resume.history)
-        # Other processes get files, not arrays: they read them as the first one does.
+        # Files, not arrays: other processes read them exactly as the first one does.
         resumed = None if resume is None else run.checkpoint(planned.name, resume.iteration)
         model, start = None, None if planned.start is None else run.model(planned.start)
         if start is not None:
@@ -285,10 +285,10 @@ def _train_stage(
 
 
 def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | None:
-    """Return the newest readable checkpoint of a stage, made with the same options; None without one. Raises ValueError
-    if there are some, and none can be read."""
+    """Return the newest readable checkpoint of a stage, made with the same options; None if there are no checkpoints.
+    Raises ValueError if none of them can be read."""
     damaged: list[tuple[Path, ValueError]] = []
-    # Newest first; a damaged one gives way to the one before.
+    # Newest first; after a damaged one, the one before is tried.
     for path in reversed(run.checkpoints(planned.name)):
         try:
             checkpoint = load_checkpoint(path, system=type(planned.system))
@@ -344,7 +344,7 @@ def check_alike(record: RunRecord, scene: Scene, session: Session) -> None:
 
 def digests_of(record: RunRecord, scene: Scene, session: Session) -> list[bytes]:
     """Return 32 bytes for each of `DIFFERING` that differ if training would. Paths and the pixels of photographs, masks
-    and depth maps are not compared."""
+    and depth maps are left out."""
 
     def checksum(x: Any) -> tuple[tuple[int, ...], int]:
         return np.shape(x), zlib.crc32(np.ascontiguousarray(x).tobytes())
@@ -364,8 +364,8 @@ def digests_of(record: RunRecord, scene: Scene, session: Session) -> list[bytes]
 
 
 def _send_stage(name: str | None, files: Sequence[Path | None] = (), num_restored: int | None = None) -> None:
-    """Send the other processes the name of the stage that is trained next, with the checkpoint and the model that it
-    starts from, and None at the end."""
+    """Send the other processes the name of the next stage, with the checkpoint and the model that it starts from; None
+    at the end."""
     if team() is not None:
         broadcast(json.dumps({"name": name, "num_restored": num_restored}).encode())
         for file in files:
@@ -373,7 +373,7 @@ def _send_stage(name: str | None, files: Sequence[Path | None] = (), num_restore
 
 
 def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> None:
-    """Train what the first process sends until its end. Raises ValueError as `fit_stage`, and Stopped if a signal ends
+    """Train what the first process sends, until it ends. Raises ValueError as `fit_stage`, and Stopped if a signal ends
     one of the processes."""
     check_alike(record, scene, session)
     plan = record.plan
@@ -383,13 +383,13 @@ def follow_first_process(record: RunRecord, scene: Scene, session: Session) -> N
         path.write_bytes(data)
         return path if data else None
 
-    # The first process reports warnings; those of the others would only repeat them.
+    # The first process reports warnings; the others would only repeat them.
     with warnings.catch_warnings(), signals.noted() as is_stopped, tempfile.TemporaryDirectory() as folder:
         warnings.simplefilter("ignore")
         while (header := json.loads(broadcast(b"")))["name"] is not None:
             planned = plan[header["name"]]
             resume, start = (received(Path(folder) / name) for name in ("resume.npz", "start.npz"))
-            with contextlib.suppress(DivergedError):  # The first process restores the stage, or gives up.
+            with contextlib.suppress(DivergedError):  # The first process restores the stage or gives up.
                 fit_stage(
                     scene,
                     planned.system,

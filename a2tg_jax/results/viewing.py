@@ -1,7 +1,7 @@
 """Content of the viewer: a model or a running training, and photographs; served, or exported as files.
 
-A training is shown by a snapshot every few seconds. Between steps the state is copied to the host, and a thread makes a
-scene of it. Both together take at most `SHARE` of the time, so slow snapshots are rare.
+A training is shown by snapshots every few seconds. Between steps the state is copied to the host, and a thread encodes
+it. Together they take at most `SHARE` of the time, so slow snapshots are rare.
 """
 
 import contextlib
@@ -60,7 +60,7 @@ class ServedPhotographs:
     @property
     def views(self) -> dict[int, View]:
         """Views by the index of their cameras."""
-        with self._lock:  # Several threads of the server may call this at once; a scene is read once.
+        with self._lock:  # The server has several threads; the scene is read once.
             return self._found
 
     @functools.cached_property
@@ -70,7 +70,7 @@ class ServedPhotographs:
         return {index: by_name[name] for index, name in enumerate(self._names) if name in by_name}
 
     def jpeg(self, index: int) -> bytes | None:
-        """Return a photograph over the model's background, of its camera's size."""
+        """Return a photograph over the model's background, in its camera's size."""
         view = self.views.get(index)
         if view is None:
             return None
@@ -89,7 +89,7 @@ class ServedPhotographs:
 
 
 def routes_of(source: Source) -> dict[str, Route]:
-    """Return the routes of the viewer's server. Photographs that cannot be read are left out, with a warning."""
+    """Return the routes of the viewer's server. Unreadable photographs are left out, with a warning."""
     return {
         "/": Route("text/html; charset=utf-8", viewer_html().encode()),
         f"/{SCENE_NAME}": Route("application/octet-stream", source.encoded),
@@ -119,7 +119,7 @@ class LiveView:
             background, origin = BACKGROUNDS[run.system.background], origin_of_scene(self._scene)
             # Copied now: the next step donates the state's buffers.
             model = dataclasses.replace(jax.device_get(run.state.model), background=background, origin=origin)
-            self._due = np.inf  # The thread sets it when it is done.
+            self._due = np.inf  # The thread sets it when done.
             self._encoder = threading.Thread(target=self._encode, args=(model, began), daemon=True)
             self._encoder.start()
         began = self._now()
@@ -144,7 +144,7 @@ class LiveView:
             return json.dumps(self._status | {"is_paused": self._paused.is_set()}).encode()
 
     def _note(self, run: StageRun) -> None:
-        history, self._noted = run.history, self._now()  # A long history takes time to put together.
+        history, self._noted = run.history, self._now()  # Assembling a long history takes time.
         found: dict[str, Any] = {"stage": run.stage.name, "iterations": run.stage.iterations}
         if len(history.iteration):
             found |= {
@@ -227,12 +227,12 @@ def export_web(
                 raise ValueError("there are no photographs of the model's cameras: leave out `photographs`")
             files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in views}
         files[out / PHOTOGRAPHS_NAME] = json.dumps(views).encode()
-        files[page] = viewer_html().encode()  # Last, so that it never shows files that are not there yet.
+        files[page] = viewer_html().encode()  # Last, so that the page never refers to missing files.
         for path in files:
             check_new(path, "`web`", overwrite=overwrite)
         with contextlib.suppress(OSError, ValueError, TypeError):  # There may be no page.
             old = {out / photograph_name(int(index)) for index in read_json(out / PHOTOGRAPHS_NAME)}
-    # Nothing is written before all files were checked and all contents made.
+    # Nothing is written until all files are checked and all contents made.
     for path, content in files.items():
         with replacing(path) as temporary:
             temporary.write_bytes(content)
@@ -252,7 +252,7 @@ def losses_of(source: Source) -> dict[str, float]:
     model = source.model
     if not model.num:
         return {}
-    # The near plane that the page has.
+    # The page's near plane.
     settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
     again, scene = decode_model(source.encoded), source.load_scene_or_warn()
     if scene is not None:

@@ -6,13 +6,13 @@ from importlib import resources
 SCENE_NAME = "scene.a2tgz"
 """Name of the scene file next to the page."""
 PHOTOGRAPHS_NAME = "photographs.json"
-"""Name of the list of cameras with photographs next to the page, as `photograph_name` names them."""
+"""Name of the list of cameras with photographs next to the page (`photograph_name`)."""
 STATUS_NAME = "training.json"
 """Name of the status of a running training, which the page polls while it exists."""
 
 
 def viewer_html(*, is_training: bool = False) -> str:
-    """Return the viewer's page, which shows the scene next to it, or follows a running training."""
+    """Return the viewer's page for the scene next to it, or for a running training."""
     page = resources.files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
     # An attribute, not a script: the page's policy allows no other script than its own.
     return page.replace("<html ", '<html data-training="yes" ', 1) if is_training else page
@@ -20,7 +20,7 @@ def viewer_html(*, is_training: bool = False) -> str:
 
 def viewer_html_with(scene: bytes) -> str:
     """Return the viewer's page with a scene in it; it needs no other file."""
-    # Text that no browser runs, so that the page's policy needs to allow nothing more, before the script.
+    # text/plain, which browsers do not run, so that the page's policy stays as it is; before the script.
     data = f'<script type="text/plain" id="scene-data">{base64.b64encode(scene).decode("ascii")}</script>\n  '
     head, script, rest = viewer_html().partition('<script type="module">')
     return f"{head}{data}{script}{rest}"

@@ -1,4 +1,4 @@
-"""Server of a page and its files from memory; runs on waitress.
+"""Server of a page and its files from memory, on waitress.
 
 It listens on the loopback, or on a network. There it answers only below a random path, the token: the address grants
 access.
@@ -40,7 +40,7 @@ class Route:
 
     content_type: str
     content: bytes | Callable[[], bytes | None]
-    """Bytes, or a function that finds them at each request and returns None if there are none."""
+    """Bytes, or a function that returns them for each request, None if there are none."""
     act: Callable[[], None] | None = None
     """Function called first. Such a path answers only POST requests from the page itself."""
 
@@ -50,12 +50,12 @@ class Route:
 
 @dataclasses.dataclass(frozen=True)
 class Door:
-    """Address at which a server listens, and the token that lets requests in."""
+    """Address of a server, and the token that requests need."""
 
     name: str = LOOPBACK
-    """Name or address by which the user named this machine."""
+    """Name or address of this machine, as the user gave it."""
     address: str = LOOPBACK
-    """IPv4 address at which it listens; 0.0.0.0 for all of this machine."""
+    """IPv4 address to listen on; 0.0.0.0 for all of this machine's."""
     port: int = 0
     token: str = ""
     """First part of every path; empty for none."""
@@ -79,7 +79,7 @@ class Door:
         return is_own and port == str(self.port)
 
     def behind(self, path: str) -> str | None:
-        """Return the path behind the token; None if the path has another token or none."""
+        """Return the path after the token; None if the token is wrong or missing."""
         if not self.token:
             return path
         # Compared in constant time: the time of an answer must not reveal the token.
@@ -88,7 +88,7 @@ class Door:
 
 
 def lan_address() -> str:
-    """Return the IPv4 address by which the network reaches this machine; the loopback if there is no network."""
+    """Return this machine's IPv4 address in the network; the loopback without a network."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((ELSEWHERE, 9))  # Chooses an interface and sends nothing.
@@ -100,8 +100,8 @@ def lan_address() -> str:
 def application(routes: Mapping[str, Route], door: Door) -> Application:
     """Answer GET and HEAD, or POST, at the paths of `routes`, such as "/", and nothing else.
 
-    A request must name this machine as its host, and begin its path with the door's token. A page from elsewhere, whose
-    name is made to lead here, cannot read the scene.
+    A request must name this machine as its host, and its path must begin with the door's token. Pages of other sites
+    cannot read the scene, even if their names resolve to this machine.
     """
 
     def answer(
@@ -138,14 +138,14 @@ def serve(
     """Serve until Ctrl-C, the usual end of a server.
 
     Args:
-      routes: what is answered, by path.
+      routes: routes by path.
       host: address to listen on; any but the loopback opens the server to the network, below a random path.
-      port: on that address; 0 is a free one.
-      on_start: called with the address once it answers.
+      port: port number; 0 is a free one.
+      on_start: function called with the URL once the server answers.
 
     Raises:
       ValueError: if waitress is not installed, the port is taken, or this machine has no such address.
-      Stopped: if the process is to end otherwise (`signals.raised`).
+      Stopped: if another signal ends the process (`signals.raised`).
     """
     with _running(routes, host, port) as (url, ended):  # In a thread: waitress hides how its loop ended.
         try:
@@ -161,7 +161,7 @@ def serve(
 
 @contextlib.contextmanager
 def served(routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0) -> Iterator[str]:
-    """Serve in a thread within the block, and yield the address. Arguments and errors as in `serve`.
+    """Serve in a thread during the block, and yield the URL. Arguments and errors as in `serve`.
 
     An error that ends the server is a warning at the end of the block.
     """
@@ -173,7 +173,7 @@ def served(routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0) 
 
 @contextlib.contextmanager
 def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tuple[str, Future[None]]]:
-    """Yield the address of a server in a thread, and a future of its end or the error that ended it."""
+    """Yield the URL of a server in a thread, and a future for its end or the error that ended it."""
     try:
         waitress: Any = importlib.import_module("waitress")
     except ImportError as error:
@@ -181,7 +181,7 @@ def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tupl
     try:
         if not 0 <= port < 2**16:  # `create_server` would leave the socket open.
             raise OverflowError("ports are 0 to 65535")
-        listening = socket.create_server((host, port))  # It may reuse a port of a program that has just ended.
+        listening = socket.create_server((host, port))  # SO_REUSEADDR: a port freed a moment ago may be reused.
     except (OSError, OverflowError, UnicodeError) as error:
         place, remedy = f"port {port}", "leave out --port for a free one"
         if host != LOOPBACK:
