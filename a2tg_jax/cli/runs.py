@@ -135,6 +135,7 @@ class Render:
         run = open_run(self.folder)
         out = self.out or run.path / "frames"
         check_rate(self.fps)
+        # Fields of the class are the defaults.
         if self.path == "test" and (self.frames, self.fps) != (Render.frames, Render.fps):
             raise ValueError("--frames and --fps have no effect on --path test: leave them out")
         size = None if self.size is None else parse_size(self.size)
@@ -142,6 +143,7 @@ class Render:
             raise ValueError(f"--supersample must be at least 1; got {self.supersample}")
         check_output(out)
         if self.path != "test":
+            # Before minutes of rendering.
             FrameFolder(out).check([video_name()], overwrite=self.overwrite)
         paths = render_frames(
             run,
@@ -197,6 +199,7 @@ class MeshCommand:
             check_export(file, default, "--out", overwrite=self.overwrite)
         print(write_mesh(source, out, self.options))
         if is_run and out.resolve() == default.resolve():
+            # Listed, so that the next a2tg mesh may replace it (check_export).
             RunFolder(self.source).own(default)
 
 
@@ -265,6 +268,7 @@ class Export:
             raise ValueError("give --web PATH for a page, or --ply FILE for other programs")
         if self.float64 and self.ply is None:
             raise ValueError("--float64 has no effect without --ply: add it")
+        # All outputs are checked before the first one is written.
         if self.ply is not None:
             check_output(self.ply)
             check_ply(self.ply)

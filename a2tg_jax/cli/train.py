@@ -150,6 +150,7 @@ class Train:
     """Time without a sign of life after which a process counts as lost and the others stop, with --coordinator."""
 
     def run(self) -> None:
+        # Processes must join before anything starts the devices of JAX.
         with joined(self.place) as team:
             session = Session(after_compiling=tidy_memory, devices=devices_named(self.devices))
             most = bytes_allowed(self.max_memory)
@@ -301,6 +302,7 @@ def devices_named(text: str) -> list[jax.Device] | None:
     if not text.isdecimal() or not 1 <= int(text) <= len(devices):
         found = f"this machine has {counted(len(devices), f'{devices[0].platform.upper()} device')}"
         raise ValueError(f"--devices must be all, or a number from 1 to {len(devices)}; got {text!r}: {found}")
+    # By process, so that all have the same list.
     by_process = [jax.local_devices(process_index=index) for index in range(jax.process_count())]
     chosen = [device for own in by_process for device in own[: int(text)]]
     return chosen if len(chosen) > 1 else None

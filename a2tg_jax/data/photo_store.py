@@ -248,6 +248,7 @@ class Shelf:
     def _left(self, pixels: np.ndarray, source: Path, view: Processing | None) -> Picture:
         """Return a picture of pixels without room in memory. Arguments as for `keep`."""
         if view is None or (is_remote(source) and not self._takes_disk(pixels.nbytes)):
+            # docs/reliability.md, "Photographs beyond the memory"
             checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
             return Picture(pixels.shape, _FileRead(source, view, checksum), is_remote=is_remote(source))
         folder, shape = cache_folder(), pixels.shape

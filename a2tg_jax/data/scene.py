@@ -165,6 +165,7 @@ def kinds_of(views: Sequence[View]) -> list[tuple[int, int, int]]:
 
 def _lenses(views: Sequence[View]) -> dict[int, Array]:
     """Return the rays of each lens by their identity, in order of appearance; its views share the array."""
+    # By identity: arrays have no hash, and lenses.Lens.rays gives views of one lens one array.
     return {id(view.camera.rays): view.camera.rays for view in views if view.camera.rays is not None}
 
 

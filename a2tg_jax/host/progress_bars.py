@@ -69,5 +69,6 @@ def is_line_due(done: int, total: int, printed: int, at: float) -> bool:
       printed: number of items at the last line.
       at: time of the last line, by `time.perf_counter`.
     """
+    # Without a total (0), the seconds alone decide.
     is_next = done - printed >= PLAIN_SHARE * total and time.perf_counter() - at >= PLAIN_SECONDS
     return is_next or done == total
