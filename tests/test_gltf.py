@@ -411,7 +411,7 @@ CHANGES = [
     (lambda d: d["nodes"][0].update(matrix=np.diag([1.0, -1.0, 1.0, 1.0]).ravel().tolist()), "must have a rotation"),
     (lambda d: first_primitive(d)["extras"]["a2tg"]["origin"].update(scale=-1.0), "positive scale"),
     (lambda d: first_primitive(d)["extras"]["a2tg"]["origin"].update(Ks=["a"]), "numbers"),
-    (lambda d: first_primitive(d)["extras"]["a2tg"]["appearance"].update(module="os", name="system"), "which is unknown"),
+    (lambda d: first_primitive(d)["extras"]["a2tg"]["appearance"].update(module="os", name="system"), "is unknown"),
     (lambda d: first_primitive(d)["attributes"].pop(f"{SPLATS}:SH_DEGREE_2_COEF_3"), "lack KHR.*SH_DEGREE_2_COEF_3"),
     (lambda d: first_primitive(d).pop("extensions"), "holds no splats"),
     (lambda d: first_primitive(d).pop("attributes"), "damaged"),
