@@ -492,7 +492,7 @@ def part(name, place, value):
         (header_with(base_degree=4), "base degree"),
         (header_with(base_degree=3), "degrees must be in 3..3"),
         (header_with(degrees=[0, 1, 2, 7]), "degrees must be in 0..3"),
-        (header_with(degrees=[]), "degrees are of a table that is empty"),
+        (header_with(degrees=[]), "degrees refer to an empty table"),
         (header_with(degrees=[0, 3]), "must be below 2|the part degrees"),
         (header_with(degrees="0123"), "degrees must be"),
         (sizes_of(16, 16), "the part texel_colors"),
@@ -532,12 +532,12 @@ def part(name, place, value):
         (header_with(appearance__module="os", appearance__name="system"), "which is unknown"),
         (header_with(appearance__parts__texture__start=7), "options of Texture"),
         (header_with(appearance__parts={}), "degrees must be in 0..0"),
-        (lambda header: header["appearance"]["parts"].pop("exponents"), "the part shapes is not known"),
+        (lambda header: header["appearance"]["parts"].pop("exponents"), "the part shapes is unknown"),
         (header_with(appearance__parts={"wings": {}}), "damaged"),
         (header_with(appearance=None), "damaged"),
         (header_with(origin__names=["x"] * 1000), "the part origin_viewmats|too small"),
         (header_with(background=[0, 1]), "unpack"),
-        (lambda header: header.pop("origin"), "the part origin_viewmats is not known"),
+        (lambda header: header.pop("origin"), "the part origin_viewmats is unknown"),
         (lambda header: header.pop("num"), "damaged"),
     ],
 )  # fmt: skip
@@ -617,7 +617,7 @@ def test_a_reader_reads_all_or_nothing():
     reader.numbers("a", 3, 3, 8)
     with pytest.raises(ValueError, match="the part a is missing"):
         reader.numbers("a", 3, 3, 8)
-    with pytest.raises(ValueError, match="the part b is not known"):
+    with pytest.raises(ValueError, match="the part b is unknown"):
         reader.end()
     with pytest.raises(ValueError, match="its parts must have"):
         ColumnReader(writer.body[:-1], writer.parts, writer.ends, 1000)

@@ -169,11 +169,11 @@ def test_newest_checkpoints_are_kept(tmp_path):
 
 def test_places_that_cannot_be_written_are_named(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match=r"run cannot be made, for .*file is a file$"):
+    with pytest.raises(ValueError, match=r"run cannot be made, because .*file is a file$"):
         check_output(tmp_path / "file" / "run")
     check_output(tmp_path / "file")
     if sys.platform == "linux":
-        with pytest.raises(ValueError, match=r"^/proc/x cannot be made, for nothing can be written in /proc: "):
+        with pytest.raises(ValueError, match=r"^/proc/x cannot be made, because /proc is not writable: "):
             check_output(Path("/proc/x"))
 
 

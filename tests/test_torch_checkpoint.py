@@ -145,7 +145,7 @@ HOSTILE = {
     "reaches beyond": {"splats": {**tensors(), "means": Tensor(np.zeros((7, 3)), reaching)}},
     "negative": {"splats": {**tensors(), "means": Tensor(np.zeros((7, 3)), lambda s, o, n, t: (s, o, n, (-1, 1)))}},
     "no means": {"splats": {name: tensor for name, tensor in tensors().items() if name != "means"}},
-    "no checkpoint": {"splats": {**tensors(), "means": Tensor(np.zeros((7, 3)), lambda s, o, n, t: (s, o, 3, t))}},
+    "PyTorch checkpoint": {"splats": {**tensors(), "means": Tensor(np.zeros((7, 3)), lambda s, o, n, t: (s, o, 3, t))}},
     "coefficients": {"splats": {**tensors(), "shN": Tensor(np.zeros((7, 5, 3)))}},
     "finite": {"splats": {**tensors(), "means": Tensor(np.full((7, 3), np.nan))}},
 }
@@ -209,5 +209,5 @@ def test_checkpoints_are_not_written(tmp_path):
     with pytest.raises(ValueError, match="can be read, but not written"):
         save_splats(tmp_path / "a.pt", Model(some_gaussians()))
     (tmp_path / "a.pt").write_bytes(b"\x80\x02}q\x00.")
-    with pytest.raises(ValueError, match=r"PyTorch 1\.6"):
+    with pytest.raises(ValueError, match=r"PyTorch checkpoint \(1\.6"):
         load_splats(tmp_path / "a.pt")

@@ -64,7 +64,7 @@ def read_archive(
             raise ValueError(f"it has no {missing[0]}")
         header = parse_json(arrays.pop(HEADER).tobytes())
         if not isinstance(header, dict):
-            raise ValueError("its header is no JSON object")
+            raise ValueError("its header is not a JSON object")
     except ValueError as error:
         reason = str(error).removeprefix(f"{path}: ")
         raise ValueError(f"{path}: is not an {format}, or is damaged ({reason}); copy or write it again") from error

@@ -104,13 +104,13 @@ def _decoded(coder: str, data: bytes, num_planes: int, length: int) -> np.ndarra
     if coder == "zstd":
         announced = zstandard.get_frame_parameters(data).content_size
         if announced != size:  # The library would allocate this many bytes.
-            raise ValueError(f"its frame is of {announced} bytes")
+            raise ValueError(f"its frame has {announced} bytes")
         return np.frombuffer(zstandard.ZstdDecompressor().decompress(data, allow_extra_data=False), np.uint8)
     num, height, width = _webp_shape(num_planes, length)
     with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
         # Before any pixel is decoded: the header alone decides how much Pillow allocates.
         if image.size != (width, num * height):
-            raise ValueError(f"its image is of {image.size} pixels")
+            raise ValueError(f"its image has {image.size} pixels")
         pixels = np.asarray(image.convert("RGB"))
     planes = pixels.reshape(num, height * width, WEBP_CHANNELS).transpose(0, 2, 1).reshape(-1, height * width)
     # The last image is padded to three channels, and each plane to a whole rectangle.
@@ -410,7 +410,7 @@ class ColumnReader:
     def end(self) -> None:
         """Raise ValueError unless all parts were read."""
         if left := [name for name, parts in self._parts.items() if parts]:
-            raise ValueError(f"the part {left[0]} is not known")
+            raise ValueError(f"the part {left[0]} is unknown")
 
     def exact(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         planes = self.planes(name, np.dtype(dtype).itemsize, math.prod(shape))
@@ -418,7 +418,7 @@ class ColumnReader:
 
     def indices(self, name: str, length: int, count: int) -> np.ndarray:
         if count == 0 and length:
-            raise ValueError(f"{name} are of a table that is empty")
+            raise ValueError(f"{name} refer to an empty table")
         self._take_room(name, length)  # A table of one row has no bytes, but its indices take memory.
         num_planes = num_bytes_of(max(count - 1, 0).bit_length())
         indices: np.ndarray = from_planes(self.planes(name, num_planes, length), 1)[0]

@@ -117,7 +117,7 @@ def _to_json(value: Any) -> Any:
         return {name: _to_json(item) for name, item in value.items()}
     if isinstance(value, tuple):
         return [_to_json(item) for item in value]
-    # NumPy's scalars and arrays are no JSON.
+    # JSON has no NumPy scalars and arrays.
     return value.tolist() if hasattr(value, "tolist") else value
 
 

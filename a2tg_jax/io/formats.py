@@ -90,7 +90,7 @@ def format_of(path: str | os.PathLike[str]) -> FileFormat:
     for suffix, found in FORMATS.items():
         if name.endswith(suffix):
             return found
-    raise ValueError(f"{shortened(os.fspath(path))}: no format is known by this suffix; known are {', '.join(FORMATS)}")
+    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix; known are {', '.join(FORMATS)}")
 
 
 def writer_of(path: str | os.PathLike[str]) -> Writer:

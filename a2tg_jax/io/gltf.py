@@ -235,7 +235,7 @@ def _shown(document: Document, described: Mapping[str, Any], splats: others.Elli
     def integers(name: str, kind: str, most: int) -> np.ndarray:
         values = document.numbers(described[name], kind, f"{EXTENSION}.{name}")
         if len(values) != num or not ((values >= 0) & (values <= most) & (values % 1 == 0)).all():
-            raise ValueError(f"{EXTENSION}.{name} must be {num} times whole numbers in 0..{most}")
+            raise ValueError(f"{EXTENSION}.{name} must be {num} integers in 0..{most}")
         return values.astype(np.int64)
 
     sizes, texels, shapes, degrees = None, None, None, np.full(num, sh_degree)
@@ -276,7 +276,7 @@ def _texels(document: Document, described: Mapping[str, Any], count: int) -> np.
     if "texels" in described:
         texels = document.numbers(described["texels"], "VEC4", f"{EXTENSION}.texels")
     if len(texels) != count:
-        raise ValueError(f"{EXTENSION}.sizes are of {count} texels, but there are {len(texels)}")
+        raise ValueError(f"{EXTENSION}.sizes need {count} texels, but there are {len(texels)}")
     for name, columns in RANGES.items() if "texelRanges" in described else ():
         low, high = described["texelRanges"][name]
         if not all(type(end) in (int, float) and abs(end) <= LARGEST_FLOAT for end in (low, high)):

@@ -141,7 +141,7 @@ class Document:
         if type(index) is not int or not isinstance(entries, list) or not 0 <= index < len(entries):
             raise ValueError(f"has no {kind}[{shortened(index)}]")
         if not isinstance(entries[index], dict):
-            raise ValueError(f"its {kind}[{index}] is no object")
+            raise ValueError(f"its {kind}[{index}] is not an object")
         return entries[index]
 
     def numbers(self, index: object, kind: str, what: str) -> np.ndarray:
@@ -194,7 +194,7 @@ class Document:
     def _read(self, uri: Any) -> bytes:
         """Return the bytes of a buffer that is a file in the same folder, or embedded in the JSON."""
         if not isinstance(uri, str):
-            raise ValueError("the uri of a buffer is no text")
+            raise ValueError("the uri of a buffer is not text")
         if uri.startswith("data:"):
             head, mark, text = uri.partition("base64,")
             try:
@@ -250,7 +250,6 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
         place += CHUNK.size
         if place + length > total:
             raise ValueError("is damaged: a chunk is longer than the file")
-        # The first of a kind counts.
         chunks.setdefault(kind, data[place : place + length])
         place += length
     if JSON_CHUNK not in chunks:

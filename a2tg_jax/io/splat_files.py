@@ -215,12 +215,12 @@ def _ksplat_splats(data: bytes) -> others.Ellipsoids:
     """Return the splats of all sections."""
     if len(data) < HEADER_BYTES:
         raise ValueError(
-            f"is no .ksplat file, or is cut off: its header has {HEADER_BYTES} bytes, the file {len(data)}"
+            f"is not a .ksplat file, or is cut off: its header has {HEADER_BYTES} bytes, the file {len(data)}"
         )
     major, minor, num_sections, _, _, _, level, *_, low, high = KSPLAT_HEADER.unpack_from(data)
     if (major, minor) != KSPLAT_VERSION or level > 2:
         raise ValueError(
-            f"is no .ksplat file of version 0.1 and compression level 0 to 2; got {major}.{minor}, level {level}"
+            f"is not a .ksplat file of version 0.1 and compression level 0 to 2; got {major}.{minor}, level {level}"
         )
     start = HEADER_BYTES + num_sections * SECTION_BYTES
     if start > len(data):

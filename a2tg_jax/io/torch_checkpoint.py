@@ -66,7 +66,7 @@ def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
             raise ValueError(f"{path}: {error}") from None
         except Exception as error:  # A damaged pickle may raise anything.
             reason = shortened(str(error) or type(error).__name__, 200)
-            raise ValueError(f"{path}: is no checkpoint of PyTorch 1.6 or newer, or is damaged ({reason})") from error
+            raise ValueError(f"{path}: is not a PyTorch checkpoint (1.6 or newer), or is damaged ({reason})") from error
     with reading(path):
         return _gaussians_of(arrays, path)
 
@@ -157,7 +157,7 @@ def _unpickled(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
             return entry.read(num_bytes)
 
     if folder + "byteorder" in names and start(folder + "byteorder", len(BYTE_ORDER) + 1) != BYTE_ORDER:
-        raise _Refused("is a checkpoint of a big-endian machine")
+        raise _Refused("is from a big-endian machine")
     data = start(pickled, MOST_PICKLE_BYTES + 1)
     if len(data) > MOST_PICKLE_BYTES:
         raise _Refused(f"has a pickle of more than {MOST_PICKLE_BYTES:,} bytes")

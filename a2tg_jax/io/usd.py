@@ -121,7 +121,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if usd-core is missing, or it is no USD file, is damaged, or holds no splats.
+      ValueError: if usd-core is missing, or the file is not USD, is damaged, or holds no splats.
     """
     check_suffix(path, "load_usd")
     usd, path = import_usd(), Path(path)
@@ -139,7 +139,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
                 ((_model_of(usd, prim, path), _world_of(usd, prim, unit)) for prim in fields), up
             )
         except RuntimeError as error:  # usd-core's errors, which have several lines.
-            raise ValueError(f"is no USD file, or is damaged ({shortened(str(error))})") from error
+            raise ValueError(f"is not a USD file, or is damaged ({shortened(str(error))})") from error
 
 
 def _world_of(usd: Any, prim: object, unit: float) -> np.ndarray:

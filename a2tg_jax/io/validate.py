@@ -150,7 +150,7 @@ def check_count(name: str, value: object, most: int) -> None:
 
 
 def check_like(name: str, tree: object, wanted: object) -> None:
-    """Raise ValueError, naming the leaf, unless two pytrees of one structure have the same shapes and dtypes."""
+    """Raise ValueError, naming the leaf, unless two pytrees of the same structure have equal shapes and dtypes."""
     pairs: Iterable[Any] = zip(jax.tree_util.tree_leaves_with_path(tree), jax.tree.leaves(wanted), strict=True)
     for (path, leaf), like in pairs:
         label = f"{name}{jax.tree_util.keystr(path)}"

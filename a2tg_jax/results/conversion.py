@@ -93,7 +93,7 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
         raise ValueError(f"`bake` needs a model with cameras; {source} has none")
     shown = model.appearance
     if shown.is_portable and shown.texture is None and shown.exponents is None:
-        return model, "baked: nothing, for the model is plain"
+        return model, "baked: nothing, because the model is plain"
     training, held_out = cameras_apart(model.origin)
     plain = bake(model, training, growth=options.growth, iterations=options.iterations, progress=True)
     # The bake has not seen held-out cameras, so that they judge it fairly.

@@ -331,14 +331,14 @@ def check_output(path: Path) -> None:
     missing = [folder for folder in (place, *place.parents) if not folder.exists()]
     existing = missing[-1].parent if missing else place if place.is_dir() else place.parent
     if not existing.exists():
-        raise ValueError(f"{path} cannot be made, for there is no {existing}")
+        raise ValueError(f"{path} cannot be made, because there is no {existing}")
     if not existing.is_dir():
-        raise ValueError(f"{path} cannot be made, for {existing} is a file")
+        raise ValueError(f"{path} cannot be made, because {existing} is a file")
     try:
         # Trying is the only sure test: permissions, read-only mounts and network drives differ.
         os.rmdir(tempfile.mkdtemp(dir=existing))
     except OSError as error:
-        raise ValueError(f"{path} cannot be made, for nothing can be written in {existing}: {error.strerror}") from None
+        raise ValueError(f"{path} cannot be made, because {existing} is not writable: {error.strerror}") from None
     if len(missing) > 1 and not existing.is_relative_to(os.getcwd()):
         print(f"a2tg: {missing[-1]} does not exist and will be made", file=sys.stderr)
 

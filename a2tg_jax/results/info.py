@@ -67,6 +67,7 @@ def read_psnrs(path: Path) -> dict[str, dict[str, float]]:
     try:
         for name, model in data["models"].items():
             psnrs[name] = {split: model[split]["psnr"] for split in SPLITS if split in model}
+            # Not isinstance: true would be printed as 1.00 dB.
             if not all(type(psnr) in (int, float) for psnr in psnrs[name].values()):
                 raise TypeError
     except (KeyError, TypeError, AttributeError):
@@ -85,6 +86,7 @@ def _stage_facts(run: RunFolder, name: str) -> dict[str, Any]:
         return {"state": "in training", "iteration": iteration_of(newest), "checkpoint": str(newest)}
     try:
         model = load_model(path)
+    # A damaged file must not hide the other stages.
     except ValueError as error:
         return {"state": "damaged", "damage": str(error)}
     facts = {"state": "finished", "model": str(path), "num_gaussians": model.num, "num_bytes": model.num_bytes}
