@@ -175,7 +175,7 @@ def _grid(parents: Gaussians, shapes: np.ndarray | None, texels: np.ndarray, v: 
         np.linalg.inv(np.exp(-0.5 * ((means[:, None] - means[None, :]) / widths[None, :]) ** 2))
         for means, widths in (v, u)
     ]
-    # The shares are a product of the two axes, so that two small inverses do.
+    # The shares are products over the two axes, so that two small inverses suffice.
     own = np.einsum("vw,nwx,xu->nvu", unmixed[0], depths, unmixed[1].T)
     # The inverse may give negative depths next to opaque texels.
     alphas = np.clip(1 - np.exp(-np.maximum(own, 0)), 1e-6, MOST_ALPHA).reshape(-1)

@@ -154,7 +154,7 @@ def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDE
       ladder: steps of groups, from coarse to fine.
 
     Returns:
-      Trials from coarse to fine, for each group of which the model has numbers.
+      Trials from coarse to fine, for each group that the model has.
     """
     finest = finest_choices(ladder)
     trials = []

@@ -98,7 +98,7 @@ def _solve(
     model: Model, groups: list[Targets], background: Array, settings: RenderSettings, num_steps: int, ridge: ArrayLike
 ) -> Colors:
     """Return the changes of the colours."""
-    # A linear function's derivative is the same at any point: 0 will do.
+    # A linear function has the same derivative everywhere: it is taken at 0.
     nothing = jax.tree.map(jnp.zeros_like, colors_of(model))
 
     def pulled(residual: Callable[[Camera, Targets], Array]) -> Colors:

@@ -94,7 +94,7 @@ class Step(NamedTuple):
 
 
 def _cheapest(model: Model, step: Step, is_allowed: Callable[[Model], bool]) -> Model:
-    """Return the model after the cheapest steps per byte, as many as are allowed."""
+    """Return the model after as many of the cheapest steps per byte as allowed."""
     order = np.argsort(step.cost / np.maximum(step.saved, 1), kind="stable")
     # Textures of odd sides have no step.
     order = order[step.saved[order] > 0]

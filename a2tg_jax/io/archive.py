@@ -1,6 +1,6 @@
 """Archives: named arrays with a JSON header in one uncompressed .npz, readable by numpy alone.
 
-The entry "header" holds the JSON text as bytes; its "format" and "version" say what the file is.
+The entry "header" is JSON text as bytes; its "format" and "version" identify the file.
 """
 
 import json
@@ -41,7 +41,7 @@ def write_archive(
     text = json.dumps({**header, "format": format, "version": VERSION}, allow_nan=False)
     # The header is bytes, not a NumPy string: `read_npz` accepts numbers only.
     entries = {HEADER: np.frombuffer(text.encode(), np.uint8), **{name: np.asarray(a) for name, a in arrays.items()}}
-    # To a path without .npz NumPy would append it, so that `replacing` would not find the file.
+    # An open file, because NumPy appends .npz to paths without it, and `replacing` would not find the result.
     with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **entries)  # type: ignore[arg-type]
 

@@ -265,7 +265,7 @@ def num_bytes_of(bits: int) -> int:
 
 def to_byte_planes(values: np.ndarray) -> np.ndarray:
     """Return uint8 [C·itemsize, n]: the lowest bytes of numbers [C, n] of any type, column by column, then the next."""
-    # Little-endian whatever the machine: the lowest byte comes first in the file.
+    # Little-endian on any machine: the lowest byte comes first in the file.
     values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     num_columns, length = values.shape
     # High bytes of neighbours are alike, low ones are noise: apart, they compress better.
@@ -345,7 +345,7 @@ class ColumnWriter:
             return
         ends = Ends(*self._known_ends[name]) if name in self._known_ends else ends_of(values, precision)
         self.ends[name] = list(ends)
-        # A constant needs no planes: the ends say it all.
+        # A constant needs no planes: its ends are enough.
         if ends.low == ends.high:
             self.planes(name, np.zeros((0, values.shape[1]), np.uint8))
             # Readers count these numbers against the room, although they have no bytes.

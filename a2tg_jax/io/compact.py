@@ -151,7 +151,7 @@ def load_compact(path: str | os.PathLike[str]) -> Model:
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is not a compact scene, is damaged, or is of another version.
+      ValueError: if it is not a compact scene, is damaged, or has another version.
     """
     check_suffix(path, "load_compact")
     return decode_model(existing_bytes(path, "compact scene"), os.fspath(path))

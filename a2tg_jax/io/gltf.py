@@ -43,7 +43,7 @@ OWN = "a2tg"
 """Key in the extras of splats for what belongs to their model."""
 TexelKind = Literal["float32", "uint8"]
 OPTIONS = {"uv": "uv", "outside": "outside", "rgb": "rgb", "alpha": "alpha", "maxAlpha": "max_alpha"}
-"""Names of the options that say how textures are shown, and their fields."""
+"""Names of the options of the texture lookup, and their fields."""
 RANGES = {"rgb": slice(0, 3), "alpha": slice(3, 4)}
 """Columns of texels that share ends."""
 
@@ -255,7 +255,7 @@ def _shown(document: Document, described: Mapping[str, Any], splats: others.Elli
         if len(log_exponents) != num:
             raise ValueError(f"{EXTENSION}.shapes must be {num} numbers; got {len(log_exponents)}")
         shapes = shapes_of(log_exponents)
-    # Rows are not left out: the tables of the extension are by row.
+    # No rows are dropped: the extension's tables are by row.
     gaussians = others.gaussians_of(splats, document.path, is_flat=has_textures or has_shapes, keeps_all=True)
     # `Bands` keeps tables up to the highest degree, empty ones included.
     sh = splats.sh if not has_degrees else np.pad(splats.sh, ((0, 0), (0, NUM_BASES[-1] - highest), (0, 0)))

@@ -161,7 +161,7 @@ def gaussians_of(
     Otherwise the thinnest axis becomes the normal. Splats with numbers that are not finite are dropped with a warning,
     unless `keeps_all`.
     """
-    # A textured file has tables by row: none can be left out.
+    # A textured file has tables by row: none can be dropped.
     if not keeps_all:
         kept = whole_rows(os.fspath(path), splats.scales, splats.means, splats.quats, splats.opacities, splats.sh)
         splats = Ellipsoids(*(values[kept] for values in splats))

@@ -144,7 +144,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: if it is no PLY, is cut off, lacks an attribute, or has no Gaussian of finite numbers.
+      ValueError: if it is not a PLY, is cut off, lacks an attribute, or has no finite Gaussian.
     """
     check_suffix(path, "load_ply")
     model = load_ply_model(path)

@@ -200,11 +200,10 @@ def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
 
 def load_ksplat(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians of any compression level, in the world of the file. Ellipsoids are flattened as in `load_ply`.
-    FileNotFoundError: there is no such file. ValueError: it is no such file, is cut off, inconsistent, or has no
-    splats."""
+    FileNotFoundError: there is no such file. ValueError: it is not a .ksplat, cut off, inconsistent, or empty."""
     data = existing_bytes(path, "file")
     with reading(path):
-        with np.errstate(over="ignore", invalid="ignore"):  # What is not finite is left out.
+        with np.errstate(over="ignore", invalid="ignore"):  # Rows that are not finite are dropped.
             splats = _ksplat_splats(data)
         gaussians = others.gaussians_of(splats, path, is_flat=False)
         check_model(Model(gaussians))

@@ -83,7 +83,7 @@ def align_poses(
       num_steps: number of Adam steps.
 
     Raises:
-      ValueError: if an argument is of another kind, or there are no views.
+      ValueError: if an argument has the wrong type, or there are no views.
     """
     check_are_views(views, "align_poses(scene.test, model)")
     check_is_model(model)

@@ -130,7 +130,7 @@ def parameter_bytes(gaussians: Gaussians, textures: Textures | None = None) -> i
       textures: their textures; None without textures.
 
     Raises:
-      ValueError: if one is of another kind.
+      ValueError: if an argument has the wrong type.
     """
     check_kind("gaussians", gaussians, Gaussians, "say model.num_bytes" if hasattr(gaussians, "num_bytes") else "")
     if textures is not None:

@@ -193,7 +193,7 @@ def fuse(grid: BlockGrid, depths: RenderedDepth, space: Space) -> None:
 
 
 def _blocks_near(depths: RenderedDepth, space: Space) -> Array:
-    """Return blocks [P, 3] around the depths along their rays, with repetitions; NOWHERE where there is no depth."""
+    """Return blocks [P, 3] around the depths along their rays, with repetitions; NOWHERE without a depth."""
     points = back_project(depths.depth, depths.camera).reshape(-1, 3)
     rays = points - depths.camera.center[None]
     rays = rays / jnp.maximum(jnp.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)

@@ -150,7 +150,7 @@ class Raster(NamedTuple):
 
 
 def draw_view(mesh: Mesh, camera: Camera) -> Raster:
-    """Draw a mesh in the view of a camera; faces that reach behind the camera are left out."""
+    """Draw a mesh in a camera's view, without faces that reach behind the camera."""
     viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
     at = mesh.vertices @ viewmat[:3, :3].T + viewmat[:3, 3]
     z = at[:, 2]

@@ -114,7 +114,7 @@ def render_frames(
       size: width and height of the frames, views being cropped to their aspect; None: the cameras' sizes.
 
     Raises:
-      ValueError, OSError: if that stage is not finished, there are no such views or path, or a file is in the way.
+      ValueError, OSError: if that stage is not finished, the views or the path are missing, or a file is in the way.
     """
     if num_frames < 1:
         raise ValueError(f"the number of frames must be at least 1; got {num_frames}")

@@ -82,7 +82,7 @@ def unseen(scene: Scene) -> AbstractContextManager[Watch]:
 
 @dataclasses.dataclass(frozen=True)
 class RunOptions:
-    """Options of a run's execution. The model does not depend on them, except for last bits on other devices."""
+    """Options of a run's execution. They do not affect the model, except for last bits on other devices."""
 
     overwrite: bool = False
     """Replace the run that is in the folder; it is deleted once the new run has its report."""
