@@ -145,8 +145,7 @@ def chosen_system(name: str, preset: str | None = None) -> System:
 
 def compared_system(name: str, other: System, preset: str | None = None) -> System:
     """Return a system by name, with another's options where names match and its own preset's otherwise, if it has that
-    preset. Options set by an instance take precedence. Raises ValueError if there is no such
-    system."""
+    preset. Options set by an instance take precedence. Raises ValueError if there is no such system."""
     found = find_system(name)
     kind = type(found)
     start = kind() if preset is None else kind.presets().get(preset, kind())
