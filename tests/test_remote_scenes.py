@@ -321,7 +321,7 @@ def write_nothing_known(folder):
         ("nos3fs://bucket/fox", ValueError, "nos3fs://bucket/fox: s3fs is needed: pip install s3fs$"),
         ("memory://[bucket", FileNotFoundError, r"memory://\[bucket: no such scene folder"),
         ("s3://", ValueError, "s3://: names no folder; write s3://bucket/scene"),
-        ("file://scenes/fox", ValueError, "file://scenes/fox: is no file of .* write file:///full/path"),
+        ("file://scenes/fox", ValueError, "file://scenes/fox: is not a file on this machine; write file:///full/path"),
         (5, ValueError, "path must be a path, a URL, or a UPath of universal_pathlib; got 5"),
         (None, ValueError, "path must be .*; got None"),
         ("nothing://bucket/fox", ValueError, "nothing://bucket/fox: cannot be opened .*nothing"),
