@@ -157,7 +157,9 @@ def plan_growth(
     return Moves(rows, jnp.minimum(num_draws + 1, MAX_SHARES), (num_draws > 0) | is_added, info)
 
 
-def perturb(key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array | float) -> Gaussians:
+def perturb(
+    key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array | float, scales: Array | None = None
+) -> Gaussians:
     """Add exploration noise to the means of the live rows: Σ·ε·sigmoid(100·((1 - o) - 0.995))·lr·5e5.
 
     Σ = R S Sᵀ Rᵀ is the covariance of the flat splat (its third scale is 0), ε is standard normal: the noise stays
@@ -168,6 +170,7 @@ def perturb(key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array |
       gaussians: N rows.
       num_live: rows in use; may be traced.
       lr: the current learning rate of the means, in world units; may be traced.
+      scales: standard deviations along the first axes, [N, 2] or of ellipsoids [N, 3]; None: `gaussians.scales`.
 
     Raises:
       ValueError: if an argument has another shape than it must have.
@@ -175,11 +178,12 @@ def perturb(key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array |
     check_gaussians(gaussians)
     check_shape("num_live", num_live, ())
     check_shape("lr", lr, ())
+    scales = gaussians.scales if scales is None else scales
     means, dtype = gaussians.means, gaussians.means.dtype
     noise = jax.random.normal(key, means.shape, dtype)
-    axes = rotation_matrices(gaussians.quats)[:, :, :2]
+    axes = rotation_matrices(gaussians.quats)[:, :, : scales.shape[1]]
     # Sums of products instead of matmuls, which accelerators may round to fewer bits.
-    in_plane = jnp.sum(axes * noise[:, :, None], axis=1) * gaussians.scales**2
+    in_plane = jnp.sum(axes * noise[:, :, None], axis=1) * scales**2
     shift = jnp.sum(axes * in_plane[:, None, :], axis=2)
     # 1 − o, without the cancellation of the difference.
     transparency = jax.nn.sigmoid(-gaussians.logit_opacities)

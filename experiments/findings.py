@@ -1,14 +1,14 @@
 """The table of docs/results.md: every comparison of PROTOCOL.md, from the committed records of both scales."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from lab import tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid, read_grid
 from lab.kept import read_kept
-from lab.statistics import Comparison, compare, differences, holm
+from lab.statistics import Comparison, bootstrap, compare, differences, holm
 from lab.tables import EQUAL_BYTES, Result
 
 DENSE, FEW = "dense", "few views"
@@ -22,7 +22,6 @@ SECONDARY = {
     "1.2 MB": ("bytewise − best plain method, 1.2 MB", "psnr"),
 }
 """Secondary endpoints: row of the table and figure."""
-DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,22 +33,27 @@ class Row:
     label: str
     other: str
 
+    def differences(self, figure: str) -> dict[str, list[np.ndarray]]:
+        return differences(self.results, self.label, self.other, figure)
+
     def compared(self, figure: str) -> Comparison:
-        return compare(differences(self.results, self.label, self.other, figure))
+        return compare(self.differences(figure))
 
 
-def rows_of_degrees(results: Sequence[Result]) -> list[Row]:
-    """Return the comparisons of A²TG with plain Gaussians of its degree, and of degrees 0 and 3, by bytes per pixel."""
+def rows_of_degrees(results: Mapping[int, Sequence[Result]]) -> list[Row]:
+    """Return the comparisons of A²TG with plain Gaussians of its degree, and of degrees 0 and 3, by bytes per pixel.
+
+    The results are by the degree of A²TG, whose bytes the others of a grid fill.
+    """
     rows = []
-    for size in sorted({bytes_per_pixel(result) for result in results}):
-        own = [result for result in results if bytes_per_pixel(result) == size]
-        for degree in (3, 1, 0):
+    for size in sorted({bytes_per_pixel(result) for own in results.values() for result in own}):
+        at_size = {degree: [one for one in own if bytes_per_pixel(one) == size] for degree, own in results.items()}
+        for degree, own in at_size.items():
             plain = MCMC if degree == 3 else f"{MCMC}, degree {degree}"
             name = f"A²TG − plain, degree {degree}, {size} bytes a pixel"
             rows.append(Row(name, own, f"A²TG, degree {degree}", plain + EQUAL_BYTES))
-        of_three = [result for result in own if result.run.method.label.startswith(MCMC)]
         name = f"plain, degree 0 − degree 3, {size} bytes a pixel"
-        rows.append(Row(name, of_three, f"{MCMC}, degree 0{EQUAL_BYTES}", MCMC + EQUAL_BYTES))
+        rows.append(Row(name, at_size[3], f"{MCMC}, degree 0{EQUAL_BYTES}", MCMC + EQUAL_BYTES))
     return rows
 
 
@@ -81,11 +85,11 @@ def table_of(rows: Sequence[Row]) -> str:
     """Return the table of the comparisons that have runs."""
     lines = []
     for row in rows:
-        found = {figure: row.compared(figure) for figure in DIGITS}
+        found = {figure: row.compared(figure) for figure in tables.QUALITY}
         psnr = found["psnr"]
         if not psnr.by_scene:
             continue
-        low, high = psnr.bootstrap
+        low, high = bootstrap(row.differences("psnr"))
         lines.append([
             row.name, with_interval(psnr, "psnr"), "–" if np.isnan(low) else f"{low:+.2f} to {high:+.2f}",
             with_interval(found["ssim"], "ssim"), with_interval(found["lpips"], "lpips"),
@@ -98,7 +102,7 @@ def table_of(rows: Sequence[Row]) -> str:
 
 def with_interval(found: Comparison, figure: str) -> str:
     """Return a mean with its t interval, in bold if the interval excludes 0."""
-    text = tables.SceneMean(found.mean, found.half_width, found.p_value).as_text(DIGITS[figure])
+    text = found.over_scenes.as_text(tables.DIGITS[figure])
     return f"**{text}**" if found.is_decided else text
 
 
@@ -122,7 +126,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         text += f"{endpoints(rows)}\n"
     scale = "smoke" if lab.is_smoke else "protocol160"
     records = read_kept(lab.out.parent / scale / "records.json")
-    results = [each for d in (0, 1, 3) for each in tables.results_of(read_grid(f"degree_{d}", scale), records)]
+    results = {degree: tables.results_of(read_grid(f"degree_{degree}", scale), records) for degree in (3, 1, 0)}
     lab.write(EXPERIMENT.name, f"{text}## A²TG and degrees\n\n{table_of(rows_of_degrees(results))}")
 
 

@@ -21,7 +21,7 @@ def test_views_seeds_and_scenes_are_averaged_in_this_order():
     results = [at("x", "own", 22.0), at("x", "other", 20.0), at("x", "own", 21.0, 1), at("x", "other", 20.0, 1)]
     results += [at("y", "own", 25.0), at("y", "other", 26.0), at("z", "own", 20.0)]
     found = compare(differences(results, "own", "other", "psnr"))
-    assert found.by_scene == {"x": 1.5, "y": -1.0} and found.mean == 0.25 and found.num_won() == 1
+    assert found.by_scene == {"x": 1.5, "y": -1.0} and found.over_scenes.mean == 0.25 and found.num_won() == 1
     assert not found.is_decided and found.p_value == 1.0
     with pytest.raises(ValueError, match="different views of x"):
         differences([at("x", "own", 22.0, views="ac"), at("x", "other", 20.0)], "own", "other", "psnr")
@@ -40,7 +40,7 @@ def test_the_sign_flip_test_is_scipys_exact_permutation_test():
 def test_the_interval_is_that_of_students_t():
     """3.182 standard errors of four values, as tables of t say."""
     found = compare({str(value): [np.array([value])] for value in (1.0, 2.0, 3.0, 6.0)})
-    assert found.half_width == pytest.approx(3.18245 * np.sqrt(14 / 3 / 4), rel=1e-5)
+    assert found.over_scenes.half_width == pytest.approx(3.18245 * np.sqrt(14 / 3 / 4), rel=1e-5)
 
 
 def test_the_bootstrap_of_one_view_a_scene_is_that_of_scenes():

@@ -8,14 +8,13 @@ A·(u, v) + c: a homography without perspective, for which u² + v² is the squa
 import dataclasses
 from typing import Any, ClassVar, Self
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import rotation_matrices
 from a2tg_jax.events import Now
-from a2tg_jax.mcmc import NOISE_SCALE, NOISE_STEEPNESS, NOISE_TRANSPARENCY, Noise, densify_times
+from a2tg_jax.mcmc import Noise, densify_times, perturb
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.systems.two_stages import grown_by_mcmc, pruned
 from a2tg_jax.training.stage import Stage
@@ -75,17 +74,9 @@ class EllipsoidNoise(Noise):
     """Exploration noise with the covariance of the ellipsoids (`mcmc.perturb`)."""
 
     def apply(self, now: Now, model: a2tg.Model, moments: Any, state: tuple[()]) -> a2tg.Change:
-        gaussians, dtype = model.gaussians, model.gaussians.means.dtype
-        axes = rotation_matrices(gaussians.quats)
-        noise = jax.random.normal(now.keys[0], gaussians.means.shape, dtype)
-        along = jnp.sum(axes * noise[:, :, None], axis=1) * model.appearance.scales(gaussians) ** 2
-        transparency = jax.nn.sigmoid(-gaussians.logit_opacities)
-        gate = jax.nn.sigmoid(NOISE_STEEPNESS * (transparency - NOISE_TRANSPARENCY))
-        gate = jnp.where(jnp.arange(gaussians.num) < model.live_count, gate, 0.0)
-        strength = gate * (jnp.asarray(now.rate_of_means, dtype) * NOISE_SCALE)
-        means = gaussians.means + jnp.sum(axes * along[:, None, :], axis=2) * strength[:, None]
-        model = dataclasses.replace(model, gaussians=dataclasses.replace(gaussians, means=means))
-        return a2tg.Change(model, moments, state)
+        scales = model.appearance.scales(model.gaussians)
+        gaussians = perturb(now.keys[0], model.gaussians, model.live_count, now.rate_of_means, scales)
+        return a2tg.Change(dataclasses.replace(model, gaussians=gaussians), moments, state)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

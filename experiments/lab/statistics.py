@@ -9,13 +9,9 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import scipy.stats
 
-from lab.tables import Result, grouped
+from lab.tables import CONFIDENCE, QUALITY, Result, SceneMean, grouped, over_scenes
 
-FIGURES = ("psnr", "ssim", "lpips")
-"""Figures of a view in a record's `per_view`, in their order."""
-CONFIDENCE = 0.95
 NUM_DRAWS = 10_000
 Differences = Mapping[str, Sequence[np.ndarray]]
 """Differences of the views of every pair [V], by scene."""
@@ -26,18 +22,15 @@ class Comparison:
     """Mean difference of two methods over scenes; what too few scenes leave open is NaN."""
 
     by_scene: Mapping[str, float]
-    mean: float
-    half_width: float
-    """Half-width of the t interval over scenes."""
-    bootstrap: tuple[float, float]
-    """Interval of the hierarchical bootstrap."""
+    over_scenes: SceneMean
+    """Mean over scenes, with its t interval."""
     p_value: float
     """p-value of the exact sign-flip test over scenes."""
 
     @property
     def is_decided(self) -> bool:
         """Whether the t interval excludes 0."""
-        return abs(self.mean) > self.half_width
+        return abs(self.over_scenes.mean) > self.over_scenes.half_width
 
     def num_won(self, is_lower_better: bool = False) -> int:
         """Return the number of scenes in which the first method is better."""
@@ -50,7 +43,7 @@ def differences(results: Sequence[Result], label: str, other: str, figure: str) 
     Raises:
       ValueError: if the methods of a pair were scored on different views.
     """
-    place = FIGURES.index(figure)
+    place = QUALITY.index(figure)  # Records have the figures of a view in this order.
     found: dict[str, list[np.ndarray]] = {}
     for cell, block in grouped(results, lambda result: result.run.cell):
         views = {result.label: result.record["per_view"] for result in block if result.label in (label, other)}
@@ -64,17 +57,11 @@ def differences(results: Sequence[Result], label: str, other: str, figure: str) 
     return found
 
 
-def compare(found: Differences, seed: int = 0) -> Comparison:
+def compare(found: Differences) -> Comparison:
     """Return the mean over scenes of some differences."""
     by_scene = {scene: float(np.mean([pair.mean() for pair in pairs])) for scene, pairs in found.items()}
     values = np.array(list(by_scene.values()))
-    mean, half, p_value = float("nan"), float("nan"), float("nan")
-    if len(values):
-        mean = float(values.mean())
-    if len(values) > 1:
-        half = float(scipy.stats.sem(values) * scipy.stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1))
-        p_value = sign_flip(values)
-    return Comparison(by_scene, mean, half, bootstrap(found, seed), p_value)
+    return Comparison(by_scene, over_scenes(values), sign_flip(values) if len(values) > 1 else float("nan"))
 
 
 def sign_flip(values: np.ndarray) -> float:
