@@ -72,14 +72,14 @@ def _model_of(path: Path) -> Path:
     counts = {model: num_images(_model_files(model)["images"]) for model in models}
     # A model's own folder, if given, is the user's choice.
     chosen = path if path in models else max(models, key=lambda model: counts[model])
-    told = {
+    descriptions = {
         model: f"{'/'.join(model.parts[len(path.parts) :]) or 'its own'} ({counted(counts[model], 'image')})"
         for model in models
     }
     others = [model for model in models if model != chosen]
     warnings.warn(
-        f"{path}: has {len(models)} COLMAP models; {told[chosen]} is read, and not "
-        f"{', '.join(told[model] for model in others)}; to read another, give its folder, such as {others[0]}",
+        f"{path}: has {len(models)} COLMAP models; {descriptions[chosen]} is read, and not "
+        f"{', '.join(descriptions[model] for model in others)}; to read another, give its folder, such as {others[0]}",
         stacklevel=3,
     )
     return chosen

@@ -119,9 +119,9 @@ def _decoded_name(path: Path, name: bytes) -> str:
     try:
         return name.decode()
     except UnicodeDecodeError:
-        told = shortened(name.decode(errors="backslashreplace"))
+        shown = shortened(name.decode(errors="backslashreplace"))
         raise ValueError(
-            f"{path}: the image name {told} is not UTF-8; rename the photograph, and export the model again"
+            f"{path}: the image name {shown} is not UTF-8; rename the photograph, and export the model again"
         ) from None
 
 
@@ -276,8 +276,8 @@ def _read_text(file: BinaryIO, path: Path, kind: str) -> Any:
         except (ValueError, OverflowError, StopIteration) as error:
             if str(error).startswith(str(path)):  # It names the file already.
                 raise
-            told = "it is cut off" if isinstance(error, StopIteration) else shortened(str(error))
-            raise ValueError(f"{path}: line {number} cannot be read ({told}); export the model again") from None
+            reason = "it is cut off" if isinstance(error, StopIteration) else shortened(str(error))
+            raise ValueError(f"{path}: line {number} cannot be read ({reason}); export the model again") from None
     if announced not in (None, len(found)):
         message = f"{path}: says that it has {announced} {kind}, and has {len(found)}: if it is cut off, export it"
         warnings.warn(f"{message} again", stacklevel=3)

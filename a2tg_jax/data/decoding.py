@@ -103,9 +103,9 @@ def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
         details = exif.get_ifd(ExifTags.IFD.Exif)
         # Make and model are in the main directory of EXIF, focal lengths in the one below.
         lens = (*(exif.get(tag) for tag in LENS_TAGS), *(details.get(tag) for tag in LENS_TAGS))
-        told = tuple(str(value) for value in lens if value)
+        lens_facts = tuple(str(value) for value in lens if value)
         is_transparent = _has_alpha(image) and bool((np.asarray(image.convert("RGBA"))[..., 3] < 255).any())
-        return PictureFacts(size, turn in TURNED, image.format or "", told, is_transparent)
+        return PictureFacts(size, turn in TURNED, image.format or "", lens_facts, is_transparent)
 
 
 def _has_alpha(image: Image.Image) -> bool:

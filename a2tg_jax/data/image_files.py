@@ -92,8 +92,8 @@ def warn_of_unposed(folder: Path, names: Iterable[str], is_deep: bool = True) ->
     photos = (file for file in files if file.suffix.lower() in PHOTO_SUFFIXES)
     others = sorted(file.as_posix() for file in photos if _letters(file.with_suffix("").as_posix()) not in own)
     if others:
-        told = f"{counted(len(others), 'photograph')} without a pose, such as {shortened(others[0])}"
-        warnings.warn(f"{folder}: {told}: not used", stacklevel=3)
+        left_out = f"{counted(len(others), 'photograph')} without a pose, such as {shortened(others[0])}"
+        warnings.warn(f"{folder}: {left_out}: not used", stacklevel=3)
 
 
 def map_in_threads(

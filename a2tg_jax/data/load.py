@@ -15,7 +15,7 @@ from a2tg_jax.data.colmap import find_models, load_colmap
 from a2tg_jax.data.division import among_processes, sharing_errors
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.phone_captures import polycam, record3d
-from a2tg_jax.data.photo_folder import holds_photos, is_video, told_of_capture
+from a2tg_jax.data.photo_folder import capture_hint, holds_photos, is_video
 from a2tg_jax.data.photo_reading import AlphaMeaning, Options
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.photogrammetry import metashape, realityscan
@@ -167,7 +167,7 @@ def _read(path: Path, options: Options) -> Scene:
             command = f"`a2tg sfm {as_argument(path)} SCENE`"
             raise ValueError(f"{path}: is a video; to make a scene of it, run {command} first")
         # OpenSfM's reconstruction.json is JSON as well, but no transforms file.
-        is_json = is_json and is_regular(path) and told_of_capture(path) is None
+        is_json = is_json and is_regular(path) and capture_hint(path) is None
     else:
         check_reachable(path.parent if path.suffix.lower() in (".json", ".xml") else path)
     if is_json:
@@ -181,16 +181,16 @@ def _read(path: Path, options: Options) -> Scene:
         )
     if (make := _frames(path)) is not None:
         return load_frames(make(), options)
-    told = told_of_capture(path)
+    hint = capture_hint(path)
     if is_regular(path):
         nothing = (
             "is neither a transforms.json nor an XML file of Metashape's cameras (File > Export > Export Cameras); "
             "give one of these, or the scene's folder"
         )
-        raise FileNotFoundError(f"{path}: {told or nothing}")
-    if told is not None:
+        raise FileNotFoundError(f"{path}: {hint or nothing}")
+    if hint is not None:
         again = f"; or find cameras again: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
-        raise FileNotFoundError(f"{path}: {told}{again}")
+        raise FileNotFoundError(f"{path}: {hint}{again}")
     # Such as scene/images, or a folder in it.
     scene = next((parent for parent in path.resolve().parents[:2] if _loader(parent) is not None), None)
     if scene is not None:

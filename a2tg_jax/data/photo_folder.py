@@ -87,7 +87,7 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
       ValueError: if it is a file, or holds fewer than `least` photographs.
     """
     if folder.is_file():
-        raise ValueError(f"{folder}: {told_of_capture(folder) or 'is a file; give its folder'}")
+        raise ValueError(f"{folder}: {capture_hint(folder) or 'is a file; give its folder'}")
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of photographs")
     files = sorted(file.relative_to(folder) for file in _files_below(folder))
@@ -101,17 +101,17 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
     others = set().union(*kinds.values())
     kinds["copies of others"] = _copies(folder, [name for name in names if name not in others])
     others |= kinds["copies of others"]
-    told = [f"{kind}: {len(found)} ({first_names(_patterns(found))})" for kind, found in kinds.items() if found]
-    told_others = f"Not taken for photographs: {'; '.join(told)}. To use some, give a folder of these only"
+    groups = [f"{kind}: {len(found)} ({first_names(_patterns(found))})" for kind, found in kinds.items() if found]
+    others_text = f"Not taken for photographs: {'; '.join(groups)}. To use some, give a folder of these only"
     photos = [name for name in names if name not in others]
     unread = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
     if len(photos) < least:
         held = f"holds {counted(len(photos), 'photograph') if photos else 'no photographs'}" if files else "is empty"
         needed = f"{folder}: {held}; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
         skipped = [_skipped(folder, unread)] if unread else []
-        raise ValueError(". ".join([needed, *([told_others] if others else []), *skipped]))
+        raise ValueError(". ".join([needed, *([others_text] if others else []), *skipped]))
     if others:
-        warnings.warn(f"{folder}: {told_others}", stacklevel=3)
+        warnings.warn(f"{folder}: {others_text}", stacklevel=3)
     foreign = [file for file in unread if file.suffix.lower() in FOREIGN_SUFFIXES + VIDEO_SUFFIXES]
     if foreign:
         warnings.warn(f"{folder}: {_skipped(folder, foreign)}", stacklevel=3)
@@ -127,24 +127,26 @@ def _skipped(folder: Path, files: list[Path]) -> str:
     """Return the number of skipped files by suffix, the formats that are read, and how to convert."""
     counts = Counter(file.suffix.lower() or "without suffix" for file in files)
     parts = [f"{number} {suffix}" for suffix, number in counts.most_common(MOST_TOLD)]
-    told = f"Skipped: {', '.join(parts)}{', …' if len(counts) > MOST_TOLD else ''}; read: {', '.join(PHOTO_SUFFIXES)}"
+    message = (
+        f"Skipped: {', '.join(parts)}{', …' if len(counts) > MOST_TOLD else ''}; read: {', '.join(PHOTO_SUFFIXES)}"
+    )
     foreign = next((file for file in files if file.suffix.lower() in FOREIGN_SUFFIXES), None)
     video = next((file for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
     if foreign is not None:
         pattern = as_argument(folder / foreign.parent / f"*{foreign.suffix}")  # ImageMagick itself expands the star.
-        told += f". To make JPEG files of them: magick mogrify -format jpg {pattern}"
+        message += f". To make JPEG files of them: magick mogrify -format jpg {pattern}"
     if video is not None:
-        told += f". A video is given by itself: a2tg sfm {as_argument(folder / video)} SCENE"
-    return told
+        message += f". A video is given by itself: a2tg sfm {as_argument(folder / video)} SCENE"
+    return message
 
 
-def told_of_capture(path: Path) -> str | None:
+def capture_hint(path: Path) -> str | None:
     """Return what a file or folder of another program is and what to do with it, or None if it is unknown."""
     if not path.is_dir():
-        return next((told for pattern, told in FOUND_BY if "/" not in pattern and path.match(pattern)), None)
+        return next((text for pattern, text in FOUND_BY if "/" not in pattern and path.match(pattern)), None)
     # min, because glob has no fixed order.
-    found = ((min(path.glob(pattern), default=None), told) for pattern, told in FOUND_BY)
-    return next((f"{first.relative_to(path).as_posix()} {told}" for first, told in found if first is not None), None)
+    found = ((min(path.glob(pattern), default=None), text) for pattern, text in FOUND_BY)
+    return next((f"{first.relative_to(path).as_posix()} {text}" for first, text in found if first is not None), None)
 
 
 def _written(folder: Path, names: Sequence[str]) -> set[str]:

@@ -131,8 +131,8 @@ def read_photos(
         facts, read[number] = _read(found[number], options)
         return facts
 
-    told = [f"{own.photo.name} downscaled by {own.downscale}" for own in found]
-    facts = divided(options.division, told, own_share, place)
+    descriptions = [f"{own.photo.name} downscaled by {own.downscale}" for own in found]
+    facts = divided(options.division, descriptions, own_share, place)
     # All of them are read here if there is one process.
     others = [number for number in range(len(found)) if number not in read]
     # Decided before the threads start: their order is not fixed.
@@ -312,10 +312,10 @@ def _find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) 
         if not is_folder(smaller) or any(each.is_relative_to(smaller) for each in named):
             continue
         names = [name for own, name in files if own == folder]
-        if told := [each for each in map_in_threads(difference, names, place=folder) if each]:
+        if unlike := [each for each in map_in_threads(difference, names, place=folder) if each]:
             warnings.warn(
-                f"{smaller}: does not hold the files of {folder} at 1/{downscale} of their size, for {len(told)} of "
-                f"{len(names)}, such as {told[0]}: not used",
+                f"{smaller}: does not hold the files of {folder} at 1/{downscale} of their size, for {len(unlike)} of "
+                f"{len(names)}, such as {unlike[0]}: not used",
                 stacklevel=4,
             )
         else:
@@ -341,8 +341,8 @@ def _read_mask(
         counts = is_opaque & counts if has_both else is_opaque
     size = counts.shape[::-1]
     if size not in (stored, lens.size):
-        told = "x".join(map(str, size)), "x".join(map(str, stored))
-        raise ValueError(f"{file}: is {told[0]}, but its photograph is {told[1]}; a mask must be of the same size")
+        sizes = "x".join(map(str, size)), "x".join(map(str, stored))
+        raise ValueError(f"{file}: is {sizes[0]}, but its photograph is {sizes[1]}; a mask must be of the same size")
     # Pillow takes no [H, W, 1]. Resampled, only 255 from nothing but 255 stays 255.
     planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
     planes, _ = lens.view_pixels(planes, downscale)

@@ -121,10 +121,10 @@ def _posed_cameras(file: Path) -> list[tuple[str, Element, np.ndarray]]:
                 own[:3, :3] /= np.cbrt(abs(np.linalg.det(world[:3, :3]))) or 1.0
             found.append((label, sensor, own))
     by_offset = "have no own pose, such as {}: placed by their sensors' offsets from the master, in units of its pose"
-    for labels, told in ((in_rigs, by_offset), (unused, "have no pose or are switched off, such as {}: not used")):
+    for labels, text in ((in_rigs, by_offset), (unused, "have no pose or are switched off, such as {}: not used")):
         if labels:
             count = f"{file}: {len(labels)} of {len(found) + len(unused)} cameras"
-            warnings.warn(f"{count} {told.format(shortened(labels[0]))}", stacklevel=3)
+            warnings.warn(f"{count} {text.format(shortened(labels[0]))}", stacklevel=3)
     return found
 
 
@@ -189,8 +189,8 @@ def _metashape_lens(sensor: Element, what: str) -> dict[str, Any]:
     higher = HIGHER_TERMS[projection]
     # Skew is b2·y, where y goes up to height / f.
     if any(map(read, higher)) or abs(read("b2")) * height / max(read("f"), 1.0) > LARGEST_SKEW:
-        told = ", ".join(higher)
-        raise ValueError(f"{what}: its {projection} lens has {told} or b2, which are not supported; {UNDISTORTED}")
+        names = ", ".join(higher)
+        raise ValueError(f"{what}: its {projection} lens has {names} or b2, which are not supported; {UNDISTORTED}")
     # Metashape's manual: u = w/2 + cx + x·(f + b1) + y·b2, v = h/2 + cy + y·f.
     lens: dict[str, Any] = {
         "w": int(width), "h": int(height), "fl_x": read("f") + read("b1"), "fl_y": read("f"),

@@ -239,5 +239,5 @@ def scene_name(folder: Path | str) -> str:
     is_url = isinstance(folder, str) or is_remote(folder)
     # As in a path, the first part is the root, which is no name.
     parts = ("", *str(folder).split("/")[2:]) if is_url else Path(folder).resolve().parts
-    told = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]
-    return "/".join(parts[told[-1] if told else -1 :])
+    specific = [at for at, part in enumerate(parts) if at and part.lower() not in GENERIC_NAMES]
+    return "/".join(parts[specific[-1] if specific else -1 :])

@@ -107,9 +107,9 @@ def run_sfm(
     with _new_folder(out), tempfile.TemporaryDirectory(dir=out, prefix="sfm-") as folder, _quiet():
         work = Path(folder)
         staged = stage(sources, work, frames=frames, panorama=panorama, progress=progress, tell=on_note)
-        names, told = staged.names, ", ".join(map(str, sources))
+        names, given = staged.names, ", ".join(map(str, sources))
         if len(names) < LEAST_PHOTOS:
-            raise ValueError(f"{told}: {len(names)} photographs; at least {LEAST_PHOTOS} are needed")
+            raise ValueError(f"{given}: {len(names)} photographs; at least {LEAST_PHOTOS} are needed")
         if matching == "auto":
             matching = "exhaustive" if len(names) <= MAX_EXHAUSTIVE else "sequential"
         database = work / "database.db"
@@ -121,7 +121,7 @@ def run_sfm(
         with closing(pycolmap().Database.open(database)) as opened:
             images, num_matched = opened.read_all_images(), int(opened.num_verified_image_pairs())
             blank = sorted(image.name for image in images if not opened.num_keypoints_for_image(image.image_id))
-        _check_models(models, names, told, matching, num_matched, blank)
+        _check_models(models, names, given, matching, num_matched, blank)
         model = models[0]
         with _clock("undistorting", progress):
             chosen, undistorted = work / "chosen", work / "undistorted"
@@ -212,11 +212,11 @@ def _map(database: Path, staged: Staged, work: Path, seed: int, progress: bool) 
 
 
 def _check_models(
-    models: Sequence[Any], names: Sequence[str], told: str, matching: Matching, num_matched: int, blank: Sequence[str]
+    models: Sequence[Any], names: Sequence[str], given: str, matching: Matching, num_matched: int, blank: Sequence[str]
 ) -> None:
     """Raise ValueError without a usable model, and warn of the photographs that the largest one leaves out.
 
-    The models are sorted, the largest first; `told` names the sources in messages; `blank` are the names of the
+    The models are sorted, the largest first; `given` names the sources in messages; `blank` are the names of the
     photographs without features.
     """
     placed = {models[0].image(number).name for number in models[0].reg_image_ids()} if models else set()
@@ -241,9 +241,9 @@ def _check_models(
         found = f"only {len(placed)} of" if placed else "none of the"
         pairs = counted(num_matched, "pair")
         raise ValueError(
-            "; ".join([f"{told}: {found} {len(names)} photographs could be placed ({pairs} match)", *reasons])
+            "; ".join([f"{given}: {found} {len(names)} photographs could be placed ({pairs} match)", *reasons])
         )
-    missing = f"{told}: {len(left_out)} of {len(names)} photographs could not be placed and are left out"
+    missing = f"{given}: {len(left_out)} of {len(names)} photographs could not be placed and are left out"
     warnings.warn("; ".join([f"{missing} ({first_names(left_out)})", *reasons]), stacklevel=3)
 
 

@@ -125,8 +125,8 @@ def stage(
         try:
             name.encode()
         except UnicodeEncodeError:  # Names have surrogates for bytes that are not UTF-8.
-            told = os.fsencode(file).decode(errors="backslashreplace")
-            raise ValueError(f"{told}: its name is not UTF-8, as COLMAP needs it; rename the photograph") from None
+            shown = os.fsencode(file).decode(errors="backslashreplace")
+            raise ValueError(f"{shown}: its name is not UTF-8, as COLMAP needs it; rename the photograph") from None
 
     def look(source: int, file: Path, name: str) -> _Photo:
         facts = picture_facts(file)

@@ -70,8 +70,8 @@ def load_transforms(file: Path, options: Options) -> Scene:
         train_names = listed.get("train_filenames", names) - test_names
         if unused := sorted(names - train_names - test_names):
             only = "; val_filenames count only without test_filenames" if listed.get("val_filenames") else ""
-            told = f"{len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}"
-            warnings.warn(f"{file}: {told}", stacklevel=3)
+            message = f"{len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}"
+            warnings.warn(f"{file}: {message}", stacklevel=3)
         train, test = ([shot for shot in shots if shot.name in chosen] for chosen in (train_names, test_names))
     cloud = _points_beside(file, meta)
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
