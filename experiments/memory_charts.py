@@ -36,4 +36,4 @@ def _points(results: Sequence[tables.Result], label: str, x: str, y: str) -> lis
     return [(tables.mean(group, x), tables.mean(group, y)) for group in groups.values()]
 
 
-EXPERIMENT = Experiment("memory_charts", ("claim", "ablation"), present, __doc__)
+EXPERIMENT = Experiment("memory_charts", ("fixed_memory", "fixed_number", "ablation"), present, __doc__)

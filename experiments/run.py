@@ -1,10 +1,10 @@
 """Run experiments by name: train what is missing, then write their tables, charts and pictures.
 
-    python experiments/run.py claim ablation --scenes SCENES --lpips-weights lpips_alex.npz
+    python experiments/run.py fixed_memory ablation --scenes SCENES --lpips-weights lpips_alex.npz
     python experiments/run.py all --scenes SCENES --scale small --lpips-weights lpips_alex.npz
-    python experiments/run.py appendix
+    python experiments/run.py pages
 
-    python experiments/run.py claim --scene ~/scenes/garden --downscale 4
+    python experiments/run.py fixed_memory --scene ~/scenes/garden --downscale 4
     python experiments/run.py path/to/mine.toml --scenes SCENES
 
 A stopped call continues when it is called again; finished runs are never run again. `--plan` prints what is left to
@@ -28,15 +28,14 @@ from a2tg_jax import configure_cpu
 from a2tg_jax.host.text import did_you_mean
 
 MODULES = (
-    "choose_plain", "findings", "summary", "equal_bytes", "larger_pictures", "ablation", "texture_resolution",
-    "memory_charts", "resolution_shares", "decomposition", "comparison_pictures", "upscale_gains", "polish", "shrink",
-    "on_disk", "efficiency", "equal_bytes_speed",
+    "choose_plain", "findings", "ablation", "texture_resolution", "memory_charts", "resolution_shares", "decomposition",
+    "comparison_pictures", "efficiency",
 )  # fmt: skip
-"""Modules of this folder that hold an EXPERIMENT; those that measure time come last."""
-EVERYTHING, APPENDIX = "all", "appendix"
+"""Modules of this folder that hold an EXPERIMENT; the one that measures time comes last."""
+EVERYTHING, PAGES = "all", "pages"
 OTHERS = {
     EVERYTHING: "All of these experiments, then the pages.",
-    APPENDIX: "Write docs/results-appendix.md and the tables of docs/results.md from the committed results.",
+    PAGES: "Write the tables of docs/results.md and NOTEBOOK.md from the committed results.",
 }
 
 
@@ -63,7 +62,7 @@ def chosen(known: Mapping[str, Experiment], args: argparse.Namespace) -> list[Ex
         if name not in known and name not in OTHERS and name not in args.own_grids:
             hint = did_you_mean(name, [*known, *OTHERS]) or _of_an_option(name, args) or "; --help lists all"
             stop(f"there is no experiment {name!r}{hint}")
-    are_both = len(set(args.names) - set(args.own_grids) - {APPENDIX}) and args.own_grids
+    are_both = len(set(args.names) - set(args.own_grids) - {PAGES}) and args.own_grids
     if are_both and args.out is None and args.scale != "smoke":
         stop("results of grid files and of experiments lie in different folders: call them one after another, or name "
              "a folder for both with --out")  # fmt: skip
@@ -103,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     wanted = chosen(known, args)
     lab = run_experiments(wanted, args) if wanted else None
     is_committed = lab is not None and lab.out.resolve().parent == pages.EXPERIMENTS / "results" and not lab.is_partial
-    if (EVERYTHING in args.names and is_committed) or (APPENDIX in args.names and not args.plan):
+    if (EVERYTHING in args.names and is_committed) or (PAGES in args.names and not args.plan):
         pages.refresh()
 
 

@@ -51,8 +51,8 @@ def test_every_grid_names_runs_that_can_be_trained(name, scale):
 
 def test_choices_are_made_on_validation_views(tmp_path):
     """No run for choosing holds test views, nor is it taken for a run that does, and its pages say so."""
-    final = next(read_grid("claim", "smoke").jobs({}))
-    choosing = next(read_grid("claim", "smoke", validation=True).jobs({}))
+    final = next(read_grid("fixed_memory", "smoke").jobs({}))
+    choosing = next(read_grid("fixed_memory", "smoke", validation=True).jobs({}))
     assert choosing == dataclasses.replace(final, validation=True) and choosing.key != final.key
     assert choosing.start is None or choosing.start.validation
     folders = Folders(tmp_path, tmp_path)
@@ -60,7 +60,7 @@ def test_choices_are_made_on_validation_views(tmp_path):
     assert [view.name for view in scene.test] == [view.name for view in whole.train[::8]]
     assert {view.name for view in (*scene.train, *scene.test)} == {view.name for view in whole.train}
     lab = Lab(argument_parser("").parse_args(["--scale", "smoke", "--validation", "--out", str(tmp_path)]))
-    assert lab.grid("claim").validation
+    assert lab.grid("fixed_memory").validation
     lab.write("page", "# Title\n")
     assert "validation views" in (tmp_path / "page.md").read_text()
     named = Lab(argument_parser("").parse_args(["--scale", "smoke", "--validation", "--tables-only"]))
@@ -113,7 +113,7 @@ def test_a_rehearsal_runs_every_method_once_and_keeps_to_itself():
     assert cell == dataclasses.replace(whole.cells[0], iterations=(300, 300))
     assert short.methods == whole.methods and short.at_equal_bytes == whole.at_equal_bytes
     lab = Lab(argument_parser("").parse_args(["--scale", "full", "--rehearsal", "--tables-only"]))
-    assert lab.out.parts[-3:] == ("runs", "results", "full-rehearsal") and len(lab.grid("claim").cells) == 1
+    assert lab.out.parts[-3:] == ("runs", "results", "full-rehearsal") and len(lab.grid("fixed_memory").cells) == 1
 
 
 def test_all_experiments_of_a_scale_are_those_whose_grids_have_it():
@@ -124,13 +124,11 @@ def test_all_experiments_of_a_scale_are_those_whose_grids_have_it():
     assert everywhere == set(known)
 
 
-def test_scenes_are_chosen_and_held_out():
-    labels = lambda **wanted: {cell.scene.label for cell in read_grid("claim", "small", **wanted).cells}  # noqa: E731
+def test_scenes_are_chosen():
+    labels = lambda **wanted: {cell.scene.label for cell in read_grid("ablation", "small", **wanted).cells}  # noqa: E731
     assert labels() == {"fox", "herz_jesus_p25", "lego", "snowmiku"}
-    assert labels(held_out=False) == labels() - {"snowmiku"}
     assert labels(scenes=["lego"]) == {"lego"}
     assert labels(scenes=["built-in"]) == {"built-in"}, "what is asked for comes before what a grid has"
-    assert "snowmiku" not in {cell.scene.label for cell in read_grid("defaults", "small").cells}
     with pytest.raises(ValueError, match="no scene 'dog' at this scale; there are"):
         labels(scenes=["dog"])
 
@@ -138,11 +136,11 @@ def test_scenes_are_chosen_and_held_out():
 def test_scenes_of_ones_own_take_the_place_of_the_scales(tmp_path):
     (tmp_path / "garden").mkdir()
     own = own_scene(tmp_path / "garden", 4)
-    grid = read_grid("claim", "small", own=(own,))
+    grid = read_grid("fixed_memory", "small", own=(own,))
     assert {cell.scene for cell in grid.cells} == {SceneAt("garden", (tmp_path / "garden").as_posix(), 4)}
     assert Folders(pathlib.Path("scenes"), tmp_path).scenes / own.path == tmp_path / "garden"
     lab = Lab(argument_parser("").parse_args(["--scene", str(tmp_path / "garden"), "--out", str(tmp_path / "out")]))
-    assert lab.is_partial and {cell.scene.label for cell in lab.grid("claim").cells} == {"garden"}
+    assert lab.is_partial and {cell.scene.label for cell in lab.grid("fixed_memory").cells} == {"garden"}
     with pytest.raises(ValueError, match="no scene folder"):
         own_scene(tmp_path / "nowhere", 1)
     with pytest.raises(ValueError, match="at least 1"):
@@ -228,7 +226,7 @@ def test_mistakes_in_a_grid_file_are_reported(tmp_path, before, after, words):
 @pytest.mark.parametrize(("only", "labels"), [(None, ["a", "b"]), ((), []), (("b",), ["b"])])
 def test_a_block_has_all_scenes_or_those_that_it_names(only, labels):
     scenes = {label: SceneAt(label, label) for label in "ab"}
-    assert [scene.label for scene in chosen_scenes(scenes, Block(only=only), None, True, "mine.toml")] == labels
+    assert [scene.label for scene in chosen_scenes(scenes, Block(only=only), None, "mine.toml")] == labels
 
 
 def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
@@ -245,21 +243,27 @@ def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (["clam"], "no experiment 'clam'; did you mean claim?"),
-        (["claim", "--scale", "smal"], "no --scale smal; did you mean small?"),
+        (["fixed_memor"], "no experiment 'fixed_memor'; did you mean fixed_memory?"),
+        (["fixed_memory", "--scale", "smal"], "no --scale smal; did you mean small?"),
         (["efficiency", "--only", "dog"], "no scene 'dog'"),
         (["efficiency", "--scale", "small", "--scenes", "nowhere"], "nowhere"),
-        (["claim", "--only", "legoo"], "no scene 'legoo' at this scale; did you mean lego?"),
+        (["fixed_memory", "--only", "legoo"], "no scene 'legoo' at this scale; did you mean lego?"),
         (["nowhere/mine.toml"], "no grid file nowhere/mine.toml"),
-        (["claim", "--plan", "--scenes", "nowhere"], "no folder --scenes nowhere"),
-        (["claim", "--plan", "--jobs", "0"], "--jobs must be at least 1; got 0"),
-        (["claim", "--plan", "--memory-gb", "nan"], "--memory-gb must be a finite number larger than 0; got nan"),
-        (["claim", "--plan", "--downscale", "2"], "--downscale is that of --scene: add --scene"),
-        (["claim", "--plan", "--scene", ".", "--downscale", "0"], "--downscale must be at least 1; got 0"),
-        (["claim", "--plan", "--scene", ".", "--only", "fox"], "--only chooses scenes of the scale"),
-        (["claim", "--plan", "--cluster-parameter", "mem_gb=3"], "--cluster-parameter needs --cluster"),
-        (["claim", "--cluster", "slurm", "--cluster-parameter", "mem_gb"], "wants NAME=VALUE; got 'mem_gb'"),
-        (["claim", "--only", "fox", "lego"], "no experiment 'lego'; if it is a scene, repeat the option: --only lego"),
+        (["fixed_memory", "--plan", "--scenes", "nowhere"], "no folder --scenes nowhere"),
+        (["fixed_memory", "--plan", "--jobs", "0"], "--jobs must be at least 1; got 0"),
+        (
+            ["fixed_memory", "--plan", "--memory-gb", "nan"],
+            "--memory-gb must be a finite number larger than 0; got nan",
+        ),
+        (["fixed_memory", "--plan", "--downscale", "2"], "--downscale is that of --scene: add --scene"),
+        (["fixed_memory", "--plan", "--scene", ".", "--downscale", "0"], "--downscale must be at least 1; got 0"),
+        (["fixed_memory", "--plan", "--scene", ".", "--only", "fox"], "--only chooses scenes of the scale"),
+        (["fixed_memory", "--plan", "--cluster-parameter", "mem_gb=3"], "--cluster-parameter needs --cluster"),
+        (["fixed_memory", "--cluster", "slurm", "--cluster-parameter", "mem_gb"], "wants NAME=VALUE; got 'mem_gb'"),
+        (
+            ["fixed_memory", "--only", "fox", "lego"],
+            "no experiment 'lego'; if it is a scene, repeat the option: --only lego",
+        ),
     ],
 )
 def test_misspelt_names_are_one_line_and_exit_code_2(arguments, words, capsys, tmp_path):
@@ -284,8 +288,8 @@ def test_a_plan_refuses_options_that_training_refuses(tmp_path, options, words, 
 
 
 def test_names_may_follow_options_that_can_be_repeated():
-    args = parse_arguments(experiments(), ["--only", "fox", "claim", "--only", "lego", "plain"])
-    assert (args.only, args.names) == (["fox", "lego"], ["claim", "plain"])
+    args = parse_arguments(experiments(), ["--only", "fox", "fixed_memory", "--only", "lego", "parts"])
+    assert (args.only, args.names) == (["fox", "lego"], ["fixed_memory", "parts"])
 
 
 @pytest.mark.parametrize(
@@ -294,7 +298,7 @@ def test_names_may_follow_options_that_can_be_repeated():
 def test_damaged_records_are_reported(tmp_path, text, words, capsys):
     (tmp_path / "records.json").write_text(text)
     with pytest.raises(SystemExit) as ended:
-        main(["claim", "--scale", "smoke", "--plan", "--work", str(tmp_path), "--out", str(tmp_path)])
+        main(["fixed_memory", "--scale", "smoke", "--plan", "--work", str(tmp_path), "--out", str(tmp_path)])
     assert ended.value.code == 2 and words in capsys.readouterr().err
 
 
@@ -305,7 +309,7 @@ def test_a_block_sets_budgets_in_place_of_gaussians(tmp_path):
 
 
 def test_a_grid_file_may_not_take_the_tables_of_an_experiment(tmp_path, capsys):
-    path = tmp_path / "claim.toml"
+    path = tmp_path / "fixed_memory.toml"
     path.write_text(OWN_GRID, encoding="utf-8")
     with pytest.raises(SystemExit):
         main([str(path)])
@@ -313,7 +317,7 @@ def test_a_grid_file_may_not_take_the_tables_of_an_experiment(tmp_path, capsys):
 
 
 def test_experiments_and_grid_files_are_not_mixed_in_one_folder(tmp_path, capsys):
-    given = ["claim", own_grid(tmp_path), "--tables-only", "--work", str(tmp_path / "work")]
+    given = ["fixed_memory", own_grid(tmp_path), "--tables-only", "--work", str(tmp_path / "work")]
     with pytest.raises(SystemExit) as ended:
         main(given)
     assert ended.value.code == 2 and "call them one after another" in capsys.readouterr().err
@@ -323,18 +327,16 @@ def test_experiments_and_grid_files_are_not_mixed_in_one_folder(tmp_path, capsys
 def test_smoke_and_grid_files_leave_the_committed_results_alone(tmp_path):
     args = parse_arguments(experiments(), [own_grid(tmp_path), "--work", str(tmp_path)])
     assert Lab(args).out == EXPERIMENTS.parent / "runs" / "results" / "small"
-    args = parse_arguments(experiments(), ["claim", "--scale", "smoke", "--work", str(tmp_path)])
+    args = parse_arguments(experiments(), ["fixed_memory", "--scale", "smoke", "--work", str(tmp_path)])
     assert Lab(args).out == EXPERIMENTS.parent / "runs" / "results" / "smoke"
 
 
 def test_a_scale_may_have_fewer_methods():
-    small, smoke = (read_grid("defaults", scale) for scale in ("small", "smoke"))
-    assert len(small.methods) > 10 and [method.label for method in smoke.methods] == small_ends(small.methods)
-
-
-def small_ends(methods):
-    """The first and the last label."""
-    return [methods[0].label, methods[-1].label]
+    small, smoke = (read_grid("fixed_number", scale) for scale in ("small", "smoke"))
+    assert len(small.methods) == 10 and [one.label for one in smoke.methods] == [
+        small.methods[4].label,
+        small.methods[9].label,
+    ]
 
 
 def test_the_grid_of_the_documentation_can_be_read(tmp_path):

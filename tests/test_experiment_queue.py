@@ -158,8 +158,8 @@ def test_what_is_wanted_is_asked_again_after_every_job(folders):
 
 
 def test_an_estimate_of_memory_grows_with_splats_and_what_they_show():
-    job = next(read_grid("claim", "full").jobs({}))
-    small = dataclasses.replace(job, system=next(read_grid("claim", "smoke").jobs({})).system)
+    job = next(read_grid("fixed_memory", "full").jobs({}))
+    small = dataclasses.replace(job, system=next(read_grid("fixed_memory", "smoke").jobs({})).system)
     assert queue.BASE_BYTES < queue.estimated_bytes(small) < queue.estimated_bytes(job)
     plain, billboards = (a2tg.find_system(name).preset("quick") for name in ("gaussians-2d-mcmc", "bbsplat"))
     assert model_bytes(plain) == plain.densify.cap * 58 * 4

@@ -64,9 +64,9 @@ def _is_alive(pid):
 @pytest.mark.long
 @pytest.mark.skipif(not pathlib.Path("/proc/self/stat").is_file(), reason="needs /proc to see processes")
 def test_an_experiment_is_killed_goes_on_and_is_not_run_again(tmp_path):
-    """The claim on the built-in scene, at a tiny scale."""
+    """Equal bytes on the built-in scene, at a tiny scale."""
     out, work = tmp_path / "out", tmp_path / "work"
-    process = call("claim", "--out", out, "--work", work, "--jobs", 2)
+    process = call("fixed_memory", "--out", out, "--work", work, "--jobs", 2)
     deadline = time.monotonic() + 300
     while not (out / "records.json").is_file() and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.1)
@@ -77,19 +77,18 @@ def test_an_experiment_is_killed_goes_on_and_is_not_run_again(tmp_path):
         time.sleep(0.1)
     assert len(workers) >= 2 and not any(map(_is_alive, workers)), "nobody goes on alone"
     before = json.loads((out / "records.json").read_text())
-    assert 1 <= len(before) < 8
-    done = call("claim", "--out", out, "--work", work, "--jobs", 2)
+    assert 1 <= len(before) < 6
+    done = call("fixed_memory", "--out", out, "--work", work, "--jobs", 2)
     printed, _ = done.communicate(timeout=600)
     assert done.returncode == 0, printed
     after = json.loads((out / "records.json").read_text())
-    assert len(after) == 8 and {key: after[key] for key in before} == before
+    assert len(after) == 6 and {key: after[key] for key in before} == before
     assert not list((work / "checkpoints").glob("*.npz")), "what is finished needs none"
-    own = [row for row in after.values() if row["stage"] == "textures" and row["system"] == "a2tg"]
-    (own,) = [row for row in own if "single_texel_rate" not in row["options"]]
+    (own,) = [row for row in after.values() if row["stage"] == "textures" and row["system"] == "a2tg"]
     last = [row for row in after.values() if row["stage"] != "gaussians" and row["num"] != 400]
     assert len(last) == 2 and all(0.99 * own["mb"] < row["mb"] <= own["mb"] for row in last)
-    assert "against 2DGS*-MCMC, equal bytes" in (out / "claim.md").read_text()
-    again = call("claim", "--out", out, "--work", work)
+    assert "| 2DGS*-MCMC, equal bytes |" in (out / "fixed_memory.md").read_text()
+    again = call("fixed_memory", "--out", out, "--work", work)
     printed, _ = again.communicate(timeout=120)
     assert again.returncode == 0 and ".npz" not in printed and " dB;" not in printed
 
@@ -109,12 +108,12 @@ def test_submitit_sends_jobs_out(tmp_path):
 
 
 def test_ctrl_c_is_one_line_and_says_how_to_continue(capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["run.py", "claim", "--scenes", "my scenes"])
+    monkeypatch.setattr(sys, "argv", ["run.py", "fixed_memory", "--scenes", "my scenes"])
     with pytest.raises(SystemExit) as ended, interruptible():
         raise KeyboardInterrupt
     printed = capsys.readouterr().err.strip()
     assert ended.value.code == 130 and printed.count("\n") == 0
-    assert printed.endswith("run.py claim --scenes 'my scenes'")
+    assert printed.endswith("run.py fixed_memory --scenes 'my scenes'")
 
 
 def test_sigterm_ends_as_ctrl_c_does(capsys):
@@ -131,7 +130,7 @@ def test_records_of_an_earlier_version_are_told_and_trained_again_on_request(tmp
     assert versions.as_text([old, new, old]) == "2 of bytewise (version 1, now 2)"
     assert versions.as_text([new, record(system="a2tg"), record(system="nowhere:Gone", version=3)]) == ""
     (tmp_path / "records.json").write_text(json.dumps({"old": old, "new": new}), encoding="utf-8")
-    given = ["claim", "--out", str(tmp_path), "--work", str(tmp_path / "work")]
+    given = ["fixed_memory", "--out", str(tmp_path), "--work", str(tmp_path / "work")]
     assert set(Lab(parse_arguments(experiments(), given)).records) == {"old", "new"}
     assert set(Lab(parse_arguments(experiments(), [*given, "--renew"])).records) == {"new"}
 
@@ -153,11 +152,11 @@ def test_a_second_sigterm_ends_at_once():
 
 def test_the_plan_counts_what_is_left(tmp_path):
     """It counts runs at equal bytes before the bytes are known, and estimates CPUs by the cost of a step."""
-    grid, folders = read_grid("claim", "smoke"), Folders(tmp_path, tmp_path)
+    grid, folders = read_grid("fixed_memory", "smoke"), Folders(tmp_path, tmp_path)
     here = Machine(jobs=2, memory=8e9, has_gpu=False)
     everything = plan_of([grid], {}, folders, here)
-    assert "| built-in 1/2 | 400 | 0 | 30+20 | 0 of 6 | all |" in everything
-    assert "8 of 8 stages are left" in everything and "rough figure of CPUs" in everything
+    assert "| built-in 1/2 | 400 | 0 | 30+20 | 0 of 3 | all |" in everything
+    assert "6 of 6 stages are left" in everything and "rough figure of CPUs" in everything
     assert "on this machine, 2 at a time, with compilation" in everything and "Disk: about" in everything
     assert "8.00 GB may be used" in everything
     (row,) = re.findall(r"\| built-in 1/2, A²TG, stage gaussians, [^|]+\| ([\d.]+) \| ([\d.]+) GB \|", everything)
@@ -166,11 +165,11 @@ def test_the_plan_counts_what_is_left(tmp_path):
     assert "the paper's program on its GPU" in on_gpu and "compilation" not in on_gpu
     first = next(grid.jobs({}))
     rest = plan_of([grid], {first.key: record(), first.start.key: record()}, folders, here)
-    assert "1 of 6 | 2DGS*-MCMC; A²TG, as quick has it; 2DGS*-MCMC, equal bytes;" in rest
+    assert "1 of 3 | 2DGS*-MCMC, equal bytes; Textured Gaussians*, equal bytes" in rest
     assert "the steps of finished stages" in rest
     mb = model_bytes(first.system) / 1e6
     finished = {key: record(mb=mb) for key in stages_of([grid], {})}
-    assert "| 6 of 6 | – |" in plan_of([grid], finished, folders, here)
+    assert "| 3 of 3 | – |" in plan_of([grid], finished, folders, here)
     assert [duration(seconds) for seconds in (150, 3600, 9000)] == ["2 minutes", "1.0 hours", "2.5 hours"]
     short = record(stage="textures", num=400, ms_per_step=None)
     assert finished_pace(first, {"x": record(stage="textures", num=400), "y": short}) == pytest.approx(0.01)
@@ -178,7 +177,7 @@ def test_the_plan_counts_what_is_left(tmp_path):
 
 
 def test_progress_names_stages_in_words(tmp_path, capsys):
-    grid = read_grid("claim", "smoke")
+    grid = read_grid("fixed_memory", "smoke")
     records = {}
     progress = Progress([grid], records, tmp_path / "log.txt")
     progress.begin(2)
@@ -191,14 +190,14 @@ def test_progress_names_stages_in_words(tmp_path, capsys):
     progress.start(last)
     progress.failed(queue.Failure(last, "no room"))
     printed = capsys.readouterr().out.splitlines()
-    assert printed[0] == f"8 stages to train, 2 at a time at most; log: {tmp_path / 'log.txt'}"
-    assert printed[1] == "1 of 8 start: built-in 1/2, A²TG, stage gaussians, 400 Gaussians, seed 0"
-    assert printed[2].startswith("1 of 8 done: built-in 1/2, A²TG, ") and "25.00 dB" in printed[2]
+    assert printed[0] == f"6 stages to train, 2 at a time at most; log: {tmp_path / 'log.txt'}"
+    assert printed[1] == "1 of 6 start: built-in 1/2, A²TG, stage gaussians, 400 Gaussians, seed 0"
+    assert printed[2].startswith("1 of 6 done: built-in 1/2, A²TG, ") and "25.00 dB" in printed[2]
     assert printed[2].endswith("; 3 s, 10 ms a step") and printed[3].endswith("; 3 s"), "a short stage has no pace"
     assert printed[4].startswith(
-        "2 of 8 start: built-in 1/2, Textured Gaussians*, stage textures, bytes of 400 Gaussians"
+        "2 of 6 start: built-in 1/2, Textured Gaussians*, stage textures, bytes of 400 Gaussians"
     )
-    assert printed[5].startswith("2 of 8 FAILED: ") and printed[5].endswith(": no room")
+    assert printed[5].startswith("2 of 6 FAILED: ") and printed[5].endswith(": no room")
     log = (tmp_path / "log.txt").read_text(encoding="utf-8").splitlines()
     assert len(log) == 6 and all(line.endswith(shown) for line, shown in zip(log, printed, strict=True))
 

@@ -28,7 +28,7 @@ from a2tg_jax.training.stage import Stage
 class LimitExponents(StepEvent):
     """Lower limit of the exponents of kernels (`Appearance.exponents`), after every iteration."""
 
-    least: float = 0.6  # an opaque kernel reaches 5.7σ, and 11.7σ at 1/e (docs/results-appendix.md)
+    least: float = 0.6  # an opaque kernel reaches 5.7σ, and 11.7σ at 1/e (experiments/NOTEBOOK.md)
     """Smallest exponent of a kernel, 0 to 1. Smaller ones have longer tails, which take longer to draw; up to 1/e it
     limits nothing."""
 
@@ -61,18 +61,18 @@ class Bytewise(TwoStages):
     prune: Prune = PRUNING
     """Pruning of the Gaussians that show least, up to 0.8 of the first stage; others grow in their place. The end of
     the stage prunes in any case."""
-    kernel_rate: float = 0.01  # 0.02 and 0.005 are worse (docs/results-appendix.md, "Shapes of kernels")
+    kernel_rate: float = 0.01  # 0.02 and 0.005 are worse (experiments/NOTEBOOK.md, "Shapes of kernels")
     """Adam's learning rate of the kernels' shapes; 0: all kernels are Gaussians, as other programs draw them, for which
     a view_dependence_share of 0.23 is better."""
     exponents: LimitExponents = LimitExponents()
     """Lower limit of the exponents of kernels; 0: no limit."""
-    view_dependence_share: float = 0.1  # the best with shapes of kernels (docs/results-appendix.md)
+    view_dependence_share: float = 0.1  # the best with shapes of kernels (experiments/NOTEBOOK.md)
     """Share of the bytes for view dependence; 0: none."""
     view_dependence_rate: float = 2e-3
     """Adam's learning rate of the coefficients above base_degree."""
     view_dependence: AdaptDegrees = AdaptDegrees()
     """Spherical harmonics above base_degree, in the second stage."""
-    texture_share: float = 0.02  # 0 to 0.05 differ by hundredths of a dB (docs/results-appendix.md)
+    texture_share: float = 0.02  # 0 to 0.05 differ by hundredths of a dB (experiments/NOTEBOOK.md)
     """Share of the bytes for textures; 0: none."""
     texel_rate: float = 2.5e-3
     """Adam's learning rate of the texels; textures of one texel are not trained."""

@@ -26,7 +26,7 @@ SMOKE: dict[str, Any] = {
 }  # fmt: skip
 SMOKE_CAP = 1_000
 FLOATS_PER_TEXEL = 4
-# Chosen in docs/results-appendix.md, "The parts of bytewise".
+# Chosen in experiments/NOTEBOOK.md, "The parts of bytewise".
 PRUNING = Prune(at=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8))
 NO_PRUNING = dataclasses.replace(PRUNING, share=0.0)
 LAST_PRUNING = 0.8

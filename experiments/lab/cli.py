@@ -64,10 +64,9 @@ class Lab:
 
     def grid(self, name: str) -> Grid:
         """Return a grid with the requested scenes."""
-        held_out = not self.args.without_held_out
         return read_grid(
-            name, self.scale, scenes=self.args.only, held_out=held_out, own=self.own_scenes,
-            validation=self.args.validation, rehearsal=self.args.rehearsal,
+            name, self.scale, scenes=self.args.only, own=self.own_scenes, validation=self.args.validation,
+            rehearsal=self.args.rehearsal,
         )  # fmt: skip
 
     @property
@@ -107,7 +106,7 @@ class Lab:
     @property
     def is_partial(self) -> bool:
         """Return whether scenes are left out."""
-        return bool(self.args.only or self.args.without_held_out or self.args.scene)
+        return bool(self.args.only or self.args.scene)
 
     @property
     def pages(self) -> Path:
@@ -276,7 +275,6 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--scene", action="append", type=Path, default=[], metavar="PATH",
         help="run this scene folder instead of the scale's; may be repeated")  # fmt: skip
     add("--downscale", type=int, metavar="K", help="factor by which the photographs of --scene are downscaled")
-    add("--without-held-out", action="store_true", help="leave out the held-out scenes")
     add("--validation", action="store_true",
         help="hold out every eighth training view in place of the test views, to choose options by")  # fmt: skip
     add("--rehearsal", action="store_true",

@@ -195,7 +195,6 @@ def read_grid(
     scale: str,
     *,
     scenes: Sequence[str] | None = None,
-    held_out: bool = True,
     own: Sequence[SceneAt] = (),
     validation: bool = False,
     rehearsal: bool = False,
@@ -205,7 +204,6 @@ def read_grid(
     Args:
       name: name of a grid, or the path of a file that ends in .toml.
       scenes: labels of the wanted scenes; None for those that the file, or else the scale, names.
-      held_out: whether held-out scenes count.
       own: scenes that take the place of all these; empty for none.
       validation: whether validation views are held out in place of the test views.
       rehearsal: whether only the first cell is run, at a hundredth of the iterations.
@@ -230,7 +228,7 @@ def read_grid(
     cells = [
         cell
         for block in blocks_of(settings, f"{place}: {scale}")
-        for cell in _cells(block, own or chosen_scenes(known_scenes, block, scenes, held_out, place), place)
+        for cell in _cells(block, own or chosen_scenes(known_scenes, block, scenes, place), place)
     ]
     if not cells:
         raise ValueError(f"{place}: no scene is left")

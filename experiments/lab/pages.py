@@ -1,6 +1,6 @@
-"""Pages of the documentation that show tables of results, between marks that name their files.
+"""Tables of results within pages of text, between marks that name their files.
 
-<!-- results/small/claim.md -->
+<!-- results/small/fixed_memory.md -->
 …
 <!-- end -->
 """
@@ -11,23 +11,15 @@ from pathlib import Path
 from a2tg_jax.host.atomic import replacing
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
-DOCS = EXPERIMENTS.parent / "docs"
-PAGE, APPENDIX = DOCS / "results.md", DOCS / "results-appendix.md"
-TEXT = EXPERIMENTS / "appendix.md"
-"""Text of the appendix, without its tables."""
+PAGES = (EXPERIMENTS.parent / "docs" / "results.md", EXPERIMENTS / "NOTEBOOK.md")
 TITLE = re.compile(r"^# .*\n+", re.MULTILINE)
 BLOCK = re.compile(r"(<!-- (results/\S+\.md) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def pages(experiments: Path = EXPERIMENTS) -> dict[Path, str]:
-    """Return the pages with the committed tables, by path."""
-    sources = {PAGE: PAGE, APPENDIX: TEXT}
-    return {page: with_tables(source.read_text(encoding="utf-8"), experiments) for page, source in sources.items()}
-
-
-def refresh(experiments: Path = EXPERIMENTS) -> None:
-    """Write the pages."""
-    for page, text in pages(experiments).items():
+def refresh() -> None:
+    """Write the current tables into the pages."""
+    for page in PAGES:
+        text = with_tables(page.read_text(encoding="utf-8"), EXPERIMENTS)
         with replacing(page) as temporary:
             temporary.write_text(text, encoding="utf-8")
         print(page, flush=True)

@@ -10,8 +10,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 COLORS = {
     "A²TG": "#cc3311", "2DGS*-MCMC": "#4477aa", "Textured Gaussians*": "#228833", "SuperGaussians": "#aa3377",
     "BBSplat": "#ccaa33", "2DGS*": "#66ccee", "A²TG, as quick has it": "#ee7733",
-    "Bytewise": "#000000", "Bytewise, untextured": "#888888", "2DGS*-MCMC, degree 0": "#332288",
-    "2DGS*-MCMC, degree 1": "#44aa99", "2DGS*-MCMC, degree 2": "#ddaa33",
+    "Bytewise": "#000000", "2DGS*-MCMC, degree 0": "#332288", "2DGS*-MCMC, degree 1": "#44aa99",
 }  # fmt: skip
 OTHER_COLOR = "#777777"
 STYLES = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"))
@@ -71,6 +70,25 @@ def charts(
     handles = {label: handle for axes in row for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     columns = min(LEGEND_COLUMNS, max(1, len(handles)))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, fontsize=8)
+    return figure
+
+
+def forest(found: Mapping[str, tuple[Sequence[float], float, float]], x_label: str) -> Figure:
+    """Return a row for each comparison: the values of its scenes, and their mean with its interval.
+
+    Args:
+      found: values, mean and half-width of the interval by name; the first is drawn on top.
+    """
+    figure = Figure(figsize=(8.0, 0.8 + 0.26 * len(found)), layout="constrained")
+    axes = figure.add_subplot()
+    for place, (values, mean, half_width) in enumerate(found.values()):
+        axes.plot(values, [place] * len(values), "o", color="#4477aa", alpha=0.35, markersize=4, markeredgewidth=0)
+        axes.errorbar(mean, place, xerr=np.nan_to_num(half_width), fmt="D", color="#000000", markersize=4, capsize=3)
+    axes.axvline(0.0, color="#888888", linewidth=0.8)
+    axes.set_yticks(range(len(found)), list(found), fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xlabel(x_label)
+    axes.grid(alpha=0.25, axis="x")
     return figure
 
 

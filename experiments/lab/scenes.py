@@ -22,8 +22,6 @@ class SceneAt:
     """DATASET/NAME, or a name without a data set."""
     path: str
     downscale: int = 1
-    held_out: bool = False
-    """Mark of a scene on which no choice may be made."""
     size: tuple[int, int] | None = None
     """Width and height of its photographs in full, where bytes are given for each pixel."""
     fold: int | None = None
@@ -113,7 +111,7 @@ def _placed(path: str, folder: Path | None) -> str:
 
 
 def chosen_scenes(
-    scenes: Mapping[str, SceneAt], block: Block, wanted: Sequence[str] | None, held_out: bool, place: str
+    scenes: Mapping[str, SceneAt], block: Block, wanted: Sequence[str] | None, place: str
 ) -> list[SceneAt]:
     """Return the scenes of a block, or the wanted ones, at the block's downscale if it has one.
 
@@ -126,5 +124,4 @@ def chosen_scenes(
             hint = did_you_mean(label, scenes) or f"; there are {', '.join(scenes)}"
             raise ValueError(f"{place}: there is no scene {label!r} at this scale{hint}")
     found = [scenes[label] for label in labels]
-    found = [dataclasses.replace(scene, downscale=block.downscale or scene.downscale) for scene in found]
-    return [scene for scene in found if held_out or not scene.held_out]
+    return [dataclasses.replace(scene, downscale=block.downscale or scene.downscale) for scene in found]

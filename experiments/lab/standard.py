@@ -26,8 +26,6 @@ WRITERS: Mapping[str, Callable[[Grid, Sequence[Result]], str]] = {
     "choices": _choices,
 }
 """Functions that write the tables of a grid, by kind."""
-BESIDE_PAPER = ("full", "small", "smoke")
-"""Scales whose pages have the paper's tables; the appendix shows those of `small` beside those of `long`."""
 
 
 def table_experiment(name: str, description: str, grid: str | None = None) -> Experiment:
@@ -57,10 +55,8 @@ def paper_experiment(name: str, place: str, description: str) -> Experiment:
 
     def present(lab: Lab, grids: Sequence[Grid]) -> None:
         (grid,) = grids
-        text = f"# {grid.title}\n\n{_as_text(lab, grid)}"
-        if grid.scale in BESIDE_PAPER:
-            text += f"\n## In the paper\n\n{tables.paper_table(name, place, tables.QUALITY_COLUMNS)}"
-        lab.write(name, text)
+        paper = tables.paper_table(name, place, tables.QUALITY_COLUMNS)
+        lab.write(name, f"# {grid.title}\n\n{_as_text(lab, grid)}\n## In the paper\n\n{paper}")
 
     return Experiment(name, (name,), present, description)
 
@@ -75,11 +71,6 @@ def _as_text(lab: Lab, grid: Grid) -> str:
 
 
 STANDARD = (
-    table_experiment("claim", "The paper's claim: A²TG beside plain Gaussians and textures of one size, equal bytes."),
-    table_experiment("texel_rate", "The texels' learning rate at two densities, without the held-out scene."),
-    table_experiment("defaults", "Each open choice of the method, one at a time, without the held-out scene."),
-    table_experiment("plain", "Plain Gaussians at equal bytes, by densification, degree and pruning."),
-    table_experiment("where_textures_pay", "The claim over the number of Gaussians, training length and image size."),
     paper_experiment("fixed_memory", "budget_mb", "Every method in A²TG's final bytes: Table 1 of the paper."),
     paper_experiment("fixed_number", "gaussians", "Every method with one number of Gaussians: Table 2 of the paper."),
     table_experiment("degree_0", "The paper's claim with every method at degree 0 (PROTOCOL.md)."),
@@ -87,5 +78,4 @@ STANDARD = (
     table_experiment("degree_3", "The paper's claim with every method at degree 3 (PROTOCOL.md)."),
     table_experiment("bytewise", "bytewise against the best plain method of each scene (PROTOCOL.md)."),
     table_experiment("parts", "What each part of bytewise brings (PROTOCOL.md)."),
-    table_experiment("quick_preset", "The preset `quick` with its numbers put back to the paper's, one at a time."),
 )

@@ -2,11 +2,10 @@
 
 A column is a scene, or the mean over a data set if scenes belong to data sets. Means are taken over the seeds of a
 scene first, then over scenes, so that every scene counts once. `± x` is the half-width of the 95 % t interval over
-scenes. A difference within the spread of seeds is called undecided.
+scenes.
 """
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -83,8 +82,6 @@ class SceneMean:
     """NaN without scenes."""
     half_width: float
     """Half-width of the t interval over scenes at the level `CONFIDENCE`; NaN with fewer than two scenes."""
-    p_value: float
-    """Two-sided p-value of Student's t-test of a mean of 0; NaN with fewer than two scenes."""
 
     def as_text(self, digits: int) -> str:
         """Return the mean and its interval for a table."""
@@ -96,21 +93,10 @@ class SceneMean:
 def over_scenes(values: Iterable[float]) -> SceneMean:
     """Return the mean of one value a scene."""
     found = np.array(list(values), float)
-    nan = float("nan")
     if len(found) < 2 or np.isnan(found).any():
-        return SceneMean(float(np.mean(found)) if len(found) else nan, nan, nan)
-    error = scipy.stats.sem(found)
-    half = error * scipy.stats.t.ppf((1 + CONFIDENCE) / 2, len(found) - 1)
-    return SceneMean(float(found.mean()), float(half), float(scipy.stats.ttest_1samp(found, 0.0).pvalue))
-
-
-def gains_by_scene(results: Sequence[Result], label: str, other: str, figure: str) -> dict[str, float]:
-    """Return a method's figure less another's, averaged over seeds, then over the sizes of each scene."""
-    sizes: dict[str, list[float]] = {}
-    for cell, block in grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
-        if gains := _gains(block, label, other, figure):
-            sizes.setdefault(cell.scene.label, []).append(float(np.mean(gains)))
-    return {scene: float(np.mean(own)) for scene, own in sizes.items()}
+        return SceneMean(float(np.mean(found)) if len(found) else float("nan"), float("nan"))
+    half = scipy.stats.sem(found) * scipy.stats.t.ppf((1 + CONFIDENCE) / 2, len(found) - 1)
+    return SceneMean(float(found.mean()), float(half))
 
 
 def number(value: float, digits: int) -> str:
@@ -221,14 +207,13 @@ def variants_of_reference(grid: Grid, results: Sequence[Result]) -> str:
 
 
 def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]) -> str:
-    """Return the gain of the reference over other methods in each cell, with a verdict.
+    """Return the gain of the reference over other methods in each cell.
 
     Args:
       results: finished runs of one grid.
       reference: label of the method.
       others: labels of the compared methods; those at equal bytes end with `EQUAL_BYTES`.
     """
-    spread = seed_spread(results, reference, others)
     rows: list[list[str]] = []
     every: dict[str, dict[str, list[float]]] = {other: {} for other in others}
     for place, block in grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
@@ -242,26 +227,13 @@ def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]
                 shown.append(MISSING)
                 continue
             every[other].setdefault(place.scene.label, []).append(float(np.mean(gains)))
-            said = "" if spread is None else f" ({verdict(gains, spread)})"
-            shown.append(
-                f"{signed(float(np.mean(gains)), 2)}{said} · {signed(float(np.mean(lpips)), 3)} · "
-                f"{signed(float(np.mean(train)), 2)}"
-            )
+            means = (float(np.mean(found)) for found in (gains, lpips, train))
+            shown.append(" · ".join(signed(one, digits) for one, digits in zip(means, (2, 3, 2), strict=True)))
         rows.append([*_place_texts(place, own[0]), number(mean(own, "mb"), 2), quality(own), _seeds(own), *shown])
     rows.append(["*mean ± 95 % interval*", *[""] * 6, *map(_mean_and_interval, every.values())])
     header = ["scene", "pixels", "iterations", "Gaussians", "MB", f"{reference}: PSNR / SSIM / LPIPS", "seeds"]
     text = markdown([*header, *(f"against {other}: dB · LPIPS · train dB" for other in others)], rows)
-    return f"{text}\n{_spread_text(spread)}\n"
-
-
-def _spread_text(spread: float | None) -> str:
-    interval = "The last row is the mean over scenes, each counted once, with its 95 % t interval over scenes."
-    if spread is None:
-        return f"No cell has two seeds, so no verdict is given. {interval}"
-    return (
-        f"Two seeds differ by {spread:.2f} dB in such a difference (root mean square). A mean of n seeds within that "
-        f"spread, divided by √n, is called undecided. {interval}"
-    )
+    return f"{text}\nThe last row is the mean over scenes, each counted once, with its 95 % t interval over scenes.\n"
 
 
 def _place_texts(cell: Cell, result: Result) -> list[str]:
@@ -281,24 +253,6 @@ def _mean_and_interval(gains: Mapping[str, Sequence[float]]) -> str:
     if len(gains) < 2:
         return MISSING
     return over_scenes(float(np.mean(own)) for own in gains.values()).as_text(2)
-
-
-def seed_spread(results: Sequence[Result], reference: str, others: Sequence[str]) -> float | None:
-    """Return the root mean square difference of two seeds in a gain, in dB; None if no cell has two seeds."""
-    spreads = []
-    for _, block in grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
-        for other in others:
-            gains = _gains(block, reference, other, "psnr")
-            spreads += [a - b for a, b in itertools.pairwise(gains)]
-    return float(np.sqrt(np.mean(np.square(spreads)))) if spreads else None
-
-
-def verdict(gains: Sequence[float], spread: float) -> str:
-    """Return "above", "below", or "undecided" if the mean gain is within the spread of seeds."""
-    mean_gain = float(np.mean(gains))
-    if abs(mean_gain) <= spread / np.sqrt(len(gains)):
-        return "undecided"
-    return "above" if mean_gain > 0 else "below"
 
 
 def _gains(block: Sequence[Result], reference: str, other: str, figure: str) -> list[float]:
