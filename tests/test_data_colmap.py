@@ -11,6 +11,7 @@ from test_data_transforms import dot_place as place_of, save_dot, shares_seen
 
 from a2tg_jax.data import load_scene, view_image
 from a2tg_jax.data.colmap import _model_of, _read_model, viewmat_of
+from a2tg_jax.data.colmap_cameras import MODELS, ColmapCamera
 from a2tg_jax.data.colmap_library import pycolmap
 
 TARGET = np.array([0.3, -0.2, 0.1])
@@ -226,6 +227,33 @@ def test_bad_options(tmp_path, options, message):
         load_scene(tmp_path, **options)
 
 
+def test_camera_models_are_those_of_pycolmap():
+    colmap = pycolmap()
+    numbers = {int(model): name for name, model in colmap.CameraModelId.__members__.items() if name != "INVALID"}
+    assert {number: model.name for number, model in MODELS.items()} == numbers
+    points = np.random.default_rng(0).uniform([-0.3, -0.2, 1], [0.3, 0.2, 2], (20, 3))
+    for model in MODELS.values():
+        theirs = colmap.Camera.create_from_model_name(0, model.name, 40.0, 64, 48)
+        own = ColmapCamera(model.name, 64, 48, tuple(theirs.params.tolist()))
+        assert len(own.params) == model.num_params
+        assert len(own.distortion) == len(theirs.extra_params_idxs())
+        assert model.num_focal == len(theirs.focal_length_idxs())
+        if own.is_undistorted:
+            np.testing.assert_allclose(own.matrix, theirs.calibration_matrix())
+            np.testing.assert_allclose(own.pixels(points), theirs.img_from_cam(points), rtol=1e-12)
+            np.testing.assert_allclose(own.slopes(own.pixels(points)), points[:, :2] / points[:, 2:], atol=1e-12)
+
+
+def test_without_pycolmap_pinholes_are_read_and_other_lenses_say_what_to_do(tmp_path, monkeypatch):
+    """It has no wheel for ARM Linux, for example."""
+    write_scene(tmp_path / "pinhole", num_views=2)
+    write_scene(tmp_path / "opencv", num_views=2, models=("OPENCV",))
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert len(loaded(tmp_path / "pinhole", 2).train) == 2
+    with pytest.raises(ValueError, match="undistorting photographs need pycolmap, which is not installed"):
+        load_scene(tmp_path / "opencv")
+
+
 @pytest.mark.long
 def test_zlib_survives_pycolmap_in_a_fresh_process(tmp_path):
     """pycolmap breaks Python's zlib unless that is loaded first."""
@@ -235,6 +263,10 @@ import sys
 import a2tg_jax.data
 assert "pycolmap" not in sys.modules, "importing the package is slower than it need be"
 a2tg_jax.data.load_scene({str(tmp_path)!r})
+assert "pycolmap" not in sys.modules, "pinholes do not need it"
+from a2tg_jax.data.colmap_cameras import MODELS, ColmapCamera
+from a2tg_jax.data.colmap_library import pycolmap
+pycolmap()
 import gzip, io, numpy as np
 np.savez_compressed(io.BytesIO(), a=np.zeros(1000))
 gzip.compress(bytes(1000))

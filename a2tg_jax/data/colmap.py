@@ -4,13 +4,14 @@ import dataclasses
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, assemble_scene, every_kth, rigid_viewmat
+from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.colmap_files import KINDS, POINT, FrameRecord, ImageRecord, RigRecord, num_images, read_file
 from a2tg_jax.data.image_files import inside, on_disk, warn_of_unposed
 from a2tg_jax.data.lenses import checked_lens
@@ -37,8 +38,8 @@ refined rig differs from one place by about that much."""
 class SparseModel(NamedTuple):
     """Sparse model."""
 
-    cameras: dict[int, Any]
-    """pycolmap.Camera, by id."""
+    cameras: dict[int, ColmapCamera]
+    """Cameras by id."""
     images: list[ImageRecord]
     points: np.ndarray
     """[P] `POINT`, by id."""

@@ -27,7 +27,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.colmap_cameras import BY_NAME, MODELS, ColmapCamera
 from a2tg_jax.host.regular_files import open_regular
 from a2tg_jax.host.text import shortened
 
@@ -105,16 +105,6 @@ def read_file(path: Path, kind: str) -> Any:
             return _Binary(path, data).read(kind)
 
 
-@functools.cache
-def _camera_models() -> dict[int, tuple[str, int]]:
-    """Return the name and the number of parameters of COLMAP's camera models, by their number."""
-    return {
-        int(model): (name, len(pycolmap().Camera.create_from_model_name(0, name, 1.0, 1, 1).params))
-        for name, model in pycolmap().CameraModelId.__members__.items()
-        if name != "INVALID"
-    }
-
-
 def _decoded_name(path: Path, name: bytes) -> str:
     try:
         return name.decode()
@@ -160,13 +150,12 @@ class _Binary:
         numbers = _little_endian(format)
         return numbers.unpack_from(self.data, self.skip(numbers.size))
 
-    def cameras(self) -> tuple[int, Any]:
+    def cameras(self) -> tuple[int, ColmapCamera]:
         number, model = self.take("Ii")
-        if model not in _camera_models():
+        if model not in MODELS:
             raise self.error(f"has the camera model {model}, which is none of COLMAP's")
-        name, count = _camera_models()[model]
-        width, height, *params = self.take(f"2Q{count}d")
-        return number, pycolmap().Camera(model=name, width=width, height=height, params=params)
+        width, height, *params = self.take(f"2Q{MODELS[model].num_params}d")
+        return number, ColmapCamera(MODELS[model].name, width, height, tuple(params))
 
     def images(self) -> ImageRecord:
         number, *pose, camera = self.take("I7dI")
@@ -222,13 +211,12 @@ def _text_record(kind: str, path: Path, line: bytes, features: bytes) -> Any:
     record: Any
     if kind == "cameras":
         number, name = whole(), next(words).decode("ascii", "replace")
-        count = dict(_camera_models().values()).get(name)
-        if count is None:
+        if name not in BY_NAME:
             raise ValueError(f"COLMAP has no camera model {shortened(name)}")
-        width, height, params = whole(), whole(), [float(word) for word in words]
-        if len(params) != count:
-            raise ValueError(f"{name} has {count} parameters; got {len(params)}")
-        record = number, pycolmap().Camera(model=name, width=width, height=height, params=params)
+        width, height, params = whole(), whole(), tuple(float(word) for word in words)
+        if len(params) != BY_NAME[name].num_params:
+            raise ValueError(f"{name} has {BY_NAME[name].num_params} parameters; got {len(params)}")
+        record = number, ColmapCamera(name, width, height, params)
     elif kind == "images":
         number, pose, camera, _ = whole(), floats(7), whole(), next(words)
         name = _decoded_name(path, line.split(None, 9)[9].strip())  # The rest of the line, which may have spaces.

@@ -17,10 +17,19 @@ def pycolmap() -> ModuleType:
     with "free(): invalid pointer" (pycolmap 4.2.1). Its import also installs glog's signal handlers, which print a
     C++ stack at SIGTERM; the handlers from before are restored. Photographs are read by several threads, of which only
     one may import it.
+
+    Raises:
+      ValueError: if it is not installed, since it has no wheel for some machines.
     """
     import zlib  # noqa: F401
 
     with _lock, contextlib.nullcontext() if "pycolmap" in sys.modules else signal_handlers_kept():
-        import pycolmap  # noqa: F401
+        try:
+            import pycolmap  # noqa: F401
+        except ImportError as error:  # There are wheels for x86-64 Linux and Windows and for macOS on arm64.
+            raise ValueError(
+                f"finding cameras and undistorting photographs need pycolmap, which is not installed on this machine "
+                f"({error}): do this step on another machine, with a2tg sfm or COLMAP's image_undistorter"
+            ) from None
 
     return sys.modules["pycolmap"]

@@ -4,13 +4,14 @@ import dataclasses
 import functools
 import threading
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from a2tg_jax.core.cameras import check_intrinsics
+from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.observations import pinhole_pixels
 
@@ -37,10 +38,9 @@ _LOCK = threading.Lock()
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lens:
-    """A calibrated camera of any COLMAP model. Pixel centres are at +0.5, as in COLMAP."""
+    """A calibrated camera of any COLMAP model."""
 
-    camera: Any
-    """pycolmap.Camera, at the size it was calibrated for."""
+    camera: ColmapCamera
     is_kept: bool = False
     """Whether photographs are kept as they are, with `rays` as places in the image plane of their K."""
 
@@ -52,33 +52,36 @@ class Lens:
     @cached_property
     def is_pinhole(self) -> bool:
         """Whether the camera projects like its calibration matrix (models with zero distortion do)."""
+        if self.camera.is_undistorted:
+            return True
         width, height = self.size
-        # Models with distortion are pinholes if all of its parameters are 0, whatever their kind.
         grid = np.stack(np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5)), -1).reshape(-1, 2)
-        rays = np.asarray(self.camera.cam_from_img(grid))
-        projected = _homogeneous(rays) @ self.camera.calibration_matrix()[:2].T
+        projected = _homogeneous(self.camera.slopes(grid)) @ self.camera.matrix[:2].T
         return bool(np.abs(projected - grid).max() <= PINHOLE_TOLERANCE)  # False for NaN: no ray, no pinhole
 
     @cached_property
     def pinhole(self) -> tuple[np.ndarray, tuple[int, int]]:
         """K [3, 3] and (width, height) of the undistorted image: same focal lengths, largest area without blanks."""
+        if self.camera.is_undistorted:
+            return self.camera.matrix, self.size
+        colmap = pycolmap()
         try:
             if self.is_pinhole:
-                return self.camera.calibration_matrix(), self.size
-            pinhole = pycolmap().undistort_camera(pycolmap().UndistortCameraOptions(), self.camera)
+                return self.camera.matrix, self.size
+            pinhole = colmap.undistort_camera(colmap.UndistortCameraOptions(), self.camera.colmap)
         except (ValueError, RuntimeError):  # COLMAP's own check that the model is perspective
-            raise ValueError(f"{self.camera.model.name} cannot be undistorted to a pinhole camera{CUT}") from None
+            raise ValueError(f"{self.camera.name} cannot be undistorted to a pinhole camera{CUT}") from None
         K, size = pinhole.calibration_matrix(), (pinhole.width, pinhole.height)
         # The middle half of the image must be nearly in the photograph and not mirrored. Corners may fold, because
         # calibrations are arbitrary where they saw no feature.
         x, y = (side * np.linspace(0.25, 0.75, GRID) for side in size)
         rays = _homogeneous(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)) @ np.linalg.inv(K).T
-        places = np.asarray(self.camera.img_from_cam(rays)).reshape(GRID, GRID, 2) / self.size
+        places = self.camera.pixels(rays).reshape(GRID, GRID, 2) / self.size
         is_inside = ((places >= -MARGIN) & (places <= 1 + MARGIN)).all()  # False for NaN.
         is_ordered = (np.diff(places[..., 0], axis=1) > 0).all() and (np.diff(places[..., 1], axis=0) > 0).all()
         if not (is_inside and is_ordered):
             raise ValueError(
-                f"{self.camera.model.name} has a distortion that folds the image or leaves it: correct its parameters, "
+                f"{self.camera.name} has a distortion that folds the image or leaves it: correct its parameters, "
                 'or keep the photographs as they are (lens="keep")'
             )
         return K, size
@@ -123,7 +126,7 @@ class Lens:
         height)."""
         if not self.is_kept:
             return pinhole_pixels(points, K)
-        return np.asarray(self.camera.img_from_cam(points)) * np.divide(size, self.size)
+        return self.camera.pixels(points) * np.divide(size, self.size)
 
     def rays(self, width: int, height: int) -> np.ndarray | None:
         """Return the rays [height, width, 2] of views of a size, as in `Camera.rays`; NaN where there is none.
@@ -136,17 +139,14 @@ class Lens:
         K = _scaled_intrinsics(self._matrix(), self.size, (width, height))
         if self.is_pinhole:
             return None
-        # lru_cache needs arguments that can be hashed.
-        camera = self.camera
         with _LOCK:  # Threads that read photographs of one lens share its rays.
-            return _rays(camera.model.name, self.size, tuple(camera.params.tolist()), (width, height), K.tobytes())
+            return _rays(self.camera, (width, height), K.tobytes())
 
     def _matrix(self) -> np.ndarray:
         try:
-            matrix: np.ndarray = self.camera.calibration_matrix()
-        except (ValueError, RuntimeError):
-            raise ValueError(f"{self.camera.model.name} has no image plane{CUT}") from None
-        return matrix
+            return self.camera.matrix
+        except ValueError as error:
+            raise ValueError(f"{error}{CUT}") from None
 
     def _sampled(self, planes: np.ndarray) -> np.ndarray:
         """Return float32 planes of the undistorted image, sampled bilinearly from planes [h, w, C] of a photograph."""
@@ -159,7 +159,7 @@ class Lens:
             x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(top, top + len(rows)) + 0.5)
             rays = _homogeneous(np.stack([x, y], -1).reshape(-1, 2)) @ to_rays
             # From x and y of COLMAP, whose first pixel has its centre at 0.5, to row and column of the array.
-            places = np.asarray(self.camera.img_from_cam(rays)) * np.divide(stored, self.size) - 0.5
+            places = self.camera.pixels(rays) * np.divide(stored, self.size) - 0.5
             coordinates = places[:, ::-1].T.reshape(2, len(rows), width)
             for channel in range(planes.shape[2]):
                 rows[..., channel] = map_coordinates(planes[..., channel], coordinates, order=1, mode="nearest")
@@ -167,22 +167,19 @@ class Lens:
 
 
 @functools.lru_cache(maxsize=256)
-def _rays(
-    model: str, size: tuple[int, int], params: tuple[float, ...], picture: tuple[int, int], K: bytes
-) -> np.ndarray:
+def _rays(camera: ColmapCamera, picture: tuple[int, int], K: bytes) -> np.ndarray:
     """Return the rays of a lens for pictures of a size; the same array for the same lens."""
-    camera = pycolmap().Camera(model=model, width=size[0], height=size[1], params=params)
     x, y = np.meshgrid(*(np.arange(side) + 0.5 for side in picture))
-    places = np.stack([x, y], -1).reshape(-1, 2) * np.divide(size, picture)
-    slopes = np.asarray(camera.cam_from_img(places), np.float64)
+    places = np.stack([x, y], -1).reshape(-1, 2) * np.divide((camera.width, camera.height), picture)
+    slopes = camera.slopes(places)
     # A polynomial that folds has no inverse there: what comes back must lead to the pixel again.
-    again = np.asarray(camera.img_from_cam(_homogeneous(np.nan_to_num(slopes))))
+    again = camera.pixels(_homogeneous(np.nan_to_num(slopes)))
     is_ray = np.linalg.norm(again - places, axis=1) <= FARTHEST_FROM_RAY
     is_ray &= np.linalg.norm(slopes, axis=1) <= np.tan(WIDEST_ANGLE)  # False for NaN.
     if is_ray.mean() < LEAST_SEEN:
         raise ValueError(
-            f"{model} gives {is_ray.mean():.0%} of the pixels a ray within {np.rad2deg(WIDEST_ANGLE):.0f}° of the "
-            "direction of view: are its parameters right?"
+            f"{camera.name} gives {is_ray.mean():.0%} of the pixels a ray within {np.rad2deg(WIDEST_ANGLE):.0f}° of "
+            "the direction of view: are its parameters right?"
         )
     rays = _homogeneous(slopes) @ np.frombuffer(K).reshape(3, 3)[:2].T
     found = np.where(is_ray[:, None], rays, np.nan).astype(np.float32).reshape(picture[1], picture[0], 2)
@@ -195,19 +192,18 @@ def forget_rays() -> None:
     _rays.cache_clear()
 
 
-def checked_lens(camera: Any, what: str, use: LensUse = "undistort") -> Lens:
-    """Return the lens of a pycolmap.Camera, named `what` in errors.
+def checked_lens(camera: ColmapCamera, what: str, use: LensUse = "undistort") -> Lens:
+    """Return the lens of a camera, named `what` in errors.
 
     Raise ValueError if a number is not finite or beyond the bounds of `check_intrinsics` and `LARGEST_DISTORTION`.
     """
-    params = np.asarray(camera.params, np.float64)
-    if not np.isfinite(params).all():
-        raise ValueError(f"{what}: its camera's parameters must be finite; got {params.tolist()}")
-    distortion = params[list(camera.extra_params_idxs())]
-    if distortion.size and np.abs(distortion).max() > LARGEST_DISTORTION:
-        raise ValueError(f"{what}: its distortion must be within ±{LARGEST_DISTORTION:g}; got {distortion.tolist()}")
-    if len(camera.focal_length_idxs()):  # Panoramas have none.
-        check_intrinsics(camera.calibration_matrix(), camera.width, camera.height, what)
+    if not np.isfinite(camera.params).all():
+        raise ValueError(f"{what}: its camera's parameters must be finite; got {list(camera.params)}")
+    if any(abs(value) > LARGEST_DISTORTION for value in camera.distortion):
+        wanted = f"within ±{LARGEST_DISTORTION:g}"
+        raise ValueError(f"{what}: its distortion must be {wanted}; got {list(camera.distortion)}")
+    if camera.model.num_focal:  # Panoramas have none.
+        check_intrinsics(camera.matrix, camera.width, camera.height, what)
     return Lens(camera, is_kept=use == "keep")
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_viewmat
-from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.image_files import inside
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.photo_reading import Counted, Options, Photo, read_photos
@@ -225,5 +225,5 @@ def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int])
     else:
         # k4 to k6 of FULL_OPENCV are in a denominator, which is 1 with zeros.
         model, distortion = "FULL_OPENCV", [*(terms[key] for key in PRISM_KEYS[:5]), 0.0, 0.0, 0.0]
-    params = [fx, fy, number("cx", width / 2), number("cy", height / 2), *distortion]
-    return checked_lens(pycolmap().Camera(model=model, width=width, height=height, params=params), what, use)
+    params = (fx, fy, number("cx", width / 2), number("cy", height / 2), *distortion)
+    return checked_lens(ColmapCamera(model, width, height, params), what, use)
