@@ -12,6 +12,7 @@ import pytest
 from PIL import ExifTags, Image
 from test_data_colmap import write_scene as write_colmap
 
+from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import intrinsics
 from a2tg_jax.data import load_scene, run_sfm, sfm, synthetic
 from a2tg_jax.data.colmap_library import pycolmap
@@ -74,6 +75,9 @@ def test_photographs_of_two_folders_become_a_scene(tmp_path):
     np.testing.assert_allclose(steps / steps.sum(), expected_steps / expected_steps.sum(), atol=0.05)
     up = np.stack([-np.asarray(view.camera.viewmat)[1, :3] for view in scene.train])
     assert (up @ up.T > 0.9).all(), "no photograph lies on its side"
+    back = scene.transform.inverse()
+    original = [back.apply_to_viewmat(np.asarray(view.camera.viewmat, np.float64)) for view in scene.train]
+    np.testing.assert_allclose(vertical_of(np.stack(original)), [0, -1, 0], atol=1e-6)
     with pytest.raises(FileExistsError, match="exists already"):
         run_sfm(tmp_path / "a", tmp_path / "scene", progress=False)
 

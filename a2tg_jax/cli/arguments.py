@@ -14,6 +14,7 @@ from tyro.conf import Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from a2tg_jax.host.remote_files import is_url, without_secrets
+from a2tg_jax.io.other_programs import World
 
 Parsed = TypeVar("Parsed")
 
@@ -34,6 +35,13 @@ RunOrFile = Annotated[
     arg(
         metavar="RUN_OR_FILE",
         help="Run folder, model (*.npz), compact scene (*.a2tgz), or splats of other programs (*.ply, *.spz, ...).",
+    ),
+]
+FileWorld = Annotated[
+    World,
+    arg(
+        help="Axes of files of other programs. upright: turned until +y is down, as these programs expect; map "
+        "coordinates are kept. original: as the capture has them."
     ),
 ]
 LpipsWeights = Annotated[

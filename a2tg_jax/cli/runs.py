@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import LastModel, LpipsWeights, RunFolderPath, RunOrFile, defaulting_to
+from a2tg_jax.cli.arguments import FileWorld, LastModel, LpipsWeights, RunFolderPath, RunOrFile, defaulting_to
 from a2tg_jax.cli.train import open_browser, print_result
 from a2tg_jax.host.text import counted
 from a2tg_jax.mesh.files import mesh_files
@@ -239,8 +239,8 @@ class ViewCommand:
 class Export:
     """Write a page that shows a scene in any browser, or a PLY file for other programs.
 
-    The page is a folder for a web server, or one HTML file that opens without one. The PLY file holds the Gaussians in
-    the original world, flat and without textures, as 3DGS programs read them.
+    The page is a folder for a web server, or one HTML file that opens without one. The PLY file holds the Gaussians,
+    upright, flat and without textures, as 3DGS programs read them.
 
     Examples:
       a2tg export runs/fox --web site/fox
@@ -255,6 +255,7 @@ class Export:
     """Output file of the Gaussians."""
     float64: bool = False
     """Write the positions of --ply as float64, so that map coordinates keep their precision."""
+    world: FileWorld = "upright"
     single_file: bool = False
     """Write one HTML file, whatever its name."""
     photographs: bool = False
@@ -266,8 +267,9 @@ class Export:
     def run(self) -> None:
         if self.web is None and (self.ply is None or self.single_file or self.photographs):
             raise ValueError("give --web PATH for a page, or --ply FILE for other programs")
-        if self.float64 and self.ply is None:
-            raise ValueError("--float64 has no effect without --ply: add it")
+        for name in ("float64", "world"):
+            if getattr(self, name) != getattr(Export, name) and self.ply is None:
+                raise ValueError(f"--{name} has no effect without --ply: add it")
         # All outputs are checked before the first one is written.
         if self.ply is not None:
             check_output(self.ply)
@@ -285,7 +287,7 @@ class Export:
         if self.web is not None:
             print(export_web(source, self.web, **page))
         if self.ply is not None:
-            print(export_ply(source, self.ply, float64=self.float64))
+            print(export_ply(source, self.ply, float64=self.float64, world=self.world))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -294,7 +296,7 @@ class Convert:
 
     Reads and writes *.npz, *.a2tgz, *.ply, *.compressed.ply, *.spz, *.sog, *.splat, *.ksplat, *.glb, *.gltf, *.usda,
     *.usdc and *.usdz. Also reads checkpoints of gsplat, Nerfstudio, 3DGS and 2DGS (*.pt, *.pth, *.ckpt). Gaussians of
-    3DGS are flattened along their thinnest axis. Files of other programs hold the original world.
+    3DGS are flattened along their thinnest axis. Files of other programs are upright, with the original units.
 
     Other programs support no textures, and no kernels but Gaussians. --bake turns a textured splat into plain ones, as
     many as its texels or fewer, and trains them on pictures of the model from its training cameras. The photographs
@@ -319,6 +321,7 @@ class Convert:
 
     float64: bool = False
     """Write the positions of a PLY as float64, so that map coordinates keep their precision."""
+    world: FileWorld = "upright"
 
     overwrite: bool = False
     """Replace the output file."""
@@ -328,7 +331,17 @@ class Convert:
         if not self.bake and options != BakeOptions():
             raise ValueError("--bake-growth and --bake-iterations have no effect without --bake: add it")
         baking = options if self.bake else None
-        print(convert(self.source, self.out, self.model, baking=baking, float64=self.float64, overwrite=self.overwrite))
+        print(
+            convert(
+                self.source,
+                self.out,
+                self.model,
+                baking=baking,
+                float64=self.float64,
+                world=self.world,
+                overwrite=self.overwrite,
+            )
+        )
 
 
 @dataclasses.dataclass(frozen=True)

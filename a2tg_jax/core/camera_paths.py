@@ -71,6 +71,27 @@ def vertical_of(viewmats: np.ndarray) -> np.ndarray:
     return np.asarray(axis * np.sign(axis @ up))
 
 
+def upright_rotation(vertical: np.ndarray) -> np.ndarray:
+    """Return the rotation [3, 3] from a world with this vertical [3] to one whose −y is up, as programs for splats
+    expect.
+
+    The axis nearest to the vertical is turned first, as between worlds of y and z up, and half about z where y points
+    down: the axes of a capture that is upright only change their names. The shortest rotation then does the rest.
+    """
+    up = vertical / np.linalg.norm(vertical)
+    nearest = np.eye(3)[np.abs(up).argmax()] * np.sign(up[np.abs(up).argmax()])
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    quarter = np.eye(3) if nearest[1] < 0 else half_turn @ _shortest_turn(nearest, np.array([0.0, 1.0, 0.0]))
+    return np.asarray(_shortest_turn(quarter @ up, np.array([0.0, -1.0, 0.0])) @ quarter)
+
+
+def _shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the shortest rotation [3, 3] between unit vectors that are not opposite, by Rodrigues' formula."""
+    x, y, z = np.cross(start, end)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1 + start @ end)
+
+
 def central_camera(viewmats: np.ndarray) -> int:
     """Return the index of the camera [V, 4, 4] whose axis passes nearest to the subject and which is nearest to the
     median camera, with equal weight."""

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.assembly import PointCloud
@@ -20,6 +21,8 @@ BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">
 LONGEST_LINE, MOST_LINES, MOST_DIGITS = 4096, 10_000, 20
 OFFSET = "offset"
 """First word of the comment with the origin of positions."""
+ROTATION = "rotation"
+"""First word of the comment with the rotation (wxyz) from the original world to the file's."""
 COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Names of colours, in order of preference."""
 SH_DEGREE0 = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -118,19 +121,37 @@ class PlyFile:
     @property
     def offset(self) -> np.ndarray:
         """[3] float64 origin of positions: zeros without the comment "offset X Y Z"."""
+        found = self._comment(OFFSET, 3)
+        return np.zeros(3) if found is None else found
+
+    @property
+    def turn(self) -> np.ndarray:
+        """[3, 3] rotation from the original world: none without the comment "rotation W X Y Z"."""
+        return turn_of(self._comment(ROTATION, 4))
+
+    def _comment(self, first: str, count: int) -> np.ndarray | None:
+        """Return the numbers of the first comment that is a word and this many numbers."""
         for word, *numbers in filter(None, self.comments):
-            if word == OFFSET and len(numbers) == 3:
+            if word == first and len(numbers) == count:
                 try:
                     return np.array([float(number) for number in numbers])
                 except ValueError:
                     continue  # A comment of another program.
-        return np.zeros(3)
+        return None
+
+
+def turn_of(quat: np.ndarray | None) -> np.ndarray:
+    """Return the rotation [3, 3] of a quaternion (wxyz); none without one, or if it is none."""
+    if quat is None or not np.isfinite(quat).all() or not quat.any():
+        return np.eye(3)
+    return np.asarray(Rotation.from_quat(quat, scalar_first=True).as_matrix())
 
 
 def read_ply_points(path: Path) -> PointCloud:
     """Return the points of a PLY file whose first element is `vertex` with x, y, z.
 
-    Positions that are relative to an offset, as `save_ply` writes map coordinates, are in the original world.
+    Positions that are turned upright, or relative to an offset as map coordinates, by `save_ply`, come back to the
+    original world.
 
     Colours are whole numbers of 8 bits or, if some are above 255, of 16 or 32; or floats in [0, 1] or, if their mean
     is above 1, in 0..255 (above 255: 0..65535). Numbers beyond are clipped. Gaussians have the colours of their f_dc.
@@ -148,6 +169,7 @@ def read_ply_points(path: Path) -> PointCloud:
         vertices = ply.read("vertex")
     # In map coordinates, float32 has steps of half a metre.
     points = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=-1) + ply.offset
+    points = points @ ply.turn  # By the inverse: the transpose, for rows.
     return PointCloud(points, _colors(vertices, ply.fields["vertex"]))
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from a2tg_jax.core.camera_paths import upright_rotation, vertical_of
 from a2tg_jax.core.checks import check_literal
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
@@ -68,8 +69,8 @@ def run_sfm(
     """Estimate poses and points, and write a scene folder that `load_scene` reads.
 
     Photographs of one source, size and lens share one camera, whose focal length starts from EXIF data. The largest
-    model found is kept and undistorted. It runs on the CPU with the seed wherever COLMAP takes one, and maps in one
-    thread, so that runs reproduce.
+    model found is kept, turned until −y is up, and undistorted. It runs on the CPU with the seed wherever COLMAP takes
+    one, and maps in one thread, so that runs reproduce.
 
     Args:
       photos: folder of photographs of one scene, whose subfolders are searched, or a video, or several of these.
@@ -123,6 +124,7 @@ def run_sfm(
             blank = sorted(image.name for image in images if not opened.num_keypoints_for_image(image.image_id))
         _check_models(models, names, given, matching, num_matched, blank)
         model = models[0]
+        _turn_upright(model)
         with _clock("undistorting", progress):
             chosen, undistorted = work / "chosen", work / "undistorted"
             chosen.mkdir()
@@ -134,6 +136,15 @@ def run_sfm(
     error = model.compute_mean_reprojection_error()
     longest_side = max(int(side) for camera in model.cameras.values() for side in (camera.width, camera.height))
     return SfmSummary(len(names), model.num_reg_images(), model.num_points3D(), error, longest_side)
+
+
+def _turn_upright(model: Any) -> None:
+    """Turn a reconstruction until −y is up, as COLMAP's model_orientation_aligner does and programs for splats
+    expect."""
+    colmap = pycolmap()
+    poses = [model.image(number).cam_from_world().matrix() for number in model.reg_image_ids()]
+    turn = upright_rotation(vertical_of(np.stack(poses)))
+    model.transform(colmap.Sim3d(1.0, colmap.Rotation3d(turn), np.zeros(3)))
 
 
 def list_photos(database: Path, staged: Staged, camera_model: str) -> None:

@@ -11,7 +11,7 @@ from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gltf import load_gltf, save_gltf
 from a2tg_jax.io.gltf_container import buffer_files
 from a2tg_jax.io.model_file import load_model, save_model
-from a2tg_jax.io.other_programs import cut_numbers
+from a2tg_jax.io.other_programs import World, cut_numbers
 from a2tg_jax.io.ply import load_ply_model, save_ply
 from a2tg_jax.io.splat_files import import_gaussforge, load_by_gaussforge, load_ksplat, save_by_gaussforge, save_ksplat
 from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians
@@ -24,7 +24,8 @@ LEARNED = {
     "pose": "learned motions of cameras",
 }
 """Corrections of photographs in words, by name."""
-Writer = Callable[[Path, Model], None]
+Writer = Callable[..., None]
+"""Function of a path and a model and, in formats that keep no origin, the `world` of the file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +38,8 @@ class FileFormat:
     keeps_appearance: bool = False
     """Whether textures, and everything else that splats show, are kept."""
     keeps_origin: bool = False
-    """Whether cameras, background and the normalised world are kept; other formats hold the original world."""
+    """Whether cameras, background and the normalised world are kept; other formats hold the original world, or that
+    one turned upright."""
     keeps_corrections: bool = False
     """Whether learned exposures and poses of photographs are kept."""
     highest_degree: int = 3
@@ -117,13 +119,19 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
     return Model(loaded) if isinstance(loaded, Gaussians) else loaded
 
 
-def save_splats(path: str | os.PathLike[str], model: Model) -> None:
+def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "original") -> None:
     """Write a model in the format of the suffix. Other programs' formats hold its Gaussians in the original world.
+
+    Args:
+      path: the file.
+      model: any model that the format can hold.
+      world: as in `save_ply`, for all formats without cameras; glTF and OpenUSD are always upright.
 
     Raises:
       ValueError: if the suffix is unknown, an optional library is missing, or the format cannot hold the model.
     """
-    writer_of(path)(Path(path), model)
+    options = {} if format_of(path).keeps_origin else {"world": world}
+    writer_of(path)(Path(path), model, **options)
 
 
 def files_written(path: Path) -> list[Path]:

@@ -14,8 +14,10 @@ from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from a2tg_jax.appearance.parts import nearest_gaussians
+from a2tg_jax.core.camera_paths import upright_rotation, vertical_of
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gaussians, logit
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
@@ -26,6 +28,8 @@ from a2tg_jax.io.validate import check_origin
 from a2tg_jax.model import Model, concatenate
 
 Up = Literal["y", "z"]
+World = Literal["upright", "original"]
+"""World of a file: the original one, or that one turned until −y is up, as other programs show it."""
 Kind = str
 """gaussforge's name of a format, such as "spz"; "ply" stands for all with float32 positions."""
 UPRIGHT: Mapping[Up, np.ndarray] = {
@@ -35,6 +39,8 @@ UPRIGHT: Mapping[Up, np.ndarray] = {
 }
 """Rotation from a world of +z up to one of another axis."""
 UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
+LEVEL = math.cos(math.radians(3))
+"""Cosine of the largest angle between the estimated vertical and an axis that counts as the vertical itself."""
 LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-6
 HIGHEST_DEGREE = len(NUM_BASES) - 1
 THICKNESS = 1e-3
@@ -69,7 +75,7 @@ class Ellipsoids(NamedTuple):
 
 
 class WorldGaussians(NamedTuple):
-    """Plain Gaussians in the original world, as files hold them."""
+    """Plain Gaussians in the world of a file."""
 
     gaussians: Gaussians
     """Their means are relative to the offset."""
@@ -77,6 +83,8 @@ class WorldGaussians(NamedTuple):
     """[3] float64 whole numbers; zeros if the format can hold the positions."""
     means: np.ndarray
     """[N, 3] float64 positions, without the offset."""
+    turn: np.ndarray
+    """[3, 3] rotation from the original world."""
 
 
 def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False) -> Gaussians:
@@ -102,13 +110,19 @@ def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False)
 
 
 def world_gaussians(
-    gaussians: Gaussians | Model, transform: Similarity | None = None, kind: Kind = "ply"
+    gaussians: Gaussians | Model,
+    transform: Similarity | None = None,
+    kind: Kind = "ply",
+    world: World = "original",
 ) -> WorldGaussians:
-    """Return the Gaussians of a model without its appearance, in the original world; arguments as in `save_ply`."""
+    """Return the Gaussians of a model without its appearance, in a file's world; arguments as in `save_ply`."""
     plain = plain_gaussians(gaussians)
     if transform is None and isinstance(gaussians, Model) and gaussians.origin is not None:
         transform = gaussians.origin.transform
     to_world = UNMOVED if transform is None else transform.inverse()
+    turn = upright_turn(gaussians) if world == "upright" and isinstance(gaussians, Model) else np.eye(3)
+    if not np.array_equal(turn, np.eye(3)):
+        to_world = to_world.then(Similarity(1.0, turn, np.zeros(3)))
     means = to_world.apply(np.asarray(plain.means, np.float64))
     offset = offset_for(kind, means, np.asarray(plain.log_scales, np.float64) + np.log(to_world.scale))
     if offset.any():
@@ -116,7 +130,44 @@ def world_gaussians(
         to_world = dataclasses.replace(to_world, translation=to_world.translation - offset)
     # Without a move nothing is computed, so that nothing is rounded.
     moved = plain if transform is None and not offset.any() else transform_gaussians(plain, to_world)
-    return WorldGaussians(moved, offset, means)
+    return WorldGaussians(moved, offset, means, turn)
+
+
+def upright_turn(model: Model) -> np.ndarray:
+    """Return the rotation [3, 3] from a model's original world to the upright one of files, whose −y is up.
+
+    The vertical is estimated from the cameras; without cameras −y of the model is up, as in files of splats. Map
+    coordinates are not turned.
+    """
+    origin = model.origin
+    if origin is None or has_map_coordinates(model):
+        return np.eye(3)
+    up = vertical_of(origin.viewmats) if len(origin.viewmats) else np.array([0.0, -1.0, 0.0])
+    up = origin.transform.rotation.T @ up
+    # Captures that know their vertical keep their axes: the estimate is off by a few degrees.
+    return upright_rotation(np.rint(up) if np.abs(up).max() > LEVEL else up)
+
+
+def has_map_coordinates(model: Model) -> bool:
+    """Return whether float32 would round a model's positions in its original world too far."""
+    if model.origin is None:
+        return False
+    to_world, gaussians = model.origin.transform.inverse(), model.live.gaussians
+    log_scales = np.asarray(gaussians.log_scales, np.float64) + np.log(to_world.scale)
+    return bool(offset_for("ply", to_world.apply(np.asarray(gaussians.means, np.float64)), log_scales).any())
+
+
+def world_line(model: Model, world: World) -> str:
+    """Describe the world of a file of a model."""
+    if world == "original":
+        return "world: the original one, in its units and axes"
+    if has_map_coordinates(model):
+        return "world: the original one, because of its map coordinates"
+    if model.origin is None or not model.origin.names:
+        return "world: as in the source, which has no cameras to find the vertical by"
+    degrees = math.degrees(Rotation.from_matrix(upright_turn(model)).magnitude())
+    turned = f"the original one turned by {degrees:.1f}°" if degrees else "which is the original one"
+    return f"world: upright with +y down, {turned}"
 
 
 def splats_of(model: Model, *, keeps_shapes: bool = False) -> Ellipsoids:
@@ -376,12 +427,13 @@ def offset_for(kind: Kind, means: np.ndarray, log_scales: np.ndarray) -> np.ndar
     return offset if is_outside or (before > 1 and after < before / 2) else np.zeros(3)
 
 
-def origin_at(offset: np.ndarray) -> Origin | None:
-    """Return the origin, without cameras, of a model whose positions are relative to an offset [3]; None for zeros.
-    ValueError: the offset is not finite or too large."""
-    if not offset.any():
+def origin_at(offset: np.ndarray, turn: np.ndarray = UNMOVED.rotation) -> Origin | None:
+    """Return the origin, without cameras, of a model in the world of a file: turned from the original one by a
+    rotation [3, 3], and then relative to an offset [3]. None if it is the original one. ValueError: the offset is not
+    finite or too large."""
+    if not offset.any() and np.array_equal(turn, np.eye(3)):
         return None
-    origin = Origin.of_cameras([], transform=dataclasses.replace(UNMOVED, translation=-offset))
+    origin = Origin.of_cameras([], transform=Similarity(1.0, turn, -offset))
     check_origin(origin)
     return origin
 
@@ -391,15 +443,15 @@ def warn_of_offset(kind: Kind, offset: np.ndarray, path: str | os.PathLike[str])
     if offset.any():
         place = OFFSET_PLACES.get(kind, "the file has no place to say so: write this down")
         message = (
-            f"{os.fspath(path)}: positions are relative to ({', '.join(offset_words(offset))}), because the format "
+            f"{os.fspath(path)}: positions are relative to ({', '.join(number_words(offset))}), because the format "
             f"would round such large coordinates too far; {place}"
         )
         warnings.warn(message, stacklevel=3)
 
 
-def offset_words(offset: np.ndarray) -> list[str]:
-    """Return the three numbers of an offset as text that reads back to the same float64."""
-    return [repr(float(value)).removesuffix(".0") for value in offset]
+def number_words(numbers: np.ndarray) -> list[str]:
+    """Return numbers as text that reads back to the same float64."""
+    return [repr(float(value)).removesuffix(".0") for value in numbers]
 
 
 def check_positions(kind: Kind, gaussians: Gaussians, name: str) -> None:

@@ -5,7 +5,8 @@ opacities as logits, scales as logarithms, quaternions wxyz. f_rest lists the co
 channel: all of red, then green, then blue. scale_2 belongs to the axis along the normal; files of 2DGS lack it. The
 comment "SplatRenderMode: 2dgs" says that splats are flat. The format has no place for other appearances: textures,
 movable kernels and billboards, with their colours and opacities, are lost; `save_model` keeps all. Positions that
-float32 would round too far, such as map coordinates, are relative to an offset: "comment offset X Y Z".
+float32 would round too far, such as map coordinates, are relative to an offset: "comment offset X Y Z". A file that was
+turned upright says how: "comment rotation W X Y Z", the quaternion from the original world.
 
 SuperSplat packs a Gaussian into sixteen bytes, within the bounds of its chunk of 256. Elements: `chunk` (float: bounds
 of positions, log-scales and, in newer files, colours), `vertex` (four uint: position and scale in 11, 10 and 11 bits;
@@ -22,11 +23,12 @@ from typing import BinaryIO
 import jax.numpy as jnp
 import numpy as np
 from numpy.lib.recfunctions import append_fields
+from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.data.ply import OFFSET, PlyFile
+from a2tg_jax.data.ply import OFFSET, ROTATION, PlyFile
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io import other_programs as others
@@ -53,6 +55,7 @@ def save_ply(
     *,
     third_scale: bool = True,
     float64: bool = False,
+    world: others.World = "original",
 ) -> None:
     """Write Gaussians with the attributes of 2DGS, normals along the splats' own, and a third scale.
 
@@ -69,28 +72,30 @@ def save_ply(
       third_scale: write scale_2, a thousandth of the shorter scale, which programs for 3DGS need. False omits it, as
         2DGS does.
       float64: write x, y and z as float64, and never relative to an offset.
+      world: "upright" turns a model with cameras until −y is up, as programs for 3DGS expect. Map coordinates are not
+        turned.
 
     Raises:
       ValueError: if a field of the Gaussians has the wrong shape, or a number that is not finite or too large.
     """
     check_suffix(path, "save_ply")
-    found = others.world_gaussians(gaussians, transform)
+    found = others.world_gaussians(gaussians, transform, world=world)
     third = others.third_log_scales(np.asarray(found.gaussians.log_scales)) if third_scale else None
     means, offset = (found.means, np.zeros(3)) if float64 else (None, found.offset)
     with replacing(path) as temporary:
-        temporary.write_bytes(encode_ply(found.gaussians, third, offset, means))
+        temporary.write_bytes(encode_ply(found.gaussians, third, place_comments(offset, found.turn), means))
     others.warn_of_offset("ply", offset, path)
 
 
 def encode_ply(
-    gaussians: Gaussians, third: np.ndarray | None, offset: np.ndarray | None = None, means: np.ndarray | None = None
+    gaussians: Gaussians, third: np.ndarray | None, comments: str = "", means: np.ndarray | None = None
 ) -> bytes:
     """Return a PLY file of Gaussians. ValueError: they are invalid.
 
     Args:
       gaussians: N Gaussians.
       third: logarithms [N, 1] of third scales; None omits them.
-      offset: [3] origin of the means, for a comment.
+      comments: further lines of the header.
       means: [N, 3] to write as float64 instead of the Gaussians' own.
     """
     # Never write a file that `load_ply` rejects.
@@ -113,7 +118,7 @@ def encode_ply(
     ]
     kind, positions = ("float", np.asarray(gaussians.means, "<f4")) if means is None else ("double", means)
     properties = "".join(f"property {kind if name in MEANS else 'float'} {name}\n" for name in names)
-    comments = f"comment {FLAT_MARK}\n{'' if offset is None else offset_comment(offset)}"
+    comments = f"comment {FLAT_MARK}\n{comments}"
     header = f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {gaussians.num}\n{properties}end_header\n"
     parts = (positions.astype(positions.dtype.newbyteorder("<")), np.concatenate(columns, 1).astype("<f4"))
     # As bytes, since float64 positions and float32 columns share a row.
@@ -121,9 +126,19 @@ def encode_ply(
     return header.encode("ascii") + rows.tobytes()
 
 
-def offset_comment(offset: np.ndarray) -> str:
-    """Return the header line with the offset of positions; "" for zeros."""
-    return f"comment {OFFSET} {' '.join(others.offset_words(offset))}\n" if offset.any() else ""
+def place_marks(offset: np.ndarray, turn: np.ndarray) -> dict[str, np.ndarray]:
+    """Return what leads from a file back to the original world, by its word: the offset [3] of positions, and the
+    rotation [3, 3] as a quaternion (wxyz), if there are any."""
+    marks = {OFFSET: offset} if offset.any() else {}
+    if not np.array_equal(turn, np.eye(3)):
+        marks[ROTATION] = Rotation.from_matrix(turn).as_quat(scalar_first=True)
+    return marks
+
+
+def place_comments(offset: np.ndarray, turn: np.ndarray) -> str:
+    """Return `place_marks` as header lines."""
+    marks = place_marks(offset, turn).items()
+    return "".join(f"comment {word} {' '.join(others.number_words(numbers))}\n" for word, numbers in marks)
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
@@ -148,8 +163,8 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     """
     check_suffix(path, "load_ply")
     model = load_ply_model(path)
-    if model.origin is not None:
-        offset = ", ".join(others.offset_words(-model.origin.transform.translation))
+    if model.origin is not None and model.origin.transform.translation.any():
+        offset = ", ".join(others.number_words(-model.origin.transform.translation))
         warnings.warn(f"{path}: positions are relative to ({offset}); load_splats keeps this offset", stacklevel=2)
     return model.gaussians
 
@@ -188,7 +203,7 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     gaussians = Gaussians(*(jnp.asarray(rows) for rows in (means, quats, log_scales, logits, sh)))
     with reading(path):
         check_model(Model(gaussians))
-        return Model(gaussians, origin=others.origin_at(inside + ply.offset))
+        return Model(gaussians, origin=others.origin_at(inside + ply.offset, ply.turn))
 
 
 def _vertices(ply: PlyFile) -> np.ndarray:

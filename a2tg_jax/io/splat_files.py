@@ -30,12 +30,12 @@ import numpy as np
 
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.data.ply import OFFSET
+from a2tg_jax.data.ply import OFFSET, ROTATION, turn_of
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.columns import morton
-from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, offset_comment
+from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, place_comments, place_marks
 from a2tg_jax.io.validate import check_model, existing_bytes, reading
 from a2tg_jax.model import Model
 
@@ -47,8 +47,10 @@ SOG_HEADER, SOG_FLAT = "meta.json", "2dgs"
 MOST_HEADER_BYTES = 1 << 24
 
 
-def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
-    """Write the Gaussians of a model, in its original world, in the format of the suffix.
+def save_by_gaussforge(
+    path: str | os.PathLike[str], model: Gaussians | Model, *, world: others.World = "original"
+) -> None:
+    """Write the Gaussians of a model, in its original world or upright, in the format of the suffix.
 
     Positions that the format would round too far are relative to whole numbers, which a warning names, as do the files
     of compressed PLY and SOG. Another warning follows if rounding still exceeds a tenth of a typical scale.
@@ -58,7 +60,7 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
         positions.
     """
     kind = _kind_of(path)
-    gaussians, offset, _ = others.world_gaussians(model, kind=kind)
+    gaussians, offset, _, turn = others.world_gaussians(model, kind=kind, world=world)
     if not gaussians.num:
         raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
     others.check_positions(kind, gaussians, str(path))
@@ -76,7 +78,7 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
         rest = sh[:, 1:].transpose(0, 2, 1).reshape(gaussians.num, sh.shape[1] - 1, 3)
         gaussians = dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], rest], axis=1)))
     ply = encode_ply(gaussians, np.repeat(third.clip(LEAST_LOG_SCALE), gaussians.num, axis=0))
-    data = _marked(_converted(ply, "ply", kind, Path(path)), kind, offset)
+    data = _marked(_converted(ply, "ply", kind, Path(path)), kind, offset, turn)
     with replacing(path) as temporary:
         temporary.write_bytes(data)
     others.warn_of_offset(kind, offset, path)
@@ -85,7 +87,7 @@ def save_by_gaussforge(path: str | os.PathLike[str], model: Gaussians | Model) -
 def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
     """Read Gaussians from a file, in its world. Ellipsoids are flattened as `load_ply` does, with a warning.
 
-    The model's origin has the offset of a SOG file, if there is one.
+    The model's origin has the offset and the rotation of a SOG file, if there are any.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -104,7 +106,8 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
     converted = _converted(data, kind, "ply", path)
     gaussians = decode_ply(io.BytesIO(converted), path, is_flat=header.get("model") == SOG_FLAT).gaussians
     with reading(path):
-        origin = others.origin_at(np.array(header.get(OFFSET, (0, 0, 0)), np.float64).reshape(3))
+        quat = np.array(header.get(ROTATION, (1, 0, 0, 0)), np.float64).reshape(4)
+        origin = others.origin_at(np.array(header.get(OFFSET, (0, 0, 0)), np.float64).reshape(3), turn_of(quat))
     return Model(gaussians, origin=origin)
 
 
@@ -131,11 +134,11 @@ def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
     return converted
 
 
-def _marked(data: bytes, kind: str, offset: np.ndarray) -> bytes:
-    """Return a file with marks for flat splats and for the offset, if its format has them."""
+def _marked(data: bytes, kind: str, offset: np.ndarray, turn: np.ndarray) -> bytes:
+    """Return a file with marks for flat splats, the offset and the rotation, if its format has them."""
     if kind == "compressed.ply":
         # Comments of a PLY follow its format line.
-        return data.replace(b" 1.0\n", f" 1.0\ncomment {FLAT_MARK}\n{offset_comment(offset)}".encode(), 1)
+        return data.replace(b" 1.0\n", f" 1.0\ncomment {FLAT_MARK}\n{place_comments(offset, turn)}".encode(), 1)
     if kind != "sog":
         return data
     marked = io.BytesIO()
@@ -144,7 +147,7 @@ def _marked(data: bytes, kind: str, offset: np.ndarray) -> bytes:
             content = old.read(entry)
             if entry.filename == SOG_HEADER:
                 header = {**json.loads(content), "model": SOG_FLAT}
-                header |= {OFFSET: offset.tolist()} if offset.any() else {}
+                header |= {word: numbers.tolist() for word, numbers in place_marks(offset, turn).items()}
                 content = json.dumps(header, separators=(",", ":")).encode()
             # A fresh ZipInfo has a fixed date, so that files repeat.
             new.writestr(zipfile.ZipInfo(entry.filename), content)
@@ -166,15 +169,15 @@ DEFAULT_RANGE, DEFAULT_ENDS = 32767, (-1.5, 1.5)
 KSPLAT_DEGREE = 2
 
 
-def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model) -> None:
-    """Write the Gaussians of a model, in its original world, at compression level 0, with degrees up to 2.
+def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model, *, world: others.World = "original") -> None:
+    """Write the Gaussians of a model, in its original world or upright, at compression level 0, with degrees up to 2.
 
     Positions that float32 would round too far are relative to whole numbers, which a warning names.
 
     Raises:
       ValueError: if there are none, or they would not load.
     """
-    gaussians, offset, _ = others.world_gaussians(model)
+    gaussians, offset, *_ = others.world_gaussians(model, world=world)
     if not gaussians.num:
         raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
     check_model(Model(gaussians))

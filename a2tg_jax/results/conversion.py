@@ -19,6 +19,7 @@ from a2tg_jax.io.formats import (
     unseen_elsewhere,
     writer_of,
 )
+from a2tg_jax.io.other_programs import World, world_line
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
 from a2tg_jax.results.folder import check_new, check_output
@@ -47,14 +48,19 @@ def convert(
     *,
     baking: BakeOptions | None = None,
     float64: bool = False,
+    world: World = "upright",
     overwrite: bool = False,
 ) -> str:
     """Write a run's model `name`, or a file of any known format, in another suffix's format, and return a summary.
-    `baking` turns textured splats into plain ones (None: no baking); `float64` is as in `save_ply`. Raises ValueError
-    or OSError if a format is unknown, or a file cannot be read or written."""
+    `baking` turns textured splats into plain ones (None: no baking); `float64` and `world` are as in `save_ply`. Raises
+    ValueError or OSError if a format is unknown, or a file cannot be read or written."""
     writer_of(out)  # Baking takes minutes.
     if float64 and format_of(out).save is not save_ply:
         raise ValueError(f"`float64` needs an OUT that ends in .ply and is not packed; got {out}")
+    if world == "original" and format_of(out).keeps_origin:
+        raise ValueError(
+            f"`world` has no effect on {out}, which also holds the way to the original world: leave it out"
+        )
     # A *.gltf is several files, none of which may be both read and written.
     sources = {file.resolve() for file in files_of(source)}
     for file in files_written(out):
@@ -71,9 +77,9 @@ def convert(
     opened = open_source(source, name)
     model, baked = (opened.model, "") if baking is None else _baked(source, opened.model, baking)
     if float64:
-        save_ply(out, model, float64=True)
+        save_ply(out, model, float64=True, world=world)
     else:
-        save_splats(out, model)
+        save_splats(out, model, world=world)
     before, after, seconds = file_bytes(opened.path), file_bytes(out), time.perf_counter() - start
     sizes = f"{in_bytes(after)} from {in_bytes(before)} ({after / max(before, 1):.2f} times)"
     lines = [baked] if baked else []
@@ -82,8 +88,8 @@ def convert(
         lines.append(f"not kept by this format: {', '.join(lost)}")
     if unseen := unseen_elsewhere(model, out):
         lines.append(f"not shown by other programs: {unseen}")
-    if model.origin is not None and not format_of(out).keeps_origin:
-        lines.append("world: the original one, in its units and axes")
+    if not format_of(out).keeps_origin:
+        lines.append(world_line(model, world))
     return "\n".join(lines)
 
 
@@ -122,11 +128,11 @@ def check_ply(out: Path) -> None:
         raise ValueError(f"`ply` must be the path of a file that ends in .ply; got {out}")
 
 
-def export_ply(source: Source, out: Path, *, float64: bool = False) -> str:
+def export_ply(source: Source, out: Path, *, float64: bool = False, world: World = "upright") -> str:
     """Write a model's Gaussians for 3DGS programs (`save_ply`), and return a summary and what PLY does not keep."""
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_ply(out, source.model, float64=float64)
+    save_ply(out, source.model, float64=float64, world=world)
     lines = [f"file: {out}: {source.model.num:,} Gaussians"]
     if lost := lost_by(source.model, ".ply"):
         lines.append(f"not kept by this format: {', '.join(lost)}")
-    return "\n".join(lines)
+    return "\n".join([*lines, world_line(source.model, world)])

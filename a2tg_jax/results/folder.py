@@ -11,7 +11,7 @@
       metrics.json, per_view.json
       test/NAME.png              photograph, renders and error side by side
       figures/                   curves, texture resolutions, some textures, depth, normals, a flight
-      point_cloud.ply            the Gaussians in the original world
+      point_cloud.ply            the Gaussians, upright, for other programs
       viewer.html                the model in a browser, on one page
       report.html                everything on one page
       finish.json                the run that a2tg finish started from, and its options

@@ -86,7 +86,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
         if model.origin is not None and model.origin.corrections:  # exposure [3, 4] = [A | b] and pose [6] by view
             write_json(run.own(run.corrections(name)), learned(model.origin))
     main, settings = models[result.main], settings_of(plan[result.main].system)
-    save_ply(run.own(run.point_cloud), main)
+    save_ply(run.own(run.point_cloud), main, world="upright")
     # Browsers cannot show subclasses of Appearance.
     if main.appearance.is_portable:
         data = encode_web_scene(main, title=f"{scene.name} · {result.main}")
