@@ -269,7 +269,8 @@ def test_export_reports_what_ply_does_not_keep(tmp_path, capsys):
         a2tg.save_model(tmp_path / "a.npz", given)
         words = ["export", str(tmp_path / "a.npz"), "--overwrite", "--ply", str(out := tmp_path / "a.compressed.ply")]
         assert cli.main(words) == 0
-        assert capsys.readouterr().out == f"file: {out}: 3 Gaussians\n{line}"
+        world = "world: as in the source, which has no cameras to find the vertical by\n"
+        assert capsys.readouterr().out == f"file: {out}: 3 Gaussians\n{line}{world}"
 
 
 @pytest.mark.parametrize(("name", "is_export"), [("models/x.a2tgz", True), ("mesh.glb", True), ("models/x.npz", False)])
