@@ -82,3 +82,12 @@ def test_it_runs(name, tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     assert "failed" not in done.stdout
     assert done.stdout or len(list(tmp_path.iterdir())) > 1 or name == "tables"
+
+
+def test_drawings_of_the_documentation_are_drawn_and_small(tmp_path):
+    import drawings
+
+    drawings.main(tmp_path, dpi=10)
+    kept = {path.name: path.stat().st_size for path in (ROOT / "docs" / "images").glob("how-*.png")}
+    assert {path.name for path in tmp_path.iterdir()} == kept.keys()
+    assert max(kept.values()) < 100_000
