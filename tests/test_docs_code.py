@@ -1,5 +1,6 @@
 """The Python on pages runs from top to bottom, at a small size."""
 
+import dataclasses
 import inspect
 import re
 from pathlib import Path
@@ -97,6 +98,17 @@ def test_library_runs(monkeypatch, tmp_path):
     assert [output.color.shape for output in names["renders"]] == [(48, 64, 3)] * 2
     with pytest.raises(TypeError):
         a2tg.fit(names["scene"], names["system"], no_such_option=1)
+
+
+def test_the_smallest_system_has_a_stage_with_arrays():
+    names = run("systems", {"__name__": "systems", "a2tg": a2tg, "dataclasses": dataclasses, "jax": jax, "jnp": jnp})
+    system = names["Toy"]()
+    system.check()
+    (stage,) = system.stages()
+    gaussians = a2tg.init_from_points(np.eye(3), np.ones((3, 3)), sh_degree=0)
+    appearance = a2tg.allocate_appearance(stage.appearance, jax.random.key(0), gaussians)
+    assert appearance.numbers(gaussians, None).shape == (3, 4)
+    assert appearance.shade((0.5, 0.0, 0.0, 2.0), (), 0.0, 0.0)[0][0] == 0.5
 
 
 def test_other_programs_gaussians_and_poses_are_taken(monkeypatch, tmp_path):
