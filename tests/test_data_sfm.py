@@ -16,11 +16,13 @@ from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import intrinsics
 from a2tg_jax.data import load_scene, run_sfm, sfm, synthetic
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.decoding import picture_facts, picture_size, read_pixels
+from a2tg_jax.data.decoding import picture_facts, picture_size, read_pixels, software_of
 from a2tg_jax.data.photo_folder import find_photos
 from a2tg_jax.data.staging import stage
 from a2tg_jax.host import progress_bars
+from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.results.figures import save_camera_picture
+from a2tg_jax.results.images import save_animation, write_png
 
 
 def save_photos(folder, num_photos, width, height):
@@ -239,13 +241,13 @@ def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd, monkeypatch, is
 
 
 def test_too_little_in_common(tmp_path, capfd):
-    """Noise has features, and those that match by chance show no depth."""
+    """Noise has features, but none that match."""
     (tmp_path / "photos").mkdir()
     for index in range(3):
         noise = np.random.default_rng(index).integers(0, 255, (64, 64, 3), np.uint8)
         Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.png")
     with pytest.raises(
-        ValueError, match=r"none of the 3 photographs could be placed \(3 pairs match\); photographs match"
+        ValueError, match=r"none of the 3 photographs could be placed \(0 pairs match\); no two of them match: .*; take"
     ) as printed:
         run_sfm(tmp_path / "photos", tmp_path / "new" / "scene", progress=False)
     assert "features" not in str(printed.value)
@@ -268,20 +270,45 @@ class Reconstruction:
 
 def test_photographs_that_are_left_out_are_named():
     """All are placed; all but one; the smaller part of two that do not connect, one of it blank; and none."""
-    for matching, num, words in (
-        ("exhaustive", 299, "take more.*overlap"), ("exhaustive", 300, "show no depth: walk"),
-        ("sequential", 4, "matching='exhaustive'"),
+    for matching, num, num_flat, words in (
+        ("exhaustive", 1, 1, "take more.*overlap"), ("exhaustive", 300, 290, "show no depth.*: walk between them$"),
+        ("sequential", 4, 0, "overlap.*matching='exhaustive'"),
     ):  # fmt: skip
-        with pytest.raises(ValueError, match=rf"\({num} pairs match\).*{words}"):
-            sfm._check_models([], NAMES, "photos", matching, num, [])
-    sfm._check_models([Reconstruction(NAMES)], NAMES, "photos", "exhaustive", 999, [])
+        with pytest.raises(ValueError, match=rf"\({num} pairs? match(es)?\); [^;]*{words}"):
+            sfm._check_models([], NAMES, "photos", matching, sfm.Matches(num, num_flat, (), ()))
+    many = sfm.Matches(999, 700, (), ())
+    sfm._check_models([Reconstruction(NAMES)], NAMES, "photos", "exhaustive", many)
     with pytest.warns(UserWarning, match=r"^photos: 1 of 300 photographs could not be .* left out \(299.jpg\)$"):
-        sfm._check_models([Reconstruction(NAMES[:-1])], NAMES, "photos", "exhaustive", 999, [])
-    parts = [Reconstruction(NAMES[:290]), Reconstruction(NAMES[290:299])]
+        sfm._check_models([Reconstruction(NAMES[:-1])], NAMES, "photos", "exhaustive", many)
+    parts = [Reconstruction(NAMES[:270]), Reconstruction(NAMES[270:298])]
     with pytest.warns(
-        UserWarning, match=r": 10 of 300 .*\(290.jpg, 291.jpg, .*, …\).* in 1 of them \(299.jpg\).* 290, 9"
+        UserWarning,
+        match=r": 30 of 300 .*\(270.jpg, .*, 293.jpg, …\).* in 1 of them \(299.jpg\).*"
+        r"1 of them \(298.jpg\) match no other.* 270, 28",
     ):
-        sfm._check_models(parts, NAMES, "photos", "exhaustive", 999, NAMES[299:])
+        sfm._check_models(parts, NAMES, "photos", "exhaustive", many._replace(alone=("298.jpg",), blank=("299.jpg",)))
+    with pytest.warns(UserWarning, match="between 8.jpg and 11.jpg, 20.jpg and 22.jpg$"):
+        placed = [name for name in NAMES if name not in ("0.jpg", "9.jpg", "10.jpg", "21.jpg")]
+        sfm._check_models([Reconstruction(placed)], sorted(NAMES), "photos", "exhaustive", many)
+
+
+def test_gaps_are_between_photographs_of_one_folder():
+    names = [f"{top}/{index}.jpg" for top in ("panorama/heading000", "panorama/up", "phone") for index in range(3)]
+    placed = {name for name in names if not name.endswith("1.jpg")} - {"phone/0.jpg"}
+    assert sfm._gaps(names, placed) == ["0.jpg and 2.jpg"]
+
+
+def test_a_camera_that_only_turns_shows_no_depth(tmp_path):
+    """COLMAP places such photographs by guesses, so that a scene is made, with a warning."""
+    save_photos(tmp_path / "one", 1, 512, 384)
+    whole = Image.open(tmp_path / "one" / "view_000.png")
+    (tmp_path / "turned").mkdir()
+    for index in range(3):  # Parts of one photograph, as a camera with a long lens sees that turns.
+        left = 60 * index
+        whole.crop((left, 40, left + 320, 280)).save(tmp_path / "turned" / f"{index}.png")
+    words = "show no depth, as if taken from one spot or of a flat surface: walk between them"
+    with pytest.warns(UserWarning, match=words):
+        assert run_sfm(tmp_path / "turned", tmp_path / "scene", progress=False).num_registered == 3
 
 
 def test_the_picture_of_the_cameras(tmp_path):
@@ -290,6 +317,7 @@ def test_the_picture_of_the_cameras(tmp_path):
     save_camera_picture(tmp_path, tmp_path / "cameras.png")
     pixels = np.asarray(Image.open(tmp_path / "cameras.png").convert("RGB")).astype(int)
     assert pixels.shape[1] > 1.8 * pixels.shape[0] > 900
+    assert software_of(tmp_path / "cameras.png") == PROGRAM
     blue = np.abs(pixels - [0x44, 0x77, 0xAA]).max(axis=-1) < 20
     assert blue[:, : pixels.shape[1] // 2].sum() > 50 and blue[:, pixels.shape[1] // 2 :].sum() > 50
 
@@ -360,6 +388,38 @@ def test_pictures_that_are_no_photographs_are_left_out(tmp_path):
         ValueError, match=r"holds no photographs; at least 3 .*\. Not taken for photographs: .*\. To use"
     ):
         find_photos(tmp_path)
+
+
+def test_pictures_of_this_program_are_left_out_under_any_name(tmp_path):
+    random = np.random.default_rng(0)
+    photos = [f"{index}.{suffix}" for index, suffix in enumerate(("png", "webp", "jpg", "png"))]
+    for name in photos:
+        save_blocks(tmp_path / name, 64, 48, random)
+    with Image.open(tmp_path / "0.png") as image:
+        write_png(tmp_path / "my view.PNG", image.rotate(180))
+        save_animation(tmp_path / "flight.webp", iter([image.rotate(180), image]), 5)
+    with pytest.warns(UserWarning, match=r"photographs: written by a2tg: 2 \(flight.webp, my view.PNG\)"):
+        assert find_photos(tmp_path) == photos
+
+
+def test_photographs_may_be_listed(tmp_path):
+    """Listed files are sorted out as a folder's are, and those of one folder are one source."""
+    random = np.random.default_rng(0)
+    for name in ("a/0.png", "a/1.png", "a/2.png", "a/3.png", "b/0.jpg"):
+        save_blocks(tmp_path / name, 64, 48, random)
+    (tmp_path / "a" / "notes.txt").touch()
+    (tmp_path / "a" / "1_mask.png").write_bytes((tmp_path / "a" / "1.png").read_bytes())
+    listed = [tmp_path / "a" / name for name in ("2.png", "0.png", "1.png", "notes.txt", "1_mask.png")]
+    with pytest.warns(UserWarning, match=r"masks or depth maps: 1 \(1_mask.png\)"):
+        assert staged(listed, tmp_path / "one").names == ["0.png", "1.png", "2.png"]
+    (one, other) = staged([*listed[:3], tmp_path / "b" / "0.jpg"], tmp_path / "two").groups
+    assert (one.names, other.names) == (("a/0.png", "a/1.png", "a/2.png"), ("b/0.jpg",))
+    assert len(staged([*listed[:3], tmp_path / "a" / "3.png"], tmp_path / "three").names) == 4
+    with pytest.raises(ValueError, match=r"^2 photographs of .*a given; at least 3 photographs are needed$"):
+        staged(listed[:2], tmp_path / "four")
+    (tmp_path / "a" / "clip.insv").touch()
+    with pytest.raises(ValueError, match=r"clip.insv: is a recording of Insta360"):
+        staged([*listed[:3], tmp_path / "a" / "clip.insv"], tmp_path / "five")
 
 
 def photos_of(folder, *names, data=b"no image"):

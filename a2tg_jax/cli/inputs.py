@@ -12,7 +12,7 @@ from a2tg_jax.cli.arguments import defaulting_to
 from a2tg_jax.data import run_sfm
 from a2tg_jax.data.download import BENCHMARK_SETS, fetch
 from a2tg_jax.data.load import is_scene
-from a2tg_jax.data.photo_folder import CAMERA_PICTURE, holds_photos, is_video
+from a2tg_jax.data.photo_folder import CAMERA_PICTURE, holds_photos
 from a2tg_jax.data.sfm import CameraModel, Matching
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
@@ -34,11 +34,12 @@ class Sfm:
       a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox --preset quick --downscale 4
       a2tg sfm fox.mp4 scenes/fox --frames 200
       a2tg sfm photos/phone photos/drone --out scenes/house
+      a2tg sfm photos/fox/00*.jpg scenes/fox
     """
 
     sources: Annotated[Positional[tuple[Path, ...]], arg(metavar="PHOTOS... SCENE", help_behavior_hint="")]
-    """Folders of photographs of one scene, and videos; then the new scene folder for the images and the sparse model,
-    ready for a2tg train, unless --out names it."""
+    """Folders of photographs of one scene, single photographs, and videos; then the new scene folder for the images and
+    the sparse model, ready for a2tg train, unless --out names it."""
     out: Annotated[Path | None, defaulting_to("the last of PHOTOS... SCENE", "SCENE")] = None
     """New scene folder."""
     matching: Matching = "auto"
@@ -81,15 +82,16 @@ class Sfm:
     def _places(self) -> tuple[list[Path], Path]:
         """Return the sources and the scene folder."""
         if not self.sources:
-            raise ValueError("PHOTOS is missing: a folder of photographs, or a video")
+            raise ValueError("PHOTOS is missing: a folder of photographs, photographs, or a video")
         if self.out is not None:
             return list(self.sources), self.out
         if len(self.sources) < 2:
             raise ValueError("SCENE is missing: the new scene folder comes last, or after --out")
         *sources, out = self.sources
         has_model = (out / "sparse").exists()  # run_sfm reports such a folder.
-        if is_video(out) or (holds_photos(out) and not has_model):
-            raise ValueError(f"{out} holds photographs, but the scene folder comes last; name that by --out SCENE")
+        what = "is a file" if out.is_file() else "holds photographs"
+        if out.is_file() or (holds_photos(out) and not has_model):
+            raise ValueError(f"{out} {what}, but the scene folder comes last; name that by --out SCENE")
         return sources, out
 
 

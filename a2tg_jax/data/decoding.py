@@ -132,6 +132,13 @@ def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> No
             upright.convert("RGB").save(target, quality=quality, subsampling=0, exif=exif)  # 4:4:4 keeps colours sharp.
 
 
+def software_of(path: str | os.PathLike[str]) -> str:
+    """Return the name of the program that wrote an image file; "" if the file does not say. Raises as `read_pixels`."""
+    with _opened(path, is_decoded=False) as image:
+        # PNG has it as a text, other formats in EXIF.
+        return str(image.info.get("Software") or image.getexif().get(ExifTags.Base.Software) or "")
+
+
 def upright_thumbnail(path: str | os.PathLike[str], side: int) -> tuple[tuple[int, int], np.ndarray]:
     """Return (width, height) and grey levels [side, side] of an image file turned as EXIF says."""
     with _opened(path) as image:

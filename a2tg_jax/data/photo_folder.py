@@ -4,6 +4,7 @@ Masks, depth maps, copies and pictures that this program wrote are left out: as 
 a twin among the training views, or get a pose. Captures in formats that are not read are recognised.
 """
 
+import contextlib
 import itertools
 import math
 import re
@@ -14,10 +15,10 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from a2tg_jax.data.decoding import upright_thumbnail
+from a2tg_jax.data.decoding import software_of, upright_thumbnail
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, map_in_threads
 from a2tg_jax.host.regular_files import is_regular, read_regular
-from a2tg_jax.host.text import as_argument, counted, first_names
+from a2tg_jax.host.text import PROGRAM, as_argument, counted, first_names
 
 FOREIGN_SUFFIXES = (
     ".jxl", ".jp2", ".j2k", ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".gif",
@@ -30,6 +31,8 @@ MOST_TOLD = 5
 """Largest number of suffixes that a message counts."""
 CAMERA_PICTURE = "cameras.png"
 """Picture of the cameras that `a2tg sfm` puts next to `sparse`."""
+OWN_SUFFIXES = (".png", ".webp")
+"""Suffixes of the pictures that this program writes."""
 LISTS = (".a2tg-run", ".a2tg-frames")
 """Lists of what runs and renders wrote into a folder, a name a line, after its checksum if it has one."""
 MOST_LIST_BYTES = 1 << 26
@@ -77,20 +80,26 @@ def holds_photos(folder: Path) -> bool:
     return len(list(itertools.islice(photos, LEAST_PHOTOS))) == LEAST_PHOTOS
 
 
-def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
+def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] | None = None) -> list[str]:
     """Return paths of the photographs below a folder, relative to it, sorted.
 
     Warnings count pictures that are no photographs, and files of other formats.
+
+    Args:
+      folder: folder of photographs.
+      least: smallest number of photographs.
+      chosen: files in the folder to choose from; None: all in it and below it.
 
     Raises:
       FileNotFoundError: if there is no such folder.
       ValueError: if it is a file, or holds fewer than `least` photographs.
     """
-    if folder.is_file():
-        raise ValueError(f"{folder}: {capture_hint(folder) or 'is a file; give its folder'}")
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder of photographs")
-    files = sorted(file.relative_to(folder) for file in _files_below(folder))
+        raise FileNotFoundError(f"{folder}: no such folder of photographs, photograph or video")
+    for file in chosen or ():
+        if (hint := capture_hint(file)) is not None:
+            raise ValueError(f"{file}: {hint}")
+    files = sorted(file.relative_to(folder) for file in (_files_below(folder) if chosen is None else set(chosen)))
     names = [file.as_posix() for file in files if file.suffix.lower() in PHOTO_SUFFIXES]
     kinds = {
         "written by a2tg": _written(folder, names),
@@ -107,7 +116,8 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS) -> list[str]:
     unread = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
     if len(photos) < least:
         held = f"holds {counted(len(photos), 'photograph') if photos else 'no photographs'}" if files else "is empty"
-        needed = f"{folder}: {held}; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
+        found = f"{folder}: {held}" if chosen is None else f"{counted(len(photos), 'photograph')} of {folder} given"
+        needed = f"{found}; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
         skipped = [_skipped(folder, unread)] if unread else []
         raise ValueError(". ".join([needed, *([others_text] if others else []), *skipped]))
     if others:
@@ -150,11 +160,20 @@ def capture_hint(path: Path) -> str | None:
 
 
 def _written(folder: Path, names: Sequence[str]) -> set[str]:
+    """Return the pictures that this program wrote, by its name in them or by a list next to or above them."""
+
+    def is_own(name: str) -> bool:
+        with contextlib.suppress(ValueError):  # Damaged pictures are reported when they are read.
+            return software_of(folder / name) == PROGRAM
+        return False
+
+    tried = [name for name in names if name.lower().endswith(OWN_SUFFIXES)]
+    found = set(itertools.compress(tried, map_in_threads(is_own, tried)))
+    # Older ones, and copies by programs that drop the name.
     cameras = (name for name in names if PurePosixPath(name).name == CAMERA_PICTURE)
-    found = {name for name in cameras if (folder / name).with_name("sparse").is_dir()}
-    for file in folder.rglob(".a2tg-*"):
-        if file.name in LISTS and is_regular(file):
-            place = PurePosixPath(file.parent.relative_to(folder).as_posix())
+    found |= {name for name in cameras if (folder / name).with_name("sparse").is_dir()}
+    for place in {parent for name in names for parent in PurePosixPath(name).parents}:
+        for file in filter(is_regular, (folder / place / own for own in LISTS)):
             lines = read_regular(file, MOST_LIST_BYTES).decode(errors="replace").splitlines()
             # As sha256sum writes lines: checksum, two spaces, name.
             found |= {str(place / line.rpartition("  ")[2]) for line in lines}.intersection(names)

@@ -1,14 +1,16 @@
 """Structure from motion for plain photographs, videos and panoramas: COLMAP's features, matching and mapping."""
 
+import itertools
 import os
+import re
 import shutil
 import sys
 import tempfile
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -38,6 +40,13 @@ PHOTOS_PER_CORE = 2
 """Photographs of which features are extracted together, so that the progress bar moves."""
 TICK = 0.5
 ADVICE = "take more, sharp and closer together: they should overlap by two thirds and show texture, unlike blank walls"
+NO_DEPTH = "photographs that match show no depth, as if taken from one spot or of a flat surface: walk between them"
+MOSTLY_FLAT = 0.9
+"""Least share of matching pairs without depth that is told. In six captures at most 0.71 of them have none."""
+MOST_NAMED, MOST_GAPS = 24, 5
+"""Largest numbers of photographs, and of gaps between photographs, that a message names."""
+FLAT = ("PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC")
+"""COLMAP's names of the relations between two photographs that show no depth."""
 
 
 class SfmSummary(NamedTuple):
@@ -73,7 +82,8 @@ def run_sfm(
     one, and maps in one thread, so that runs reproduce.
 
     Args:
-      photos: folder of photographs of one scene, whose subfolders are searched, or a video, or several of these.
+      photos: folder of photographs of one scene, whose subfolders are searched, or a video, or several of these or of
+        single photographs.
       out: new folder for `images` and `sparse/0`.
       seed: random seed of COLMAP, at least 0.
       camera_model: COLMAP's name of the camera model to estimate; the FISHEYE models are for action cameras.
@@ -88,7 +98,7 @@ def run_sfm(
       Counts of photographs, registered ones and points, and the reprojection error.
 
     Raises:
-      FileNotFoundError: if there is no such folder of photographs.
+      FileNotFoundError: if there is no such folder or photograph.
       FileExistsError: if `out` is a file, or holds a scene already.
       ValueError: if there are fewer than 3 photographs, or fewer than 3 could be registered, or one cannot be read.
     """
@@ -108,7 +118,7 @@ def run_sfm(
     with _new_folder(out), tempfile.TemporaryDirectory(dir=out, prefix="sfm-") as folder, _quiet():
         work = Path(folder)
         staged = stage(sources, work, frames=frames, panorama=panorama, progress=progress, tell=on_note)
-        names, given = staged.names, ", ".join(map(str, sources))
+        names, given = staged.names, first_names([str(source) for source in sources])
         if len(names) < LEAST_PHOTOS:
             raise ValueError(f"{given}: {len(names)} photographs; at least {LEAST_PHOTOS} are needed")
         if matching == "auto":
@@ -119,10 +129,7 @@ def run_sfm(
         _extract_features(database, staged.folder, names, progress)
         _match_features(database, len(names), seed, matching, progress)
         models = _map(database, staged, work, seed, progress)
-        with closing(pycolmap().Database.open(database)) as opened:
-            images, num_matched = opened.read_all_images(), int(opened.num_verified_image_pairs())
-            blank = sorted(image.name for image in images if not opened.num_keypoints_for_image(image.image_id))
-        _check_models(models, names, given, matching, num_matched, blank)
+        _check_models(models, names, given, matching, _read_matches(database))
         model = models[0]
         _turn_upright(model)
         with _clock("undistorting", progress):
@@ -222,40 +229,104 @@ def _map(database: Path, staged: Staged, work: Path, seed: int, progress: bool) 
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 
+class Matches(NamedTuple):
+    """What the photographs have in common."""
+
+    num_pairs: int
+    """Number of pairs with matches enough for mapping that fit one motion of the camera."""
+    num_flat: int
+    """Number of them that show no depth: the camera turned on the spot, or saw one plane."""
+    alone: tuple[str, ...]
+    """Names of the photographs with features that are in no such pair, sorted."""
+    blank: tuple[str, ...]
+    """Names of the photographs without features, sorted."""
+
+
+def _read_matches(database: Path) -> Matches:
+    colmap = pycolmap()
+    least = colmap.IncrementalPipelineOptions().min_num_matches
+    with closing(colmap.Database.open(database)) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        blank = {name for number, name in names.items() if not opened.num_keypoints_for_image(number)}
+        pair_ids, geometries = opened.read_two_view_geometries()
+    pairs = [
+        (colmap.pair_id_to_image_pair(pair_id), colmap.TwoViewGeometryConfiguration(geometry.config).name)
+        for pair_id, geometry in zip(pair_ids, geometries, strict=True)
+        if len(geometry.inlier_matches) >= least
+    ]
+    matched = {names[number] for pair, _ in pairs for number in pair}
+    alone = set(names.values()) - matched - blank
+    return Matches(len(pairs), sum(kind in FLAT for _, kind in pairs), tuple(sorted(alone)), tuple(sorted(blank)))
+
+
 def _check_models(
-    models: Sequence[Any], names: Sequence[str], given: str, matching: Matching, num_matched: int, blank: Sequence[str]
+    models: Sequence[Any], names: Sequence[str], given: str, matching: Matching, matches: Matches
 ) -> None:
     """Raise ValueError without a usable model, and warn of the photographs that the largest one leaves out.
 
-    The models are sorted, the largest first; `given` names the sources in messages; `blank` are the names of the
-    photographs without features.
+    The models are sorted, the largest first; `given` names the sources in messages.
     """
     placed = {models[0].image(number).name for number in models[0].reg_image_ids()} if models else set()
     left_out = [name for name in names if name not in placed]
+    is_scene = len(placed) >= MIN_REGISTERED
+    num_pairs, num_flat, alone, blank = matches
+    has_no_depth = num_pairs > 1 and num_flat >= MOSTLY_FLAT * num_pairs
+    if has_no_depth and is_scene:
+        warnings.warn(f"{given}: {NO_DEPTH}; their poses are a guess", stacklevel=3)
     if not left_out:
         return
-    has_no_depth = len(placed) < MIN_REGISTERED and num_matched >= len(names)
-    advice = ("photographs match, but show no depth: walk between them; " if has_no_depth else "") + ADVICE
-    if matching == "sequential":
-        advice += "; only neighbours by name were matched: name them in the order of taking, or match all "
-        advice += "pairs (matching='exhaustive')"
     reasons = []
     if blank:
-        found = f"in {len(blank)} of them ({first_names(blank)})"
+        found = f"in {len(blank)} of them ({first_names(blank, MOST_NAMED)})"
         reasons.append(f"COLMAP finds no features, as in blank or very blurred pictures, {found}")
+    if alone and num_pairs:
+        reasons.append(
+            f"{len(alone)} of them ({first_names(alone, MOST_NAMED)}) match no other: they show something else, are "
+            "blurred, or are too far from the others"
+        )
+    elif alone:
+        reasons.append("no two of them match: they show different things, are blurred, or are too far apart")
     if len(models) > 1:
         sizes = ", ".join(str(model.num_reg_images()) for model in models)
         reasons.append(f"they fall into parts of {sizes} that do not connect, and the largest is kept")
-    if len(placed) < len(names) / 2 and len(blank) < len(names):
-        reasons.append(advice)
-    if len(placed) < MIN_REGISTERED:
-        found = f"only {len(placed)} of" if placed else "none of the"
-        pairs = counted(num_matched, "pair")
-        raise ValueError(
-            "; ".join([f"{given}: {found} {len(names)} photographs could be placed ({pairs} match)", *reasons])
+    if has_no_depth and not is_scene:
+        reasons.append(NO_DEPTH)
+    elif len(placed) < len(names) / 2 and len(blank) < len(names):
+        reasons.append(ADVICE)
+    if len(placed) < len(names) / 2 and matching == "sequential":
+        reasons.append(
+            "only neighbours by name were matched: name them in the order of taking, or match all pairs "
+            "(matching='exhaustive')"
         )
+    if not is_scene:
+        found = f"only {len(placed)} of" if placed else "none of the"
+        pairs = f"{counted(num_pairs, 'pair')} match{'es' if num_pairs == 1 else ''}"
+        raise ValueError("; ".join([f"{given}: {found} {len(names)} photographs could be placed ({pairs})", *reasons]))
+    if gaps := _gaps(names, placed):
+        reasons.append(f"to connect them, take more photographs between {first_names(gaps, MOST_GAPS)}")
     missing = f"{given}: {len(left_out)} of {len(names)} photographs could not be placed and are left out"
-    warnings.warn("; ".join([f"{missing} ({first_names(left_out)})", *reasons]), stacklevel=3)
+    warnings.warn("; ".join([f"{missing} ({first_names(left_out, MOST_NAMED)})", *reasons]), stacklevel=3)
+
+
+def _gaps(names: Iterable[str], placed: Container[str]) -> list[str]:
+    """Return the placed neighbours between which others in their folder are not placed, as "3.jpg and 5.jpg".
+
+    Neighbours are those by name, where 10.jpg follows 9.jpg.
+    """
+
+    def by_numbers(name: str) -> tuple[str, list[str | int]]:
+        path = PurePosixPath(name)
+        # Every second part is a number.
+        return str(path.parent), [int(p) if at % 2 else p for at, p in enumerate(re.split(r"(\d+)", path.name))]
+
+    ordered = sorted(names, key=by_numbers)
+    known = [(at, PurePosixPath(name)) for at, name in enumerate(ordered) if name in placed]
+    gaps = [
+        f"{name.name} and {other.name}"
+        for (at, name), (after, other) in itertools.pairwise(known)
+        if after > at + 1 and name.parent == other.parent
+    ]
+    return list(dict.fromkeys(gaps))  # Once for all views of a panorama.
 
 
 @contextmanager

@@ -100,7 +100,8 @@ def stage(
     """Gather photographs of folders and videos in the folder `work/photos`.
 
     Args:
-      sources: folders of photographs, and videos. With several, names begin with the source's.
+      sources: folders of photographs, videos, and photographs. Names begin with the source's if there are several;
+        photographs of one folder are one source.
       work: folder for the gathered photographs.
       frames: largest number of frames to take from each video.
       panorama: which pictures are cut into views.
@@ -109,8 +110,14 @@ def stage(
     """
     folder = work / "photos"
     files: list[tuple[int, Path, str]] = []
-    least = LEAST_PHOTOS if len(sources) == 1 else 1
-    for number, (source, prefix) in enumerate(zip(sources, _prefixes(sources), strict=True)):
+    chosen: dict[Path, list[Path] | None] = {}  # None: all photographs of the folder, or a video.
+    for source in sources:
+        if is_video(source) or not source.is_file():
+            chosen[source] = None
+        elif (own := chosen.setdefault(source.parent, [])) is not None:
+            own.append(source)
+    least = LEAST_PHOTOS if len(chosen) == 1 else 1
+    for number, (source, prefix) in enumerate(zip(chosen, _prefixes(list(chosen)), strict=True)):
         place = source
         if is_video(source):
             place = work / f"frames{number}"
@@ -120,7 +127,7 @@ def stage(
                     f"{source}: its camera hardly moves, so that {written} of {num_frames} frames differ; walk around"
                 )
             tell(f"{source}: {written} of {counted(num_frames, 'frame')} taken")
-        files += [(number, place / name, prefix + name) for name in find_photos(place, least)]
+        files += [(number, place / name, prefix + name) for name in find_photos(place, least, chosen[source])]
     for _, file, name in files:
         try:
             name.encode()

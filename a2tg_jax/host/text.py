@@ -5,6 +5,9 @@ import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+PROGRAM = "a2tg-jax"
+"""Name of this program in files that it writes, as in the tag Software of pictures."""
+
 
 def shortened(value: object, most: int = 80) -> str:
     """Return a value as errors print it: one line of bounded length, without quotes around texts or terminal control

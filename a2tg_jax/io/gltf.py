@@ -18,7 +18,7 @@ from a2tg_jax.appearance.base import PARTS
 from a2tg_jax.appearance.parts import EXTENT, MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import PROGRAM, shortened
 from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.columns import LARGEST_FLOAT, Ends, dequantised, ends_of, quantised
 from a2tg_jax.io.config_json import config_from_dict
@@ -114,7 +114,7 @@ def save_gltf(
     # Mode 0: points, which programs without the extension show.
     primitive = {"attributes": attributes, "mode": 0, "extensions": {SPLATS: described}, "extras": {OWN: kept}}
     whole = {
-        "asset": {"version": "2.0", "generator": "a2tg-jax"},
+        "asset": {"version": "2.0", "generator": PROGRAM},
         "extensionsUsed": [SPLATS, *described.get("extensions", {})],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

@@ -10,6 +10,7 @@ from PIL import Image
 
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.io.gltf import OWN
 from a2tg_jax.io.gltf_container import Builder
 from a2tg_jax.io.other_programs import linear_colors, matrix_of, upright
@@ -150,7 +151,7 @@ def _save_glb(path: Path, mesh: Mesh, transform: Similarity | None) -> None:
     indices = builder.add(mesh.faces.astype(np.uint32).reshape(-1), is_attribute=False)
     unlit = {"pbrMetallicRoughness": surface, "extensions": {"KHR_materials_unlit": {}}, "doubleSided": True}
     described: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "a2tg-jax"},
+        "asset": {"version": "2.0", "generator": PROGRAM},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],

@@ -22,6 +22,7 @@ from a2tg_jax.core.cameras import Camera, resize_camera
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.colmap import read_cameras_and_points
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.renderer import Renderer
@@ -122,7 +123,7 @@ def save_figure(path: Path, figure: Figure) -> None:
     """Write a PNG on white, atomically."""
     FigureCanvasAgg(figure)
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
+        figure.savefig(temporary, format="png", dpi=110, metadata={"Software": PROGRAM})
 
 
 def curves_figure(histories: Mapping[str, History], starts: Mapping[str, int]) -> Figure:

@@ -15,11 +15,13 @@ from typing import BinaryIO
 import matplotlib
 import numpy as np
 from numpy.typing import ArrayLike
-from PIL import Image, ImageDraw, ImageFont
+from PIL import ExifTags, Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
 from scipy.ndimage import uniform_filter
 
 from a2tg_jax.core.notebook_display import enlarged
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.text import PROGRAM
 
 ERROR_GAIN = 4
 CHECKER = (0.75, 0.55)
@@ -117,7 +119,9 @@ def save_picture(path: str | os.PathLike[str], picture: Image.Image | np.ndarray
 
 def write_png(path: str | os.PathLike[str], picture: Image.Image | np.ndarray) -> None:
     picture = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
-    picture.save(path, format="PNG", optimize=True)
+    text = PngInfo()
+    text.add_text("Software", PROGRAM)  # `data.photo_folder` takes no such picture for a photograph.
+    picture.save(path, format="PNG", optimize=True, pnginfo=text)
 
 
 def jpeg_uri(image: np.ndarray, *, zoom: int = 1, quality: int = 88) -> str:
@@ -142,5 +146,9 @@ def save_animation(
 ) -> None:
     """Write pictures as a looping animated WebP, with one of them in memory at a time."""
     duration = round(1000 / frames_per_second)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Software] = PROGRAM  # As in `write_png`.
     # Pillow draws the rest from the generator, one at a time.
-    next(pictures).save(file, "WEBP", save_all=True, append_images=pictures, duration=duration, loop=0, **options)
+    next(pictures).save(
+        file, "WEBP", save_all=True, append_images=pictures, duration=duration, loop=0, exif=exif, **options
+    )
