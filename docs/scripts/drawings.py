@@ -110,7 +110,7 @@ def draw_ray() -> plt.Figure:
     drawn = bars.barh(names, values, color=(*colors, GREY))
     bars.bar_label(drawn, [f"{value:.2f}" for value in values], padding=3)
     bars.invert_yaxis()
-    bars.set(title="weight of each colour in the pixel", xlim=(0, 0.62))
+    bars.set(title="weight in the pixel", xlim=(0, 0.62))
     bars.spines[["top", "right"]].set_visible(False)
     return figure
 
