@@ -64,6 +64,11 @@ export class LongTexture {
     }
   }
 
+  /** Append from the start again. */
+  clear(): void {
+    this.place = 0;
+  }
+
   /** Append [n, 4] numbers. */
   append(data: Uint32Array | Uint8Array): void {
     const { gl, width } = this;
@@ -89,22 +94,29 @@ export class LongTexture {
   }
 }
 
-/** An offscreen picture: half floats if the GPU can draw to them, else bytes. */
+/** Names of drivers that draw in software. */
+const SOFTWARE = /SwiftShader|llvmpipe|softpipe|Basic Render/i;
+
+/** An offscreen picture: half floats if the GPU can draw to them, else bytes. In software, floats are faster. */
 export class Target {
   width = 0;
   height = 0;
   readonly framebuffer: WebGLFramebuffer;
   texture: WebGLTexture | null = null;
   private readonly gl: WebGL2RenderingContext;
-  /** Whether the picture holds half floats, which are not clamped to [0, 1]. */
+  /** Whether the picture holds floats or half floats, which are not clamped to [0, 1]. */
   readonly isFloat: boolean;
+  private readonly format: GLenum;
 
   constructor(gl: WebGL2RenderingContext) {
     this.gl = gl;
     this.framebuffer = gl.createFramebuffer();
     const isFloat = gl.getExtension("EXT_color_buffer_float") !== null;
     this.isFloat = isFloat || gl.getExtension("EXT_color_buffer_half_float") !== null;
-    gl.getExtension("OES_texture_half_float_linear");
+    const names = gl.getExtension("WEBGL_debug_renderer_info");
+    const driver = String(gl.getParameter(names?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER));
+    const isSingle = isFloat && SOFTWARE.test(driver) && gl.getExtension("EXT_float_blend") !== null;
+    this.format = isSingle ? gl.RGBA32F : this.isFloat ? gl.RGBA16F : gl.RGBA8;
   }
 
   resize(width: number, height: number): void {
@@ -113,12 +125,9 @@ export class Target {
     gl.deleteTexture(this.texture);
     this.texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, this.isFloat ? gl.RGBA16F : gl.RGBA8, width, height);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, this.format, width, height);
     for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
-      gl.texParameteri(gl.TEXTURE_2D, filter, gl.LINEAR);
-    }
-    for (const wrap of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) {
-      gl.texParameteri(gl.TEXTURE_2D, wrap, gl.CLAMP_TO_EDGE);
+      gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.texture, 0);

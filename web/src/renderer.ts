@@ -1,13 +1,14 @@
 /** Draws sorted splats back to front into an offscreen picture, then copies it to the canvas. */
 
+import { at } from "./arrays";
 import type { Lens, Pose } from "./camera";
 import { projection } from "./camera";
 import type { Clip } from "./extent";
 import type { Ends } from "./format";
 import { Program, Target } from "./gl";
 import type { Vec2 } from "./math";
-import { MODES, SCREEN_FRAGMENT, SCREEN_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX } from "./shaders";
-import type { Mode } from "./shaders";
+import { BATCH, MODES, SCREEN_FRAGMENT, SCREEN_VERTEX, splatFragment, splatVertex } from "./shaders";
+import type { Mode, Variant } from "./shaders";
 import type { Splats } from "./splats";
 
 /** Range of columns that is drawn in one mode. */
@@ -20,18 +21,17 @@ interface Part {
 export class Renderer {
   readonly gl: WebGL2RenderingContext;
   readonly target: Target;
-  private readonly splat: Program;
+  private readonly splats = new Map<string, Program>();
   private readonly screen: Program;
-  private readonly vertices: WebGLVertexArrayObject;
+  private readonly quads: WebGLVertexArrayObject;
   private readonly nothing: WebGLVertexArrayObject;
 
   /** Throws an Error if the driver rejects a shader. */
   constructor(gl: WebGL2RenderingContext) {
     this.gl = gl;
     this.target = new Target(gl);
-    this.splat = new Program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
     this.screen = new Program(gl, SCREEN_VERTEX, SCREEN_FRAGMENT);
-    this.vertices = gl.createVertexArray();
+    this.quads = quadsOf(gl);
     this.nothing = gl.createVertexArray();
   }
 
@@ -45,12 +45,10 @@ export class Renderer {
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
     if (splats.numDrawn === 0) return;
-    this.prepare(splats, pose, lens);
-    this.limit(clip);
     const middle = divided === null ? lens.width : Math.round(divided * lens.width);
     const parts: Part[] = [{ mode, from: 0, to: middle }];
     if (middle < lens.width) parts.push({ mode: "plain", from: middle, to: lens.width });
-    for (const part of parts) this.drawPart(splats, lens, part);
+    for (const part of parts) this.drawPart(splats, pose, lens, clip, part);
     gl.disable(gl.SCISSOR_TEST);
     gl.disable(gl.BLEND);
   }
@@ -66,7 +64,7 @@ export class Renderer {
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.target.texture);
     gl.uniform1i(screen.at("picture"), 0);
-    gl.uniform2f(screen.at("screen"), width, height);
+    gl.uniform1i(screen.at("height"), height);
     gl.uniform3fv(screen.at("background"), splats.header.background);
     gl.uniform2fv(screen.at("depths"), depths);
     gl.uniform1i(screen.at("mode"), MODES.indexOf(mode));
@@ -74,16 +72,29 @@ export class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  private prepare(splats: Splats, pose: Pose, lens: Lens): void {
-    const { gl, splat } = this;
+  /** Return the program for a scene in a mode, which is compiled at the first call. */
+  private programOf({ header }: Splats, mode: Mode): Program {
+    const variant: Variant = {
+      mode,
+      degree: Math.max(...header.degrees),
+      isTextured: header.numTexels > 0 && mode !== "plain",
+      isShaped: header.hasShapes,
+      isClamped: header.outside === "clamp",
+      isCentred: header.uv === "texel-centre",
+    };
+    const key = JSON.stringify(variant);
+    const found = this.splats.get(key) ?? new Program(this.gl, splatVertex(variant), splatFragment(variant));
+    this.splats.set(key, found);
+    return found;
+  }
+
+  private prepare(splat: Program, splats: Splats, pose: Pose, lens: Lens): void {
+    const { gl } = this;
     const { header } = splats;
     gl.useProgram(splat.handle);
-    gl.bindVertexArray(this.vertices);
-    gl.bindBuffer(gl.ARRAY_BUFFER, splats.order);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
-    const textures = { rows: splats.rows, harmonics: splats.harmonics, texels: splats.texels };
+    gl.bindVertexArray(this.quads);
+    gl.uniform1i(splat.at("numDrawn"), splats.numDrawn);
+    const textures = { order: splats.order, rows: splats.rows, harmonics: splats.harmonics, texels: splats.texels };
     Object.entries(textures).forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture.handle);
@@ -101,9 +112,6 @@ export class Renderer {
     gl.uniform1f(splat.at("peak"), header.numTexels === 0 ? 1 : Math.max(1, texel_alphas.high));
     gl.uniform1f(splat.at("nearPlane"), header.nearPlane);
     gl.uniform1f(splat.at("maxAlpha"), header.maxAlpha);
-    gl.uniform1i(splat.at("isShaped"), Number(header.hasShapes));
-    gl.uniform1i(splat.at("isClamped"), Number(header.outside === "clamp"));
-    gl.uniform1i(splat.at("isCentred"), Number(header.uv === "texel-centre"));
     gl.uniform1i(splat.at("widthBits"), splats.widthBits);
     gl.uniform4fv(splat.at("projection"), projection(pose, lens).flat());
     gl.uniform3fv(splat.at("center"), pose.position);
@@ -112,8 +120,8 @@ export class Renderer {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
-  private limit({ axes, low, high, faintest, largest }: Clip): void {
-    const { gl, splat } = this;
+  private limit(splat: Program, { axes, low, high, faintest, largest }: Clip): void {
+    const { gl } = this;
     gl.uniform3fv(splat.at("boxAxes"), axes.flat());
     gl.uniform3fv(splat.at("boxLow"), low);
     gl.uniform3fv(splat.at("boxHigh"), high);
@@ -121,12 +129,29 @@ export class Renderer {
     gl.uniform1f(splat.at("largest"), largest);
   }
 
-  private drawPart(splats: Splats, lens: Lens, { mode, from, to }: Part): void {
+  private drawPart(splats: Splats, pose: Pose, lens: Lens, clip: Clip, { mode, from, to }: Part): void {
     const { gl } = this;
     if (to <= from) return;
+    const program = this.programOf(splats, mode);
+    this.prepare(program, splats, pose, lens);
+    this.limit(program, clip);
     gl.enable(gl.SCISSOR_TEST);
     gl.scissor(from, 0, to - from, lens.height);
-    gl.uniform1i(this.splat.at("mode"), MODES.indexOf(mode));
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, splats.numDrawn);
+    const num = Math.ceil(splats.numDrawn / BATCH);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, num);
   }
+}
+
+/** Corners of the two triangles of a quad. */
+const CORNERS = [0, 1, 2, 3, 2, 1];
+
+/** Return indices of a batch of quads. In software four successive new vertices are computed at once. */
+function quadsOf(gl: WebGL2RenderingContext): WebGLVertexArrayObject {
+  const found = gl.createVertexArray();
+  const indices = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + at(CORNERS, i % 6));
+  gl.bindVertexArray(found);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
+  gl.bindVertexArray(null);
+  return found;
 }

@@ -6,6 +6,21 @@
 export const MODES = ["full", "plain", "texture", "resolution", "depth", "normals", "ellipses"] as const;
 export type Mode = (typeof MODES)[number];
 
+/** What a program draws. It is compiled for that alone: in software, branches that are not taken cost as much. */
+export interface Variant {
+  readonly mode: Mode;
+  /** Highest degree of the spherical harmonics. */
+  readonly degree: number;
+  readonly isTextured: boolean;
+  /** Whether kernels differ in shape. */
+  readonly isShaped: boolean;
+  readonly isClamped: boolean;
+  readonly isCentred: boolean;
+}
+
+/** Number of quads that an instance draws. In software every instance costs as much as a draw call. */
+export const BATCH = 1024;
+
 const HEADER = `#version 300 es
 precision highp float;
 precision highp int;
@@ -13,6 +28,13 @@ precision highp usampler2D;
 precision highp sampler2D;
 const int FULL = 0, PLAIN = 1, TEXTURE = 2, RESOLUTION = 3, DEPTH = 4, NORMALS = 5, ELLIPSES = 6;
 `;
+
+function constantsOf({ mode, degree, isTextured, isShaped, isClamped, isCentred }: Variant): string {
+  return `
+const int mode = ${MODES.indexOf(mode)}, DEGREE = ${degree};
+const bool isTextured = ${isTextured}, isShaped = ${isShaped}, isClamped = ${isClamped}, isCentred = ${isCentred};
+`;
+}
 
 const TEXELS = `
 uniform sampler2D texels;
@@ -28,14 +50,12 @@ vec4 texelAt(uint index) {
 
 /** Falloff of kernels with shapes: exp(-scale ((rho + OFFSET)^exponent - start)), as in a2tg_jax/appearance/parts.py. */
 const KERNEL = `
-uniform bool isShaped;
 const float OFFSET = 0.02, LARGEST_LOG_EXPONENT = 1.0;
 `;
 
-export const SPLAT_VERTEX = `${HEADER}${TEXELS}${KERNEL}
-layout(location = 0) in uint row;
-
-uniform usampler2D rows, harmonics;
+export const splatVertex = (variant: Variant): string => `${HEADER}${constantsOf(variant)}${TEXELS}${KERNEL}
+uniform usampler2D order, rows, harmonics;
+uniform int numDrawn;
 uniform vec4 projection[3];
 uniform vec3 center;
 uniform vec2 size;
@@ -43,8 +63,6 @@ uniform float nearPlane, peak;
 uniform vec3 boxAxes[3], boxLow, boxHigh;
 uniform float faintest, largest;
 uniform vec2 scaleEnds, quatEnds, opacityEnds, shapeEnds, harmonicEnds[4];
-uniform int mode;
-uniform bool isClamped;
 
 flat out vec4 axes;
 flat out vec3 plane;
@@ -78,24 +96,24 @@ vec3 coefficient(uvec4 words[4], int k, vec2 ends) { return values(words[(k - 1)
 
 vec3 colorOf(vec3 base, uint first, int degree, vec3 d) {
   vec3 sum = 0.28209479177387814 * base;
-  if (degree > 0) {
+  if (DEGREE > 0 && degree > 0) {
     uvec4 words[4];
     words[0] = wordsAt(harmonics, first);
-    words[1] = degree > 1 ? wordsAt(harmonics, first + 1u) : uvec4(0);
-    words[2] = degree > 2 ? wordsAt(harmonics, first + 2u) : uvec4(0);
-    words[3] = degree > 2 ? wordsAt(harmonics, first + 3u) : uvec4(0);
+    words[1] = DEGREE > 1 && degree > 1 ? wordsAt(harmonics, first + 1u) : uvec4(0);
+    words[2] = DEGREE > 2 && degree > 2 ? wordsAt(harmonics, first + 2u) : uvec4(0);
+    words[3] = DEGREE > 2 && degree > 2 ? wordsAt(harmonics, first + 3u) : uvec4(0);
     float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
     vec2 e = harmonicEnds[1];
     sum += 0.4886025119029199
       * (z * coefficient(words, 2, e) - y * coefficient(words, 1, e) - x * coefficient(words, 3, e));
-    if (degree > 1) {
+    if (DEGREE > 1 && degree > 1) {
       e = harmonicEnds[2];
       sum += 1.0925484305920792
         * (x * y * coefficient(words, 4, e) - y * z * coefficient(words, 5, e) - x * z * coefficient(words, 7, e));
       sum += 0.31539156525252005 * (2.0 * zz - xx - yy) * coefficient(words, 6, e);
       sum += 0.5462742152960396 * (xx - yy) * coefficient(words, 8, e);
     }
-    if (degree > 2) {
+    if (DEGREE > 2 && degree > 2) {
       e = harmonicEnds[3];
       sum -= 0.5900435899266435 * y * (3.0 * xx - yy) * coefficient(words, 9, e);
       sum += 2.890611442640554 * x * y * z * coefficient(words, 10, e);
@@ -174,7 +192,10 @@ vec2 corner(vec3 M[3], float r2, vec2 middle, float radius, vec2 side, out bool 
 
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+  int place = gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
   axes = vec4(0); plane = vec3(0); mean = vec3(0); shown = vec4(0); region = uvec3(0); own = vec3(0); curve = vec3(0);
+  if (place >= numDrawn) return;
+  uint row = wordsAt(order, uint(place >> 2))[place & 3];
   uvec4 first = wordsAt(rows, 2u * row);
   vec3 position = uintBitsToFloat(first.xyz);
   float depth = dot(projection[2].xyz, position) + projection[2].w;
@@ -200,7 +221,7 @@ void main() {
     M[i] = vec3(scales.x * dot(p.xyz, R[0]), scales.y * dot(p.xyz, R[1]), dot(p.xyz, position) + p.w);
   }
   vec2 middle = vec2(M[0].z, M[1].z) / depth;
-  vec2 side = vec2(gl_VertexID & 1, gl_VertexID >> 1);
+  vec2 side = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1);
   float radius = sqrt(cutoff / 2.0 + SLACK);
   bool isBeside;
   vec2 at = corner(M, cutoff, middle, radius, side, isBeside);
@@ -218,9 +239,8 @@ void main() {
   uvec2 sides = uvec2(second.y >> 16, second.y >> 21) & 31u;
   region = uvec3(second.z, sides);
   if (sides.x == 0u) region.yz = uvec2(0);
-  if (mode == PLAIN) region.yz = uvec2(0);
   own = vec3(0.0);
-  if (isClamped && region.y == 1u && region.z == 1u) {
+  if (isTextured && isClamped && region.y == 1u && region.z == 1u) {
     vec4 texel = texelAt(region.x);
     own = texel.rgb;
     opacity *= texel.a;
@@ -245,7 +265,7 @@ void main() {
 }
 `;
 
-export const SPLAT_FRAGMENT = `${HEADER}${TEXELS}${KERNEL}
+export const splatFragment = (variant: Variant): string => `${HEADER}${constantsOf(variant)}${TEXELS}${KERNEL}
 flat in vec4 axes;
 flat in vec3 plane;
 flat in vec3 mean;
@@ -255,8 +275,6 @@ flat in vec3 own;
 flat in vec3 curve;
 
 uniform float nearPlane, maxAlpha;
-uniform int mode;
-uniform bool isClamped, isCentred;
 
 out vec4 fragment;
 
@@ -291,7 +309,7 @@ void main() {
   float exponent = isShaped ? curve.y * (pow(rho + OFFSET, curve.x) - curve.z) : 0.5 * rho;
   float alpha = shown.a * exp(-exponent);
   vec3 color = shown.rgb;
-  if (region.y > 0u) {
+  if (isTextured && region.y > 0u) {
     vec4 texel = textureAt(uv);
     if (!isClamped && any(greaterThan(abs(uv), vec2(3.0)))) texel = vec4(0.0, 0.0, 0.0, 1.0);
     if (mode == FULL || mode == TEXTURE) color += texel.rgb;
@@ -314,7 +332,7 @@ void main() {
 
 export const SCREEN_FRAGMENT = `${HEADER}
 uniform sampler2D picture;
-uniform vec2 screen;
+uniform int height;
 uniform vec3 background;
 uniform vec2 depths;
 uniform int mode;
@@ -328,8 +346,8 @@ vec3 ramp(float t) {
 }
 
 void main() {
-  vec2 place = gl_FragCoord.xy / screen;
-  vec4 found = texture(picture, vec2(place.x, 1.0 - place.y));
+  ivec2 place = ivec2(gl_FragCoord.xy);
+  vec4 found = texelFetch(picture, ivec2(place.x, height - 1 - place.y), 0);
   vec3 color = found.rgb + (1.0 - found.a) * background;
   if (mode == DEPTH) {
     float depth = found.a > 0.02 ? found.r / found.a : depths.y;

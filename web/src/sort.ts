@@ -11,7 +11,7 @@ export class DepthSorter {
   private readonly counts = new Uint32Array(BUCKETS);
 
   /**
-   * Return the indices of the first `num` positions [x, y, z, …] from the farthest to the nearest. Among equal depths
+   * Return the indices, padded with zeros to a multiple of four, of the first `num` positions [x, y, z, …] from the farthest to the nearest. Among equal depths
    * the highest index comes first.
    *
    * @param row - gives the depth row · (x, y, z, 1)
@@ -22,7 +22,7 @@ export class DepthSorter {
       this.order = new Uint32Array(num);
     }
     this.findKeys(means, num, row);
-    const found = new Uint32Array(num);
+    const found = new Uint32Array(4 * Math.ceil(num / 4));
     // A radix sort: two passes of a stable counting sort, both in descending order.
     this.pass(num, 0, null, this.order);
     this.pass(num, 16, this.order, found);

@@ -17,7 +17,9 @@ export interface SortMessage {
 }
 
 export interface OrderMessage {
+  /** Indices, padded to a multiple of four. */
   readonly order: Uint32Array<ArrayBuffer>;
+  readonly num: number;
   readonly row: Row4;
 }
 
@@ -34,6 +36,6 @@ self.addEventListener("message", (event: MessageEvent<AddMessage | SortMessage>)
     return;
   }
   const order = sorter.sort(means, num, message.row);
-  const answer: OrderMessage = { order, row: message.row };
+  const answer: OrderMessage = { order, num, row: message.row };
   self.postMessage(answer, { transfer: [order.buffer] });
 });

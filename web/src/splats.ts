@@ -13,7 +13,8 @@ export class Splats {
   readonly rows: LongTexture;
   readonly harmonics: LongTexture;
   readonly texels: LongTexture;
-  readonly order: WebGLBuffer;
+  /** Indices of rows from the farthest to the nearest. */
+  readonly order: LongTexture;
   readonly widthBits: number;
   /** Number of rows received. */
   num = 0;
@@ -26,7 +27,6 @@ export class Splats {
   /** Handler for errors of the worker. */
   onFail: (reason: string) => void = () => undefined;
 
-  private readonly gl: WebGL2RenderingContext;
   private readonly packer = new Packer();
   private readonly worker: Worker;
   private isSorting = false;
@@ -35,13 +35,12 @@ export class Splats {
   private waiting: (() => void)[] = [];
 
   constructor(gl: WebGL2RenderingContext, header: Header) {
-    this.gl = gl;
     this.header = header;
     this.widthBits = Math.min(12, Math.floor(Math.log2(gl.getParameter(gl.MAX_TEXTURE_SIZE) as number)));
     this.rows = new LongTexture(gl, 2 * header.num, this.widthBits, true, "Gaussians");
     this.harmonics = new LongTexture(gl, header.numHarmonics, this.widthBits, true, "colours");
     this.texels = new LongTexture(gl, header.numTexels, this.widthBits, false, "texels");
-    this.order = gl.createBuffer();
+    this.order = new LongTexture(gl, Math.ceil(header.num / 4), this.widthBits, true, "Gaussians");
     this.worker = new SortWorker();
     this.worker.addEventListener("message", (event: MessageEvent<OrderMessage>) => this.receive(event.data));
     this.worker.addEventListener("error", (event) => this.onFail(event.message));
@@ -74,8 +73,7 @@ export class Splats {
 
   delete(): void {
     this.worker.terminate();
-    for (const texture of [this.rows, this.harmonics, this.texels]) texture.delete();
-    this.gl.deleteBuffer(this.order);
+    for (const texture of [this.order, this.rows, this.harmonics, this.texels]) texture.delete();
   }
 
   private next(): void {
@@ -85,12 +83,11 @@ export class Splats {
     this.worker.postMessage(message);
   }
 
-  private receive({ order, row }: OrderMessage): void {
-    const { gl } = this;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
-    this.numDrawn = order.length;
-    this.sorted = { row, num: order.length };
+  private receive({ order, num, row }: OrderMessage): void {
+    this.order.clear();
+    this.order.append(order);
+    this.numDrawn = num;
+    this.sorted = { row, num };
     this.isSorting = false;
     if (this.wanted === null) {
       for (const resolve of this.waiting.splice(0)) resolve();
