@@ -52,6 +52,7 @@ def test_options_beside_those_of_other_programs_exist():
         ("README.md", "docs/install.md", "install.md"),
         ("docs/api/models.md", "../library.md#models", "../library.md#models"),
         ("docs/results.md", "../experiments/results/a.png", "repository/experiments/results/a.png"),
+        ("docs/wild.md", "../experiments/NOTEBOOK.md#a", "repository/experiments/NOTEBOOK.md.txt#a"),
         ("docs/api/models.md", "../../notebooks/a.ipynb", "../notebooks/a.md"),
         ("docs/install.md", "../notebooks", "notebooks.md"),
         ("docs/install.md", "https://a.org/b.md", "https://a.org/b.md"),

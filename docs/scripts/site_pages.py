@@ -65,7 +65,10 @@ def place_of(name: str) -> str:
         return "notebooks.md"
     if name.endswith(".ipynb"):
         return f"{name.removesuffix('.ipynb')}.md"
-    return name.removeprefix("docs/") if name.startswith("docs/") else f"{FILES}/{name}"
+    if name.startswith("docs/"):
+        return name.removeprefix("docs/")
+    # As text, other Markdown is a file of the site and not a page of it.
+    return f"{FILES}/{name}.txt" if name.endswith(".md") else f"{FILES}/{name}"
 
 
 def notebook_text(notebook: dict[str, Any]) -> str:
