@@ -40,25 +40,23 @@ export class Program {
   }
 }
 
-/** An append-only array in a 2D texture, four numbers a texel. */
+/** An append-only array in a 2D texture, four words a texel. */
 export class LongTexture {
   readonly handle: WebGLTexture;
   private readonly gl: WebGL2RenderingContext;
   private readonly width: number;
-  private readonly isWords: boolean;
   private place = 0;
 
   /** Allocate `num` texels in rows of 2^widthBits. Throws a SceneError if the GPU's limit is lower. */
-  constructor(gl: WebGL2RenderingContext, num: number, widthBits: number, isWords: boolean, what: string) {
+  constructor(gl: WebGL2RenderingContext, num: number, widthBits: number, what: string) {
     this.gl = gl;
     this.width = 1 << widthBits;
-    this.isWords = isWords;
     const height = Math.max(Math.ceil(num / this.width), 1);
     const most = gl.getParameter(gl.MAX_TEXTURE_SIZE) as number;
     if (height > most) throw new SceneError(`The scene has more ${what} than this GPU supports.`);
     this.handle = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, this.handle);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, isWords ? gl.RGBA32UI : gl.RGBA8, this.width, height);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, this.width, height);
     for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
       gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
     }
@@ -69,11 +67,10 @@ export class LongTexture {
     this.place = 0;
   }
 
-  /** Append [n, 4] numbers. */
-  append(data: Uint32Array | Uint8Array): void {
+  /** Append [n, 4] words. */
+  append(data: Uint32Array): void {
     const { gl, width } = this;
     gl.bindTexture(gl.TEXTURE_2D, this.handle);
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     let done = 0;
     const num = data.length / 4;
     while (done < num) {
@@ -82,8 +79,7 @@ export class LongTexture {
       const columns = x > 0 || num - done < width ? Math.min(width - x, num - done) : width;
       const lines = columns === width ? Math.floor((num - done) / width) : 1;
       const piece = data.subarray(4 * done, 4 * (done + columns * lines));
-      const [format, type] = this.isWords ? [gl.RGBA_INTEGER, gl.UNSIGNED_INT] : [gl.RGBA, gl.UNSIGNED_BYTE];
-      gl.texSubImage2D(gl.TEXTURE_2D, 0, x, y, columns, lines, format, type, piece);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, x, y, columns, lines, gl.RGBA_INTEGER, gl.UNSIGNED_INT, piece);
       done += columns * lines;
       this.place += columns * lines;
     }

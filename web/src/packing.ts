@@ -6,7 +6,8 @@
  *     of its harmonics
  *
  * Each coefficient above degree 0 takes one word (red, green, blue, unused), padded to groups of four. Each texel takes
- * four bytes.
+ * four words, so that one fetch reads all that an interpolation needs: itself, its right neighbour, the one below, and
+ * the one right of that, each of them red, green, blue, alpha. Neighbours beyond the edge are those at the edge.
  */
 
 import type { Chunk } from "./chunks";
@@ -24,8 +25,8 @@ export interface Packed {
   readonly rows: Uint32Array;
   /** [h, 4] words of harmonics. */
   readonly harmonics: Uint32Array;
-  /** [t, 4] red, green, blue, alpha. */
-  readonly texels: Uint8Array;
+  /** [t, 4] words of texels. */
+  readonly texels: Uint32Array;
 }
 
 /** Packs successive chunks, counting texels and harmonics across them. */
@@ -58,7 +59,7 @@ export class Packer {
       means,
       rows,
       harmonics: harmonicsOf(chunk, harmonic - this.numHarmonics),
-      texels: texelsOf(chunk.texels),
+      texels: texelsOf(chunk),
     };
     this.numTexels = texel;
     this.numHarmonics = harmonic;
@@ -98,15 +99,30 @@ function harmonicsOf(chunk: Chunk, numGroups: number): Uint32Array {
   return words;
 }
 
-function texelsOf(planes: Uint8Array): Uint8Array {
-  const num = planes.length / 4;
-  const found = new Uint8Array(planes.length);
+function texelsOf({ num, sizes, texels }: Chunk): Uint32Array {
+  const count = texels.length / 4;
+  const found = new Uint32Array(4 * count);
+  const own = new Uint32Array(count);
+  for (let i = 0; i < count; i++) {
+    const green = texels[count + i]!;
+    own[i] = word(texels[i]! + green, green, texels[2 * count + i]! + green, texels[3 * count + i]!);
+  }
+  let first = 0;
   for (let i = 0; i < num; i++) {
-    const green = planes[num + i]!;
-    found[4 * i] = planes[i]! + green;
-    found[4 * i + 1] = green;
-    found[4 * i + 2] = planes[2 * num + i]! + green;
-    found[4 * i + 3] = planes[3 * num + i]!;
+    const [height, width] = [sizes[i]!, sizes[num + i]!];
+    for (let y = 0; y < height; y++) {
+      const above = first + y * width;
+      const below = first + Math.min(y + 1, height - 1) * width;
+      for (let x = 0; x < width; x++) {
+        const right = Math.min(x + 1, width - 1);
+        const place = 4 * (above + x);
+        found[place] = own[above + x]!;
+        found[place + 1] = own[above + right]!;
+        found[place + 2] = own[below + x]!;
+        found[place + 3] = own[below + right]!;
+      }
+    }
+    first += width * height;
   }
   return found;
 }

@@ -36,21 +36,31 @@ const bool isTextured = ${isTextured}, isShaped = ${isShaped}, isClamped = ${isC
 `;
 }
 
-const TEXELS = `
-uniform sampler2D texels;
+const FETCH = `
 uniform int widthBits;
+
+uvec4 wordsAt(usampler2D words, uint index) {
+  return texelFetch(words, ivec2(int(index) & ((1 << widthBits) - 1), int(index >> widthBits)), 0);
+}
+`;
+
+const TEXELS = `${FETCH}
+uniform usampler2D texels;
 uniform vec2 colorEnds, alphaEnds;
 
-vec4 texelAt(uint index) {
-  ivec2 place = ivec2(int(index) & ((1 << widthBits) - 1), int(index >> widthBits));
-  vec4 code = texelFetch(texels, place, 0) * 255.0;
+// Interpolate between the four words at an index.
+vec4 texelAt(uint index, vec4 weights) {
+  ivec4 words = ivec4(wordsAt(texels, index));
+  vec4 code = vec4(
+    dot(vec4(words & 255), weights), dot(vec4((words >> 8) & 255), weights),
+    dot(vec4((words >> 16) & 255), weights), dot(vec4((words >> 24) & 255), weights));
   return vec4(colorEnds.x + code.rgb * colorEnds.y, alphaEnds.x + code.a * alphaEnds.y);
 }
 `;
 
 /** Falloff of kernels with shapes: exp(-scale ((rho + OFFSET)^exponent - start)), as in a2tg_jax/appearance/parts.py. */
 const KERNEL = `
-const float OFFSET = 0.02, LARGEST_LOG_EXPONENT = 1.0;
+const float OFFSET = 0.02, LARGEST_LOG_EXPONENT = 1.0, HALF_LOG2E = 0.7213475204444817;
 `;
 
 export const splatVertex = (variant: Variant): string => `${HEADER}${constantsOf(variant)}${TEXELS}${KERNEL}
@@ -73,10 +83,6 @@ flat out vec3 own;
 flat out vec3 curve;
 
 const float SLACK = 1e-2;
-
-uvec4 wordsAt(usampler2D words, uint index) {
-  return texelFetch(words, ivec2(int(index) & ((1 << widthBits) - 1), int(index >> widthBits)), 0);
-}
 
 vec4 bytesOf(uint word) {
   return vec4(uvec4(word, word >> 8, word >> 16, word >> 24) & 255u);
@@ -228,10 +234,14 @@ void main() {
   if (isBeside) return;
   gl_Position = vec4(2.0 * at / size - 1.0, 0.0, 1.0);
 
-  // Relative to the projected mean: p0 = depth (b.y, -a.y, 0), p1 = depth (-b.x, a.x, 0), p2 = depth plane.
+  // Relative to the projected mean: p0 = depth (b.y, -a.y, 0), p1 = depth (-b.x, a.x, 0), p2 = depth plane, all over
+  // determinant / nearPlane, so that p2 is nearPlane over the depth of the hit.
   vec2 last = M[2].xy, a = M[0].xy - middle.x * last, b = M[1].xy - middle.y * last;
-  axes = vec4(b.y, -a.y, -b.x, a.x);
-  plane = vec3(b.x * last.y - b.y * last.x, last.x * a.y - last.y * a.x, a.x * b.y - a.y * b.x) / depth;
+  float determinant = a.x * b.y - a.y * b.x;
+  if (determinant != 0.0) {
+    axes = vec4(b.y, -a.y, -b.x, a.x) * (nearPlane / determinant);
+    plane = vec3(vec2(b.x * last.y - b.y * last.x, last.x * a.y - last.y * a.x) / determinant, 1.0) * (nearPlane / depth);
+  }
   mean = vec3(middle, depth);
 
   vec4 base = values(first.w, harmonicEnds[0]);
@@ -241,7 +251,7 @@ void main() {
   if (sides.x == 0u) region.yz = uvec2(0);
   own = vec3(0.0);
   if (isTextured && isClamped && region.y == 1u && region.z == 1u) {
-    vec4 texel = texelAt(region.x);
+    vec4 texel = texelAt(region.x, vec4(1.0, 0.0, 0.0, 0.0));
     own = texel.rgb;
     opacity *= texel.a;
     region.yz = uvec2(0);
@@ -262,6 +272,8 @@ void main() {
   }
   if (mode == FULL || mode == TEXTURE || mode == ELLIPSES) color += own;
   shown = vec4(color, opacity);
+  curve.y *= 2.0 * HALF_LOG2E;
+  curve.z *= curve.y;
 }
 `;
 
@@ -282,23 +294,20 @@ vec4 textureAt(vec2 uv) {
   vec2 sides = vec2(region.yz), unit = (uv * (1.0 / 3.0) + 1.0) * 0.5;
   vec2 place = isCentred ? unit * sides - 0.5 : unit * (sides - 1.0);
   place = clamp(place, vec2(0.0), sides - 1.0);
-  uvec2 low = min(uvec2(place), region.yz - 1u), high = min(low + 1u, region.yz - 1u);
+  ivec2 low = ivec2(place);
   vec2 f = place - vec2(low);
-  uint above = region.x + low.y * region.y, below = region.x + high.y * region.y;
-  return mix(
-    mix(texelAt(above + low.x), texelAt(above + high.x), f.x),
-    mix(texelAt(below + low.x), texelAt(below + high.x), f.x), f.y);
+  vec4 weights = vec4(1.0 - f.x, f.x, 1.0 - f.x, f.x) * vec2(1.0 - f.y, f.y).xxyy;
+  return texelAt(region.x + uint(low.y) * region.y + uint(low.x), weights);
 }
 
 void main() {
   vec2 offset = gl_FragCoord.xy - mean.xy;
+  // The nearest depth over the depth of the ray's hit.
   float q = dot(plane.xy, offset) + plane.z;
-  float hitDepth = mean.z * plane.z / q;
-  bool isHit = q != 0.0 && hitDepth >= nearPlane;
-  vec2 uv = isHit ? vec2(dot(axes.xy, offset), dot(axes.zw, offset)) / q : vec2(0.0);
-  float rhoRay = dot(uv, uv), rhoScreen = 2.0 * dot(offset, offset);
-  bool isRay = isHit && rhoRay <= rhoScreen;
-  float rho = isRay ? rhoRay : rhoScreen;
+  vec2 hit = vec2(dot(axes.xy, offset), dot(axes.zw, offset));
+  bool isHit = q > 0.0 && q <= 1.0;
+  float rhoRay = isHit ? dot(hit, hit) / (q * q) : 1e30, rhoScreen = 2.0 * dot(offset, offset);
+  float rho = min(rhoRay, rhoScreen);
 
   if (mode == ELLIPSES) {
     if (rho > 2.0) discard;
@@ -306,10 +315,10 @@ void main() {
     fragment = vec4(mix(shown.rgb, vec3(0.02), 0.75 * edge), 1.0);
     return;
   }
-  float exponent = isShaped ? curve.y * (pow(rho + OFFSET, curve.x) - curve.z) : 0.5 * rho;
-  float alpha = shown.a * exp(-exponent);
+  float alpha = shown.a * exp2(isShaped ? curve.z - curve.y * exp2(curve.x * log2(rho + OFFSET)) : -HALF_LOG2E * rho);
   vec3 color = shown.rgb;
   if (isTextured && region.y > 0u) {
+    vec2 uv = isHit ? hit / q : vec2(0.0);
     vec4 texel = textureAt(uv);
     if (!isClamped && any(greaterThan(abs(uv), vec2(3.0)))) texel = vec4(0.0, 0.0, 0.0, 1.0);
     if (mode == FULL || mode == TEXTURE) color += texel.rgb;
@@ -317,7 +326,7 @@ void main() {
   }
   if (alpha < 1.0 / 255.0) discard;
   alpha = min(alpha, maxAlpha);
-  if (mode == DEPTH) color = vec3(isRay ? hitDepth : mean.z);
+  if (mode == DEPTH) color = vec3(rhoRay <= rhoScreen ? nearPlane / q : mean.z);
   if (mode == NORMALS) color = own;
   fragment = vec4(color * alpha, alpha);
 }

@@ -37,10 +37,10 @@ export class Splats {
   constructor(gl: WebGL2RenderingContext, header: Header) {
     this.header = header;
     this.widthBits = Math.min(12, Math.floor(Math.log2(gl.getParameter(gl.MAX_TEXTURE_SIZE) as number)));
-    this.rows = new LongTexture(gl, 2 * header.num, this.widthBits, true, "Gaussians");
-    this.harmonics = new LongTexture(gl, header.numHarmonics, this.widthBits, true, "colours");
-    this.texels = new LongTexture(gl, header.numTexels, this.widthBits, false, "texels");
-    this.order = new LongTexture(gl, Math.ceil(header.num / 4), this.widthBits, true, "Gaussians");
+    this.rows = new LongTexture(gl, 2 * header.num, this.widthBits, "Gaussians");
+    this.harmonics = new LongTexture(gl, header.numHarmonics, this.widthBits, "colours");
+    this.texels = new LongTexture(gl, header.numTexels, this.widthBits, "texels");
+    this.order = new LongTexture(gl, Math.ceil(header.num / 4), this.widthBits, "Gaussians");
     this.worker = new SortWorker();
     this.worker.addEventListener("message", (event: MessageEvent<OrderMessage>) => this.receive(event.data));
     this.worker.addEventListener("error", (event) => this.onFail(event.message));
