@@ -62,7 +62,7 @@ class CloneSplitPrune(StepEvent):
     memory_budget the largest gradients are densified, however small."""
     dense_share: float = 0.01
     """Share of scene_scale above which Gaussians are split; smaller ones are cloned."""
-    least_opacity: float = 0.05  # as in 2DGS; 0.005 is compared in docs/reliability.md
+    least_opacity: float = 0.05  # as in 2DGS; 0.005 is compared in experiments/NOTEBOOK.md
     """Smallest opacity; fainter Gaussians are pruned."""
     largest_share: float = 0.1
     """Largest size as a share of scene_scale; larger Gaussians are pruned after the first reset of opacities."""

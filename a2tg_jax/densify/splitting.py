@@ -88,7 +88,7 @@ def draw_distinct_hosts(weights: Array, key: Array, is_host: Array, is_target: A
     The order of log-weights plus Gumbel noise equals successive draws without replacement (Yellott, 1977). Only the
     entries of targets have a meaning, if there are any hosts.
     """
-    # From 100,000 points: 26.0 dB, and 15.1 with replacement (docs/reliability.md).
+    # From 100,000 points: 26.0 dB, and 15.1 with replacement (experiments/NOTEBOOK.md).
     noisy = jnp.log(weights) + jax.random.gumbel(key, weights.shape, weights.dtype)
     order = jnp.argsort(jnp.where(is_host, -noisy, jnp.inf)).astype(jnp.int32)
     place = jnp.cumsum(is_target, dtype=jnp.int32) - 1

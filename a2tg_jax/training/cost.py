@@ -23,7 +23,7 @@ from a2tg_jax.training.start import initial_number
 MB = 10**6
 PROCESS = 300 * MB
 """Python, JAX and other imports."""
-# Rounded to fit the runs in docs/reliability.md, "Memory and time".
+# Rounded to fit the runs in experiments/NOTEBOOK.md, "Forecasts of memory".
 FIRST_PROGRAM, FURTHER_STAGE, FURTHER_PROGRAM = 270 * MB, 110 * MB, 25 * MB
 """Memory of compiled programs: of the first stage, of each further one, and of each program of new shapes."""
 COMPILER = 240 * MB

@@ -83,7 +83,7 @@ def fainter_where_dense(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaus
     behind them, which then do not learn.
     """
     sizes = _largest_sizes(gaussians, cameras)
-    # Measured in docs/reliability.md, "Many initial points".
+    # Measured in experiments/NOTEBOOK.md, "Many initial points".
     layers = np.maximum(FILTER_VARIANCE / np.maximum(sizes, SMALLEST_SIDE) ** 2, 1.0)
     opacities = np.asarray(gaussians.opacities, np.float64)
     # An opacity that is below the bound already stays.
