@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import re
 import shutil
 
 import efficiency
@@ -163,3 +164,12 @@ def test_pages_show_the_committed_tables():
     folder = EXPERIMENTS / "results"
     shown = {folder / name for page in pages.PAGES for name in pages.names(page.read_text(encoding="utf-8"))}
     assert shown <= set(folder.glob("*/*.md"))
+
+
+def test_figures_in_sentences_on_results_are_in_its_tables():
+    text = (EXPERIMENTS.parent / "docs" / "results.md").read_text(encoding="utf-8")
+    tables_shown = "".join(found[0] for found in pages.BLOCK.finditer(text))
+    figures = set(re.findall(r"\d\.\d{2,}", tables_shown))
+    assert figures, "the page shows no table"
+    missing = set(re.findall(r"\d\.\d{2,}", pages.BLOCK.sub("", text))) - figures
+    assert not missing, f"{missing} are in no table of the page"
