@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from test_data_colmap import write_scene as write_colmap
+from test_data_colmap import dot_place, write_scene as write_colmap
 
 from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import intrinsics
@@ -84,8 +84,8 @@ def test_photographs_of_two_folders_become_a_scene(tmp_path):
         run_sfm(tmp_path / "a", tmp_path / "scene", progress=False)
 
 
-def staged(sources, work, panorama="auto", tell=lambda line: None):
-    return stage(sources, work, frames=10, panorama=panorama, progress=False, tell=tell)
+def staged(sources, work, panorama="auto", tell=lambda line: None, masks=None):
+    return stage(sources, work, masks=masks, frames=10, panorama=panorama, progress=False, tell=tell)
 
 
 def cameras_of(found, work):
@@ -193,17 +193,126 @@ def test_colmap_reads_and_writes_every_photograph(tmp_path, name, mode, options)
     assert bitmap.write(tmp_path / group.names[0])
 
 
-@pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])
-def test_photographs_that_lose_their_alpha(tmp_path, mode):
-    """Two photographs have transparent pixels; the alpha channel of another is opaque."""
-    image = Image.fromarray(np.full((48, 64, 4), 255, np.uint8))
+def test_transparent_photographs_are_staged_as_png(tmp_path):
+    """With straight colours and alpha, upright."""
+    pixels = np.dstack([COLOUR, np.where(np.arange(96) < 40, 0, 255) * np.ones((64, 1))]).astype(np.uint8)
+    photos, image = tmp_path / "photos", Image.fromarray(pixels)
+    photos.mkdir()
+    for name in ("0.png", "1.tif", "3.PNG"):
+        image.save(photos / name)
+    image.save(photos / "2.webp", lossless=True, exact=True)
+    save_turned(image, photos / "4.png", 6)
+    image.convert("LA").save(photos / "5.png")
+    image.convert("P").save(photos / "6.png")
+    Image.fromarray(COLOUR).save(photos / "7.bmp")
+    found = staged([photos], tmp_path / "work")
+    assert found.names == ["0.png", "1.tif.png", "2.webp.png", "3.PNG", "4.png", "5.png", "6.png", "7.bmp"]
+    for name in found.names[:-1]:
+        kept = read_pixels(tmp_path / "work" / "photos" / name)
+        np.testing.assert_array_equal(kept[..., 3], pixels[..., 3])
+        if name[0] in "01234":
+            np.testing.assert_array_equal(kept, pixels)
+
+
+def test_alpha_and_masks_are_undistorted_with_the_photographs(tmp_path):
+    """An alpha channel and a mask of the dot alone are where COLMAP's undistorted photograph shows the dot."""
+    names = ["a/0.png", "a/1.PNG", "b/2.jpg", "b/3.png"]
+    model = write_colmap(tmp_path / "scene", models=("SIMPLE_RADIAL", "OPENCV"), num_views=4, names=names)
+    photos, out = tmp_path / "scene" / "images", tmp_path / "out"
+    for name in names:
+        photograph = read_pixels(photos / name)
+        is_dot = photograph[..., 0] > 20
+        if name.lower().endswith(".png"):
+            Image.fromarray(np.dstack([photograph, 255 * is_dot.astype(np.uint8)])).save(photos / name)
+        if name != "b/3.png":
+            (tmp_path / "scene" / "masks" / name).parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(is_dot).convert("L").save(tmp_path / "scene" / "masks" / f"{name}.png")
+    pycolmap().undistort_images(out, tmp_path / "scene" / "sparse" / "0", photos)
+    expected = {name: dot_place(read_pixels(out / "images" / name)) for name in names}
+    sfm._undistort_alpha_and_masks(model, photos, out)
+    with pytest.warns(UserWarning, match="1 of 4 photographs have no mask, such as b/3.png"):
+        scene = load_scene(out, test_every=0)
+    for view in scene.train:
+        assert view.has_alpha == (view.name != "b/2.jpg") and (view.mask is None) == (view.name == "b/3.png")
+        for plane in ([view.alpha] if view.has_alpha else []) + ([view.mask.read()] if view.mask else []):
+            assert plane.sum() > 0 and (plane > 0).mean() < 0.05
+            np.testing.assert_allclose(dot_place(np.asarray(plane, float)[..., None]), expected[view.name], atol=0.7)
+
+
+def test_masks_come_with_the_photographs(tmp_path):
+    """From photographs with an alpha channel, one of them turned, and masks of all but one, to a scene."""
+    save_photos(tmp_path / "photos", 4, 256, 192)
+    (tmp_path / "cut").mkdir()
+    corner = (np.indices((192, 256)) < 40).all(0)
     for index in range(4):
-        image.putpixel((index, 0), (0, 0, 0, 0 if index < 2 else 255))
-        image.convert("RGB" if index == 3 else mode).save(tmp_path / f"{index}.png")
-        image.putpixel((index, 0), (255, 255, 255, 255))
-    with pytest.warns(UserWarning, match=r"2 of 4 photographs have transparent pixels.* folder masks") as printed:
-        staged([tmp_path], tmp_path / "work")
-    assert len(printed) == 1
+        file = tmp_path / "photos" / f"view_{index:03d}.png"
+        if index < 3:
+            Image.fromarray(~corner[:, ::-1]).convert("L").save(tmp_path / "cut" / f"{file.stem}.png")
+        with Image.open(file) as image:
+            image.putalpha(Image.fromarray(~corner).convert("L"))
+            if index == 2:
+                file.unlink()
+                save_turned(image, file, 6)
+            elif index == 0:
+                file.unlink()
+                image.convert("RGB").save(file.with_suffix(".jpg"), quality=95)
+            else:
+                image.save(file)
+    with pytest.warns(UserWarning, match=r"cut: 1 of 4 photographs have no mask, such as view_003.png"):
+        run_sfm(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / "cut", progress=False)
+    assert sorted(file.name for file in (tmp_path / "scene").iterdir()) == ["images", "masks", "sparse"]
+    with pytest.warns(UserWarning, match="1 of 4 photographs have no mask, such as view_003.png"):
+        scene = load_scene(tmp_path / "scene", test_every=0)
+    for view in scene.train:
+        alpha = view.alpha if view.has_alpha else np.zeros((1, 1))
+        assert view.has_alpha == (view.name != "view_000.jpg") and not alpha[:36, :36].any()
+        if view.has_alpha:
+            assert (alpha == 0).mean() == pytest.approx(corner.mean(), rel=0.1)
+        if view.name != "view_003.png":
+            assert not view.mask.read()[:36, -36:].any()
+            assert (~view.mask.read()).mean() == pytest.approx(corner.mean(), rel=0.1)
+
+
+def test_what_is_wrong_with_masks_of_photographs(tmp_path):
+    random = np.random.default_rng(0)
+    for index in range(3):
+        save_blocks(tmp_path / "photos" / f"{index}.jpg", 64, 48, random)
+    (tmp_path / "cut").mkdir()
+    for masks, error, words in (
+        ("none", FileNotFoundError, "none: no such folder of masks"),
+        ("cut", ValueError, "holds no mask of a photograph, called 0.jpg.png for 0.jpg"),
+    ):
+        with pytest.raises(error, match=words):
+            run_sfm(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / masks, progress=False)
+    for index in range(3):
+        Image.new("L", (48, 64)).save(tmp_path / "cut" / f"{index}.png")
+    with pytest.raises(
+        ValueError, match=r"png: is 48x64, but its photograph is 64x48; a mask must be of the same size"
+    ):
+        run_sfm(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / "cut", progress=False)
+
+
+def test_masks_of_panoramas_are_cut(tmp_path):
+    """So are alpha channels. Masks exclude what is above the horizon, and a quarter left of the middle is clear."""
+    pixels = np.full((64, 128, 4), 200, np.uint8)
+    pixels[..., 3] = 255
+    pixels[:, 32:64, 3] = 0
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "photos").mkdir()
+    for index in range(3):
+        Image.fromarray(pixels).save(tmp_path / "photos" / f"{index}.png")
+        Image.fromarray(np.arange(64)[:, None] * np.ones(128) >= 32).convert("L").save(
+            tmp_path / "cut" / f"{index}.png"
+        )
+    found = staged([tmp_path / "photos"], tmp_path / "work", panorama="yes", masks=tmp_path / "cut")
+    (rig,) = found.rigs
+    for name, mask, alpha in (("up", 0, None), ("down", 255, None), ("heading300", None, 0)):
+        file = f"{rig.folder}/{name}/0.png"
+        side = rig.groups[0].size[0]
+        pixels, counts = read_pixels(found.folder / file), read_pixels(tmp_path / "work" / "masks" / f"{file}.png")
+        assert pixels.shape == (side, side, 4) and counts.shape == (side, side, 3)
+        assert mask is None or (counts == mask).all()
+        assert alpha is None or (pixels[side // 2, side // 2 + 2, 3] == alpha)
 
 
 def test_photographs_stay_as_they_are_whatever_they_are_named(tmp_path):

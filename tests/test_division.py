@@ -243,6 +243,7 @@ def test_processes_must_have_the_same_photographs(tmp_path, together):
 def test_processes_must_have_the_same_options(tmp_path, together):
     folder = write_scene(tmp_path / "scene")
     options = {"downscale": (1, 2), "test_every": (8, 4), "alpha": ("transparency", "mask"), "lens": ("undistort", "x")}
+    options |= {"mask_as": ("ignored", "background")}
     for option, values in options.items():
         calls = [functools.partial(load_scene, folder, is_divided=True, **{option: value}) for value in values]
         difference = f"{option}={values[1]}, not {option}={values[0]}; "

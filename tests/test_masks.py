@@ -148,6 +148,40 @@ def test_alpha_is_transparency_or_a_mask(tmp_path):
         load_scene(tmp_path, alpha="cut")
 
 
+@pytest.mark.parametrize("room", [None, 0], ids=["held", "on disk"])
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV_FISHEYE"])
+def test_a_mask_as_background_is_an_alpha_channel(tmp_path, model, room):
+    """Photographs with masks are as the same ones with the mask in their alpha channel, or multiplied into it."""
+    rng = np.random.default_rng(0)
+    for folder in ("masks", "alpha"):
+        write_scene(tmp_path / folder, models=(model,))
+    for index, name in enumerate(NAMES):
+        photograph = rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+        alpha = rng.integers(1, 256, (HEIGHT, WIDTH), np.uint8) if index == 4 else np.full((HEIGHT, WIDTH), 255)
+        counts = rng.random((HEIGHT // 8, WIDTH // 8)).repeat(8, 0).repeat(8, 1) < (0.5 if index else 2.0)
+        whole = np.dstack([photograph, alpha]).astype(np.uint8)
+        Image.fromarray(whole).save(tmp_path / "masks" / "images" / name)
+        Image.fromarray(np.where(counts[..., None], whole, whole * [1, 1, 1, 0]).astype(np.uint8)).save(
+            tmp_path / "alpha" / "images" / name
+        )
+        write_mask(tmp_path / "masks" / "masks" / name, counts)
+    for downscale in (1, 2):
+        options = {"downscale": downscale, "room": room}
+        views = views_of(load_scene(tmp_path / "masks", mask_as="background", **options))
+        for own, other in zip(views, views_of(load_scene(tmp_path / "alpha", **options)), strict=True):
+            assert own.mask is None and own.has_alpha == other.has_alpha == (own.name != NAMES[0])
+            for _ in range(2):
+                np.testing.assert_array_equal(own.picture.read(), other.picture.read())
+
+
+def test_a_mask_as_background_has_one_meaning(tmp_path):
+    write_scene(tmp_path)
+    with pytest.raises(ValueError, match="`alpha` must be transparency where `mask_as` is background"):
+        load_scene(tmp_path, alpha="mask", mask_as="background")
+    with pytest.raises(ValueError, match="mask_as must be one of ignored, background; got 'cut'"):
+        load_scene(tmp_path, mask_as="cut")
+
+
 @pytest.fixture(scope="module")
 def masked():
     """A scene with a different mask for each training view but one, and the same with noise where they exclude."""

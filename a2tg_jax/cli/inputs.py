@@ -42,6 +42,9 @@ class Sfm:
     the sparse model, ready for a2tg train, unless --out names it."""
     out: Annotated[Path | None, defaulting_to("the last of PHOTOS... SCENE", "SCENE")] = None
     """New scene folder."""
+    masks: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """Folder of masks of the photographs, NAME.jpg.png or NAME.png for NAME.jpg, black where a pixel does not count.
+    They are undistorted into SCENE/masks."""
     matching: Matching = "auto"
     """Pairs of photographs to match. auto: all pairs up to 200 photographs, neighbours by name beyond. exhaustive: all
     pairs. sequential: neighbours by name, for many photographs named in the order of taking."""
@@ -56,6 +59,8 @@ class Sfm:
 
     def run(self) -> None:
         sources, out = self._places()
+        if self.masks is not None:
+            check_apart(out, self.masks)
         for source in sources:
             check_apart(out, source)
             if is_scene(source):
@@ -64,6 +69,7 @@ class Sfm:
         found = run_sfm(
             sources,
             out,
+            masks=self.masks,
             camera_model=self.camera_model,
             matching=self.matching,
             frames=self.frames,

@@ -115,7 +115,8 @@ def _has_alpha(image: Image.Image) -> bool:
 def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> None:
     """Write an image file again with its pixels turned as EXIF says, as PNG or JPEG by the target's suffix.
 
-    EXIF data of the camera are kept, because the focal length is among them. Those of a TIFF's layout would be wrong.
+    A PNG keeps the alpha channel. EXIF data of the camera are kept, because the focal length is among them. Those of a
+    TIFF's layout would be wrong.
     """
     with _opened(path) as image:
         stored, exif = image.getexif(), Image.Exif()
@@ -125,9 +126,10 @@ def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> No
             {tag: value for tag, value in details.items() if tag != ExifTags.Base.MakerNote}
         )
         upright = ImageOps.exif_transpose(image)
+        mode = "RGBA" if _has_alpha(image) else "RGB"
         exif[ExifTags.Base.Orientation] = 1  # Or readers would turn the pixels again.
         if target.suffix.lower() == ".png":
-            upright.convert("RGB").save(target, exif=exif, compress_level=1)
+            upright.convert(mode).save(target, exif=exif, compress_level=1)
         else:
             upright.convert("RGB").save(target, quality=quality, subsampling=0, exif=exif)  # 4:4:4 keeps colours sharp.
 

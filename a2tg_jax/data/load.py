@@ -16,7 +16,7 @@ from a2tg_jax.data.division import among_processes, sharing_errors
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.phone_captures import polycam, record3d
 from a2tg_jax.data.photo_folder import capture_hint, holds_photos, is_video
-from a2tg_jax.data.photo_reading import AlphaMeaning, Options
+from a2tg_jax.data.photo_reading import AlphaMeaning, MaskMeaning, Options
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.photogrammetry import metashape, realityscan
 from a2tg_jax.data.scene import Scene, scene_name, warn_of_lenses
@@ -48,6 +48,9 @@ class SceneSource:
     """Hold out every k-th image for testing."""
     alpha: AlphaMeaning = "transparency"
     """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
+    mask_as: MaskMeaning = "ignored"
+    """Meaning of the pixels that masks exclude: ignored, or background, empty as transparent pixels are, which cuts
+    the subject out."""
     lens: LensUse = "undistort"
     """Photographs of distorted cameras, such as fisheyes: undistort them to pinholes, or keep them as they are."""
     validation: bool = False
@@ -79,6 +82,7 @@ def load_scene(
     test_every: int = 8,
     room: int | None = None,
     alpha: AlphaMeaning = "transparency",
+    mask_as: MaskMeaning = "ignored",
     lens: LensUse = "undistort",
     is_divided: bool = False,
 ) -> Scene:
@@ -102,6 +106,8 @@ def load_scene(
         needed (`Shelf`), which changes no result. None takes a quarter of the process's memory.
       alpha: meaning of the alpha channel: "transparency" before a background, or a "mask", of which only opaque
         pixels count.
+      mask_as: meaning of the pixels that masks exclude: "ignored" in training and metrics; or "background", transparent
+        as by an alpha channel, which cuts the subject out.
       lens: "undistort" photographs to pinholes, which crops wide angles; or "keep" them and draw through the lens,
         with a ray for each pixel (`Camera.rays`). Pixels more than 80° off the direction of view do not count.
       is_divided: whether the processes of `jax.distributed` call this together. Each then reads an equal share of the
@@ -116,7 +122,7 @@ def load_scene(
       ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left,
         or processes that load it together have other options or photographs than the first.
     """
-    source: SceneSource = SceneSource(path, downscale, test_every, alpha, lens)  # type: ignore[arg-type]
+    source: SceneSource = SceneSource(path, downscale, test_every, alpha, mask_as, lens)  # type: ignore[arg-type]
     return _load(source, room, is_divided)
 
 
@@ -134,7 +140,12 @@ def _load(source: SceneSource, room: int | None, is_divided: bool, is_built_in: 
             given += [f"{name}={value}" for name, value in vars(source).items() if name != "path"]
             division.check_same(given, "options of the scene")
         check_literal("alpha", source.alpha, AlphaMeaning)
+        check_literal("mask_as", source.mask_as, MaskMeaning)
         check_literal("lens", source.lens, LensUse)
+        if (source.alpha, source.mask_as) == ("mask", "background"):
+            raise ValueError(
+                "`alpha` must be transparency where `mask_as` is background, which makes pixels transparent; got mask"
+            )
         if source.downscale < 1 or source.downscale != int(source.downscale):
             raise ValueError(f"downscale must be a whole number of at least 1; got {source.downscale}")
         check_test_every(source.test_every)
@@ -147,7 +158,15 @@ def _load(source: SceneSource, room: int | None, is_divided: bool, is_built_in: 
         else:
             shelf = Shelf(room)
             try:
-                options = Options(int(source.downscale), source.test_every, source.alpha, source.lens, shelf, division)
+                options = Options(
+                    int(source.downscale),
+                    source.test_every,
+                    source.alpha,
+                    source.mask_as,
+                    source.lens,
+                    shelf,
+                    division,
+                )
                 scene = _read(located(source.path), options)
             finally:
                 forget_rays()

@@ -36,6 +36,8 @@ from a2tg_jax.host.text import shortened
 MASKS, DEPTHS = "masks", "depths"
 AlphaMeaning = Literal["transparency", "mask"]
 """Meaning of the alpha channel: transparency over a background, or a mask, of which only opaque pixels count."""
+MaskMeaning = Literal["ignored", "background"]
+"""Meaning of the pixels that a mask excludes: they do not count, or they are empty, as transparent ones are."""
 Counted = Callable[[np.ndarray], np.ndarray]
 """Function from a view's pixels [H, W, C] to [H, W] bool, True where they count."""
 MAX_ASPECT_ERROR = 0.01
@@ -52,6 +54,7 @@ class Options(NamedTuple):
     downscale: int
     test_every: int
     alpha: AlphaMeaning
+    mask_as: MaskMeaning
     lens: LensUse
     shelf: Shelf
     """Store of the pixels."""
@@ -197,9 +200,15 @@ def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple
             f"{advice}use the image that the camera was estimated from"
         )
 
+    mask_file, cuts_out = found.mask, options.mask_as == "background"
+
+    def whole_view(pixels: np.ndarray) -> np.ndarray:
+        if mask_file is not None and cuts_out:
+            pixels = _cut_out(pixels, read_mask(mask_file[0], stored, lens.size))
+        return lens.view_pixels(pixels, downscale)[0]
+
     def view(pixels: np.ndarray) -> np.ndarray:
-        made = lens.view_pixels(pixels, downscale)[0]
-        return made[..., :3] if options.alpha == "mask" else made
+        return whole_view(pixels)[..., :3] if options.alpha == "mask" else whole_view(pixels)
 
     try:
         size, K = lens.view_of(stored, downscale)
@@ -207,11 +216,11 @@ def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple
     except ValueError as error:
         raise ValueError(f"{photo.what}: its camera model {error}") from None
     if facts is None:
-        pixels = lens.view_pixels(photograph, downscale)[0]
+        pixels = whole_view(photograph)
         is_stored, counts = pixels is photograph, None
-        if found.mask is not None:
-            counts = _read_mask(*found.mask, lens, stored, size)
-        elif photo.counted is not None:
+        if mask_file is not None and not cuts_out:
+            counts = _view_mask(*mask_file, lens, stored, size)
+        elif mask_file is None and photo.counted is not None:
             counts = photo.counted(pixels)
         if options.alpha == "mask" and pixels.shape[2] == 4:
             is_opaque = pixels[..., 3] == 255
@@ -239,9 +248,8 @@ def _find_files(
             return None
         images, name = photo.below_images
         folder = images.with_name(MASKS)
-        names = f"{name}.png", str(Path(name).with_suffix(".png")), name
         for each in (folder, folder.with_name(f"{MASKS}_{downscale}"))[: 2 if downscale > 1 else 1]:
-            if (found := on_disk(each, *names)) is not None:
+            if (found := on_disk(each, *mask_names(name))) is not None:
                 return folder, found.relative_to(each).as_posix()
         return None
 
@@ -323,13 +331,38 @@ def _find_copies(files: Sequence[tuple[Path, str]], downscale: int, root: Path) 
     return found
 
 
-def _read_mask(
+def mask_names(name: str) -> tuple[str, str, str]:
+    """Return the names that the mask of a photograph may have, the preferred one first."""
+    return f"{name}.png", str(Path(name).with_suffix(".png")), name
+
+
+def _view_mask(
     file: Path, downscale: int, lens: Lens, stored: tuple[int, int], view_size: tuple[int, int]
 ) -> np.ndarray:
     """Return the mask [H, W] of a view, undistorted and downscaled as its photograph was.
 
     A pixel counts if all its source pixels count. Sizes are (width, height), of the photograph's file and of the view.
     """
+    counts = read_mask(file, stored, lens.size)
+    # Pillow takes no [H, W, 1]. Resampled, only 255 from nothing but 255 stays 255.
+    planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
+    planes, _ = lens.view_pixels(planes, downscale)
+    return np.asarray(resize_pixels(planes, *view_size)[..., 0] == 255)
+
+
+def _cut_out(pixels: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the pixels of a photograph [H, W, C] that are transparent too where a mask of any size excludes them."""
+    if counts.all():
+        return pixels
+    size = pixels.shape[1], pixels.shape[0]
+    counts = np.asarray(Image.fromarray(counts).resize(size, Image.Resampling.NEAREST))
+    opacities = pixels[..., 3] if pixels.shape[2] == 4 else np.uint8(255)
+    return np.dstack([pixels[..., :3], np.where(counts, opacities, np.uint8(0))])
+
+
+def read_mask(file: Path, *sizes: tuple[int, int]) -> np.ndarray:
+    """Return a mask [H, W] bool, True where pixels count, of one of some sizes (width, height), the photograph's
+    first."""
     pixels = read_pixels(file)
     counts = np.asarray(pixels[..., :3].any(axis=-1))
     if pixels.shape[2] == 4 and (pixels[..., 3] != pixels[0, 0, 3]).any():  # The alpha channel is a mask.
@@ -339,14 +372,10 @@ def _read_mask(
         # black. A file with a mask in both excludes what either does.
         has_both = 0 < len(lit) < is_opaque.sum() and (lit[:, :3] == lit[0, :3]).all()
         counts = is_opaque & counts if has_both else is_opaque
-    size = counts.shape[::-1]
-    if size not in (stored, lens.size):
-        sizes = "x".join(map(str, size)), "x".join(map(str, stored))
-        raise ValueError(f"{file}: is {sizes[0]}, but its photograph is {sizes[1]}; a mask must be of the same size")
-    # Pillow takes no [H, W, 1]. Resampled, only 255 from nothing but 255 stays 255.
-    planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
-    planes, _ = lens.view_pixels(planes, downscale)
-    return np.asarray(resize_pixels(planes, *view_size)[..., 0] == 255)
+    if counts.shape[::-1] not in sizes:
+        found, wanted = (f"{width}x{height}" for width, height in (counts.shape[::-1], sizes[0]))
+        raise ValueError(f"{file}: is {found}, but its photograph is {wanted}; a mask must be of the same size")
+    return counts
 
 
 def find_depths(images: Path, name: str) -> Path | None:

@@ -14,13 +14,19 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from PIL import Image
 from tqdm import tqdm
 
 from a2tg_jax.core.camera_paths import upright_rotation, vertical_of
 from a2tg_jax.core.checks import check_literal
+from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.decoding import picture_size, read_pixels
+from a2tg_jax.data.image_files import map_in_threads
+from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
-from a2tg_jax.data.staging import Panorama, Staged, directions, stage
+from a2tg_jax.data.photo_reading import MASKS
+from a2tg_jax.data.staging import HALF, Panorama, Staged, directions, stage
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.host.machine import num_threads
 from a2tg_jax.host.progress_bars import counting, has_terminal
@@ -67,6 +73,7 @@ def run_sfm(
     photos: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     out: str | os.PathLike[str],
     *,
+    masks: str | os.PathLike[str] | None = None,
     seed: int = 0,
     camera_model: CameraModel = "SIMPLE_RADIAL",
     matching: Matching = "auto",
@@ -78,13 +85,15 @@ def run_sfm(
     """Estimate poses and points, and write a scene folder that `load_scene` reads.
 
     Photographs of one source, size and lens share one camera, whose focal length starts from EXIF data. The largest
-    model found is kept, turned until −y is up, and undistorted. It runs on the CPU with the seed wherever COLMAP takes
-    one, and maps in one thread, so that runs reproduce.
+    model found is kept, turned until −y is up, and undistorted, with alpha channels. It runs on the CPU with the seed
+    wherever COLMAP takes one, and maps in one thread, so that runs reproduce.
 
     Args:
       photos: folder of photographs of one scene, whose subfolders are searched, or a video, or several of these or of
         single photographs.
-      out: new folder for `images` and `sparse/0`.
+      out: new folder for `images`, `sparse/0` and `masks`, if any.
+      masks: folder of masks of the photographs, NAME.EXT.png or NAME.png for NAME.EXT, black at excluded pixels. They
+        are undistorted into the folder `masks` of the scene. Cameras are found from all pixels.
       seed: random seed of COLMAP, at least 0.
       camera_model: COLMAP's name of the camera model to estimate; the FISHEYE models are for action cameras.
       matching: pairs of photographs to match; "auto" takes all pairs of up to 200, and neighbours by name of more.
@@ -98,7 +107,7 @@ def run_sfm(
       Counts of photographs, registered ones and points, and the reprojection error.
 
     Raises:
-      FileNotFoundError: if there is no such folder or photograph.
+      FileNotFoundError: if there is no such folder, photograph or folder of masks.
       FileExistsError: if `out` is a file, or holds a scene already.
       ValueError: if there are fewer than 3 photographs, or fewer than 3 could be registered, or one cannot be read.
     """
@@ -108,8 +117,10 @@ def run_sfm(
     if frames < LEAST_PHOTOS:
         raise ValueError(f"frames must be at least {LEAST_PHOTOS}; got {frames}")
     sources = [Path(photos)] if isinstance(photos, str | os.PathLike) else [Path(source) for source in photos]
-    out = Path(out)
-    for existing in (out / "images", out / "sparse"):
+    out, masks = Path(out), None if masks is None else Path(masks)
+    if masks is not None and not masks.is_dir():
+        raise FileNotFoundError(f"{masks}: no such folder of masks")
+    for existing in (out / "images", out / "sparse", out / MASKS):
         if existing.exists():
             raise FileExistsError(f"{existing}: exists already; choose another output folder or remove it")
     if out.is_file():
@@ -117,7 +128,7 @@ def run_sfm(
     # The temporary folder is in `out`, so results are moved on one disk, without a copy.
     with _new_folder(out), tempfile.TemporaryDirectory(dir=out, prefix="sfm-") as folder, _quiet():
         work = Path(folder)
-        staged = stage(sources, work, frames=frames, panorama=panorama, progress=progress, tell=on_note)
+        staged = stage(sources, work, masks=masks, frames=frames, panorama=panorama, progress=progress, tell=on_note)
         names, given = staged.names, first_names([str(source) for source in sources])
         if len(names) < LEAST_PHOTOS:
             raise ValueError(f"{given}: {len(names)} photographs; at least {LEAST_PHOTOS} are needed")
@@ -137,12 +148,39 @@ def run_sfm(
             chosen.mkdir()
             model.write(chosen)  # undistort_images takes folders.
             pycolmap().undistort_images(undistorted, chosen, staged.folder)
+            _undistort_alpha_and_masks(model, staged.folder, undistorted)
             (out / "sparse").mkdir()
             shutil.move(undistorted / "sparse", out / "sparse" / "0")
-            shutil.move(undistorted / "images", out / "images")
+            for name in ("images", MASKS):
+                if (undistorted / name).exists():
+                    shutil.move(undistorted / name, out / name)
     error = model.compute_mean_reprojection_error()
     longest_side = max(int(side) for camera in model.cameras.values() for side in (camera.width, camera.height))
     return SfmSummary(len(names), model.num_reg_images(), model.num_points3D(), error, longest_side)
+
+
+def _undistort_alpha_and_masks(model: Any, photos: Path, undistorted: Path) -> None:
+    """Add the alpha channels, which COLMAP drops, to undistorted images, and write the masks next to them."""
+    lenses = {
+        number: Lens(ColmapCamera(camera.model.name, camera.width, camera.height, tuple(camera.params)))
+        for number, camera in model.cameras.items()
+    }
+
+    def undistort(number: int) -> None:
+        image = model.image(number)
+        lens, target = lenses[image.camera_id], undistorted / "images" / image.name
+        # Photographs with transparent pixels are staged as PNG.
+        if target.suffix.lower() == ".png" and (pixels := read_pixels(photos / image.name)).shape[2] == 4:
+            Image.fromarray(lens.view_pixels(pixels)[0]).save(target, "PNG")
+        name = f"{image.name}.png"
+        if (staged := photos.with_name(MASKS) / name).exists():
+            levels = lens.view_plane(read_pixels(staged)[..., 0].astype(np.float32))
+            mask = Image.fromarray(levels >= HALF).convert("L")
+            (undistorted / MASKS / name).parent.mkdir(parents=True, exist_ok=True)
+            # COLMAP and `Lens` may round the size of an almost undistorted image differently.
+            mask.resize(picture_size(target), Image.Resampling.NEAREST).save(undistorted / MASKS / name)
+
+    map_in_threads(undistort, model.reg_image_ids())
 
 
 def _turn_upright(model: Any) -> None:

@@ -20,8 +20,9 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
-from a2tg_jax.data.image_files import map_in_threads
+from a2tg_jax.data.image_files import map_in_threads, on_disk
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS, find_photos, is_video
+from a2tg_jax.data.photo_reading import MASKS, mask_names, read_mask
 from a2tg_jax.data.video import extract_frames
 from a2tg_jax.host.text import counted
 
@@ -33,6 +34,8 @@ COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 """Suffixes of the images that COLMAP can write; it reads by content."""
 LOSSLESS_FORMATS = ("PNG", "TIFF", "BMP")
 QUALITY = 95
+HALF = 128
+"""Level from which on a pixel of a warped mask counts."""
 FIELD_OF_VIEW = np.deg2rad(100.0)
 """Field of view of each square view of a panorama; with the headings below no direction is left out."""
 AROUND = 6
@@ -92,17 +95,22 @@ class _Photo(NamedTuple):
     """Path below the staging folder, before conversion."""
     facts: PictureFacts
     is_panorama: bool
+    mask: Path | None
 
 
 def stage(
-    sources: Sequence[Path], work: Path, *, frames: int, panorama: Panorama, progress: bool, tell: Callable[[str], None]
-) -> Staged:
-    """Gather photographs of folders and videos in the folder `work/photos`.
+    sources: Sequence[Path], work: Path, *, masks: Path | None = None, frames: int, panorama: Panorama, progress: bool,
+    tell: Callable[[str], None],
+) -> Staged:  # fmt: skip
+    """Gather photographs of folders and videos in the folder `work/photos`, and masks as NAME.png in `work/masks`.
+
+    Photographs with transparent pixels keep them, as PNG.
 
     Args:
       sources: folders of photographs, videos, and photographs. Names begin with the source's if there are several;
         photographs of one folder are one source.
       work: folder for the gathered photographs.
+      masks: folder of masks of the photographs as they are shown; None: without masks.
       frames: largest number of frames to take from each video.
       panorama: which pictures are cut into views.
       progress: show progress bars.
@@ -117,7 +125,8 @@ def stage(
         elif (own := chosen.setdefault(source.parent, [])) is not None:
             own.append(source)
     least = LEAST_PHOTOS if len(chosen) == 1 else 1
-    for number, (source, prefix) in enumerate(zip(chosen, _prefixes(list(chosen)), strict=True)):
+    prefixes = _prefixes(list(chosen))
+    for number, (source, prefix) in enumerate(zip(chosen, prefixes, strict=True)):
         place = source
         if is_video(source):
             place = work / f"frames{number}"
@@ -139,23 +148,22 @@ def stage(
         facts = picture_facts(file)
         is_double = facts.size[0] == 2 * facts.size[1]
         is_cut = is_double and panorama != "no" and (panorama == "yes" or is_panorama(read_pixels(file)))
-        return _Photo(source, file, name, facts, is_cut)
+        names = dict.fromkeys([*mask_names(name), *mask_names(name.removeprefix(prefixes[source]))])
+        return _Photo(source, file, name, facts, is_cut, None if masks is None else on_disk(masks, *names))
 
     photos = map_in_threads(look, *zip(*files, strict=True))
+    lacking = [photo.name for photo in photos if photo.mask is None]
+    if masks is not None and len(lacking) == len(photos):
+        raise ValueError(f"{masks}: holds no mask of a photograph, called {lacking[0]}.png for {lacking[0]}")
+    if masks is not None and lacking:
+        message = f"{masks}: {len(lacking)} of {len(photos)} photographs have no mask, such as {lacking[0]}"
+        warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
     groups = _stage_flat([photo for photo in photos if not photo.is_panorama], folder)
     tops = {name.partition("/")[0] for group in groups for name in group.names}
     rigs = _stage_panoramas([photo for photo in photos if photo.is_panorama], folder, tops, tell)
     num_turned = sum(photo.facts.is_turned for photo in photos)
     if num_turned:
         tell(f"{counted(num_turned, 'photograph')} turned as EXIF says")
-    num_transparent = sum(photo.facts.is_transparent for photo in photos)
-    if num_transparent:
-        message = (
-            f"{', '.join(map(str, sources))}: {num_transparent} of {len(photos)} photographs have transparent pixels, "
-            "but COLMAP writes the scene's images without alpha; to leave pixels out, put masks of these images into "
-            "the scene's folder masks"
-        )
-        warnings.warn(message, stacklevel=3)
     return Staged(folder, groups, rigs)
 
 
@@ -184,19 +192,30 @@ def _made_unique(names: Sequence[str], others: Iterable[str] = ()) -> list[str]:
     return unique
 
 
+def _save_mask(levels: np.ndarray, name: Path, folder: Path) -> None:
+    """Save the mask [H, W] uint8 of a photograph below the folder of photographs, black and white."""
+    target = folder.with_name(MASKS) / f"{name.relative_to(folder)}.png"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(levels >= HALF).convert("L").save(target)
+
+
 def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
     """Link or write again photographs that are no panoramas, and group them by source, size and lens."""
 
     def wanted_name(photo: _Photo) -> str:
         """Return a photograph's name in the folder: with another suffix if its own does not suit the file there."""
+        facts = photo.facts
         # save_upright writes JPEG and PNG only.
-        suits = (".jpg", ".jpeg", ".png") if photo.facts.is_turned else COLMAP_SUFFIXES
-        if photo.facts.format in COLMAP_FORMATS and Path(photo.name).suffix.lower() in suits:
+        suits: tuple[str, ...] = (".jpg", ".jpeg", ".png") if facts.is_turned else COLMAP_SUFFIXES
+        suits = (".png",) if facts.is_transparent else suits
+        if facts.format in COLMAP_FORMATS and Path(photo.name).suffix.lower() in suits:
             return photo.name
-        return photo.name + (".png" if photo.facts.format in LOSSLESS_FORMATS else ".jpg")
+        return photo.name + (".png" if facts.is_transparent or facts.format in LOSSLESS_FORMATS else ".jpg")
 
     def place(photo: _Photo, target: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
+        if photo.mask is not None:
+            _save_mask(np.uint8(255) * read_mask(photo.mask, photo.facts.size), target, folder)
         if photo.facts.format in COLMAP_FORMATS and not photo.facts.is_turned:
             try:
                 # Whether os.link follows symbolic links depends on the system.
@@ -227,18 +246,25 @@ def _stage_panoramas(
         by_size[photo.facts.size].append(photo)
 
     def cut(photo: _Photo, top: str, view: str) -> None:
-        pixels = read_pixels(photo.file)[..., :3]
+        pixels = read_pixels(photo.file)
+        mask = None if photo.mask is None else np.uint8(255) * read_mask(photo.mask, photo.facts.size)[..., None]
         for direction in directions():
             target = folder / top / direction.name / view
             target.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(cut_view(pixels, direction)).save(target, quality=QUALITY)
+            if mask is not None:
+                _save_mask(cut_view(mask, direction)[..., 0], target, folder)
 
     rigs = []
     tops = _made_unique([f"panorama{number or ''}" for number in range(len(by_size))], tops)
     for top, (size, members) in zip(tops, by_size.items(), strict=True):
-        is_jpeg = [Path(photo.name).suffix.lower() in (".jpg", ".jpeg") for photo in members]
+        # The first suffix is added if the name has none of them.
+        suffixes = [(".png",) if photo.facts.is_transparent else (".jpg", ".jpeg") for photo in members]
         views = _made_unique(
-            [photo.name if own else f"{photo.name}.jpg" for photo, own in zip(members, is_jpeg, strict=True)]
+            [
+                photo.name if photo.name.lower().endswith(own) else photo.name + own[0]
+                for photo, own in zip(members, suffixes, strict=True)
+            ]
         )
         map_in_threads(cut, members, itertools.repeat(top), views)
         side, focal = view_size(size[0])
