@@ -507,7 +507,7 @@ def test_pictures_of_this_program_are_left_out_under_any_name(tmp_path):
     with Image.open(tmp_path / "0.png") as image:
         write_png(tmp_path / "my view.PNG", image.rotate(180))
         save_animation(tmp_path / "flight.webp", iter([image.rotate(180), image]), 5)
-    with pytest.warns(UserWarning, match=r"photographs: written by a2tg: 2 \(flight.webp, my view.PNG\)"):
+    with pytest.warns(UserWarning, match=r"photographs: written by a2tg: 2 \(flight.webp, my view.PNG\)$"):
         assert find_photos(tmp_path) == photos
 
 

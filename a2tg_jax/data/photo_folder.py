@@ -111,7 +111,9 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
     kinds["copies of others"] = _copies(folder, [name for name in names if name not in others])
     others |= kinds["copies of others"]
     groups = [f"{kind}: {len(found)} ({first_names(_patterns(found))})" for kind, found in kinds.items() if found]
-    others_text = f"Not taken for photographs: {'; '.join(groups)}. To use some, give a folder of these only"
+    others_text = f"Not taken for photographs: {'; '.join(groups)}"
+    if others != kinds["written by a2tg"]:
+        others_text += ". To use some, give a folder of these only"
     photos = [name for name in names if name not in others]
     unread = [file for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
     if len(photos) < least:
