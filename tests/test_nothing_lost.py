@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from run_folders import create_run
+from run_folders import create_run, some_result
 
 from a2tg_jax import Change, StepEvent
 from a2tg_jax.cli import main as cli, runs
@@ -554,3 +554,26 @@ def test_an_internal_error_is_not_reported_as_a_mistake_of_the_user(monkeypatch)
     monkeypatch.setattr(runs.Info, "run", raising(jax.errors.JaxRuntimeError("INTERNAL: a bug")))
     with pytest.raises(jax.errors.JaxRuntimeError, match="a bug"):
         cli.main(["info", "run"])
+
+
+def test_a_finished_run_is_trained_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(run_training, "evaluate_run", lambda *_, **__: some_result())
+    run = RunFolder(tmp_path / "run")
+    assert cli.main([*TRAIN, "--out", str(run.path), "--quiet"]) == 0
+    before, resuming = run.model(NAME).read_bytes(), ["train", "--out", str(run.path), "--resume", "--quiet"]
+    capsys.readouterr()
+    assert cli.main(resuming) == 0
+    advice = f"{run.path} is finished; to train it on: a2tg train --out {run.path} --resume --more 2000\n"
+    assert advice in capsys.readouterr().out
+    for _ in range(2):
+        assert cli.main([*resuming, "--more", "4"]) == 0
+        assert advice not in capsys.readouterr().out
+    names = [NAME, "gaussians-2d-mcmc-more", "gaussians-2d-mcmc-more-2"]
+    assert read_record(run).plan.main == tuple(names) and read_record(run).options.more == (4, 4)
+    models = [load_model(run.model(name)) for name in names]
+    assert run.model(NAME).read_bytes() == before and len({model.num for model in models}) == 1
+    assert not np.array_equal(models[1].sh, models[2].sh)
+    run.model(names[2]).unlink()
+    assert cli.main([*resuming, "--more", "4"]) == 2
+    assert "--more trains a finished run on: first finish this one with a2tg train" in capsys.readouterr().err
+    assert cli.main(resuming) == 0 and run.model(names[2]).is_file()

@@ -76,3 +76,16 @@ def test_a_custom_system_gets_paths_for_free():
     assert system.more_growth() == "stage1_iterations or initial_gaussians"
     with pytest.raises(ValueError, match=r"^densify\.cap must be at least 2; got 1$"):
         Own(densify=a2tg.Mcmc(cap=1)).check()
+
+
+@ALL
+@WITH_AND_WITHOUT
+def test_further_stages_repeat_the_last_without_growth(name, budget):
+    system = dataclasses.replace(find_system(name), memory_budget=budget, more=(5, 7))
+    *_, last, first, second = system.all_stages()
+    assert (first.name, first.iterations) == ("more", 5) and (second.name, second.iterations) == ("more-2", 7)
+    assert first.appearance == last.appearance and set(first.events) <= set(last.events)
+    assert all(event.most_gaussians is None for event in first.events)
+    system.check()
+    with pytest.raises(ValueError, match=r"^more must be at least 1; got 0"):
+        dataclasses.replace(system, more=(0,)).check()

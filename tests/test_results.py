@@ -55,7 +55,7 @@ from a2tg_jax.results.record import (
     repeating_command,
     write_record,
 )
-from a2tg_jax.results.report import bytes_compared, metrics_json, minutes, per_view_json, summary_text
+from a2tg_jax.results.report import bytes_compared, metrics_json, minutes, per_view_json, photographs_line, summary_text
 from a2tg_jax.results.run_evaluation import check_held_out, evaluate_run
 from a2tg_jax.results.run_training import RunOptions, train_run
 from a2tg_jax.systems.a2tg import A2tg
@@ -571,6 +571,17 @@ def test_the_summary_has_shares_of_budgets_and_published_bytes_if_there_are_any(
 
 
 # Histories
+
+
+@pytest.mark.parametrize("train, ending", [(23, "views between the photographs are about as good"), (27, "take more")])
+def test_one_line_says_what_the_photographs_allow(train, ending):
+    result = some_result()
+    main = result.models[result.main]
+    views = tuple(dataclasses.replace(view, psnr=float(train)) for view in main.train.per_view)
+    seen = dataclasses.replace(main.train, per_view=views)
+    measured = dataclasses.replace(main, splits=main.splits | {"train": seen})
+    line = photographs_line(dataclasses.replace(result, models=result.models | {result.main: measured}))
+    assert line.startswith(f"{train}.0 dB on training views, 24.0 held out: ") and line.endswith(ending)
 
 
 def test_history_round_trip_with_loss_terms(tmp_path):

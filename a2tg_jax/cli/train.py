@@ -30,6 +30,7 @@ from a2tg_jax.results.record import (
     DEFAULT_SYSTEM,
     RunRecord,
     contradictions,
+    is_finished,
     read_record,
     read_run_file,
     write_record,
@@ -99,6 +100,7 @@ class Train:
       --max-memory SIZE      memory limit of the process and the GPU, such as 8GB
       --config FILE          take options from a file, such as run.toml of another run
       --resume               continue from the newest checkpoint in the run folder
+      --resume --more N      train a finished run on, for N more iterations of the last stage
       --overwrite            replace an earlier run in that folder
       --quiet                hide the progress of training
 
@@ -110,7 +112,7 @@ class Train:
 
     Examples:
       a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
-      a2tg train scenes/fox --out runs/fox --resume
+      a2tg train --out runs/fox --resume
       a2tg train scenes/fox --out runs/small --memory-budget 20MB --baseline
       a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
       a2tg train --config runs/fox/run.toml --out runs/again
@@ -224,6 +226,8 @@ class Train:
           ValueError: if a flag contradicts the record.
         """
         kept, record = read_record(run), self.whole_record
+        more, options = record.options.more, dataclasses.replace(record.options, more=kept.options.more)
+        record = dataclasses.replace(record, options=options)
         changed = [f"--{name.replace('_', '-')}" for name in contradictions(record, kept)]
         if is_first and record.scene.path != kept.scene.path:
             changed.insert(0, f"{record.scene.path}, as it was trained on {kept.scene.path}")
@@ -232,6 +236,12 @@ class Train:
                 f"--resume takes every option from {run.record}: leave out {', '.join(changed)}, or start a new run "
                 f"with a2tg train --config {run.record}, these options and another --out"
             )
+        if more and not is_finished(run, kept):
+            raise ValueError(f"--more trains a finished run on: first finish this one with {resuming_command(run)}")
+        if more and self.coordinator is not None:
+            raise ValueError("--more with --resume is for one process: leave out --coordinator")
+        options = dataclasses.replace(options, more=(*options.more, *more))
+        record = dataclasses.replace(record, options=options)
         record.check()
         if is_first and record != kept:
             write_record(run, record)
@@ -267,6 +277,8 @@ def train_defaults(arguments: Sequence[str]) -> Train:
         # Several processes read the folder at once; the first one locks it later.
         with contextlib.nullcontext(open_run(Path(found.out))) if found.coordinator else opened(Path(found.out)) as run:
             record = read_record(run)
+            # Those that are given are added, so that the same number may be given twice.
+            record = dataclasses.replace(record, options=dataclasses.replace(record.options, more=()))
     elif found.config:
         record = read_run_file(Path(found.config))
     # A resumed run keeps its system and preset; `resumed` reports other ones.

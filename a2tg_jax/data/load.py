@@ -45,7 +45,7 @@ class SceneSource:
     downscale: int = 1
     """Factor k by which images are downscaled."""
     test_every: int = 8
-    """Hold out every k-th image for testing."""
+    """Hold out every k-th image for testing; 0: train on all, for the final picture."""
     alpha: AlphaMeaning = "transparency"
     """Meaning of the alpha channel: transparency before a background, or a mask that leaves pixels out."""
     mask_as: MaskMeaning = "ignored"

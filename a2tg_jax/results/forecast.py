@@ -173,7 +173,7 @@ def print_forecast(
         found.check_disk(out)
     print(found.text(limit), flush=True)
     side = max(max(view.camera.width, view.camera.height) for view in scene.train)
-    is_long = sum(stage.iterations for stage in record.options.stages()) > LONG
+    is_long = sum(stage.iterations for stage in record.options.all_stages()) > LONG
     is_long |= record.preset == "quick" and side > QUICK_SIDE
     has_quick = default_platform() == "cpu" and "quick" in type(record.options).presets()
     if out is not None and is_long and has_quick:

@@ -11,7 +11,7 @@ from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.results.folder import RunFolder, iteration_of, old_run, read_json, resuming_command
-from a2tg_jax.results.record import read_record, repeating_command
+from a2tg_jax.results.record import is_finished, read_record, repeating_command
 
 SPLITS = ("test", "validation", "train")
 
@@ -54,7 +54,7 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
         "downscale": record.scene.downscale,
         "system": record.system,
         "compare": list(record.compare),
-        "is_finished": all(is_regular(run.model(name)) for name in names),
+        "is_finished": is_finished(run, record),
         "stages": [{"name": name, **_stage_facts(run, name), "psnr": measured.get(name)} for name in names],
         "report": str(run.report) if run.report.is_file() else None,
         "damage": damage,

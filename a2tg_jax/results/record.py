@@ -48,7 +48,7 @@ OnNan = Literal["stop", "restore"]
 """Action on divergence: end with an error, or restore the newest checkpoint and reorder the views."""
 LONGEST_WITHOUT_CHECKPOINT = 500
 """Largest number of iterations between checkpoints."""
-STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections")
+STAGE_OPTIONS = ("loss", "rates", "memory_budget", "exposure", "refine_poses", "corrections", "more")
 """Options of every system that affect training only through its stages."""
 
 
@@ -252,6 +252,11 @@ def contradictions(asked: RunRecord, kept: RunRecord) -> list[str]:
     return [name for name, value in now.items() if name != "path" and (name not in before or before[name] != value)]
 
 
+def is_finished(run: RunFolder, record: RunRecord) -> bool:
+    """Return whether all stages of a run have their models."""
+    return all(is_regular(run.model(name)) for name in record.plan.names)
+
+
 def repeating_command(run: RunFolder) -> str:
     """Return the command line that repeats a run, and its finishing, if any."""
     is_finished, again = is_regular(run.finish), f"{run.path}-again"
@@ -354,8 +359,12 @@ def plan_run(systems: Mapping[str, System]) -> RunPlan:
     chains: dict[str, tuple[str, ...]] = {}
     for label, system in systems.items():
         chain: list[str] = []
-        for index, stage in enumerate(system.stages()):
-            wanted = PlannedStage(f"{label}-{stage.name}", system, index, chain[-1] if chain else None, stage)
+        stages = system.all_stages()
+        for index, stage in enumerate(stages):
+            # Further stages leave the options of the ones before as they were.
+            num_more = max(0, index + 1 - len(stages) + len(system.more))
+            own = system if num_more == len(system.more) else dataclasses.replace(system, more=system.more[:num_more])
+            wanted = PlannedStage(f"{label}-{stage.name}", own, index, chain[-1] if chain else None, stage)
             # Training both would give the same model, bit for bit.
             shared = next(
                 (

@@ -34,6 +34,8 @@ WAYS = {
 """Titles of metrics up to exposure and pose, by the suffix of a split in metrics.json: test_color_fit, …"""
 EQUAL_BYTES = 0.01
 """Largest relative difference between sizes that count as equal."""
+FEW_PHOTOGRAPHS = 3.0
+"""Difference in dB between training and held-out views from which new views need more photographs."""
 CROP_ZOOM = 3
 HIGHER_IS_BETTER = ("PSNR", "SSIM", "frames a second")
 LOWER_IS_BETTER = ("LPIPS", "memory")
@@ -205,6 +207,7 @@ def summary_text(result: RunResult, width: int | None = None) -> str:
             used = result.models[name].num_bytes
             lines.append(f"{name} takes {used:,} bytes of its budget of {budget:,} ({100 * used / budget:.2f} %)")
     lines += learning_lines(result)
+    lines += [line] if (line := photographs_line(result)) else []
     for name, gain in result.gains.items():
         lines.append(f"{result.main}: {gain:+.2f} dB over {name}, {bytes_compared(result, name)}")
     return "\n".join(lines)
@@ -228,6 +231,17 @@ def learning_lines(result: RunResult) -> list[str]:
         for name, measured in result.models.items()
         if not measured.train.has_learned
     ]
+
+
+def photographs_line(result: RunResult) -> str:
+    """Return what the main model's held-out views say about the photographs; empty without such views."""
+    main, held_out = result.models[result.main], result.record.scene.held_out
+    if held_out not in main.splits:
+        return ""
+    train, test = main.train.psnr, main.splits[held_out].psnr
+    few = "few photographs: stay near where you stood, or take more"
+    found = few if train - test >= FEW_PHOTOGRAPHS else "views between the photographs are about as good"
+    return f"{train:.1f} dB on training views, {test:.1f} held out: {found}"
 
 
 def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:
@@ -326,6 +340,7 @@ def write_report(
         main=main,
         held_out=held_out,
         warnings=learning_lines(result),
+        photographs=photographs_line(result),
         gains=[(name, bytes_compared(result, name), gain) for name, gain in result.gains.items()],
         device=jax.devices()[0].platform.upper(),
         own_time=minutes(own),

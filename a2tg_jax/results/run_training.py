@@ -46,7 +46,7 @@ from a2tg_jax.results.folder import (
 from a2tg_jax.results.forecast import print_forecast, room_for_photographs
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.model_source import check_init, write_first_stage
-from a2tg_jax.results.record import OnNan, PlannedStage, RunRecord, read_record, write_record
+from a2tg_jax.results.record import OnNan, PlannedStage, RunRecord, is_finished, read_record, write_record
 from a2tg_jax.results.report import RunResult
 from a2tg_jax.results.run_evaluation import check_held_out, check_weights, evaluate_run
 from a2tg_jax.training import (
@@ -118,7 +118,7 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     scene = record.scene.load(room_for_photographs(options.max_memory), is_divided=True)
     num_given = None if given is None else given.num
     for system in record.systems.values():
-        check_loss_data(scene.train, system.stages())
+        check_loss_data(scene.train, system.all_stages())
         check_start(scene, system, num_given if system is record.options else None)
     if record.options.small_budget:
         warnings.warn(f"{record.options.small_budget}; it is in bytes of the model, such as 20MB", stacklevel=2)
@@ -140,6 +140,8 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
     """Train the stages of a claimed run that are not finished yet, and measure. Raises as `begin_run`."""
     check_weights(options.lpips_weights)
     record, num_given = read_record(run), None
+    if is_finished(run, record):
+        print(f"{run.path} is finished; to train it on: {resuming_command(run)} --more 2000", flush=True)
     scene = record.scene.load(room_for_photographs(options.max_memory), is_divided=True)
     if record.init is not None:
         first = run.model(record.plan.main[0])

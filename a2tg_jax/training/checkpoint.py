@@ -198,7 +198,7 @@ def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = 
 
 def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], options: System) -> Checkpoint:
     options.check()
-    stages, index, is_ahead = options.stages(), header["stage"], header["is_ahead"]
+    stages, index, is_ahead = options.all_stages(), header["stage"], header["is_ahead"]
     if type(index) is not int or not 0 <= index < len(stages):  # bool is an int
         raise ValueError(f"stage must be a number in 0..{len(stages) - 1}; got {shortened(index)}")
     stage = stages[index]

@@ -103,7 +103,7 @@ def forecast_stages(
     If a file gives Gaussians instead of the first stage, `num_given` is their number. Bytes are of all devices that
     train together.
     """
-    stages = system.stages()
+    stages = system.all_stages()
     num, floats, shown = initial_number(scene, system, stages[0]), 0.0, None
     if num_given is not None:
         num, stages = num_given, stages[1:]

@@ -114,7 +114,7 @@ def fit(
       ValueError: if options contradict each other, the scene or the checkpoint.
     """
     _check_arguments(scene, system, resume, checkpoint_every)
-    stages, first = system.stages(), 0 if resume is None else resume.stage
+    stages, first = system.all_stages(), 0 if resume is None else resume.stage
     check_loss_data(scene.train, stages[first:])
     if resume is None:
         check_start(scene, system)
@@ -188,7 +188,7 @@ def fit_stage(
       watch: called between steps with the stage under way (`training.loop.Watch`).
     """
     _check_arguments(scene, system, resume, checkpoint_every)
-    stages = system.stages()
+    stages = system.all_stages()
     if not 0 <= index < len(stages):
         raise ValueError(f"index must be in 0..{len(stages) - 1}, one of the stages; got {index}")
     check_loss_data(scene.train, stages[index : index + 1])

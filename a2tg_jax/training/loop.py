@@ -164,7 +164,7 @@ class StageRun:
         """Args:
         scene: training views and points.
         system: the options.
-        index: number of the stage in `system.stages()`, from 0.
+        index: number of the stage in `system.all_stages()`, from 0.
         start: the model to start from; None: `resume`, or Gaussians at the scene's points.
         resume: a checkpoint of this stage (`checkpoint.check_resume`).
         num_restored: which order of the views, from 0; None: the checkpoint's order, or the first.
@@ -174,7 +174,7 @@ class StageRun:
         self.mesh, exchange = self.session.mesh, self.session.exchange
         self._exchange = None if exchange is None else exchange.for_batches(system.batch_size)
         self.views, self.system, self.index = scene.train, system, index
-        self.stage = system.stages()[index]
+        self.stage = system.all_stages()[index]
         self.num_restored = (resume.num_restored if resume else 0) if num_restored is None else num_restored
         self._earlier = resume.history if resume else History.empty()
         self._rows: list[dict[str, float]] = []

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
 from a2tg_jax.core.checks import check_int, check_number, fields_of
-from a2tg_jax.events import Event
+from a2tg_jax.events import EVERY_ITERATION, Event, StepEvent
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, check_config, config_to_dict, flatten_config
 from a2tg_jax.rasterize.kernels.platforms import MAX_TILE_SIZE
@@ -145,6 +145,9 @@ class System:
     refine_poses: bool = False
     """Learn a small rigid motion of each training camera, for captures whose poses are not exact."""
     corrections: Corrections = dataclasses.field(default_factory=Corrections)
+    more: tuple[int, ...] = ()
+    """Iterations of further stages. Each repeats the last stage on its model, without growth. With --resume, they are
+    added to a finished run."""
 
     name: ClassVar[str] = ""
     """Name on the command line."""
@@ -226,6 +229,22 @@ class System:
         """
         raise NotImplementedError(f"{type(self).__name__} must compose its stages")
 
+    def all_stages(self) -> tuple[Stage, ...]:
+        """Return the stages, and the further ones of `more`.
+
+        Of the last stage's events, these keep the ones of every iteration, such as noise: the others have happened.
+        """
+        stages = self.stages()
+        if not self.more:
+            return stages
+        last = stages[-1]
+        kept = [each for each in last.events if isinstance(each, StepEvent)]
+        kept = [each for each in kept if each.times(last.iterations) == EVERY_ITERATION]
+        further = dataclasses.replace(last, events=tuple(kept), raises_sh_degree=False)
+        names = ["more", *(f"more-{number}" for number in range(2, len(self.more) + 1))]
+        pairs = zip(names, self.more, strict=True)
+        return (*stages, *(dataclasses.replace(further, name=name, iterations=length) for name, length in pairs))
+
     @classmethod
     def preset(cls, name: str, **options: object) -> Self:
         """Return the options of a preset, some of them changed.
@@ -288,6 +307,8 @@ class System:
         check_number("sh_degree", self.sh_degree, least=0, most=3)
         check_int("seed", self.seed, 0, 2**31 - 1)
         check_number("tile_size", self.tile_size, least=1, most=MAX_TILE_SIZE)
+        for iterations in self.more:
+            check_number("more", iterations, least=1)
 
     def _check_stages(self) -> None:
         stages = self.stages()
@@ -295,10 +316,10 @@ class System:
             raise ValueError(f"{type(self).__name__}.stages must return a tuple of stages; got {shortened(stages)}")
         if not stages:
             raise ValueError(f"{type(self).__name__} has no stages")
-        names = [stage.name for stage in stages]
+        names = [stage.name for stage in self.all_stages()]
         if len(set(names)) < len(names):
             raise ValueError(f"the stages of {type(self).__name__} must have different names; got {', '.join(names)}")
-        for stage in stages:
+        for stage in self.all_stages():
             stage.check()
         # A sky would be pruned for its size, or leave no room for the Gaussians at points.
         pruning = next((event for stage in stages for event in stage.events if event.prunes_large), None)
