@@ -137,6 +137,22 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await other.page.close();
   });
 
+  test("slow pictures are coarse in motion and complete at rest", async () => {
+    const { page } = await opened("", { viewport: { width: 320, height: 240 } });
+    const isWhole = (): Promise<unknown> =>
+      page.waitForFunction(() => document.querySelector<HTMLCanvasElement>("#view")?.width === 320);
+    await isWhole();
+    await page.evaluate(() => {
+      const { viewer } = window.a2tg ?? {};
+      if (viewer === undefined) return;
+      viewer["cost"] = 1e4;
+      viewer.onMove();
+    });
+    await page.waitForFunction(() => document.querySelector<HTMLCanvasElement>("#view")?.width === 80);
+    await isWhole();
+    await page.close();
+  });
+
   test("a slider shows the camera's photograph", async () => {
     const { page } = await opened();
     await page.waitForSelector("#wipe");

@@ -144,3 +144,36 @@ export class Target {
     return Float32Array.from(bytes, (byte) => byte / 255);
   }
 }
+
+/** Takes the time of commands without waiting for them. */
+export class Stopwatch {
+  private readonly gl: WebGL2RenderingContext;
+  private sync: WebGLSync | null = null;
+  private since = 0;
+
+  constructor(gl: WebGL2RenderingContext) {
+    this.gl = gl;
+  }
+
+  get isRunning(): boolean {
+    return this.sync !== null;
+  }
+
+  /** Run until the GPU has executed `commands`. */
+  start(commands: () => void): void {
+    const { gl } = this;
+    this.since = performance.now();
+    commands();
+    this.sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+  }
+
+  /** Return the milliseconds that the commands took, once they are executed. */
+  take(): number | null {
+    const { gl, sync } = this;
+    if (sync === null || gl.getSyncParameter(sync, gl.SYNC_STATUS) !== gl.SIGNALED) return null;
+    gl.deleteSync(sync);
+    this.sync = null;
+    return performance.now() - this.since;
+  }
+}

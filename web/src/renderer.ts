@@ -18,6 +18,16 @@ interface Part {
   readonly to: number;
 }
 
+/** What a picture shows. */
+export interface Shown {
+  readonly pose: Pose;
+  readonly lens: Lens;
+  readonly clip: Clip;
+  readonly mode: Mode;
+  /** Share of the width right of which textures are left out. */
+  readonly divided?: number | null;
+}
+
 export class Renderer {
   readonly gl: WebGL2RenderingContext;
   readonly target: Target;
@@ -35,20 +45,28 @@ export class Renderer {
     this.nothing = gl.createVertexArray();
   }
 
-  /** Draw a pose at the lens' size. Right of the share `divided` of the width, textures are left out. */
-  draw(splats: Splats, pose: Pose, lens: Lens, clip: Clip, mode: Mode, divided: number | null = null): void {
+  /**
+   * Draw a picture at the lens' size, or continue it.
+   *
+   * @param start - place, in the order from the farthest to the nearest, of the first splat; 0 begins a picture
+   * @param end - place behind the last splat
+   */
+  draw(splats: Splats, shown: Shown, start = 0, end = splats.numDrawn): void {
     const { gl, target } = this;
+    const { lens, mode, divided = null } = shown;
     target.resize(lens.width, lens.height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
     gl.viewport(0, 0, lens.width, lens.height);
     gl.disable(gl.SCISSOR_TEST);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    if (splats.numDrawn === 0) return;
+    if (start === 0) {
+      gl.clearColor(0, 0, 0, 0);
+      gl.clear(gl.COLOR_BUFFER_BIT);
+    }
+    if (end <= start) return;
     const middle = divided === null ? lens.width : Math.round(divided * lens.width);
     const parts: Part[] = [{ mode, from: 0, to: middle }];
     if (middle < lens.width) parts.push({ mode: "plain", from: middle, to: lens.width });
-    for (const part of parts) this.drawPart(splats, pose, lens, clip, part);
+    for (const part of parts) this.drawPart(splats, shown, part, start, end);
     gl.disable(gl.SCISSOR_TEST);
     gl.disable(gl.BLEND);
   }
@@ -88,12 +106,11 @@ export class Renderer {
     return found;
   }
 
-  private prepare(splat: Program, splats: Splats, pose: Pose, lens: Lens): void {
+  private prepare(splat: Program, splats: Splats, { pose, lens }: Shown): void {
     const { gl } = this;
     const { header } = splats;
     gl.useProgram(splat.handle);
     gl.bindVertexArray(this.quads);
-    gl.uniform1i(splat.at("numDrawn"), splats.numDrawn);
     const textures = { order: splats.order, rows: splats.rows, harmonics: splats.harmonics, texels: splats.texels };
     Object.entries(textures).forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
@@ -129,16 +146,17 @@ export class Renderer {
     gl.uniform1f(splat.at("largest"), largest);
   }
 
-  private drawPart(splats: Splats, pose: Pose, lens: Lens, clip: Clip, { mode, from, to }: Part): void {
+  private drawPart(splats: Splats, shown: Shown, { mode, from, to }: Part, start: number, end: number): void {
     const { gl } = this;
     if (to <= from) return;
     const program = this.programOf(splats, mode);
-    this.prepare(program, splats, pose, lens);
-    this.limit(program, clip);
+    this.prepare(program, splats, shown);
+    this.limit(program, shown.clip);
+    gl.uniform1i(program.at("start"), start);
+    gl.uniform1i(program.at("end"), end);
     gl.enable(gl.SCISSOR_TEST);
-    gl.scissor(from, 0, to - from, lens.height);
-    const num = Math.ceil(splats.numDrawn / BATCH);
-    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, num);
+    gl.scissor(from, 0, to - from, shown.lens.height);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil((end - start) / BATCH));
   }
 }
 

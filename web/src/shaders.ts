@@ -65,7 +65,7 @@ const float OFFSET = 0.02, LARGEST_LOG_EXPONENT = 1.0, HALF_LOG2E = 0.7213475204
 
 export const splatVertex = (variant: Variant): string => `${HEADER}${constantsOf(variant)}${TEXELS}${KERNEL}
 uniform usampler2D order, rows, harmonics;
-uniform int numDrawn;
+uniform int start, end;
 uniform vec4 projection[3];
 uniform vec3 center;
 uniform vec2 size;
@@ -85,7 +85,8 @@ flat out vec3 curve;
 const float SLACK = 1e-2;
 
 vec4 bytesOf(uint word) {
-  return vec4(uvec4(word, word >> 8, word >> 16, word >> 24) & 255u);
+  int bits = int(word);
+  return vec4(ivec4(bits, bits >> 8, bits >> 16, bits >> 24) & 255);
 }
 
 vec4 values(uint word, vec2 ends) { return ends.x + bytesOf(word) * ends.y; }
@@ -97,37 +98,36 @@ vec3 curveOf(float logExponent) {
   return vec3(exponent, 1.0 / (pow(2.0 + OFFSET, exponent) - start), start);
 }
 
-// Coefficient k, 1 to 15, from the words of one row.
-vec3 coefficient(uvec4 words[4], int k, vec2 ends) { return values(words[(k - 1) >> 2][(k - 1) & 3], ends).rgb; }
+// Sum of the products of weights and coefficients, which a word each holds.
+vec3 summed(uvec4 words, vec4 weights) {
+  ivec4 bits = ivec4(words);
+  return vec3(
+    dot(vec4(bits & 255), weights), dot(vec4((bits >> 8) & 255), weights), dot(vec4((bits >> 16) & 255), weights));
+}
 
 vec3 colorOf(vec3 base, uint first, int degree, vec3 d) {
   vec3 sum = 0.28209479177387814 * base;
   if (DEGREE > 0 && degree > 0) {
-    uvec4 words[4];
-    words[0] = wordsAt(harmonics, first);
-    words[1] = DEGREE > 1 && degree > 1 ? wordsAt(harmonics, first + 1u) : uvec4(0);
-    words[2] = DEGREE > 2 && degree > 2 ? wordsAt(harmonics, first + 2u) : uvec4(0);
-    words[3] = DEGREE > 2 && degree > 2 ? wordsAt(harmonics, first + 3u) : uvec4(0);
     float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
-    vec2 e = harmonicEnds[1];
-    sum += 0.4886025119029199
-      * (z * coefficient(words, 2, e) - y * coefficient(words, 1, e) - x * coefficient(words, 3, e));
+    vec3 one = 0.4886025119029199 * vec3(-y, z, -x);
+    uvec4 words = wordsAt(harmonics, first);
+    sum += harmonicEnds[1].x * dot(one, vec3(1)) + harmonicEnds[1].y * summed(words, vec4(one, 0.0));
     if (DEGREE > 1 && degree > 1) {
-      e = harmonicEnds[2];
-      sum += 1.0925484305920792
-        * (x * y * coefficient(words, 4, e) - y * z * coefficient(words, 5, e) - x * z * coefficient(words, 7, e));
-      sum += 0.31539156525252005 * (2.0 * zz - xx - yy) * coefficient(words, 6, e);
-      sum += 0.5462742152960396 * (xx - yy) * coefficient(words, 8, e);
+      vec4 two = vec4(1.0925484305920792 * x * y, -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2.0 * zz - xx - yy), -1.0925484305920792 * x * z);
+      float last = 0.5462742152960396 * (xx - yy);
+      uvec4 next = wordsAt(harmonics, first + 1u);
+      sum += harmonicEnds[2].x * (dot(two, vec4(1)) + last)
+        + harmonicEnds[2].y * (summed(uvec4(words.w, next.xyz), two) + last * bytesOf(next.w).rgb);
     }
     if (DEGREE > 2 && degree > 2) {
-      e = harmonicEnds[3];
-      sum -= 0.5900435899266435 * y * (3.0 * xx - yy) * coefficient(words, 9, e);
-      sum += 2.890611442640554 * x * y * z * coefficient(words, 10, e);
-      sum -= 0.4570457994644658 * y * (4.0 * zz - xx - yy) * coefficient(words, 11, e);
-      sum += 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(words, 12, e);
-      sum -= 0.4570457994644658 * x * (4.0 * zz - xx - yy) * coefficient(words, 13, e);
-      sum += 1.445305721320277 * z * (xx - yy) * coefficient(words, 14, e);
-      sum -= 0.5900435899266435 * x * (xx - 3.0 * yy) * coefficient(words, 15, e);
+      vec4 three = vec4(-0.5900435899266435 * y * (3.0 * xx - yy), 2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4.0 * zz - xx - yy), 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy));
+      vec3 rest = vec3(-0.4570457994644658 * x * (4.0 * zz - xx - yy), 1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3.0 * yy));
+      sum += harmonicEnds[3].x * (dot(three, vec4(1)) + dot(rest, vec3(1)))
+        + harmonicEnds[3].y * (summed(wordsAt(harmonics, first + 2u), three)
+          + summed(wordsAt(harmonics, first + 3u), vec4(rest, 0.0)));
     }
   }
   return max(sum + 0.5, 0.0);
@@ -198,9 +198,9 @@ vec2 corner(vec3 M[3], float r2, vec2 middle, float radius, vec2 side, out bool 
 
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
-  int place = gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
+  int place = start + gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
   axes = vec4(0); plane = vec3(0); mean = vec3(0); shown = vec4(0); region = uvec3(0); own = vec3(0); curve = vec3(0);
-  if (place >= numDrawn) return;
+  if (place >= end) return;
   uint row = wordsAt(order, uint(place >> 2))[place & 3];
   uvec4 first = wordsAt(rows, 2u * row);
   vec3 position = uintBitsToFloat(first.xyz);

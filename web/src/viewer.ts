@@ -9,21 +9,40 @@ import { WHOLE, clipOf, extentOf } from "./extent";
 import type { Clip, Crop, Extent } from "./extent";
 import { SceneError } from "./format";
 import type { Header, SceneCamera } from "./format";
+import { Stopwatch } from "./gl";
 import { add, dot, scale } from "./math";
 import type { Row4, Vec2, Vec3 } from "./math";
 import { Renderer } from "./renderer";
+import type { Shown } from "./renderer";
+import { BATCH } from "./shaders";
 import type { Mode } from "./shaders";
 import { Splats } from "./splats";
 import { verticalOf } from "./vertical";
 
-const SLOW = 45;
-const QUICK = 18;
+/** Milliseconds that a picture may take in motion, and a slice of one at rest. */
+const BUDGET = 50;
+/** Smallest share of the pixels of a side. */
 const COARSEST = 0.25;
-/** Milliseconds after the last motion until the picture is drawn at full resolution. */
+/** Milliseconds after the last motion until pictures become finer. */
 const REST = 160;
 /** Lens for scenes without cameras: 53° across the narrower side. */
 const FREE_LENS: Lens = { fx: 600, fy: 600, cx: 300, cy: 300, skew: 0, width: 600, height: 600 };
 const UNIT: Extent = { centre: [0, 0, 0], half: [1, 1, 1] };
+
+/** A picture that is drawn in slices of splats, from the farthest to the nearest. */
+interface Painting {
+  readonly shown: Shown;
+  /** Share of the pixels of a side. */
+  readonly share: number;
+  /** Number of splats drawn so far. */
+  num: number;
+}
+
+/** A slice whose time is taken: its shares of the splats and of the pixels of a side. */
+interface Slice {
+  readonly splats: number;
+  readonly pixels: number;
+}
 
 export class Viewer implements Steered {
   readonly canvas: HTMLCanvasElement;
@@ -52,11 +71,15 @@ export class Viewer implements Steered {
 
   private readonly gl: WebGL2RenderingContext;
   private readonly renderer: Renderer;
+  private readonly watch: Stopwatch;
+  private timed: Slice = { splats: 1, pixels: 1 };
+  /** Milliseconds that a picture of all pixels takes, at most. */
+  private cost = Infinity;
+  private isSlow = false;
+  private painting: Painting | null = null;
+  private isStale = true;
   private isWaiting = false;
   private movedAt = -Infinity;
-  private coarseness = 1;
-  private drawnAt = 0;
-  private isSettled = true;
 
   /** Throws a SceneError if the browser has no WebGL 2. */
   constructor(canvas: HTMLCanvasElement) {
@@ -70,6 +93,7 @@ export class Viewer implements Steered {
     }
     this.gl = gl;
     this.renderer = new Renderer(gl);
+    this.watch = new Stopwatch(gl);
     new Controls(canvas, this);
     new ResizeObserver(() => this.draw()).observe(canvas);
   }
@@ -136,7 +160,7 @@ export class Viewer implements Steered {
   onAim(x: number, y: number): void {
     const { lens, splats } = this;
     if (splats === null) return;
-    this.renderer.draw(splats, this.pose, lens, this.clip, "depth");
+    this.renderer.draw(splats, { pose: this.pose, lens, clip: this.clip, mode: "depth" });
     const column = Math.min(Math.max(Math.floor(x), 0), lens.width - 1);
     const row = Math.min(Math.max(Math.floor(y), 0), lens.height - 1);
     const pixel = this.renderer.target.read(column, row, 1, 1);
@@ -151,11 +175,10 @@ export class Viewer implements Steered {
     this.onMove();
   }
 
-  /** Request a redraw with the next frame. */
+  /** Request a new picture. */
   draw(): void {
-    if (this.isWaiting) return;
-    this.isWaiting = true;
-    requestAnimationFrame((time) => this.frame(time));
+    this.isStale = true;
+    this.request();
   }
 
   /** Render a view to [h, w, 4], rows from the top: premultiplied colours and alpha. */
@@ -164,7 +187,7 @@ export class Viewer implements Steered {
     if (splats === null) throw new SceneError("No scene is loaded yet.");
     splats.sort(projection(pose, lens)[2]);
     await splats.settled();
-    this.renderer.draw(splats, pose, lens, this.clip, mode);
+    this.renderer.draw(splats, { pose, lens, clip: this.clip, mode });
     const found = this.renderer.target.read(0, 0, lens.width, lens.height);
     this.draw();
     return found;
@@ -179,30 +202,74 @@ export class Viewer implements Steered {
     return projection(this.pose, this.lens)[2];
   }
 
-  private frame(time: number): void {
-    this.isWaiting = false;
-    const { splats, canvas } = this;
-    if (splats === null || this.gl.isContextLost()) return;
-    splats.sort(this.depthRow);
-    const isMoving = performance.now() - this.movedAt < REST;
-    if (isMoving && !this.isSettled) this.adapt(time - this.drawnAt);
-    const share = (isMoving ? this.coarseness : 1) * Math.min(window.devicePixelRatio, 2);
-    const width = Math.max(Math.round(canvas.clientWidth * share), 1);
-    const height = Math.max(Math.round(canvas.clientHeight * share), 1);
-    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    const lens = fitted(this.image, width, height, this.fit);
-    this.renderer.draw(splats, this.pose, lens, this.clip, this.mode, this.divided);
-    this.renderer.present(splats, this.mode, this.depths, this.divided);
-    this.onFrame();
-    this.drawnAt = time;
-    this.isSettled = !isMoving;
-    if (isMoving) this.draw();
+  private request(): void {
+    if (this.isWaiting) return;
+    this.isWaiting = true;
+    requestAnimationFrame(() => this.frame());
   }
 
-  /** Adapt the resolution during motion to the time between frames. */
-  private adapt(milliseconds: number): void {
-    if (milliseconds > SLOW) this.coarseness = Math.max(this.coarseness * 0.8, COARSEST);
-    else if (milliseconds < QUICK) this.coarseness = Math.min(this.coarseness * 1.05, 1);
+  private frame(): void {
+    this.isWaiting = false;
+    const { splats, watch } = this;
+    if (splats === null || this.gl.isContextLost()) return;
+    splats.sort(this.depthRow);
+    const spent = watch.take();
+    if (spent !== null) {
+      this.cost = spent / (this.timed.splats * this.timed.pixels ** 2);
+      this.isSlow = spent > BUDGET / 2;
+    }
+    const isMoving = performance.now() - this.movedAt < REST;
+    // What is slow is waited for: nothing that the user does next shall queue behind several pictures.
+    const isReady = !(watch.isRunning && this.isSlow);
+    if (isReady && (this.isStale || (!isMoving && this.painting !== null))) this.paint(splats, isMoving);
+    if (isMoving || watch.isRunning || this.isStale || this.painting !== null) this.request();
+  }
+
+  /** Draw a picture or, at rest, a slice of it. */
+  private paint(splats: Splats, isMoving: boolean): void {
+    const { watch } = this;
+    if (this.isStale || this.painting === null) this.painting = this.begun(this.coarseness);
+    this.isStale = false;
+    const { painting } = this;
+    const { shown, share, num } = painting;
+    const all = splats.numDrawn;
+    const slice = Math.max((all * BUDGET) / (this.cost * share ** 2), BATCH);
+    // A last slice of less than half a slice is drawn with the one before.
+    const end = isMoving || all - num < 1.5 * slice ? all : Math.min(num + Math.ceil(slice), all);
+    const isLast = end === all;
+    const commands = (): void => {
+      this.renderer.draw(splats, shown, num, end);
+      if (isLast) this.present(splats, shown);
+    };
+    if (watch.isRunning) commands();
+    else {
+      this.timed = { splats: Math.max(end - num, 1) / Math.max(all, 1), pixels: share };
+      watch.start(commands);
+    }
+    painting.num = end;
+    if (isLast) this.painting = share < 1 ? this.begun(Math.min(2 * share, 1)) : null;
+  }
+
+  private begun(share: number): Painting {
+    const { canvas, clip, mode, divided, pose } = this;
+    const scale = share * Math.min(window.devicePixelRatio, 2);
+    const width = Math.max(Math.round(canvas.clientWidth * scale), 1);
+    const height = Math.max(Math.round(canvas.clientHeight * scale), 1);
+    const lens = fitted(this.image, width, height, this.fit);
+    return { shown: { pose, lens, clip, mode, divided }, share, num: 0 };
+  }
+
+  private present(splats: Splats, { lens: { width, height } }: Shown): void {
+    const { canvas } = this;
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    this.renderer.present(splats, this.mode, this.depths, this.divided);
+    this.onFrame();
+  }
+
+  /** Share of the pixels of a side that can be drawn within the budget, in few steps, as a canvas loses its picture with its size. */
+  private get coarseness(): number {
+    const share = Math.sqrt(BUDGET / this.cost);
+    return Math.min(Math.max(2 ** (Math.floor(2 * Math.log2(share)) / 2), COARSEST), 1);
   }
 
   /** Nearest and farthest depth of the depth mode's colour ramp. */
