@@ -41,22 +41,11 @@ def untrained(*args, **kwargs):
     return SimpleNamespace(model=model)
 
 
-def test_the_readme_compares_a_transparent_photograph_on_the_background_of_the_model(monkeypatch, tmp_path):
-    """The photographs show nothing, and the Gaussians are hidden: on white, both are white."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(a2tg, "configure_cpu", lambda: None)
-    cameras = [a2tg.look_at([x, -2, 0], [0, 0, 0], width=16, height=12) for x in (-0.5, 0.0, 0.5)]
-    images = [np.zeros((12, 16, 4), np.uint8)] * 3
-    points = [[0, 0, 0.1 * i] for i in range(4)]
-    scene = a2tg.scene_from_arrays(images, [each.viewmat for each in cameras], cameras[0].K, points)
-    hidden = a2tg.init_from_points(scene.points, scene.colors, opacity=1e-4)
-    model = a2tg.Model(hidden, background=(1.0, 1.0, 1.0), origin=origin_of_scene(scene))
-    monkeypatch.setattr(a2tg, "fit", lambda scene, system: SimpleNamespace(model=model))
-    names = run("README", {"given": scene}, {'a2tg.load_scene("scene", downscale=4)': "given"})
-    assert names["loss"](names["view"].camera) < 1e-6
-    with pytest.warns(UserWarning, match=r"transparent and was put on black: say view_image\(view, model.background\)"):
-        black = a2tg.view_image(names["view"])
-    assert a2tg.psnr(black, names["target"]) == 0  # from 0 to 1 at each pixel
+def test_the_code_of_the_readme_runs():
+    names = run("README", {})
+    assert names["images"].shape == (len(names["scene"].test), 78, 104, 3)
+    for leaf in jax.tree.leaves(names["gradient"]):
+        assert np.isfinite(leaf).all() and np.any(np.asarray(leaf))
 
 
 def test_textures_are_read_edited_and_put_back():

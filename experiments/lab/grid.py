@@ -53,6 +53,10 @@ class Method:
     choices: Mapping[str, "Method"] | None = dataclasses.field(default=None, hash=False)
     """Methods by scene, of which the method is the one of its scene."""
 
+    def is_chosen_for(self, scene: SceneAt) -> bool:
+        """Return whether it is a method for a scene, which one that is chosen for each scene may not be yet."""
+        return self.choices is None or scene.label in self.choices
+
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
@@ -110,11 +114,18 @@ class Grid:
     table: str = "quality"
     """Kind of its tables."""
 
+    def check_choices(self) -> None:
+        """Raise ValueError if a method is to be chosen for each scene and one has no choice."""
+        for cell, method in itertools.product(self.cells, (self.reference, *self.methods)):
+            if not method.is_chosen_for(cell.scene):
+                place = f"{self.name}{SUFFIX}: {method.label!r}"
+                raise ValueError(f"{place} has no choice for {cell.scene.label!r}: run choose_plain --validation first")
+
     def runs(self, records: Mapping[str, Record]) -> Iterator[Run]:
         """Yield every run that can be named already, in the order of the cells."""
         for cell in self.cells:
             for method in dict.fromkeys((self.reference, *self.methods)):
-                if method.most is not None and cell.gaussians > method.most:
+                if (method.most is not None and cell.gaussians > method.most) or not method.is_chosen_for(cell.scene):
                     continue
                 yield Run(method, cell, "", self._job(method, cell))
             reference = self.reference_record(cell, records)
@@ -122,6 +133,8 @@ class Grid:
                 yield Run(method, cell, "bytes", self._job_in(method, cell, reference["mb"]))
             wanted = seconds_of(self.reference_job(cell), records)
             for method in self.at_equal_time if wanted else ():
+                if not method.is_chosen_for(cell.scene):
+                    continue
                 if taken := seconds_of(self._job(method, cell), records):
                     first, second = (max(1, round(count * wanted / taken)) for count in cell.iterations)
                     longer = dataclasses.replace(cell, iterations=(first, second))
@@ -148,8 +161,6 @@ class Grid:
     def _job(self, method: Method, cell: Cell) -> Job:
         scene, place = cell.scene, f"{self.name}{SUFFIX}: {method.label!r}"
         if method.choices is not None:
-            if scene.label not in method.choices:
-                raise ValueError(f"{place} has no choice for {scene.label!r}: run choose_plain --validation first")
             method = method.choices[scene.label]
         if method.by_number and cell.budget is not None:
             cell = dataclasses.replace(cell, budget=None, gaussians=splats_in(cell.budget, method))

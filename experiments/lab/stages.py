@@ -43,6 +43,7 @@ def stages_of(grids: Sequence[Grid], records: Mapping[str, Record]) -> dict[str,
 def check_systems(grids: Sequence[Grid], records: Mapping[str, Record]) -> None:
     """Raise ValueError if training would refuse an option of a run; grid and method are named."""
     for grid in grids:
+        grid.check_choices()
         for run in grid.runs(guessed(grid, records)):
             try:
                 run.job.system.check()
