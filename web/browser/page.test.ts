@@ -165,6 +165,22 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
+  test("a hint vanishes with the first motion, and a drag leaves no frame", async () => {
+    const { page } = await opened();
+    expect(await page.isVisible("#hint")).toBe(true);
+    await page.keyboard.press("Tab");
+    await page.mouse.move(200, 200);
+    await page.mouse.down();
+    await page.mouse.move(240, 200);
+    await page.mouse.up();
+    await page.keyboard.press("a");
+    expect(await page.isVisible("#hint")).toBe(false);
+    expect(
+      await page.evaluate(() => getComputedStyle(document.querySelector("#view") ?? document.body).outlineStyle),
+    ).toBe("none");
+    await page.close();
+  });
+
   test("textures on and off, side by side", async () => {
     const { page } = await opened();
     await page.check("#divide");

@@ -54,10 +54,15 @@ export class Controls {
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("keydown", (event) => this.pressKey(event));
     canvas.addEventListener("keyup", (event) => this.keys.delete(event.code));
-    canvas.addEventListener("blur", () => this.keys.clear());
+    canvas.addEventListener("blur", () => {
+      this.keys.clear();
+      canvas.classList.remove("is-pointed");
+    });
   }
 
   private press(event: PointerEvent): void {
+    // Browsers frame what a script focuses; the frame is for those who come by keyboard.
+    this.canvas.classList.add("is-pointed");
     this.canvas.focus({ preventScroll: true });
     this.canvas.setPointerCapture(event.pointerId);
     this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });

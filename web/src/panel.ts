@@ -140,6 +140,7 @@ export class Panel {
   }
 
   private leave(): void {
+    element("hint", HTMLElement).hidden = true;
     if (this.current !== null) this.setCurrent(null);
     this.noteLink();
   }
