@@ -173,10 +173,11 @@ def test_colours_without_their_factor_are_named(given):
 
 def test_a_transparent_photograph_is_compared_on_the_background_of_the_model():
     """The photograph shows nothing, and the Gaussians are hidden: on white, both are white."""
-    camera = a2tg.look_at([0, -2, 0], [0, 0, 0], width=16, height=12)
-    scene = a2tg.scene_from_arrays([np.zeros((12, 16, 4), np.uint8)], [camera.viewmat], camera.K, np.eye(3))
+    cameras = [a2tg.look_at([x, -2, 0], [0, 0, 0], width=16, height=12) for x in (-0.5, 0.5)]
+    images = [np.zeros((12, 16, 4), np.uint8)] * 2
+    scene = a2tg.scene_from_arrays(images, [each.viewmat for each in cameras], cameras[0].K, 0.1 * np.eye(4, 3))
     hidden = a2tg.init_from_points(scene.points, scene.colors, opacity=1e-4)
-    model, (view,) = a2tg.Model(hidden, background=(1.0, 1.0, 1.0)), scene.train
+    model, view = a2tg.Model(hidden, background=(1.0, 1.0, 1.0)), scene.train[0]
     assert a2tg.psnr(model.render(view.camera).color, a2tg.view_image(view, model.background)) > 50
     with pytest.warns(UserWarning, match=r"transparent and was put on black: say view_image\(view, model.background\)"):
         assert not np.asarray(a2tg.view_image(view)).any()

@@ -44,7 +44,7 @@ def untrained(*args, **kwargs):
 def test_the_code_of_the_readme_runs():
     names = run("README", {})
     assert names["images"].shape == (len(names["scene"].test), 78, 104, 3)
-    for leaf in jax.tree.leaves(names["gradient"]):
+    for leaf in (*jax.tree.leaves(names["gradient"]), names["pose_gradient"].viewmat):
         assert np.isfinite(leaf).all() and np.any(np.asarray(leaf))
 
 

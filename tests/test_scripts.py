@@ -8,6 +8,10 @@ import subprocess
 import sys
 
 import pytest
+from PIL import Image
+
+import a2tg_jax as a2tg
+from a2tg_jax.data.scene import origin_of_scene
 
 ROOT = pathlib.Path(__file__).parents[1]
 sys.path.append(str(ROOT))  # Last, so that the installed package comes first.
@@ -91,3 +95,14 @@ def test_drawings_of_the_documentation_are_drawn_and_small(tmp_path):
     kept = {path.name: path.stat().st_size for path in (ROOT / "docs" / "images").glob("how-*.png")}
     assert {path.name for path in tmp_path.iterdir()} == kept.keys()
     assert max(kept.values()) < 100_000
+
+
+def test_the_loop_of_the_readme_is_drawn(tmp_path):
+    import loop
+
+    scene = a2tg.synthetic_scene(num_views=4, width=24, height=16, num_points=50)
+    gaussians = a2tg.init_from_points(scene.points, scene.colors)
+    a2tg.save_model(tmp_path / "model.npz", a2tg.Model(gaussians, origin=origin_of_scene(scene)))
+    loop.main(tmp_path / "model.npz", tmp_path / "loop.webp", num_frames=3)
+    with Image.open(tmp_path / "loop.webp") as picture:
+        assert picture.n_frames == 4 and picture.size == (24, 16)
