@@ -121,6 +121,18 @@ def table_of(rows: Sequence[Row]) -> str:
     return tables.markdown(["", "ΔPSNR, dB", "bootstrap", "ΔSSIM", "ΔLPIPS", "scenes won", "p"], lines)
 
 
+def scenes_table(rows: Sequence[Row]) -> str:
+    """Return ΔPSNR of each scene in the comparisons that have runs."""
+    found = {row.name: row.compared("psnr").by_scene for row in rows}
+    found = {name: by_scene for name, by_scene in found.items() if by_scene}
+    scenes = dict.fromkeys(scene for by_scene in found.values() for scene in by_scene)
+    lines = [
+        [scene, *(tables.signed(by_scene.get(scene, float("nan")), 2) for by_scene in found.values())]
+        for scene in scenes
+    ]
+    return tables.markdown(["ΔPSNR, dB", *found], lines)
+
+
 def with_interval(found: Comparison, figure: str) -> str:
     """Return a mean with its t interval, in bold if the interval excludes 0."""
     text = found.over_scenes.as_text(tables.DIGITS[figure])
@@ -146,7 +158,8 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     records = read_kept(lab.out.parent / scale / "records.json")
     degrees = {degree: tables.results_of(read_grid(f"degree_{degree}", scale), records) for degree in (3, 1, 0)}
     rows = [*rows_of_bytewise(bytewise), *rows_of_parts(parts), *rows_of_degrees(degrees)]
-    lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(rows)}\n{endpoints(rows)}")
+    dense = [row for row in rows_of_bytewise(bytewise) if "0.3 MB" in row.name and FEW not in row.name]
+    lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(rows)}\n{endpoints(rows)}\n{scenes_table(dense)}")
     found = {row.name: row.compared("psnr") for row in rows}
     charted = {
         name: (list(one.by_scene.values()), one.over_scenes.mean, one.over_scenes.half_width)
