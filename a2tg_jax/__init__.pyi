@@ -62,6 +62,7 @@ from .finish.tuning import Tuned as Tuned, tune_compact as tune_compact
 from .host.machine import set_num_threads as set_num_threads
 from .host.startup import configure_cpu as configure_cpu
 from .io.compact import CompactChoices as CompactChoices, load_compact as load_compact, save_compact as save_compact
+from .io.edit_file import Box as Box, Edit as Edit, apply_edit as apply_edit, load_edit as load_edit
 from .io.formats import load_splats as load_splats, save_splats as save_splats
 from .io.gltf import load_gltf as load_gltf, save_gltf as save_gltf
 from .io.model_file import load_model as load_model, save_model as save_model

@@ -13,7 +13,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, logit, rotation_matrices
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import partition
-from a2tg_jax.densify.clone_split import CloneSplitPrune, Edit, OpacityReset, apply_edit, reset_interval
+from a2tg_jax.densify.clone_split import CloneSplitPlan, CloneSplitPrune, OpacityReset, apply_plan, reset_interval
 from a2tg_jax.events import Change, EventInfo, Seen, read_probe
 from a2tg_jax.model import Model
 
@@ -82,8 +82,8 @@ def test_edit_moves_rows_and_moments_together():
     kept[rng.choice(LIVE, 6, replace=False)] = False
     rows = rng.permutation(np.flatnonzero(kept))
     cloned, split = np.isin(np.arange(NUM), rows[:5]), np.isin(np.arange(NUM), rows[5:9])
-    edit = Edit(*map(jnp.asarray, (kept, cloned, split)))
-    after, after_moments = jax.jit(apply_edit)(jax.random.key(3), edit, model, moments)
+    edit = CloneSplitPlan(*map(jnp.asarray, (kept, cloned, split)))
+    after, after_moments = jax.jit(apply_plan)(jax.random.key(3), edit, model, moments)
 
     sources = [*np.flatnonzero(kept), *np.flatnonzero(cloned | split)]
     assert int(after.num_live) == len(sources) == 19 + 9
@@ -104,11 +104,11 @@ def test_halves_are_drawn_from_the_gaussian_they_split():
     model = random_model(0)
     one = jax.tree.map(lambda x: jnp.repeat(x[:1], 4_000, axis=0), model.gaussians)
     mask = jnp.ones(4_000, bool)
-    edit = Edit(mask, mask & False, mask)
+    edit = CloneSplitPlan(mask, mask & False, mask)
     wide = jax.tree.map(lambda x: jnp.concatenate([x, x]), one)
     masks = jax.tree.map(lambda m: jnp.concatenate([m, m & False]), edit)
     split = Model(wide, num_live=jnp.asarray(4_000, jnp.int32))
-    after, _ = apply_edit(jax.random.key(7), masks, split, ones(split))
+    after, _ = apply_plan(jax.random.key(7), masks, split, ones(split))
     offsets = np.asarray(after.gaussians.means) - np.asarray(one.means)[0]
     local = offsets @ np.asarray(rotation_matrices(one.quats[:1]))[0]
     np.testing.assert_allclose(local.std(axis=0)[:2], np.asarray(one.scales)[0], rtol=0.05)

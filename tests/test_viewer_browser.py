@@ -3,6 +3,7 @@
 Needs Node, Chromium, and `npm ci` in web/; skipped where one is missing.
 """
 
+import dataclasses
 import json
 import os
 import shutil
@@ -118,5 +119,14 @@ def test_the_page_shows_a_real_scene(node, shared, tmp_path):
 
 
 @pytest.mark.long
-def test_the_page_itself(node):
-    run_node("test:browser", "--", "page", "adjust")
+def test_the_page_itself(node, tmp_path):
+    """An edit that it saves shows in Python what the page shows."""
+    run_node("test:browser", "--", "page", "adjust", A2TG_EDIT=str(tmp_path))
+    edit, model = a2tg.load_edit(tmp_path / "edit.json"), small_model()
+    edited, (camera,) = a2tg.apply_edit(model, edit), model.origin.cameras
+    assert edited.background == pytest.approx((1, 128 / 255, 0))
+    without = a2tg.apply_edit(model, dataclasses.replace(edit, floaters=0.0))
+    assert 10 < edited.num < without.num < model.num - 10
+    page = np.reshape(json.loads((tmp_path / "picture.json").read_text()), (camera.height, camera.width, 4))
+    shown = np.asarray(edited.render(camera, background=(0.0, 0.0, 0.0)).color)
+    assert np.abs(page[..., :3] - shown).mean() < 1 / 255 < np.abs(page[..., :3] - without.render(camera).color).mean()

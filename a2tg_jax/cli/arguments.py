@@ -44,6 +44,10 @@ FileWorld = Annotated[
         "coordinates are kept. original: as the capture has them."
     ),
 ]
+EditFile = Annotated[
+    Path | None,
+    arg(metavar="FILE", help="Edit (*.json) to apply to the model first, as a2tg view saves it: crop, vertical, ..."),
+]
 LpipsWeights = Annotated[
     Path | None,
     arg(metavar="FILE", help="Weights (.npz) for LPIPS with AlexNet or SqueezeNet; without them, LPIPS is left out."),

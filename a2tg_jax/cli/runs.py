@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import FileWorld, LastModel, LpipsWeights, RunFolderPath, RunOrFile, defaulting_to
+from a2tg_jax.cli.arguments import EditFile, FileWorld, LastModel, LpipsWeights, RunFolderPath, RunOrFile, defaulting_to
 from a2tg_jax.cli.train import open_browser, print_result
 from a2tg_jax.host.text import counted
 from a2tg_jax.mesh.files import mesh_files
@@ -128,6 +128,7 @@ class Render:
     out: Annotated[Path | None, defaulting_to("RUN/frames")] = None
     """Output folder."""
     model: LastModel = None
+    edit: EditFile = None
     overwrite: bool = False
     """Replace files that exist. Files of earlier renders are always replaced, and frames of a longer flight deleted."""
 
@@ -153,6 +154,7 @@ class Render:
             name=self.model,
             size=size,
             supersample=self.supersample,
+            edit=self.edit,
             overwrite=self.overwrite,
         )
         print(f"wrote {counted(len(paths), 'frame')} to {out}/")
@@ -183,6 +185,7 @@ class MeshCommand:
     """Output file, *.glb, *.ply or *.obj."""
     options: Annotated[MeshOptions, arg(name="")] = MeshOptions()
     model: LastModel = None
+    edit: EditFile = None
     overwrite: bool = False
     """Replace files that exist. A run's mesh.glb, once a2tg mesh has written it, is always replaced."""
 
@@ -193,7 +196,7 @@ class MeshCommand:
         self.options.check(out)
         files = mesh_files(out, has_texture=self.options.texture != "none")
         check_not_source(files, self.source, "--out")
-        source = open_source(self.source, self.model)
+        source = open_source(self.source, self.model, self.edit)
         check_output(out)
         for file in files:
             check_export(file, default, "--out", overwrite=self.overwrite)
@@ -218,6 +221,7 @@ class ViewCommand:
 
     source: RunOrFile
     model: LastModel = None
+    edit: EditFile = None
     host: str = LOOPBACK
     """Address to listen on. 0.0.0.0 opens the page to the network, for a phone on the same Wi-Fi. Anyone who has the
     printed address, which contains a random token, can see the scene; the connection is not encrypted."""
@@ -227,7 +231,8 @@ class ViewCommand:
     """Open a browser if the machine has a display."""
 
     def run(self) -> None:
-        serve(routes_of(open_source(self.source, self.model)), host=self.host, port=self.port, on_start=self._started)
+        source = open_source(self.source, self.model, self.edit)
+        serve(routes_of(source), host=self.host, port=self.port, on_start=self._started)
 
     def _started(self, address: str) -> None:
         print(f"{address} shows {self.source}; press Ctrl-C to stop", flush=True)
@@ -261,6 +266,7 @@ class Export:
     photographs: bool = False
     """Add the photographs of the run's cameras to the page."""
     model: LastModel = None
+    edit: EditFile = None
     overwrite: bool = False
     """Replace the outputs of --web and --ply if they exist."""
 
@@ -283,7 +289,7 @@ class Export:
             if self.ply is not None:
                 check_apart(files[0], self.ply)  # A PLY file may be in the folder of a page.
             check_not_source(files, self.source, "--web")
-        source = open_source(self.source, self.model)
+        source = open_source(self.source, self.model, self.edit)
         if self.web is not None:
             print(export_web(source, self.web, **page))
         if self.ply is not None:
@@ -304,6 +310,7 @@ class Convert:
 
     Examples:
       a2tg convert runs/fox fox.sog --bake
+      a2tg convert runs/fox fox-edited.npz --edit edit.json
       a2tg convert scene.spz scene.npz
     """
 
@@ -311,6 +318,7 @@ class Convert:
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """Output file."""
     model: LastModel = None
+    edit: EditFile = None
 
     bake: bool = False
     """Turn splats with textures, or with kernels of other shapes, into plain ones."""
@@ -336,6 +344,7 @@ class Convert:
                 self.source,
                 self.out,
                 self.model,
+                edit=self.edit,
                 baking=baking,
                 float64=self.float64,
                 world=self.world,

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from a2tg_jax.core.cameras import (
@@ -102,8 +101,9 @@ def central_camera(viewmats: np.ndarray) -> int:
     return int(np.argmin(misses + remote))
 
 
-def turntable(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
-    """Return a closed orbit around the subject, the point nearest to all optical axes, about the capture's vertical.
+def turntable(cameras: Sequence[Camera], num_frames: int, up: np.ndarray | None = None) -> list[Camera]:
+    """Return a closed orbit around the subject, the point nearest to all optical axes, about the vertical `up` [3], by
+    default the one estimated from the cameras.
 
     It keeps the cameras' mean distance and elevation, looks at the subject with a level horizon, and begins at the side
     of the first camera, whose intrinsics and image size are used throughout.
@@ -115,7 +115,7 @@ def turntable(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
         raise ValueError(f"an orbit needs a camera and a frame; got {len(cameras)} cameras, {num_frames} frames")
     viewmats = _viewmats(cameras)
     centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
-    subject, up = nearest_point(centers, axes), vertical_of(viewmats)
+    subject, up = nearest_point(centers, axes), vertical_of(viewmats) if up is None else up
     offsets = centers - subject
     distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     if np.median(-np.sum(offsets * axes, axis=1) / distances) < LEAST_FACING:
@@ -191,6 +191,8 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     Raises:
       ValueError: if there are fewer than two cameras or no frames.
     """
+    from scipy.ndimage import gaussian_filter1d  # Not at import, which models do.
+
     check_int("num_frames", num_frames, 1)
     cameras = checked_cameras(cameras)
     if len(cameras) < 2:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.similarity import Similarity
 
@@ -38,6 +39,8 @@ class Origin:
     corrections: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """[V, ...] learned values of each photograph (`training.corrections`), by the correction's name, in the world of
     the training. `viewmats` are corrected already."""
+    up: np.ndarray | None = None
+    """[3] unit vertical that was chosen (`apply_edit`); None: it is estimated from the cameras."""
 
     @staticmethod
     def of_cameras(
@@ -60,6 +63,13 @@ class Origin:
         )
 
     @property
+    def vertical(self) -> np.ndarray:
+        """[3] unit vertical; without cameras −y, as in most files of splats."""
+        if self.up is not None:
+            return self.up
+        return vertical_of(self.viewmats) if len(self.viewmats) else np.array([0.0, -1.0, 0.0])
+
+    @property
     def cameras(self) -> list[Camera]:
         """Cameras in float32."""
         return [
@@ -72,7 +82,8 @@ class Origin:
         viewmats = np.array([similarity.apply_to_viewmat(viewmat) for viewmat in self.viewmats]).reshape(-1, 4, 4)
         # Learned rows are in units of the world that is left here; `viewmats` contain them already.
         transform = self.transform.then(similarity)
-        return dataclasses.replace(self, viewmats=viewmats, transform=transform, corrections={})
+        up = None if self.up is None else similarity.rotation @ self.up
+        return dataclasses.replace(self, viewmats=viewmats, transform=transform, corrections={}, up=up)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Origin):

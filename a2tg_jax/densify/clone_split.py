@@ -1,6 +1,6 @@
 """Adaptive density control (3DGS, Kerbl et al., 2023; 2DGS, Huang et al., 2024): clone, split, prune, reset opacities.
 
-Arrays hold N rows, of which the first `num_live` exist. All edits happen inside the step at fixed shapes: later rows
+Arrays hold N rows, of which the first `num_live` exist. All changes happen inside the step at fixed shapes: later rows
 move up over pruned ones, and copies are appended while there is room.
 """
 
@@ -38,7 +38,7 @@ RECOVERY = 100
 """Number of iterations after a reset without pruning of faint Gaussians: Adam needs them to raise an opacity again."""
 
 
-class Edit(NamedTuple):
+class CloneSplitPlan(NamedTuple):
     """Kept rows and doubled rows; [N] booleans."""
 
     is_kept: Array
@@ -93,18 +93,18 @@ class CloneSplitPrune(StepEvent):
         return max(num, self.cap)
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: GradientStatistics) -> Change:
-        edit, num_refused = self.plan(now, model, state.average())
-        model, moments = apply_edit(now.keys[0], edit, model, moments)
-        return Change(model, moments, self.init(model), EventInfo(jnp.any(edit.is_kept), num_refused))
+        plan, num_refused = self.plan(now, model, state.average())
+        model, moments = apply_plan(now.keys[0], plan, model, moments)
+        return Change(model, moments, self.init(model), EventInfo(jnp.any(plan.is_kept), num_refused))
 
-    def plan(self, now: Now, model: Model, gradients: Array) -> tuple[Edit, Array]:
-        """Return the edit of each row, given its average gradient, and the number of Gaussians without room."""
+    def plan(self, now: Now, model: Model, gradients: Array) -> tuple[CloneSplitPlan, Array]:
+        """Return the plan of each row, given its average gradient, and the number of Gaussians without room."""
         is_kept = _is_live(model) & ~self._is_pruned(now, model)
         # A copy of what is pruned would be pruned as well.
         is_wanted = is_kept & (gradients >= self.threshold)
         room = min(model.gaussians.num, self.cap) - jnp.sum(is_kept, dtype=jnp.int32)
-        edit = self._edit(now, model, is_kept, is_wanted & (_ranks(gradients, is_wanted) < room))
-        return edit, jnp.sum(is_wanted & ~(edit.is_cloned | edit.is_split), dtype=jnp.int32)
+        plan = self._planned(now, model, is_kept, is_wanted & (_ranks(gradients, is_wanted) < room))
+        return plan, jnp.sum(is_wanted & ~(plan.is_cloned | plan.is_split), dtype=jnp.int32)
 
     def _is_pruned(self, now: Now, model: Model) -> Array:
         """Return a mask [N] of rows that are too faint or too large."""
@@ -114,10 +114,10 @@ class CloneSplitPrune(StepEvent):
         is_faint = (opacities < self.least_opacity) & ~(is_late & (since_reset < RECOVERY))
         return is_faint | (is_late & (jnp.max(model.gaussians.scales, axis=1) > self.largest_share * now.scene_scale))
 
-    def _edit(self, now: Now, model: Model, is_kept: Array, is_doubled: Array) -> Edit:
+    def _planned(self, now: Now, model: Model, is_kept: Array, is_doubled: Array) -> CloneSplitPlan:
         """Split large doubled rows and clone small ones."""
         is_large = jnp.max(model.gaussians.scales, axis=1) > self.dense_share * now.scene_scale
-        return Edit(is_kept, is_doubled & ~is_large, is_doubled & is_large)
+        return CloneSplitPlan(is_kept, is_doubled & ~is_large, is_doubled & is_large)
 
 
 @pytree
@@ -134,7 +134,7 @@ class FillingDensity(CloneSplitPrune):
             )
         return max(num, self.cap)
 
-    def plan(self, now: Now, model: Model, gradients: Array) -> tuple[Edit, Array]:
+    def plan(self, now: Now, model: Model, gradients: Array) -> tuple[CloneSplitPlan, Array]:
         assert now.times is not None
         is_there = _is_live(model)
         num_live = jnp.sum(is_there, dtype=jnp.int32)
@@ -149,7 +149,7 @@ class FillingDensity(CloneSplitPrune):
         is_kept = is_kept | (is_there & jnp.any(is_kept) & (place < (reached + 1) // 2))
         num_doubled = reached - jnp.sum(is_kept, dtype=jnp.int32)
         is_doubled = is_kept & (_ranks(gradients, is_kept) < num_doubled)
-        return self._edit(now, model, is_kept, is_doubled), jnp.zeros((), jnp.int32)
+        return self._planned(now, model, is_kept, is_doubled), jnp.zeros((), jnp.int32)
 
 
 def _is_live(model: Model) -> Array:
@@ -163,7 +163,7 @@ def _ranks(values: Array, is_ranked: Array) -> Array:
     return jnp.zeros(num, jnp.int32).at[order].set(jnp.arange(num, dtype=jnp.int32))
 
 
-def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tuple[Model, AdamState]:
+def apply_plan(key: Array, plan: CloneSplitPlan, model: Model, moments: AdamState) -> tuple[Model, AdamState]:
     """Move kept rows up, in order, and append the copies of doubled ones. New rows start with zero moments.
 
     Both halves of a split Gaussian are drawn from it, each a Gaussian 1.6 times smaller. A clone has the place of its
@@ -171,15 +171,15 @@ def apply_edit(key: Array, edit: Edit, model: Model, moments: AdamState) -> tupl
     """
     num = model.gaussians.num
     index = jnp.arange(num, dtype=jnp.int32)
-    is_doubled = edit.is_cloned | edit.is_split
-    num_kept, num_copies = (jnp.sum(mask, dtype=jnp.int32) for mask in (edit.is_kept, is_doubled))
+    is_doubled = plan.is_cloned | plan.is_split
+    num_kept, num_copies = (jnp.sum(mask, dtype=jnp.int32) for mask in (plan.is_kept, is_doubled))
     # Sorting masks stably puts marked rows first, in their order, at fixed shapes.
-    kept_first = jnp.argsort(~edit.is_kept, stable=True).astype(jnp.int32)
+    kept_first = jnp.argsort(~plan.is_kept, stable=True).astype(jnp.int32)
     doubled_first = jnp.argsort(~is_doubled, stable=True).astype(jnp.int32)
     is_copy = (index >= num_kept) & (index < num_kept + num_copies)
     rows = jnp.where(is_copy, doubled_first[jnp.maximum(index - num_kept, 0)], kept_first)
     exists = index < num_kept + num_copies
-    is_half = edit.is_split[rows] & exists
+    is_half = plan.is_split[rows] & exists
     moments = clear_moments(model, gather_moments(moments, rows), is_copy | is_half | ~exists)
     model = gather_rows(model, rows)
     gaussians = split_in_half(key, model.gaussians, is_half)

@@ -41,6 +41,7 @@ from a2tg_jax.io.model_file import (
     appearance_to_dict,
     background_of,
     origin_arrays,
+    origin_header,
     origin_of,
     origin_shapes,
 )
@@ -59,6 +60,8 @@ HEAD = struct.Struct("<8sHIII")
 ORIGIN_DTYPES = {
     "viewmats": "f8", "Ks": "f8", "sizes": "i4", "is_test": "u1", "scale": "f8", "rotation": "f8", "translation": "f8",
 }  # fmt: skip
+FLOATERS = "floaters"
+"""Name of the parts with the scores of floaters, which only files for browsers have."""
 LARGEST_CHUNK, LEAST_CHUNK = 16384, 256
 """Numbers of rows in a chunk of a file for browsers."""
 
@@ -164,6 +167,7 @@ def encode_model(
     *,
     order: np.ndarray | None = None,
     page: Mapping[str, object] | None = None,
+    floaters: np.ndarray | None = None,
 ) -> bytes:
     """Return the bytes that `save_compact` writes. Raises the same errors.
 
@@ -173,6 +177,7 @@ def encode_model(
       grids: as in `save_compact` (`grids_of`); numbers beyond their ends are clipped.
       order: indices [N] of existing rows, for chunks that are drawn as they arrive; None for a single chunk.
       page: header entry for the viewer.
+      floaters: `floater_scores` of the rows that exist, which the viewer compares with a limit.
     """
     choices.check()
     check_gaussians(model.gaussians, "model.gaussians")
@@ -217,7 +222,7 @@ def encode_model(
         """Return the file and the number of bytes that it unpacks to."""
         writer = ColumnWriter(coder, ends)
         if model.origin is not None:
-            header["origin"] = {"names": list(model.origin.names)}
+            header["origin"] = origin_header(model.origin)
             for name, array in origin_arrays(model.origin).items():
                 writer.exact(f"origin_{name}", np.asarray(array, ORIGIN_DTYPES[name]))
         for start in starts:
@@ -228,6 +233,8 @@ def encode_model(
             else:
                 writer.numbers("means", part.means.T, choices.means)
             _write(writer, part, choices, header)
+            if floaters is not None:
+                writer.planes(FLOATERS, floaters[order[places]][None])
         return framed(header | {"parts": writer.parts, "ends": writer.ends}, writer.body), writer.num_unpacked
 
     data, num_unpacked = encoded(choices.coder)
@@ -289,10 +296,12 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
         num, chunk = header["num"], header.get("chunk", max(header["num"], 1))
         if type(num) is not int or num < 0 or type(chunk) is not int or chunk < 1:
             raise ValueError(f"must have a number of rows, in chunks; got {num!r}, {chunk!r}")
-        parts = [
-            _rows_of(reader, min(chunk, num - start), header, choices, appearance)
-            for start in range(0, max(num, 1), chunk)
-        ]
+        parts, has_floaters = [], any(name == FLOATERS for name, *_ in header["parts"])
+        for start in range(0, max(num, 1), chunk):
+            length = min(chunk, num - start)
+            parts.append(_rows_of(reader, length, header, choices, appearance))
+            if has_floaters:
+                reader.planes(FLOATERS, 1, length)  # They follow from the rows.
         origin = None
         if "origin" in header:
             shapes = origin_shapes(len(header["origin"]["names"]))

@@ -59,7 +59,7 @@ def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, 
     described = {**(header or {}), "appearance": appearance_to_dict(model.appearance)}
     described["background"] = list(model.background)
     if model.origin is not None:
-        described["origin"] = {"names": list(model.origin.names)}
+        described["origin"] = origin_header(model.origin)
         arrays |= {ORIGIN + name: array for name, array in origin_arrays(model.origin).items()}
         arrays |= {ORIGIN + CORRECTIONS + name: rows for name, rows in model.origin.corrections.items()}
     write_archive(path, described, arrays, format=FORMAT)
@@ -180,6 +180,11 @@ def background_of(header: Mapping[str, Any]) -> Color:
     return float(red), float(green), float(blue)
 
 
+def origin_header(origin: Origin) -> dict[str, Any]:
+    """Return what JSON keeps of an origin: the names, and the vertical if it was chosen."""
+    return {"names": list(origin.names)} | ({} if origin.up is None else {"up": np.asarray(origin.up).tolist()})
+
+
 def origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
     """Return the numbers of an origin."""
     world = origin.transform
@@ -201,7 +206,7 @@ def origin_shapes(num: int) -> dict[str, tuple[int, ...]]:
 
 
 def origin_of(data: Mapping[str, object], arrays: Mapping[str, Any]) -> Origin:
-    """Return the origin of `origin_arrays`, which may be nested lists, with data["names"]. ValueError: a shape or a
+    """Return the origin of `origin_arrays`, which may be nested lists, and of `origin_header`. ValueError: a shape or a
     number is wrong."""
     names, found = data["names"], dict[str, np.ndarray]()
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -218,4 +223,7 @@ def origin_of(data: Mapping[str, object], arrays: Mapping[str, Any]) -> Origin:
     viewmats, Ks, sizes, is_test, scale, rotation, translation = found.values()
     learned = {name.removeprefix(CORRECTIONS): rows for name, rows in arrays.items() if name.startswith(CORRECTIONS)}
     world = Similarity(float(scale), rotation, translation)
-    return Origin(viewmats, Ks, sizes, tuple(names), is_test, world, learned)
+    up = data.get("up")
+    if up is not None:
+        check_shape(ORIGIN + "up", up := np.asarray(up, np.float64), (3,))
+    return Origin(viewmats, Ks, sizes, tuple(names), is_test, world, learned, up)

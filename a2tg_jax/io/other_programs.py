@@ -17,13 +17,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.appearance.parts import nearest_gaussians
-from a2tg_jax.core.camera_paths import upright_rotation, vertical_of
+from a2tg_jax.core.camera_paths import upright_rotation
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gaussians, logit
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity, transform_gaussians
 from a2tg_jax.host.text import counted
-from a2tg_jax.io.model_file import origin_arrays
+from a2tg_jax.io.model_file import origin_arrays, origin_header
 from a2tg_jax.io.validate import check_origin
 from a2tg_jax.model import Model, concatenate
 
@@ -142,8 +142,9 @@ def upright_turn(model: Model) -> np.ndarray:
     origin = model.origin
     if origin is None or has_map_coordinates(model):
         return np.eye(3)
-    up = vertical_of(origin.viewmats) if len(origin.viewmats) else np.array([0.0, -1.0, 0.0])
-    up = origin.transform.rotation.T @ up
+    up = origin.transform.rotation.T @ origin.vertical
+    if origin.up is not None:
+        return upright_rotation(up)
     # Captures that know their vertical keep their axes: the estimate is off by a few degrees.
     return upright_rotation(np.rint(up) if np.abs(up).max() > LEVEL else up)
 
@@ -163,7 +164,7 @@ def world_line(model: Model, world: World) -> str:
         return "world: the original one, in its units and axes"
     if has_map_coordinates(model):
         return "world: the original one, because of its map coordinates"
-    if model.origin is None or not model.origin.names:
+    if model.origin is None or (not model.origin.names and model.origin.up is None):
         return "world: as in the source, which has no cameras to find the vertical by"
     degrees = math.degrees(Rotation.from_matrix(upright_turn(model)).magnitude())
     turned = f"the original one turned by {degrees:.1f}°" if degrees else "which is the original one"
@@ -302,9 +303,15 @@ def degree_to_read(degree: int, name: str) -> int:
 
 
 def upright(origin: Origin | Similarity | None, up: Up) -> Similarity:
-    """Return the similarity from a model's world, given its origin or transform, to a file's with this axis up."""
+    """Return the similarity from a model's world, given its origin or transform, to a file's with this axis up.
+
+    +z of the model is up, or the vertical that was chosen.
+    """
     transform = origin.transform if isinstance(origin, Origin) else origin
-    return Similarity(1.0 if transform is None else 1.0 / float(transform.scale), UPRIGHT[up], np.zeros(3))
+    turn = UPRIGHT[up]
+    if isinstance(origin, Origin) and origin.up is not None:
+        turn = turn @ upright_rotation(np.array([0.0, 0.0, 1.0])).T @ upright_rotation(origin.up)
+    return Similarity(1.0 if transform is None else 1.0 / float(transform.scale), turn, np.zeros(3))
 
 
 def matrix_of(similarity: Similarity) -> np.ndarray:
@@ -370,7 +377,7 @@ def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
 
 def origin_to_json(origin: Origin) -> dict[str, Any]:
     """Return an origin as lists of numbers and texts, without the corrections."""
-    return {"names": list(origin.names)} | {name: array.tolist() for name, array in origin_arrays(origin).items()}
+    return origin_header(origin) | {name: array.tolist() for name, array in origin_arrays(origin).items()}
 
 
 # Ranges and steps of numbers

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from a2tg_jax.appearance.base import check_appearance
-from a2tg_jax.core.cameras import check_calibration
+from a2tg_jax.core.cameras import MAX_SKEW, check_calibration
 from a2tg_jax.core.checks import LARGEST_NUMBER, check_floats, check_shape, dtype_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.origin import Origin
@@ -110,6 +110,10 @@ def check_origin(origin: Origin) -> None:
     for name, viewmat, K, (width, height) in cameras:
         check_calibration(viewmat, K, width, height, f"origin, camera {shortened(name)}")
     check_similarity(origin.transform, "origin.transform")
+    if origin.up is not None:
+        check_shape("origin.up", origin.up, (3,))
+        if not abs(np.linalg.norm(origin.up) - 1) < MAX_SKEW:
+            raise ValueError(f"origin.up must have unit length; got {np.asarray(origin.up).tolist()}")
     for name, rows in origin.corrections.items():
         check_floats(f"origin.corrections.{name}", rows, (len(origin.names), *np.shape(rows)[1:]))
         check_bounded(f"origin.corrections.{name}", rows)

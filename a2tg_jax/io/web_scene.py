@@ -12,7 +12,9 @@ from a2tg_jax.core.camera_paths import central_camera
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.io.columns import Choice, opacities_of
 from a2tg_jax.io.compact import CompactChoices, encode_model
+from a2tg_jax.io.edit_file import scores_of
 from a2tg_jax.io.model_rows import check_encodable
+from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 
 CHOICES = CompactChoices(
@@ -46,6 +48,7 @@ def encode_web_scene(
     check_gaussians(model.gaussians, "model.gaussians")
     check_encodable(model.appearance, "a file for browsers")
     model = model.live
+    check_model(model)
     texture = model.appearance.texture
     if texture is not None and model.num:
         # Baked into the texels, so that shaders need only one rule for textures.
@@ -65,9 +68,10 @@ def encode_web_scene(
         is_test = model.origin.is_test
         candidates = np.flatnonzero(~is_test) if not np.all(is_test) else np.arange(len(is_test))
         page["first"] = int(candidates[central_camera(model.origin.viewmats[candidates])])
+    scores = scores_of(model)
     # Stable, so that the same model gives the same file.
     order = np.argsort(-importance(model), kind="stable")
-    return encode_model(model, dataclasses.replace(CHOICES, coder=coder), order=order, page=page)
+    return encode_model(model, dataclasses.replace(CHOICES, coder=coder), order=order, page=page, floaters=scores)
 
 
 def importance(model: Model) -> np.ndarray:

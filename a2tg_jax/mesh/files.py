@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import PROGRAM
@@ -35,7 +36,7 @@ def mesh_files(path: str | os.PathLike[str], *, has_texture: bool) -> list[Path]
     return [path, *(path.with_suffix(suffix) for suffix in beside)]
 
 
-def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | None = None) -> list[Path]:
+def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | Origin | None = None) -> list[Path]:
     """Write a mesh as GLB, PLY or OBJ, by the suffix of the path.
 
     GLB holds the texture or linear vertex colours, unlit, as in the photographs. PLY holds vertex colours and no
@@ -46,8 +47,8 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
     Args:
       path: the file; an existing one is replaced once the new one is complete.
       mesh: a mesh.
-      transform: transform from the original world to the mesh's world, such as `model.origin.transform`. None writes
-        the mesh unchanged, in each format.
+      transform: transform from the original world to the mesh's world, or the origin with it, such as `model.origin`,
+        whose chosen vertical counts for GLB. None writes the mesh unchanged, in each format.
 
     Returns:
       The files written, the given one first.
@@ -62,6 +63,7 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
         _save_glb(path, mesh, transform)
         return [path]
     # Mesh.transform returns float64, which map coordinates need.
+    transform = transform.transform if isinstance(transform, Origin) else transform
     mesh = mesh if transform is None else mesh.transform(transform.inverse())
     if suffix == ".obj":
         return _save_obj(path, mesh)
@@ -121,16 +123,17 @@ def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
     return written
 
 
-def _save_glb(path: Path, mesh: Mesh, transform: Similarity | None) -> None:
+def _save_glb(path: Path, mesh: Mesh, origin: Similarity | Origin | None) -> None:
     """Write a GLB file of a mesh, unlit."""
     # With a transform, the node maps to the upright world of `save_gltf`, and its extras have the transform if the
     # original world is far from there. Without one, positions far from the origin are relative to the node's
     # translation.
+    transform = origin.transform if isinstance(origin, Origin) else origin
     builder = Builder()
     node: dict[str, Any] = {"name": "mesh", "mesh": 0}
     middle = _middle(mesh.vertices) if transform is None else np.zeros(3)
     if transform is not None:
-        node["matrix"] = matrix_of(upright(transform, "y")).T.ravel().tolist()
+        node["matrix"] = matrix_of(upright(origin, "y")).T.ravel().tolist()
         if _middle(mesh.transform(transform.inverse()).vertices).any():
             kept = {"scale": float(transform.scale), "rotation": np.asarray(transform.rotation).tolist()}
             node["extras"] = {OWN: kept | {"translation": np.asarray(transform.translation).tolist()}}

@@ -46,14 +46,16 @@ def convert(
     out: Path,
     name: str | None = None,
     *,
+    edit: Path | None = None,
     baking: BakeOptions | None = None,
     float64: bool = False,
     world: World = "upright",
     overwrite: bool = False,
 ) -> str:
     """Write a run's model `name`, or a file of any known format, in another suffix's format, and return a summary.
-    `baking` turns textured splats into plain ones (None: no baking); `float64` and `world` are as in `save_ply`. Raises
-    ValueError or OSError if a format is unknown, or a file cannot be read or written."""
+    `edit` is as in `open_source`; `baking` turns textured splats into plain ones (None: no baking); `float64` and
+    `world` are as in `save_ply`. Raises ValueError or OSError if a format is unknown, or a file cannot be read or
+    written."""
     writer_of(out)  # Baking takes minutes.
     if float64 and format_of(out).save is not save_ply:
         raise ValueError(f"`float64` needs an OUT that ends in .ply and is not packed; got {out}")
@@ -74,7 +76,7 @@ def convert(
     if baking is not None:
         baking.check()
     start = time.perf_counter()
-    opened = open_source(source, name)
+    opened = open_source(source, name, edit)
     model, baked = (opened.model, "") if baking is None else _baked(source, opened.model, baking)
     if float64:
         save_ply(out, model, float64=True, world=world)

@@ -100,6 +100,7 @@ def render_frames(
     name: str | None = None,
     size: tuple[int, int] | None = None,
     supersample: int = 1,
+    edit: Path | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
     """Write one PNG per frame and return their paths. The photographs are not needed.
@@ -111,6 +112,7 @@ def render_frames(
       route: the test views, a smooth path past all cameras, an orbit around the subject, or a path through the views in
         a file that the viewer saved.
       name: model to render; None: the last one of the run's main system.
+      edit: file of an edit that is applied before.
       size: width and height of the frames, views being cropped to their aspect; None: the cameras' sizes.
 
     Raises:
@@ -120,7 +122,7 @@ def render_frames(
         raise ValueError(f"the number of frames must be at least 1; got {num_frames}")
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"{out} is a file; choose a folder for the frames with `out`")
-    source = open_source(run.path, name)
+    source = open_source(run.path, name, edit)
     cameras = dict(_cameras(source.model, route, num_frames))
     if size is not None:
         cameras = {file_name: crop_camera(camera, *size) for file_name, camera in cameras.items()}
@@ -192,8 +194,10 @@ def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tup
         raise ValueError("the model has no cameras to render")
     views = sorted(zip(model.origin.names, model.origin.is_test, model.origin.cameras, strict=True), key=lambda v: v[0])
     if route != "test":
-        path = smooth_path if route == "smooth" else turntable
-        return numbered(path([camera for _, _, camera in views], num_frames))
+        cameras = [camera for _, _, camera in views]
+        if route == "smooth":
+            return numbered(smooth_path(cameras, num_frames))
+        return numbered(turntable(cameras, num_frames, model.origin.up))
     if not model.origin.is_test.any():
         raise ValueError("the run has no test views; render a path instead with `path` smooth")
     tests = {name: camera for name, is_test, camera in views if is_test}

@@ -130,7 +130,7 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
     if options.texture != "none":
         print(f"unwrapping {counted(mesh.num_faces, 'face')}", flush=True)
         mesh = texture_mesh(mesh, pictures, size=options.texture_size)
-    files = save_mesh(out, mesh, origin.transform)
+    files = save_mesh(out, mesh, origin)
     size = in_bytes(sum(file.stat().st_size for file in files))
     texture = "" if mesh.texture is None else f", a texture of {mesh.texture.shape[1]} × {mesh.texture.shape[0]}"
     return "\n".join(

@@ -18,6 +18,7 @@ from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import in_bytes
+from a2tg_jax.io.edit_file import apply_edit, load_edit
 from a2tg_jax.io.formats import FORMATS, format_of, load_splats
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.other_programs import plain_gaussians
@@ -88,10 +89,15 @@ def finished_stage(run: RunFolder, name: str | None = None) -> tuple[RunRecord, 
     return record, planned
 
 
-def open_source(path: Path, name: str | None = None) -> Source:
+def open_source(path: Path, name: str | None = None, edit: Path | None = None) -> Source:
     """Open a run folder or a file of any format that `load_splats` reads. `name` is a model of a run, as `a2tg info`
-    prints it; None: the last one of its main system. Raises FileNotFoundError if there is no such file, or the run's
-    stage is not finished, and ValueError if it cannot be read."""
+    prints it; None: the last one of its main system. `edit` is the file of an edit that is applied to the model. Raises
+    FileNotFoundError if there is no such file, or the run's stage is not finished, and ValueError if it cannot be
+    read."""
+    if edit is not None:
+        change = load_edit(edit)  # Before a large model is read.
+        source = open_source(path, name)
+        return dataclasses.replace(source, model=apply_edit(source.model, change))
     if path.is_dir():
         run = _run_at(path)
         record, planned = finished_stage(run, name)

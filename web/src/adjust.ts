@@ -1,6 +1,8 @@
-/** The panel's sections that adjust what is shown: roll and vertical, crop box and floaters. */
+/** The panel's sections that adjust what is shown: roll and vertical, crop box, floaters and background. */
 
+import { colorOf, hexOf } from "./edit";
 import { WHOLE } from "./extent";
+import type { Header } from "./format";
 import type { Vec3 } from "./math";
 import { element } from "./page";
 import { rollOf, rolled, verticalIn } from "./vertical";
@@ -44,14 +46,17 @@ export class LevelControls {
   }
 }
 
-/** Sliders of the crop box and of the floaters. */
+/** Sliders of the crop box and of the floaters, and the background. */
 export class CropControls {
+  /** Handler called when the user has changed something. */
+  onChange: () => void = () => undefined;
   private readonly viewer: Viewer;
   private readonly from = ["from-width", "from-depth", "from-height"].map((id) => element(id, HTMLInputElement));
   private readonly to = ["to-width", "to-depth", "to-height"].map((id) => element(id, HTMLInputElement));
   private readonly floaters = element("floaters", HTMLInputElement);
   private readonly ranges = ["width-range", "depth-range", "height-range"].map((id) => element(id, HTMLOutputElement));
   private readonly strictness = element("floaters-value", HTMLOutputElement);
+  private readonly background = element("background", HTMLInputElement);
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
@@ -60,13 +65,33 @@ export class CropControls {
       slider.addEventListener("input", () => this.apply());
     }
     element("uncrop", HTMLButtonElement).addEventListener("click", () => this.reset());
+    this.background.addEventListener("input", () => {
+      viewer.background = colorOf(this.background.value);
+      this.changed();
+    });
+  }
+
+  /** Show what a new scene has. */
+  begin(header: Header): void {
+    this.floaters.disabled = !header.hasFloaters;
+    this.show(header);
+  }
+
+  /** Set the sliders to what the viewer shows. */
+  show(header: Header): void {
+    const { crop, floaters, background } = this.viewer;
+    for (const [k, slider] of this.from.entries()) slider.value = String(crop.from[k]);
+    for (const [k, slider] of this.to.entries()) slider.value = String(crop.to[k]);
+    this.floaters.value = String(floaters);
+    this.background.value = hexOf(background ?? header.background);
+    this.tell();
   }
 
   private reset(): void {
-    for (const [k, slider] of this.from.entries()) slider.value = String(WHOLE.from[k]);
-    for (const [k, slider] of this.to.entries()) slider.value = String(WHOLE.to[k]);
-    this.floaters.value = "0";
-    this.apply();
+    const { viewer } = this;
+    [viewer.crop, viewer.floaters] = [WHOLE, 0];
+    if (viewer.splats !== null) this.show(viewer.splats.header);
+    this.changed();
   }
 
   private apply(): void {
@@ -74,7 +99,12 @@ export class CropControls {
     viewer.crop = { from: valuesOf(this.from), to: valuesOf(this.to) };
     viewer.floaters = Number(this.floaters.value);
     this.tell();
-    viewer.draw();
+    this.changed();
+  }
+
+  private changed(): void {
+    this.viewer.draw();
+    this.onChange();
   }
 
   /** Show the values of the sliders next to their names. */

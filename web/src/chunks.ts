@@ -1,7 +1,7 @@
 /** Chunks of consecutive rows, read from the parts of a file. */
 
 import { at, joined } from "./arrays";
-import { damaged } from "./format";
+import { FLOATERS, damaged } from "./format";
 import type { Header, Quantity } from "./format";
 import type { PartReader } from "./parts";
 
@@ -20,6 +20,8 @@ export interface Chunk {
   readonly sizes: Uint8Array;
   /** [n] shapes of the kernels; zeros if all are Gaussians. */
   readonly shapes: Uint8Array;
+  /** [n] scores of floaters; zeros without them. */
+  readonly floaters: Uint8Array;
   /** Band l ≥ 1 at index l − 1: [3, 2l + 1, m] red − green, green, blue − green of the m rows of degree ≥ l. */
   readonly bands: readonly Uint8Array[];
   /** [4, t]: red − green, green, blue − green, alpha. */
@@ -56,7 +58,19 @@ export async function readChunk(parts: PartReader, header: Header, start: number
   const texels =
     header.sizes === null ? [] : [await codes("texel_colors", 3, numTexels), await codes("texel_alphas", 1, numTexels)];
   const shapes = header.hasShapes ? await codes("shapes", 1, num) : new Uint8Array(num);
-  return { start, num, means, numbers: joined(numbers), degrees, sizes, shapes, bands, texels: joined(texels) };
+  const floaters = header.hasFloaters ? await parts.planes(FLOATERS, 1, num) : new Uint8Array(num);
+  return {
+    start,
+    num,
+    means,
+    numbers: joined(numbers),
+    degrees,
+    sizes,
+    shapes,
+    floaters,
+    bands,
+    texels: joined(texels),
+  };
 }
 
 /**

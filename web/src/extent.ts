@@ -9,7 +9,7 @@ const PERCENTILES_PER_SPREAD = 1.2;
 /** Half the length of the largest crop box over that of the extent. */
 const REACH = 2.5;
 /** Largest number that shaders compare with. */
-const UNLIMITED = 3e38;
+export const UNLIMITED = 3e38;
 
 /** Box of most splats, aligned with the file's axes. */
 export interface Extent {
@@ -24,10 +24,8 @@ export interface Clip {
   readonly axes: Mat3;
   readonly low: Vec3;
   readonly high: Vec3;
-  /** Smallest opacity. */
-  readonly faintest: number;
-  /** Largest standard deviation. */
-  readonly largest: number;
+  /** Largest score of floaters, which are from 0 to 255. */
+  readonly floating: number;
 }
 
 /** Shares of the largest crop box, 0 to 1, at which it begins and ends along width, depth and height. */
@@ -52,7 +50,7 @@ export function halfAlong({ half }: Extent, axis: Vec3): number {
 /**
  * Return limits for a crop box that stands upright.
  *
- * @param floaters - strictness, 0 to 1, with which faint and large splats are hidden
+ * @param floaters - strictness, 0 to 1, with which floaters are hidden
  */
 export function clipOf(extent: Extent, up: Vec3, { from, to }: Crop, floaters: number): Clip {
   const axes = uprightAxes(up);
@@ -63,12 +61,7 @@ export function clipOf(extent: Extent, up: Vec3, { from, to }: Crop, floaters: n
     (2 * share - 1) * REACH * halfAlong(extent, axis);
   const low = (k: 0 | 1 | 2): number => (from[k] > 0 ? place(from[k], axes[k]) : -UNLIMITED);
   const high = (k: 0 | 1 | 2): number => (to[k] < 1 ? place(to[k], axes[k]) : UNLIMITED);
-  return { axes, low: [low(0), low(1), low(2)], high: [high(0), high(1), high(2)], ...floaterLimits(extent, floaters) };
-}
-
-function floaterLimits({ half }: Extent, floaters: number): Pick<Clip, "faintest" | "largest"> {
-  if (floaters <= 0) return { faintest: 0, largest: UNLIMITED };
-  return { faintest: 0.5 * floaters, largest: Math.max(...half) * 10 ** (0.5 - 2 * floaters) };
+  return { axes, low: [low(0), low(1), low(2)], high: [high(0), high(1), high(2)], floating: 255 * (1 - floaters) };
 }
 
 /** Return horizontal axes, the first one close to the world's x (or y), and the vertical. */

@@ -3,12 +3,14 @@
 import { at } from "./arrays";
 import type { Intrinsics, Viewmat } from "./camera";
 import { HARMONIC_TEXELS } from "./packing";
-import { isVector } from "./math";
+import { isVector, normalize } from "./math";
 import type { Vec2, Vec3 } from "./math";
 
 export const MAGIC = [0x61, 0x32, 0x74, 0x67, 0x7a, 0x0d, 0x0a, 0x1a];
 export const VERSION = 3;
 export const HEAD_BYTES = 22;
+/** Name of the parts with the scores of floaters. */
+export const FLOATERS = "floaters";
 const MOST_ROWS = 1 << 24;
 const LARGEST_HEADER = 1 << 24;
 const LARGEST_RATIO = 64;
@@ -75,6 +77,7 @@ export interface FileHeader {
   readonly numTexels: number;
   /** Whether kernels differ in shape. */
   readonly hasShapes: boolean;
+  readonly hasFloaters: boolean;
   readonly nearPlane: number;
   readonly maxAlpha: number;
   readonly uv: "texel-centre" | "align-corners";
@@ -85,6 +88,8 @@ export interface FileHeader {
   readonly background: Vec3;
   /** Names of the cameras; null for a scene without an origin. */
   readonly names: readonly string[] | null;
+  /** The vertical that was chosen; null if it is estimated from the cameras. */
+  readonly up: Vec3 | null;
   /** Index of the camera at which the viewer opens. */
   readonly first: number;
   readonly parts: readonly Coding[];
@@ -123,7 +128,8 @@ export function parseHeader(text: Uint8Array, head: Head): FileHeader {
   const raw = new Fields(JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(text)), "the header");
   const parts = raw.list("parts").map(codingOf);
   const numBytes = parts.reduce((sum, part) => sum + part.numBytes, HEAD_BYTES + head.codedBytes);
-  const names = raw.has("origin") ? raw.fields("origin").texts("names") : null;
+  const origin = raw.has("origin") ? raw.fields("origin") : null;
+  const names = origin?.texts("names") ?? null;
   const appearance = raw.fields("appearance");
   const kinds = appearance.fields("parts");
   const texture = raw.has("sizes") ? kinds.fields("texture").fields("options") : null;
@@ -149,6 +155,7 @@ export function parseHeader(text: Uint8Array, head: Head): FileHeader {
     sizes,
     numTexels,
     hasShapes: kinds.has("exponents"),
+    hasFloaters: parts.some(({ name }) => name === FLOATERS),
     nearPlane: page?.between("near_plane", 0, 1e9) ?? NEAR_PLANE,
     maxAlpha: own?.between("max_alpha", 0, 1) ?? MAX_ALPHA,
     uv: texture?.oneOf("uv", ["texel-centre", "align-corners"]) ?? "texel-centre",
@@ -158,6 +165,7 @@ export function parseHeader(text: Uint8Array, head: Head): FileHeader {
     ends: endsOf(raw.fields("ends"), choices),
     background: vector<Vec3>(raw.list("background"), 3, "background"),
     names,
+    up: origin?.has("up") === true ? normalize(vector<Vec3>(origin.list("up"), 3, "up")) : null,
     first: page?.has("first") === true ? page.count("first", 0, Math.max((names?.length ?? 0) - 1, 0)) : 0,
     parts,
     numBytes,
@@ -168,7 +176,7 @@ export function parseHeader(text: Uint8Array, head: Head): FileHeader {
     texture.oneOf("alpha", ["projected"]);
   }
   // Bytes of all numbers, so that memory for them is allocated for files only that can hold them.
-  const perRow = Math.ceil((3 * header.meanBits) / 8) + 9 + Number(header.hasShapes);
+  const perRow = Math.ceil((3 * header.meanBits) / 8) + 9 + Number(header.hasShapes) + Number(header.hasFloaters);
   const coefficients = degreeCounts.reduce((sum, count, i) => sum + count * ((at(degrees, i) + 1) ** 2 - 1), 0);
   const leastBytes = perRow * num + 3 * coefficients + 4 * numTexels + 204 * (names?.length ?? 0);
   if (numTexels > MOST_ROWS || leastBytes > header.room) throw damaged("its header claims more rows than bytes");

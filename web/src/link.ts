@@ -1,6 +1,8 @@
 /** Conversion between views and URL fragments. */
 
 import type { Fit, Lens, Pose } from "./camera";
+import { WHOLE } from "./extent";
+import type { Crop } from "./extent";
 import { isVector, normalize, orthonormal } from "./math";
 import type { Vec3 } from "./math";
 import { MODES } from "./shaders";
@@ -13,13 +15,17 @@ export interface View {
   readonly fit: Fit;
   /** The vertical; null if it is estimated. */
   readonly up: Vec3 | null;
+  readonly crop: Crop;
+  readonly floaters: number;
+  /** The background; null if it is the scene's. */
+  readonly background: Vec3 | null;
 }
 
 /** Position, right, forward; focus; fx, fy, cx, cy, skew, width, height. */
 type ViewNumbers = readonly [...Vec3, ...Vec3, ...Vec3, number, ...Vec3, ...Vec3, number];
 
 /** Return the fragment of a view, such as #view=…&mode=depth. */
-export function linkOf({ pose, lens, mode, fit, up }: View): string {
+export function linkOf({ pose, lens, mode, fit, up, crop, floaters, background }: View): string {
   const numbers: ViewNumbers = [
     ...pose.position,
     ...pose.rotation[0],
@@ -37,6 +43,9 @@ export function linkOf({ pose, lens, mode, fit, up }: View): string {
   if (mode !== "full") fields.push(`mode=${mode}`);
   if (fit !== "whole") fields.push(`fit=${fit}`);
   if (up !== null) fields.push(`up=${textOf(up)}`);
+  if (isCropped(crop)) fields.push(`crop=${textOf([...crop.from, ...crop.to])}`);
+  if (floaters > 0) fields.push(`floaters=${textOf([floaters])}`);
+  if (background !== null) fields.push(`background=${textOf(background)}`);
   return `#${fields.join("&")}`;
 }
 
@@ -61,7 +70,23 @@ export function viewOf(hash: string): View | null {
     mode,
     fit: fields.get("fit") === "close" ? "close" : "whole",
     up: isVector<Vec3>(up, 3) ? normalize(up) : null,
+    crop: cropOf(fields.get("crop")),
+    floaters: sharesOf(fields.get("floaters"), 1)?.[0] ?? 0,
+    background: sharesOf<Vec3>(fields.get("background"), 3),
   };
+}
+
+const isCropped = ({ from, to }: Crop): boolean => from.some((x) => x > 0) || to.some((x) => x < 1);
+
+function cropOf(text: string | null): Crop {
+  const shares = sharesOf<readonly [...Vec3, ...Vec3]>(text, 6);
+  return shares === null ? WHOLE : { from: [shares[0], shares[1], shares[2]], to: [shares[3], shares[4], shares[5]] };
+}
+
+/** Parse numbers from 0 to 1. Returns null if there are not this many. */
+function sharesOf<T extends readonly number[] = readonly [number]>(text: string | null, length: T["length"]): T | null {
+  const shares = numbersOf(text);
+  return text !== null && isVector<T>(shares, length) && shares.every((x) => x >= 0 && x <= 1) ? shares : null;
 }
 
 const textOf = (numbers: readonly number[]): string =>

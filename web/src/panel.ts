@@ -3,6 +3,7 @@
 import { CropControls, LevelControls } from "./adjust";
 import { intrinsicsOf, viewmatOf } from "./camera";
 import type { Intrinsics, Viewmat } from "./camera";
+import { textOfEdit } from "./edit";
 import type { Header } from "./format";
 import { linkOf, viewOf } from "./link";
 import type { Vec2 } from "./math";
@@ -40,6 +41,7 @@ export class Panel {
   private kept: KeptView[] = [];
   private linkTimer = 0;
   private readonly leveling: LevelControls;
+  private readonly cropping: CropControls;
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
@@ -59,8 +61,10 @@ export class Panel {
     });
     this.onClick("keep", () => this.keep());
     this.onClick("save", () => this.save());
+    this.onClick("save-edit", () => this.saveEdit());
     this.leveling = new LevelControls(viewer);
-    new CropControls(viewer);
+    this.cropping = new CropControls(viewer);
+    this.cropping.onChange = () => this.noteLink();
     viewer.onLeave = () => this.leave();
     addEventListener("keydown", (event) => this.pressKey(event));
     addEventListener("resize", () => this.placePhotograph());
@@ -76,6 +80,7 @@ export class Panel {
     document.title = `${title} · a2tg view`;
     setText("note", header.note);
     element("cameras", HTMLElement).hidden = header.cameras.length === 0;
+    this.cropping.begin(header);
     const choices = header.cameras.map(
       (camera, index) => new Option(camera.isTest ? `${camera.name} (test)` : camera.name, String(index)),
     );
@@ -106,6 +111,7 @@ export class Panel {
     const { splats } = this.viewer;
     if (splats === null) return;
     this.viewer.settle(splats);
+    this.tellEdit();
     this.setCurrent(splats.header.cameras.length > 0 ? splats.header.first : null);
     this.viewer.draw();
   }
@@ -178,6 +184,7 @@ export class Panel {
   }
 
   private noteLink(): void {
+    this.tellEdit();
     clearTimeout(this.linkTimer);
     this.linkTimer = window.setTimeout(() => {
       // Some browsers forbid changing the address of a page opened from disk.
@@ -190,8 +197,8 @@ export class Panel {
   }
 
   private get link(): string {
-    const { pose, image, mode, fit, up, isUpChosen } = this.viewer;
-    return linkOf({ pose, lens: image, mode, fit, up: isUpChosen ? up : null });
+    const { pose, image, mode, fit, up, isUpChosen, crop, floaters, background } = this.viewer;
+    return linkOf({ pose, lens: image, mode, fit, up: isUpChosen ? up : null, crop, floaters, background });
   }
 
   private async copyLink(): Promise<void> {
@@ -216,6 +223,8 @@ export class Panel {
     if (viewer.splats !== null) viewer.settle(viewer.splats);
     [viewer.pose, viewer.image, viewer.fit] = [view.pose, view.lens, view.fit];
     if (view.up !== null) viewer.chooseUp(view.up);
+    [viewer.crop, viewer.floaters, viewer.background] = [view.crop, view.floaters, view.background];
+    if (this.header !== null) this.cropping.show(this.header);
     this.setMode(view.mode);
     this.setCurrent(null);
     viewer.draw();
@@ -229,14 +238,24 @@ export class Panel {
   }
 
   private save(): void {
-    const text = JSON.stringify({ format: "a2tg-jax path", version: 1, views: this.kept }, null, 1);
-    const anchor = document.createElement("a");
-    anchor.href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
-    anchor.download = "path.json";
-    anchor.click();
-    URL.revokeObjectURL(anchor.href);
+    download(JSON.stringify({ format: "a2tg-jax path", version: 1, views: this.kept }, null, 1), "path.json");
     this.kept = [];
     this.tellKept();
+  }
+
+  /** Text of what was changed; null if nothing was. */
+  private get edit(): string | null {
+    const { clip, floaters, up, isUpChosen, background } = this.viewer;
+    return textOfEdit({ clip, floaters, up: isUpChosen ? up : null, background });
+  }
+
+  private tellEdit(): void {
+    element("save-edit", HTMLButtonElement).disabled = this.edit === null;
+  }
+
+  private saveEdit(): void {
+    const text = this.edit;
+    if (text !== null) download(text, "edit.json");
   }
 
   private tellKept(): void {
@@ -257,6 +276,14 @@ export class Panel {
       panel.open = !panel.open;
     }
   }
+}
+
+function download(text: string, name: string): void {
+  const anchor = document.createElement("a");
+  anchor.href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
+  anchor.download = name;
+  anchor.click();
+  URL.revokeObjectURL(anchor.href);
 }
 
 async function toggleFullScreen(): Promise<void> {

@@ -6,7 +6,7 @@ import { projection } from "./camera";
 import type { Clip } from "./extent";
 import type { Ends } from "./format";
 import { Program, Target } from "./gl";
-import type { Vec2 } from "./math";
+import type { Vec2, Vec3 } from "./math";
 import { BATCH, MODES, SCREEN_FRAGMENT, SCREEN_VERTEX, splatFragment, splatVertex } from "./shaders";
 import type { Mode, Variant } from "./shaders";
 import type { Splats } from "./splats";
@@ -72,7 +72,7 @@ export class Renderer {
   }
 
   /** Copy the picture to the canvas. */
-  present(splats: Splats, mode: Mode, depths: Vec2, divided: number | null = null): void {
+  present(background: Vec3, mode: Mode, depths: Vec2, divided: number | null = null): void {
     const { gl, screen } = this;
     const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -83,7 +83,7 @@ export class Renderer {
     gl.bindTexture(gl.TEXTURE_2D, this.target.texture);
     gl.uniform1i(screen.at("picture"), 0);
     gl.uniform1i(screen.at("height"), height);
-    gl.uniform3fv(screen.at("background"), splats.header.background);
+    gl.uniform3fv(screen.at("background"), background);
     gl.uniform2fv(screen.at("depths"), depths);
     gl.uniform1i(screen.at("mode"), MODES.indexOf(mode));
     gl.uniform1f(screen.at("divider"), divided === null ? -1 : Math.round(divided * width));
@@ -137,13 +137,12 @@ export class Renderer {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   }
 
-  private limit(splat: Program, { axes, low, high, faintest, largest }: Clip): void {
+  private limit(splat: Program, { axes, low, high, floating }: Clip): void {
     const { gl } = this;
     gl.uniform3fv(splat.at("boxAxes"), axes.flat());
     gl.uniform3fv(splat.at("boxLow"), low);
     gl.uniform3fv(splat.at("boxHigh"), high);
-    gl.uniform1f(splat.at("faintest"), faintest);
-    gl.uniform1f(splat.at("largest"), largest);
+    gl.uniform1f(splat.at("floating"), floating);
   }
 
   private drawPart(splats: Splats, shown: Shown, { mode, from, to }: Part, start: number, end: number): void {

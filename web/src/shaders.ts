@@ -71,7 +71,7 @@ uniform vec3 center;
 uniform vec2 size;
 uniform float nearPlane, peak;
 uniform vec3 boxAxes[3], boxLow, boxHigh;
-uniform float faintest, largest;
+uniform float floating;
 uniform vec2 scaleEnds, quatEnds, opacityEnds, shapeEnds, harmonicEnds[4];
 
 flat out vec4 axes;
@@ -209,6 +209,7 @@ void main() {
   vec3 inBox = vec3(dot(boxAxes[0], position), dot(boxAxes[1], position), dot(boxAxes[2], position));
   if (any(lessThan(inBox, boxLow)) || any(greaterThan(inBox, boxHigh))) return;
   uvec4 second = wordsAt(rows, 2u * row + 1u);
+  if (float(second.z >> 24) > floating) return;
   float opacity = values(second.x, opacityEnds).a;
   float cutoff = 2.0 * log(255.0 * opacity * peak);
   if (mode == ELLIPSES) cutoff = opacity < 0.02 ? 0.0 : 2.0;
@@ -219,7 +220,6 @@ void main() {
   }
 
   vec2 scales = exp(values(second.y, scaleEnds).xy);
-  if (opacity < faintest || max(scales.x, scales.y) > largest) return;
   mat3 R = rotationOf(values(second.x, quatEnds).xyz);
   vec3 M[3];
   for (int i = 0; i < 3; i++) {
@@ -247,7 +247,7 @@ void main() {
   vec4 base = values(first.w, harmonicEnds[0]);
   vec3 color = colorOf(base.rgb, second.w, int(second.y >> 26), normalize(position - center));
   uvec2 sides = uvec2(second.y >> 16, second.y >> 21) & 31u;
-  region = uvec3(second.z, sides);
+  region = uvec3(second.z & 0xffffffu, sides);
   if (sides.x == 0u) region.yz = uvec2(0);
   own = vec3(0.0);
   if (isTextured && isClamped && region.y == 1u && region.z == 1u) {

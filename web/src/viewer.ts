@@ -59,6 +59,8 @@ export class Viewer implements Steered {
   crop: Crop = WHOLE;
   /** Strictness with which floaters are hidden, 0 to 1. */
   floaters = 0;
+  /** The background that the user has chosen; null shows the scene's own. */
+  background: Vec3 | null = null;
   mode: Mode = "full";
   /** Share of the width left of which textures are shown; null shows them everywhere. */
   divided: number | null = null;
@@ -193,7 +195,7 @@ export class Viewer implements Steered {
     return found;
   }
 
-  private get clip(): Clip {
+  get clip(): Clip {
     const extent = this.splats === null ? UNIT : extentOf(this.splats.header.means);
     return clipOf(extent, this.up, this.crop, this.floaters);
   }
@@ -262,7 +264,7 @@ export class Viewer implements Steered {
   private present(splats: Splats, { lens: { width, height } }: Shown): void {
     const { canvas } = this;
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    this.renderer.present(splats, this.mode, this.depths, this.divided);
+    this.renderer.present(this.background ?? splats.header.background, this.mode, this.depths, this.divided);
     this.onFrame();
   }
 
@@ -278,7 +280,8 @@ export class Viewer implements Steered {
   }
 }
 
-/** Return the vertical of the cameras of a scene; without cameras −y, as in most point clouds. */
-function verticalOfScene({ cameras }: Header): Vec3 {
+/** Return the vertical that a scene says or its cameras have; without cameras −y, as in most point clouds. */
+function verticalOfScene({ cameras, up }: Header): Vec3 {
+  if (up !== null) return up;
   return cameras.length === 0 ? [0, -1, 0] : verticalOf(cameras.map(({ viewmat }) => poseOf(viewmat, 1).rotation));
 }

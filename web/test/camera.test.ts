@@ -3,6 +3,8 @@ import { expect, test } from "vitest";
 import { aimed, dollied, fitted, moved, orbited, overview, poseOf, projection, target, viewmatOf } from "../src/camera";
 import type { Lens, Pose } from "../src/camera";
 import type { Extent } from "../src/extent";
+import { WHOLE } from "../src/extent";
+import type { Crop } from "../src/extent";
 import { linkOf, viewOf } from "../src/link";
 import { cross, dot, norm, orthonormal, subtract } from "../src/math";
 import type { Row4, Vec3 } from "../src/math";
@@ -115,14 +117,20 @@ test.each([
 });
 
 test("links preserve a view", () => {
-  const view = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "depth", fit: "close", up: [0, 0.6, 0.8] }));
+  const crop: Crop = { from: [0, 0.25, 0], to: [1, 1, 0.5] };
+  const edit = { crop, floaters: 0.3, background: [1, 0.5, 0] as const };
+  const view = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "depth", fit: "close", up: [0, 0.6, 0.8], ...edit }));
+  expect([view?.crop, view?.floaters, view?.background]).toEqual([crop, 0.3, [1, 0.5, 0]]);
   expect(view?.mode).toBe("depth");
   expectClose(view?.pose.position ?? [], POSE.position, 5);
   expectClose(view?.pose.rotation.flat() ?? [], POSE.rotation.flat(), 5);
   expect(view?.lens).toEqual(LENS);
   expect([view?.fit, view?.up]).toEqual(["close", [0, 0.6, 0.8]]);
-  const plain = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "full", fit: "whole", up: null }));
-  expect([plain?.fit, plain?.up]).toEqual(["whole", null]);
+  const none = { crop: WHOLE, floaters: 0, background: null };
+  const link = linkOf({ pose: POSE, lens: LENS, mode: "full", fit: "whole", up: null, ...none });
+  const plain = viewOf(link);
+  expect([plain?.fit, plain?.up, plain?.crop]).toEqual(["whole", null, WHOLE]);
+  expect(viewOf(`${link}&crop=0,0,2,1,1,1&floaters=x&background=1,1`)).toEqual(plain);
 });
 
 test.each([

@@ -1,0 +1,72 @@
+"""How much each Gaussian looks like a floater: in front of everything else, alone, and seen by few cameras (host)."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from a2tg_jax.core.similarity import camera_centers
+
+NUM_NEIGHBOURS = 8
+MOST_CAMERAS = 64
+"""Largest number of cameras that are asked, evenly chosen."""
+CELLS = 12
+"""Number of cells along each side of a picture, each with its own typical depth."""
+FEWEST = 8
+"""Number of Gaussians in a cell that count as much as the whole picture does."""
+FREE, LARGEST = 0.5, 2.5
+"""Octaves that do not count, which nine of ten Gaussians of a surface have at most, and those of the largest score."""
+LEAST_DEPTH = 1e-6
+
+
+def floater_scores(
+    means: np.ndarray, log_scales: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray
+) -> np.ndarray:
+    """Return scores [N] as bytes, from 0, on a surface, to 255. Opacities do not matter.
+
+    Three signs are logarithms to base 2, at least 0. In front: the quadratic mean, over the cameras, of the typical
+    depth around a Gaussian in the picture over its own. Alone: the gap to the nearest Gaussians, as an angle seen from
+    the nearest camera, over the scene's median. Seen by few: the median number of cameras over the Gaussian's. The
+    score grows with √(front · (alone + seen by few)): objects are in front of their background, but not alone, and a
+    sparse background is alone, but not in front.
+
+    Args:
+      means: [N, 3] positions.
+      log_scales: [N, 2].
+      viewmats, Ks, sizes: [V, 4, 4], [V, 3, 3] and [V, 2] of the cameras; without cameras only gaps count.
+    """
+    if len(means) < 2:
+        return np.zeros(len(means), np.uint8)
+    means, few = np.asarray(means, np.float64), slice(None, None, -(-len(viewmats) // MOST_CAMERAS) or 1)
+    distances, ids = cKDTree(means).query(means, k=min(NUM_NEIGHBOURS, len(means) - 1) + 1)
+    # A gap ends where the neighbour begins; the own size does not fill it, since floaters are large.
+    reach = np.exp(np.asarray(log_scales, np.float64).mean(axis=1))
+    gaps = np.maximum(distances - reach[ids], 0.1 * distances)[:, 1:].mean(axis=1)
+    if not len(viewmats):
+        return _bytes_of(_octaves_over_median(gaps))
+    num_views, front = np.zeros(len(means)), np.zeros(len(means))
+    for viewmat, K, (width, height) in zip(viewmats[few], Ks[few], sizes[few], strict=True):
+        x, y, depth = viewmat[:3, :3] @ means.T + viewmat[:3, 3:]
+        before = np.flatnonzero(depth > LEAST_DEPTH)
+        column, row, _ = K @ np.stack([x[before], y[before], depth[before]]) / depth[before]
+        is_seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        seen, octaves = before[is_seen], np.log2(depth[before[is_seen]])
+        cell = (column[is_seen] / width * CELLS).astype(int) + CELLS * (row[is_seen] / height * CELLS).astype(int)
+        # A cell of few is mostly floaters.
+        picture = FEWEST * octaves.mean() if len(octaves) else 0.0
+        typical = (np.bincount(cell, octaves) + picture) / (np.bincount(cell) + FEWEST)
+        num_views[seen] += 1
+        front[seen] += np.maximum(typical[cell] - octaves, 0) ** 2
+    front = np.sqrt(front / np.maximum(num_views, 1))
+    away, _ = cKDTree(camera_centers(viewmats)).query(means)
+    angles = gaps / np.maximum(away, LEAST_DEPTH)
+    unseen = np.log2(np.maximum(max(np.median(num_views), 1.0) / np.maximum(num_views, 0.5), 1.0))
+    return _bytes_of(np.sqrt(front * (_octaves_over_median(angles) + unseen)))
+
+
+def _octaves_over_median(values: np.ndarray) -> np.ndarray:
+    # The median of copies at one place is 0.
+    typical = np.median(values) or values.max() or 1.0
+    return np.log2(np.maximum(values / typical, 1.0))
+
+
+def _bytes_of(octaves: np.ndarray) -> np.ndarray:
+    return np.rint(255 * np.clip((octaves - FREE) / (LARGEST - FREE), 0, 1)).astype(np.uint8)

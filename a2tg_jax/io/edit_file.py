@@ -1,0 +1,132 @@
+"""Edits as JSON: what the viewer hides, turns and colours, applied to a model for all other files."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from a2tg_jax.core.floaters import floater_scores
+from a2tg_jax.core.origin import Color, Origin
+from a2tg_jax.core.similarity import Similarity, check_similarity
+from a2tg_jax.host.json_text import MOST_BYTES, parse_json
+from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.host.text import shortened
+from a2tg_jax.model import Model
+
+FORMAT, VERSION = "a2tg-jax edit", 1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Box:
+    """Box of a crop, in the model's world: low ≤ axes · x ≤ high."""
+
+    axes: np.ndarray
+    """[3, 3] rotation; its rows are the directions of the sides."""
+    low: np.ndarray
+    """[3], −inf where nothing is cut."""
+    high: np.ndarray
+    """[3], inf where nothing is cut."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Edit:
+    """Changes of a model, in its own world. Those that are None change nothing."""
+
+    crop: Box | None = None
+    """Box outside of which Gaussians are removed, by their centres."""
+    floaters: float = 0.0
+    """Strictness from 0, which keeps all, to 1 with which floaters are removed."""
+    up: np.ndarray | None = None
+    """[3] unit vertical."""
+    background: Color | None = None
+
+
+def load_edit(path: Path) -> Edit:
+    """Return the edit of a file that the viewer saved. FileNotFoundError: there is no such file. ValueError, naming the
+    file: it is invalid."""
+    path = Path(path)
+    if not is_regular(path):
+        raise FileNotFoundError(f"{path}: no such edit; the viewer's 'Save edit' makes one")
+    try:
+        data = parse_json(read_regular(path, MOST_BYTES))
+        if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
+            raise ValueError(f"is not an edit of version {VERSION} that the viewer saved")
+        if unknown := sorted(set(data) - {"format", "version", "crop", "floaters", "up", "background"}):
+            raise ValueError(f"has the unknown entry {shortened(unknown[0])}")
+        return _edit_of(data)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _edit_of(data: dict[str, Any]) -> Edit:
+    floaters = data.get("floaters", 0.0)
+    if type(floaters) not in (int, float) or not 0 <= floaters <= 1:
+        raise ValueError(f"floaters must be a number from 0 to 1; got {shortened(floaters)}")
+    crop, up, background = data.get("crop"), data.get("up"), data.get("background")
+    if crop is not None:
+        if not isinstance(crop, dict):
+            raise ValueError(f"crop must be an object; got {shortened(crop)}")
+        rows = crop.get("axes", np.eye(3).tolist())
+        if not isinstance(rows, list) or len(rows) != 3:
+            raise ValueError(f"crop.axes must be 3 directions; got {shortened(rows)}")
+        axes = np.stack([_numbers("crop.axes", row) for row in rows])
+        check_similarity(Similarity(1.0, axes, np.zeros(3)), "crop.axes")
+        low, high = _numbers("crop.low", crop.get("low"), -math.inf), _numbers("crop.high", crop.get("high"), math.inf)
+        crop = Box(axes, low, high)
+    if up is not None:
+        up = _numbers("up", up)
+        if not np.linalg.norm(up) > 0:
+            raise ValueError("up must not be zero")
+        up = up / np.linalg.norm(up)
+    if background is not None:
+        red, green, blue = _numbers("background", background).tolist()
+        background = (red, green, blue)
+    return Edit(crop, float(floaters), up, background)
+
+
+def _numbers(name: str, values: object, instead: float | None = None) -> np.ndarray:
+    """Return three numbers; `instead` stands for null, if it is given."""
+    kinds = (int, float) if instead is None else (int, float, type(None))
+    if not isinstance(values, list) or len(values) != 3 or not all(type(x) in kinds for x in values):
+        raise ValueError(f"{name} must be 3 numbers{'' if instead is None else ' or null'}; got {shortened(values)}")
+    return np.array([instead if x is None else x for x in values], np.float64)
+
+
+def scores_of(model: Model) -> np.ndarray:
+    """Return `floater_scores` of the Gaussians that exist."""
+    gaussians, origin = model.live.gaussians, model.origin or Origin.of_cameras([])
+    cameras = (origin.viewmats, origin.Ks, origin.sizes)
+    return floater_scores(np.asarray(gaussians.means), np.asarray(gaussians.log_scales), *cameras)
+
+
+def apply_edit(model: Model, edit: Edit) -> Model:
+    """Return an edited model: without the Gaussians outside the box and the floaters, with another vertical and
+    background (host).
+
+    The vertical changes no number of the model. Files of other programs, meshes, orbits and the viewer are upright by
+    it.
+
+    Raises:
+      ValueError: if no Gaussian would be left.
+    """
+    model = model.live
+    is_kept = np.ones(model.num, bool)
+    if edit.floaters > 0:
+        is_kept &= scores_of(model) <= largest_score(edit.floaters)
+    if edit.crop is not None:
+        places = np.asarray(model.gaussians.means, np.float64) @ edit.crop.axes.T
+        is_kept &= ((places >= edit.crop.low) & (places <= edit.crop.high)).all(axis=1)
+    if model.num and not is_kept.any():
+        raise ValueError(f"the edit would remove all {model.num:,} Gaussians: widen its crop, or lower its floaters")
+    model = model if is_kept.all() else model[is_kept]
+    if edit.up is not None:
+        origin = model.origin or Origin.of_cameras([])
+        model = dataclasses.replace(model, origin=dataclasses.replace(origin, up=edit.up))
+    return model if edit.background is None else dataclasses.replace(model, background=edit.background)
+
+
+def largest_score(strictness: float) -> float:
+    """Return the largest score of a floater that is kept."""
+    return 255 * (1 - strictness)

@@ -1,0 +1,148 @@
+"""Edits of the viewer: what they keep, and where they are applied."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from small_values import some_gaussians
+from test_upright import captured
+from viewer_cases import small_model
+
+import a2tg_jax as a2tg
+from a2tg_jax.cli.main import main
+from a2tg_jax.core.camera_paths import turntable
+from a2tg_jax.core.floaters import floater_scores
+from a2tg_jax.core.similarity import Similarity, camera_centers
+from a2tg_jax.io.columns import decode
+from a2tg_jax.io.compact import decode_model, unframed
+from a2tg_jax.io.edit_file import scores_of
+from a2tg_jax.io.web_scene import encode_web_scene
+
+NOWHERE = Similarity(1.0, np.eye(3), np.zeros(3))
+TILTED = Rotation.from_euler("xy", [25, 10], degrees=True).as_matrix()
+EDIT = {"format": "a2tg-jax edit", "version": 1}
+
+
+def edit_file(folder, **changes):
+    path = folder / "edit.json"
+    path.write_text(json.dumps(EDIT | changes))
+    return path
+
+
+def test_a_crop_keeps_what_is_in_the_box(tmp_path):
+    """Turned, with open sides; textures and cameras stay with their Gaussians."""
+    model = small_model()
+    crop = {"axes": TILTED.tolist(), "low": [None, -0.5, None], "high": [0.4, None, None]}
+    edited = a2tg.apply_edit(model, a2tg.load_edit(edit_file(tmp_path, crop=crop, background=[1, 0, 0.5])))
+    x, y, _ = TILTED @ np.asarray(model.gaussians.means).T
+    wanted = model[(x <= 0.4) & (y >= -0.5)]
+    assert 0 < wanted.num < model.num
+    np.testing.assert_array_equal(edited.gaussians.means, wanted.gaussians.means)
+    np.testing.assert_array_equal(edited.textures.sizes, wanted.textures.sizes)
+    assert (edited.background, edited.origin) == ((1, 0, 0.5), model.origin)
+    with pytest.raises(ValueError, match="the edit would remove all 300 Gaussians"):
+        a2tg.apply_edit(model, a2tg.load_edit(edit_file(tmp_path, crop={"low": [50, None, None], "high": [None] * 3})))
+
+
+def test_floaters_are_what_floats_not_what_is_faint():
+    """A wall that is sparse, large and faint stays; small opaque needles before it go."""
+    model, rng = captured(NOWHERE), np.random.default_rng(0)
+    floor = np.concatenate([rng.uniform(-1, 1, (400, 2)), rng.normal(0, 0.01, (400, 1))], axis=1)
+    wall = np.concatenate([rng.uniform(-6, 6, (60, 2)), rng.normal(-3, 0.1, (60, 1))], axis=1)
+    centers = camera_centers(model.origin.viewmats)
+    needles = np.repeat(centers, 2, axis=0)[:20] * rng.uniform(0.6, 0.85, (20, 1)) + rng.normal(0, 0.1, (20, 3))
+    means = np.concatenate([floor, wall, needles])
+    log_scales = np.repeat(np.log([0.05, 1.0, 0.02]), [400, 60, 20])[:, None] * np.ones(2)
+    cameras = (model.origin.viewmats, model.origin.Ks, model.origin.sizes)
+    scores = floater_scores(means, log_scales, *cameras)
+    assert scores[-20:].min() > 26 > scores[:-20].max()
+    logits = np.where(np.arange(480) < 460, -3.0, 3.0)  # An opacity of 0.05, and 0.95 of the needles.
+    gaussians = some_gaussians(480)
+    arrays = {"means": means, "log_scales": log_scales, "logit_opacities": logits}
+    gaussians = dataclasses.replace(gaussians, **{name: jnp.asarray(x, jnp.float32) for name, x in arrays.items()})
+    edited = a2tg.apply_edit(a2tg.Model(gaussians, origin=model.origin), a2tg.Edit(floaters=0.9))
+    np.testing.assert_array_equal(edited.gaussians.means, gaussians.means[:460])
+
+
+def test_scores_of_few_or_equal_gaussians():
+    """Without cameras the one far away floats."""
+    nothing = (np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), np.zeros((0, 2)))
+    assert floater_scores(np.zeros((1, 3)), np.zeros((1, 2)), *nothing).tolist() == [0]
+    assert floater_scores(np.zeros((30, 3)), np.full((30, 2), -9.0), *nothing).max() == 0
+    cloud = np.concatenate([np.random.default_rng(0).uniform(size=(200, 3)), [[9.0, 9.0, 9.0]]])
+    scores = floater_scores(cloud, np.full((201, 2), -5.0), *nothing)
+    assert scores[-1] == 255 > 4 * np.median(scores)
+
+
+def test_the_viewers_file_has_the_same_scores_and_the_vertical():
+    model = a2tg.apply_edit(small_model(), a2tg.Edit(up=np.array([0.0, 0.6, 0.8])))
+    header, body = unframed(data := encode_web_scene(model))
+    scores, start = [], 0
+    for name, coder, length in header["parts"]:
+        if name == "floaters":
+            count = min(header["chunk"], 300 - sum(map(len, scores)))
+            scores.append(decode(coder, body[start : start + length], 1, count)[0])
+        start += length
+    np.testing.assert_array_equal(np.sort(np.concatenate(scores)), np.sort(scores_of(model)))
+    assert header["origin"]["up"] == [0.0, 0.6, 0.8]
+    assert decode_model(data).origin == model.origin
+
+
+def test_a_chosen_vertical_turns_files_and_orbits_but_no_number(tmp_path):
+    model, up = captured(NOWHERE), TILTED @ [0, 0, 1]
+    edited = a2tg.apply_edit(model, a2tg.Edit(up=up))
+    np.testing.assert_array_equal(edited.gaussians.sh, model.gaussians.sh)
+    for suffix in (".npz", ".a2tgz", ".glb"):
+        a2tg.save_splats(tmp_path / f"m{suffix}", edited)
+        np.testing.assert_allclose(a2tg.load_splats(tmp_path / f"m{suffix}").origin.up, up, atol=1e-12)
+    turned = edited.transform(Similarity(2.0, TILTED.T, np.ones(3)))
+    np.testing.assert_allclose(turned.origin.vertical, [0, 0, 1], atol=1e-12)
+    a2tg.save_ply(tmp_path / "m.ply", edited, world="upright")
+    found = a2tg.load_splats(tmp_path / "m.ply")
+    np.testing.assert_allclose(found.origin.transform.rotation @ up, [0, -1, 0], atol=1e-12)
+    glb = (tmp_path / "m.glb").read_bytes()
+    described = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
+    matrix = np.reshape(described["nodes"][0]["matrix"], (4, 4)).T
+    np.testing.assert_allclose(matrix[:3, :3] @ up, [0, 1, 0], atol=1e-12)
+    orbit = turntable(edited.origin.cameras, 8, edited.origin.up)
+    np.testing.assert_allclose([camera.viewmat[0, :3] @ up for camera in orbit], 0, atol=1e-6)
+
+
+def test_commands_take_an_edit(tmp_path, capsys):
+    a2tg.save_model(tmp_path / "m.npz", captured(NOWHERE))
+    means = np.asarray(captured(NOWHERE).gaussians.means)
+    path = edit_file(tmp_path, crop={"low": [0, None, None], "high": [None] * 3}, up=(TILTED @ [0, 0, 1]).tolist())
+    words = ["convert", str(tmp_path / "m.npz"), str(tmp_path / "n.npz"), "--edit", str(path)]
+    assert main(words) == 0
+    edited = a2tg.load_model(tmp_path / "n.npz")
+    np.testing.assert_array_equal(edited.gaussians.means, means[means[:, 0] >= 0])
+    outputs = ["--web", str(tmp_path / "site"), "--ply", str(tmp_path / "n.ply")]
+    assert main(["export", str(tmp_path / "m.npz"), *outputs, "--edit", str(path)]) == 0
+    assert "the original one turned by" in capsys.readouterr().out
+    page = decode_model((tmp_path / "site" / "scene.a2tgz").read_bytes())
+    assert a2tg.load_ply(tmp_path / "n.ply").num == page.num == edited.num
+    assert page.origin == edited.origin
+    assert main([*words[:2], str(tmp_path / "o.npz"), "--edit", str(tmp_path / "none.json")]) == 2
+    assert "no such edit; the viewer's 'Save edit' makes one" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"version": 2}, "is not an edit of version 1"),
+        ({"floaters": 1.5}, "floaters must be a number from 0 to 1; got 1.5"),
+        ({"floaters": True}, "floaters must be a number"),
+        ({"crop": [1]}, "crop must be an object"),
+        ({"crop": {"low": [1, 2], "high": [None] * 3}}, "crop.low must be 3 numbers or null"),
+        ({"crop": {"axes": [[1, 0, 0]] * 3, "low": [0] * 3, "high": [1] * 3}}, "crop.axes must have a rotation"),
+        ({"up": [0, 0, 0]}, "up must not be zero"),
+        ({"background": [1, 2, None]}, "background must be 3 numbers"),
+        ({"crops": {}}, "has the unknown entry crops"),
+    ],
+)
+def test_invalid_edits_are_refused(tmp_path, changes, message):
+    with pytest.raises(ValueError, match=f"edit.json: .*{message}"):
+        a2tg.load_edit(edit_file(tmp_path, **changes))
