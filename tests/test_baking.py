@@ -7,6 +7,7 @@ import sys
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from run_folders import create_run
 from small_values import some_gaussians
 
 from a2tg_jax import (
@@ -25,10 +26,13 @@ from a2tg_jax.appearance.parts import bands_of_dense, curves_of, falloff_of, nea
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import WHITE, Origin
+from a2tg_jax.data.load import SceneSource
 from a2tg_jax.finish import baking
 from a2tg_jax.finish.baking import as_plain, bake, distill, drawn_scene, kernels, likeness, pictures, split_splats
 from a2tg_jax.finish.shrinking import fewest_texels
 from a2tg_jax.results import conversion
+from a2tg_jax.results.record import RunRecord, write_record
+from a2tg_jax.systems.a2tg import A2tg
 
 CAMERA = Camera(jnp.eye(4).at[2, 3].set(4), jnp.asarray([[60.0, 0, 24], [0, 60, 18], [0, 0, 1]]), 48, 36)
 
@@ -195,6 +199,35 @@ def test_convert_bakes(tmp_path, capsys):
     assert load_splats(tmp_path / "b.ply").num > 3
     assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.ply"), "--bake"]) == 2
     assert "needs a model with cameras" in capsys.readouterr().err
+
+
+def test_a_bake_of_a_run_is_kept(tmp_path, monkeypatch, capsys):
+    """It is used again for the same model and options only."""
+    run, model, baked = create_run(tmp_path / "run"), textured(), []
+    system = A2tg(stage1_iterations=1, stage2_iterations=1)
+    write_record(run, RunRecord(SceneSource("/scene"), "a2tg", system))
+    save_model(run.own(run.model("a2tg-textures")), model)
+
+    def once(*arguments, **options):
+        baked.append(options)
+        return bake(*arguments, **options | {"progress": False})
+
+    monkeypatch.setattr(conversion, "bake", once)
+
+    def converts(name, *options):
+        words = ["convert", str(run.path), str(tmp_path / name), "--bake", "--bake-iterations", "0", *options]
+        assert main(words) == 0
+        return capsys.readouterr().out.splitlines()[0]
+
+    first, again = converts("a.ply"), converts("b.npz")
+    assert again == f"{first}; kept in {run.baked('a2tg-textures')}" and len(baked) == 1
+    assert load_splats(tmp_path / "b.npz").num == load_splats(tmp_path / "a.ply").num
+    converts("c.ply", "--bake-growth", "1.5")
+    save_model(run.model("a2tg-textures"), model.with_sh(model.sh + 0.1))
+    converts("d.ply", "--bake-growth", "1.5")
+    run.baked("a2tg-textures").write_bytes(b"damaged")
+    converts("e.ply", "--bake-growth", "1.5")
+    assert len(baked) == 4 and "baked/a2tg-textures.npz" in run.written()
 
 
 @pytest.mark.parametrize(("name", "reason"), [("b.sog", "pip install"), ("b.pt", "can be read, but not written")])

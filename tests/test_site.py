@@ -9,6 +9,7 @@ import pytest
 import site_pages
 
 import a2tg_jax as a2tg
+from a2tg_jax.cli.flags import FLAGS
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -36,6 +37,13 @@ def test_the_table_of_the_reference_has_the_names_of_its_pages():
 def test_the_page_of_options_is_current():
     written = (DOCS / "options.md").read_text(encoding="utf-8")
     assert options.page() == written, "run python docs/scripts/options.py"
+
+
+def test_the_flags_of_commands_are_those_of_the_page():
+    written = (DOCS / "options.md").read_text(encoding="utf-8")
+    found: dict[str, str] = {}
+    exec(options.flags_module(written), found)
+    assert found["FLAGS"] == FLAGS, "run python docs/scripts/options.py"
 
 
 def test_options_beside_those_of_other_programs_exist():

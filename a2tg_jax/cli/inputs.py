@@ -31,7 +31,8 @@ class Sfm:
     The scene folder gets images, sparse points and cameras.png, which shows where the cameras are.
 
     Examples:
-      a2tg sfm photos/fox scenes/fox && a2tg train scenes/fox --out runs/fox --preset quick --downscale 4
+      a2tg sfm photos/fox scenes/fox
+      a2tg train scenes/fox --out runs/fox --system bytewise --preset quick --downscale 4
       a2tg sfm fox.mp4 scenes/fox --frames 200
       a2tg sfm photos/phone photos/drone --out scenes/house
       a2tg sfm photos/fox/00*.jpg scenes/fox
@@ -82,7 +83,7 @@ class Sfm:
             f"mean reprojection error {found.mean_error:.2f} pixels"
         )
         run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
-        command = f"{shlex.join(run)} {quick_flags(found.longest_side)}"
+        command = f"{shlex.join(run)} --system bytewise {quick_flags(found.longest_side)}"
         print(f"cameras: {out / CAMERA_PICTURE}\nscene: {out}; continue with: {command}")
 
     def _places(self) -> tuple[list[Path], Path]:

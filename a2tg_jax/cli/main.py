@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
+from a2tg_jax.cli.flags import FLAGS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.startup import configure_cpu
@@ -25,7 +26,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg demo                            train a built-in scene, about a minute on two cores
   a2tg sfm photos/ scene/              find camera poses for photographs or a video with COLMAP
   a2tg download --list                 benchmark data sets that can be downloaded
-  a2tg train scene/ --out runs/scene --preset quick --downscale 4
+  a2tg train scene/ --out runs/scene --system bytewise --preset quick --downscale 4
                                        train a scene in minutes, evaluate it, write a report
   a2tg eval runs/scene                 evaluate a run again
   a2tg finish runs/scene --out runs/f  shrink and polish the trained model, in a new run folder
@@ -72,6 +73,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in (*COMMANDS, "-h", "--help", "--version"):
         near = did_you_mean(name, COMMANDS)
         return _fail(f"there is no command {name!r}{near or ';'} the commands are {', '.join(COMMANDS)}")
+    if name in COMMANDS and (error := _misspelt_flag(name, arguments)):
+        return _fail(error)
     try:
         if name not in COMMANDS:
             print(version("a2tg-jax") if name == "--version" else OVERVIEW, flush=True)
@@ -112,6 +115,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         is_typed = any(word.partition("=")[0] == flag for word in arguments)
         return _fail(f"{flag}{space}{rest}" if is_typed else text)
     return 0
+
+
+def _misspelt_flag(name: str, arguments: Sequence[str]) -> str | None:
+    """Return an error for the first flag that a command lacks; None if there is none, or custom systems may have it."""
+    known = {"help", "help-all", *FLAGS[name].split()}
+    given = [word.partition("=")[0][2:].replace("_", "-") for word in arguments if word.startswith("--")]
+    # A configuration file may name one.
+    is_custom = {"config", "resume"} & set(given) or any(":" in word for word in arguments)
+    if name == "train" and is_custom:
+        return None
+    for flag in given:
+        if flag not in known and re.sub(r"(^|\.)no-", r"\1", flag) not in known:
+            near = did_you_mean(flag, known)
+            hint = near.replace("did you mean ", "did you mean --") if near else f"; a2tg {name} --help lists them"
+            return f"a2tg {name} has no option --{flag}{hint}"
+    return None
 
 
 def command_class(name: str) -> Any:

@@ -358,8 +358,8 @@ class Compress:
     """Write the smallest file of a model within a given loss of PSNR.
 
     The loss is measured on at most 16 training views. If the photographs are missing, it is estimated from renders, for
-    a model of 30 dB. A table lists the loss and the bytes of each choice of bits. This takes minutes on a CPU. With
-    --tune-iterations the model is trained further while its numbers are rounded, so that fewer bits suffice.
+    a model of 30 dB. This takes minutes on a CPU. With --tune-iterations the model is trained further while its numbers
+    are rounded, so that fewer bits suffice.
 
     Examples:
       a2tg compress runs/fox
@@ -379,10 +379,20 @@ class Compress:
     0: numbers are only rounded."""
     overwrite: bool = False
     """Replace the output file. A file that a2tg compress wrote into a run folder is always replaced."""
+    verbose: bool = False
+    """Print a table of the loss and the bytes of each choice of bits."""
 
     def run(self) -> None:
-        turns = self.tune_iterations
-        print(compress(self.source, self.out, max_loss=self.max_loss, tune_iterations=turns, overwrite=self.overwrite))
+        print(
+            compress(
+                self.source,
+                self.out,
+                max_loss=self.max_loss,
+                tune_iterations=self.tune_iterations,
+                overwrite=self.overwrite,
+                verbose=self.verbose,
+            )
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Color
 from a2tg_jax.data import View, view_image
 from a2tg_jax.data.scene import check_are_views
+from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.columns import Precision
 from a2tg_jax.io.compact import CompactChoices, decode_model, encode_model
 from a2tg_jax.model import Model, check_is_model
@@ -145,26 +146,29 @@ def finest_choices(ladder: Ladder = LADDER) -> CompactChoices:
     return CompactChoices().keeping({group: steps[-1] for group, steps in ladder.items()})
 
 
-def measure_choices(model: Model, losses: Sequence[Loss], ladder: Ladder = LADDER) -> list[Trial]:
+def measure_choices(
+    model: Model, losses: Sequence[Loss], ladder: Ladder = LADDER, *, progress: bool = False
+) -> list[Trial]:
     """Return sizes and losses of each step of each group, with the other groups at their finest (host).
 
     Args:
       model: the model.
       losses: measures of loss.
       ladder: steps of groups, from coarse to fine.
+      progress: show a progress bar.
 
     Returns:
       Trials from coarse to fine, for each group that the model has.
     """
     finest = finest_choices(ladder)
-    trials = []
+    tried: list[tuple[str, Precision]] = []
     for group, steps in ladder.items():
         coarsest = finest.keeping({group: steps[0]})
         # Groups without numbers, such as texels of a model without textures, do not change the size.
         if len(encode_model(model, coarsest)) < 0.999 * len(encode_model(model, finest)):
-            tried = (finest.keeping({group: step}) for step in steps)
-            trials += [try_choices(model, choices, losses, group) for choices in tried]
-    return trials
+            tried += [(group, step) for step in steps]
+    shown = progress_over(tried, "rounding", "way", is_shown=progress)
+    return [try_choices(model, finest.keeping({group: step}), losses, group) for group, step in shown]
 
 
 class TooMuchLostError(ValueError):

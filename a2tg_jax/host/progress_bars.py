@@ -1,5 +1,6 @@
 """Progress over items: a bar on a terminal; elsewhere plain lines, at most one per tenth and per three seconds."""
 
+import datetime
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -49,15 +50,24 @@ class PlainCounter:
 
     def __init__(self, title: str, total: int | None):
         self._title, self._total, self._done = title, total, 0
-        self._last_line = 0, time.perf_counter()
+        self._began = time.perf_counter()
+        self._last_line = 0, self._began
 
     def update(self, num: int = 1) -> None:
         """Count items."""
         self._done += num
         if is_line_due(self._done, self._total or 0, *self._last_line):
             of_total = f" of {self._total:,}" if self._total else ""
-            print(f"{self._title}: {self._done:,}{of_total}", file=sys.stderr, flush=True)
+            print(f"{self._title}: {self._done:,}{of_total}{self._left}", file=sys.stderr, flush=True)
             self._last_line = self._done, time.perf_counter()
+
+    @property
+    def _left(self) -> str:
+        """Remaining time in words; empty at the end, or if the total is not known."""
+        if self._total is None or self._done >= self._total:
+            return ""
+        seconds = (time.perf_counter() - self._began) / self._done * (self._total - self._done)
+        return f", about {datetime.timedelta(seconds=round(seconds))} left"
 
 
 def is_line_due(done: int, total: int, printed: int, at: float) -> bool:

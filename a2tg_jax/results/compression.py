@@ -43,8 +43,9 @@ def compress(
     max_loss: float = 0.05,
     tune_iterations: int = 0,
     overwrite: bool = False,
+    verbose: bool = False,
 ) -> str:
-    """Write the smallest compact file of a model within a given loss, and return a table of the choices tried.
+    """Write the smallest compact file of a model within a given loss, and return a line about it.
 
     Losses are in PSNR on a run's training views. Without photographs they are estimated from renders, for a model of
     `ASSUMED_PSNR`.
@@ -56,6 +57,7 @@ def compress(
       max_loss: largest loss in dB.
       tune_iterations: iterations of training with rounding for each choice of bits that is tuned
         (`finish.tuning.smallest_tuned`); 0: the model's numbers are only rounded.
+      verbose: return a table of the choices tried before that line.
 
     Raises:
       ValueError, OSError: if the model or the photographs for tuning are missing, the file exists, a compact file
@@ -90,7 +92,7 @@ def compress(
     tunings = f", then training up to {MOST_TUNINGS} times" if tune else ""
     ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
     print(f"trying {ways}{tunings}; on a CPU this takes minutes", flush=True)
-    trials = measure_choices(model, measures, ladder)
+    trials = measure_choices(model, measures, ladder, progress=True)
     untuned, found = None, TunedFiles([])
     # Rounding alone may lose too much. With tuning, that is no error yet.
     try:
@@ -108,7 +110,8 @@ def compress(
         temporary.write_bytes(data)
     share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
     size = f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
-    return "\n".join([*_table(trials, found, chosen, losses), size])
+    lines = _table(trials, found, chosen, losses) if verbose else []
+    return "\n".join([*lines, *_ended(found), size])
 
 
 def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: Iterable[str]) -> list[str]:
@@ -123,10 +126,12 @@ def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: 
     for name, trial in named[len(trials) :]:
         kept = ", ".join(f"{group} {getattr(trial.choices, group)}" for group in GROUPS if group in groups)
         bits.append(f"{name}: {kept}")
-    if found.diverged:
-        # Before the line of the chosen file.
-        bits.insert(-1, f"tuning ended early, what was found before is kept: {found.diverged}")
     return [*aligned(list(zip(*rows, strict=True))), *bits]
+
+
+def _ended(found: TunedFiles) -> list[str]:
+    """Return a line about a tuning that ended early."""
+    return [f"tuning ended early, what was found before is kept: {found.diverged}"] if found.diverged else []
 
 
 def _smaller(model: Model, untuned: Trial | None, found: TunedFiles, max_loss: float) -> tuple[Trial, bytes]:

@@ -1,14 +1,19 @@
 """Conversion of models between file formats, and export of their Gaussians as PLY."""
 
+import contextlib
 import dataclasses
 import math
 import time
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake, likeness, pictures
+from a2tg_jax.host.regular_files import is_regular, sha256_of
 from a2tg_jax.host.text import counted, in_bytes
+from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.formats import (
     file_bytes,
     files_of,
@@ -19,10 +24,11 @@ from a2tg_jax.io.formats import (
     unseen_elsewhere,
     writer_of,
 )
+from a2tg_jax.io.model_file import FORMAT, load_model, save_model
 from a2tg_jax.io.other_programs import World, world_line
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.model import Model
-from a2tg_jax.results.folder import check_new, check_output
+from a2tg_jax.results.folder import RunFolder, check_new, check_output
 from a2tg_jax.results.model_source import Source, open_source
 
 
@@ -77,7 +83,7 @@ def convert(
         baking.check()
     start = time.perf_counter()
     opened = open_source(source, name, edit)
-    model, baked = (opened.model, "") if baking is None else _baked(source, opened.model, baking)
+    model, baked = (opened.model, "") if baking is None else _kept_or_baked(source, opened, baking, edit)
     if float64:
         save_ply(out, model, float64=True, world=world)
     else:
@@ -93,6 +99,26 @@ def convert(
     if not format_of(out).keeps_origin:
         lines.append(world_line(model, world))
     return "\n".join(lines)
+
+
+def _kept_or_baked(source: Path, opened: Source, options: BakeOptions, edit: Path | None) -> tuple[Model, str]:
+    """Return the baked model of a run that an earlier call has kept for the same model, edit and options, or else bake
+    and keep it. The models of files are baked each time."""
+    if not source.is_dir():
+        return _baked(source, opened.model, options)
+    run = RunFolder(source)
+    path = run.baked(opened.path.stem)
+    key: dict[str, Any] = {"sha256": sha256_of(opened.path), "version": version("a2tg-jax")}
+    key |= dataclasses.asdict(options) | {"edit": None if edit is None else sha256_of(edit)}
+    with contextlib.suppress(ValueError, OSError, KeyError, TypeError):  # Damaged: baked again.
+        kept = read_archive_header(path, format=FORMAT)["baked"] if is_regular(path) else {}
+        if kept.get("key") == key:
+            return load_model(path), f"{kept['line']}; kept in {path}"
+    plain, line = _baked(source, opened.model, options)
+    if plain is not opened.model:
+        with contextlib.suppress(OSError):  # A run may be read-only.
+            save_model(run.own(path), plain, {"baked": {"key": key, "line": line}})
+    return plain, line
 
 
 def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str]:

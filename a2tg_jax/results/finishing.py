@@ -11,6 +11,7 @@ from a2tg_jax.data import Scene
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.progress_bars import counting
 from a2tg_jax.host.regular_files import is_regular, sha256_of
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.measure.evaluation import evaluate
@@ -63,12 +64,17 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
         raise ValueError(f"{planned.name} shows nothing that these options can shrink or polish")
     # Raises before any work if a model that the evaluation needs is missing.
     finished_stages(source, record.plan)
-    with claimed(run):
+    # Each change is made and measured; before them the model is measured, and at the end the run.
+    num_steps = 2 + 2 * (bool(options.max_loss and can_shrink(model)) + can_polish)
+    with claimed(run), counting("finish", num_steps, "step") as counter:
         is_written = _is_written(run, content)  # Another process may have been here meanwhile.
         changed = [("finished", load_model(run.model(planned.name)))] if is_written else _changed(model, scene, options)
         models, steps = {"before": model}, {"before": _measured(model, scene, planned)}
+        counter.update()
         for name, after in changed:
+            counter.update()
             models[name], steps[name] = after, _measured(after, scene, planned)
+            counter.update()
         if not is_written:
             # A process that was killed before the record may have left files.
             run.clear()
@@ -83,6 +89,7 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
             save_model(run.own(run.model(planned.name)), models[kept_step(steps)], system)
             write_record(run, record)  # Last: it makes the folder a run.
         evaluate_run(run, scene, lpips_weights=lpips_weights)
+        counter.update()
     columns = [("", "bytes", "train PSNR (dB)", "held-out PSNR (dB)")]
     for name, found in steps.items():
         test = "" if found.test is None else f"{found.test:.2f}"

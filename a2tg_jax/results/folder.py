@@ -139,6 +139,10 @@ class RunFolder:
     def model(self, name: str) -> Path:
         return self.path / "models" / f"{name}.npz"
 
+    def baked(self, name: str) -> Path:
+        """Plain splats of a model, kept for further files."""
+        return self.path / "baked" / f"{name}.npz"
+
     def corrections(self, name: str) -> Path:
         return self.path / "corrections" / f"{name}.json"
 
