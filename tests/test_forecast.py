@@ -27,6 +27,8 @@ from a2tg_jax.results.forecast import (
     print_forecast,
     quick_flags,
     room_for_photographs,
+    time_after,
+    warn_of_small_photographs,
 )
 from a2tg_jax.results.record import RunRecord, SceneSource, plan_run
 from a2tg_jax.training import SYSTEMS, cost, reports
@@ -34,7 +36,7 @@ from a2tg_jax.training.corrections import BilateralGrid, sliced
 from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.options import Corrections
-from a2tg_jax.training.reports import Pace
+from a2tg_jax.training.reports import Ahead, Pace
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import StepSettings, jitted_step
 
@@ -345,6 +347,32 @@ def test_the_pace_counts_the_programs_ahead(seconds, dones, programs, expected):
     assert told.startswith(expected) and "Gaussians" not in told
 
 
+def test_a_downscale_that_leaves_few_pixels_is_questioned():
+    scene = a2tg.synthetic_scene(width=80, height=60)
+    with pytest.warns(
+        UserWarning, match=r"^`downscale` 40 leaves photographs of 80×60 pixels, .*: `downscale` 5 makes"
+    ):
+        warn_of_small_photographs(scene, 40)
+    warn_of_small_photographs(scene, 1)
+
+
+def test_the_pace_counts_what_follows_the_stage():
+    pace = pace_of([10.0, 12.0], may_grow=False, after=Ahead(400, 3))
+    for done in (10, 50):
+        pace.time(done, 1, 0, 5.0)
+    assert pace.left(50).total_seconds() == 82  # 1,350 iterations of 50 ms, and 3 programs of 5 s.
+    assert pace.told(50).endswith("about 0:00:48 for the other 950, without compiling; about 0:01:22 for the whole run")
+
+
+def test_a_run_is_forecast_with_its_later_stages_and_its_evaluation():
+    plan, scene = plan_run({"a2tg": a2tg.A2tg.preset("smoke")}), a2tg.synthetic_scene(width=40, height=30)
+    first, last = plan.names
+    after, alone = time_after(scene, plan, plan.names), time_after(scene, plan, [last])
+    views = len(scene.train) + len(scene.test)
+    assert alone[last] == after[last] == (2 * views, 2)
+    assert after[first].iterations > 2 * views + plan[last].stage.iterations / 2 and after[first].programs > 2
+
+
 @pytest.mark.parametrize("is_shown", [True, False])
 def test_the_pace_is_above_the_bar(capsys, monkeypatch, is_shown):
     monkeypatch.setattr(reports, "TIMED_SECONDS", 0.0)
@@ -361,7 +389,11 @@ def test_items_without_a_terminal_are_counted_in_plain_lines(capsys, monkeypatch
     monkeypatch.setattr(progress_bars, "PLAIN_SECONDS", 0.0)
     assert list(progress_bars.progress_over(list(range(25)), "frames", "frame")) == list(range(25))
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "frames: 3 of 25" and lines[-1] == "frames: 25 of 25" and len(lines) == 9
+    assert (
+        lines[0].startswith("frames: 3 of 25, about 0:00:00 left")
+        and lines[-1] == "frames: 25 of 25"
+        and len(lines) == 9
+    )
     assert list(progress_bars.progress_over([1, 2], "frames", "frame", is_shown=False)) == [1, 2]
     assert not capsys.readouterr().err
 

@@ -1,5 +1,6 @@
 """The live view of a training: snapshots, metrics, pause and resume. The result does not depend on them."""
 
+import datetime
 import json
 import threading
 import time
@@ -41,7 +42,8 @@ def stage_run():
     state = SimpleNamespace(model=textured())
     stage = SimpleNamespace(name="textures", iterations=30)
     history = History.empty().with_point(1, 20, 0.5, 17.0, 40, 1.25, 3.0)
-    return SimpleNamespace(state=state, stage=stage, history=history, system=SYSTEM)
+    left = datetime.timedelta(seconds=70)
+    return SimpleNamespace(state=state, stage=stage, history=history, system=SYSTEM, time_left=left)
 
 
 def encoded(live: LiveView) -> None:
@@ -63,7 +65,12 @@ def test_snapshots_and_figures():
     scene, _ = unframed(live.routes["/scene.a2tgz"].read())
     assert scene["page"]["title"] == "scene" and scene["num"] == run.state.model.num
     found = status(live)
-    assert (found["version"], found["stage"], found["iteration"], found["psnr"]) == (1, "textures", 20, 17.0)
+    assert (found["version"], found["stage"], found["iteration"], found["psnr"]) == (
+        1,
+        "textures, 0:01:10 left in all",
+        20,
+        17.0,
+    )
     assert found["bytes"] == 1.25e6 and not found["is_paused"]
     live(run, never)
     clock.seconds = SECONDS - 0.1

@@ -55,7 +55,15 @@ from a2tg_jax.results.record import (
     repeating_command,
     write_record,
 )
-from a2tg_jax.results.report import bytes_compared, metrics_json, minutes, per_view_json, photographs_line, summary_text
+from a2tg_jax.results.report import (
+    bytes_compared,
+    metrics_json,
+    minutes,
+    per_view_json,
+    photographs_line,
+    sizes_line,
+    summary_text,
+)
 from a2tg_jax.results.run_evaluation import check_held_out, evaluate_run
 from a2tg_jax.results.run_training import RunOptions, train_run
 from a2tg_jax.systems.a2tg import A2tg
@@ -190,7 +198,9 @@ def test_new_folders_on_several_levels_elsewhere_are_reported(tmp_path, monkeypa
 
 def test_a_budget_for_few_gaussians_is_reported():
     assert not a2tg.A2tg(memory_budget="1MB").small_budget and not a2tg.A2tg().small_budget
-    assert a2tg.A2tg(memory_budget="1kB").small_budget == "memory_budget has room for 4 Gaussians of 232 bytes"
+    assert a2tg.A2tg(memory_budget="1kB").small_budget == (
+        "memory_budget has room for 4 Gaussians of 232 bytes, and scenes need thousands: 2.32MB holds 10,000"
+    )
 
 
 def test_sizes_have_three_digits_and_a_suitable_unit():
@@ -571,6 +581,17 @@ def test_the_summary_has_shares_of_budgets_and_published_bytes_if_there_are_any(
 
 
 # Histories
+
+
+def test_sizes_are_of_files_that_exist(tmp_path):
+    result, run = some_result(), create_run(tmp_path)
+    assert sizes_line(run, result) == "size of a2tg-textures: 28.0 kB in memory"
+    run.viewer.write_bytes(bytes(500_000))
+    path = run.model(result.main).with_suffix(".a2tgz")
+    path.parent.mkdir()
+    path.write_bytes(bytes(4_000))
+    sizes = "500 kB as a page (viewer.html), 4.00 kB compressed (a2tg-textures.a2tgz)"
+    assert sizes_line(run, result) == f"size of a2tg-textures: 28.0 kB in memory, {sizes}"
 
 
 @pytest.mark.parametrize("train, ending", [(23, "views between the photographs are about as good"), (27, "take more")])

@@ -35,7 +35,7 @@ from a2tg_jax.results.record import (
     read_run_file,
     write_record,
 )
-from a2tg_jax.results.report import RunResult, summary_text
+from a2tg_jax.results.report import RunResult, sizes_line, summary_text
 from a2tg_jax.results.run_training import RunOptions, begin_run, follow_first_process, resume_run, unseen
 from a2tg_jax.results.viewing import shown_live
 from a2tg_jax.systems.a2tg import A2tg
@@ -90,10 +90,10 @@ class Train:
 
       SCENE                  scene folder with photographs and cameras, its URL, or "synthetic"
       --out RUN              run folder for models, checkpoints, metrics, pictures and report.html
-      --system NAME          method to train: a2tg (default), or another one that a2tg --help lists
+      --system NAME          method: bytewise (the best picture for its bytes), a2tg (default; the paper's), ...
       --preset NAME          paper (default), quick (minutes on two cores) or smoke (half a minute)
       --downscale K          divide the width and height of the photographs by K
-      --memory-budget SIZE   cap the model's size during training, such as 20MB
+      --memory-budget SIZE   cap the model's size in memory during training, such as 20MB
       --baseline             train plain Gaussians as well, and compare
       --compare NAME         train another system as well, and compare; may be repeated
       --view                 show the training in a browser, where you can pause it
@@ -111,7 +111,7 @@ class Train:
     newest two are kept until the stage is finished.
 
     Examples:
-      a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
+      a2tg train scenes/fox --out runs/fox --system bytewise --preset quick --downscale 2
       a2tg train --out runs/fox --resume
       a2tg train scenes/fox --out runs/small --memory-budget 20MB --baseline
       a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
@@ -321,9 +321,9 @@ def devices_named(text: str) -> list[jax.Device] | None:
 
 
 def print_result(result: RunResult, folder: Path) -> None:
-    """Print the metrics and the path of the report."""
-    print(summary_text(result))
-    print(f"report: {RunFolder(folder).report}")
+    """Print the metrics, the sizes and the path of the report."""
+    run = RunFolder(folder)
+    print(f"{summary_text(result)}\n{sizes_line(run, result)}\nreport: {run.report}")
 
 
 def in_browser(scene: Scene) -> AbstractContextManager[Watch]:

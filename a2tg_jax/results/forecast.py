@@ -4,7 +4,8 @@ import dataclasses
 import math
 import os
 import shutil
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -29,11 +30,14 @@ from a2tg_jax.training.cost import (
     held_bytes,
     largest_view,
 )
+from a2tg_jax.training.reports import Ahead
 
 REPORT = 290 * MB
 """Bytes of programs and imports for evaluation, figures and the report."""
 EVALUATION_PER_PIXEL = 150
 """Bytes per pixel for rendering, comparing and drawing a view, with depth and normals."""
+DRAWN_SHARE = 1.0
+"""Time of drawing, comparing and reporting a view of a model, as a share of an iteration."""
 KEPT_STATES = 3
 """Number of checkpoints on disk while a new one is written."""
 PICTURE_PER_PIXEL = 2
@@ -42,6 +46,8 @@ LONG = 10_000
 """Number of iterations beyond which CPUs take hours."""
 QUICK_SIDE = 640
 """Longer side of photographs, in pixels, up to which the preset quick takes minutes on two cores."""
+SMALL_SIDE = 100
+"""Longer side of photographs, in pixels, below which a downscale is likely to be a mistake."""
 OPTIONS = {
     "photographs": ("downscale", "batch_size"),
     "model": ("memory_budget", "sh_degree"),
@@ -125,10 +131,7 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     Gaussians of the file that replaces the main system's first stage; memory is the sum over all devices."""
     # On accelerators programs and photographs take the host's memory, not the device's.
     is_host = default_platform() == "cpu"
-    stages: dict[str, StageForecast] = {}
-    for chain in plan.chains.values():
-        num = num_given if chain[0] == plan.main[0] else None
-        stages |= zip(chain, forecast_stages(scene, plan[chain[-1]].system, num, num_devices), strict=True)
+    stages = _forecasts(scene, plan, num_given, num_devices)
     # Compiled programs stay in memory, so each stage adds to the ones before.
     resident, phases = PROCESS + FIRST_PROGRAM - FURTHER_STAGE, {}
     for name, stage in stages.items():
@@ -158,6 +161,27 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     )
 
 
+def _forecasts(scene: Scene, plan: RunPlan, num_given: int | None, num_devices: int) -> dict[str, StageForecast]:
+    """Return the forecast of each stage by name."""
+    stages: dict[str, StageForecast] = {}
+    for chain in plan.chains.values():
+        num = num_given if chain[0] == plan.main[0] else None
+        stages |= zip(chain, forecast_stages(scene, plan[chain[-1]].system, num, num_devices), strict=True)
+    return stages
+
+
+def time_after(scene: Scene, plan: RunPlan, names: Sequence[str]) -> dict[str, Ahead]:
+    """Return what follows each of the stages that are to be trained, the evaluation of the run included."""
+    stages, found = _forecasts(scene, plan, None, 1), dict[str, Ahead]()
+    drawn = DRAWN_SHARE * len(plan.names) * (len(scene.train) + len(scene.test))
+    for index, name in enumerate(names):
+        seconds = stages[name].seconds / plan[name].stage.iterations
+        later = [stages[other] for other in names[index + 1 :]]
+        iterations = sum(other.seconds for other in later) / seconds + drawn
+        found[name] = Ahead(iterations, sum(other.num_programs for other in later) + len(plan.names))
+    return found
+
+
 def print_forecast(
     scene: Scene, record: RunRecord, max_memory: int | None, num_devices: int = 1, num_given: int | None = None,
     out: Path | None = None,
@@ -178,6 +202,18 @@ def print_forecast(
     has_quick = default_platform() == "cpu" and "quick" in type(record.options).presets()
     if out is not None and is_long and has_quick:
         print(f"quicker on CPUs: {quick_flags(side, record.scene.downscale)} takes minutes", flush=True)
+
+
+def warn_of_small_photographs(scene: Scene, downscale: int) -> None:
+    """Warn if a downscale leaves few pixels, with one that leaves more."""
+    size = max(((view.camera.width, view.camera.height) for view in scene.train), key=max)
+    if downscale > 1 and max(size) < SMALL_SIDE:
+        sensible = math.ceil(max(size) * downscale / QUICK_SIDE)
+        advice = f"`downscale` {sensible} makes the longer side {max(size) * downscale // sensible:,}"
+        warnings.warn(
+            f"`downscale` {downscale} leaves photographs of {size[0]}×{size[1]} pixels, which show little: {advice}",
+            stacklevel=3,
+        )
 
 
 def quick_flags(longest_side: int, downscale: int = 1) -> str:

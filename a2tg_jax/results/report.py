@@ -18,6 +18,7 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.source_commit import source_commit
+from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.measure.evaluation import Evaluation
 from a2tg_jax.results.figures import ReportFigure
@@ -242,6 +243,14 @@ def photographs_line(result: RunResult) -> str:
     few = "few photographs: stay near where you stood, or take more"
     found = few if train - test >= FEW_PHOTOGRAPHS else "views between the photographs are about as good"
     return f"{train:.1f} dB on training views, {test:.1f} held out: {found}"
+
+
+def sizes_line(run: RunFolder, result: RunResult) -> str:
+    """Return the bytes of the main model in memory and of its files, as far as there are any."""
+    sizes = [f"{in_bytes(result.models[result.main].num_bytes)} in memory"]
+    files = {"as a page": run.viewer, "compressed": run.model(result.main).with_suffix(".a2tgz")}
+    sizes += [f"{in_bytes(path.stat().st_size)} {what} ({path.name})" for what, path in files.items() if path.is_file()]
+    return f"size of {result.main}: {', '.join(sizes)}"
 
 
 def aligned(columns: Sequence[tuple[str, ...]]) -> list[str]:

@@ -43,7 +43,12 @@ from a2tg_jax.results.folder import (
     resuming_command,
     set_aside,
 )
-from a2tg_jax.results.forecast import print_forecast, room_for_photographs
+from a2tg_jax.results.forecast import (
+    print_forecast,
+    room_for_photographs,
+    time_after,
+    warn_of_small_photographs,
+)
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.model_source import check_init, write_first_stage
 from a2tg_jax.results.record import OnNan, PlannedStage, RunRecord, is_finished, read_record, write_record
@@ -121,7 +126,9 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
         check_loss_data(scene.train, system.all_stages())
         check_start(scene, system, num_given if system is record.options else None)
     if record.options.small_budget:
-        warnings.warn(f"{record.options.small_budget}; it is in bytes of the model, such as 20MB", stacklevel=2)
+        warnings.warn(f"{record.options.small_budget}; it is in bytes of the model in memory", stacklevel=2)
+    if record.scene.path != SYNTHETIC:
+        warn_of_small_photographs(scene, record.scene.downscale)
     print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given, out)
     run = RunFolder(out)
     with claimed(run):
@@ -205,6 +212,7 @@ def train_run(
     fit = functools.partial(
         fit_stage, scene, progress=options.progress, is_stopped=is_stopped, watch=watch, session=options.session
     )
+    after = time_after(scene, record.plan, [name for name in record.plan.names if not run.model(name).is_file()])
     for planned in record.plan.stages:
         path = run.model(planned.name)
         if path.is_file():
@@ -216,7 +224,8 @@ def train_run(
                 _check_options(path, system_from_dict(made, str(path), type(planned.system)), planned.system)
         else:
             events = EventWriter(run, planned.name) if options.tensorboard else None
-            result = _train_stage(run, planned, scene, fit, events, record.on_nan)
+            own = functools.partial(fit, after=after[planned.name])
+            result = _train_stage(run, planned, scene, own, events, record.on_nan)
             if events is not None:
                 events.add(result.history)
                 events.close()

@@ -145,7 +145,8 @@ class LiveView:
 
     def _note(self, run: StageRun) -> None:
         history, self._noted = run.history, self._now()  # Assembling a long history takes time.
-        found: dict[str, Any] = {"stage": run.stage.name, "iterations": run.stage.iterations}
+        left = f", {run.time_left} left in all" if run.time_left else ""
+        found: dict[str, Any] = {"stage": f"{run.stage.name}{left}", "iterations": run.stage.iterations}
         if len(history.iteration):
             found |= {
                 "iteration": int(history.iteration[-1]),

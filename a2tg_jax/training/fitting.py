@@ -16,6 +16,7 @@ from a2tg_jax.training.checkpoint import Checkpoint, History, check_resume
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, Watch, never, unwatched
 from a2tg_jax.training.options import System
+from a2tg_jax.training.reports import Ahead
 from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import check_loss_data, check_start, check_views
 
@@ -176,6 +177,7 @@ def fit_stage(
     num_restored: int | None = None,
     watch: Watch = unwatched,
     session: Session | None = None,
+    after: Ahead = Ahead(),  # noqa: B008 - immutable
 ) -> StageResult:
     """Train one stage of a system. Arguments as in `fit`.
 
@@ -186,6 +188,7 @@ def fit_stage(
       num_restored: number of times the stage went back because it diverged; each number gives another order of the
         views. None: the checkpoint's number, or 0.
       watch: called between steps with the stage under way (`training.loop.Watch`).
+      after: what follows the stage, for the remaining time that is shown.
     """
     _check_arguments(scene, system, resume, checkpoint_every)
     stages = system.all_stages()
@@ -195,7 +198,7 @@ def fit_stage(
     if resume is not None:
         check_resume(resume, system, index)
     run = StageRun(scene, system, index, start, resume, num_restored, session)
-    run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch, on_log)
+    run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch, on_log, after)
     return _result_of(run, scene, is_last=index == len(stages) - 1)
 
 

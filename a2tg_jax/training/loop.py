@@ -6,6 +6,7 @@ after it stay idle (`step.TrainState.status`); the loop removes the cause and la
 
 import contextlib
 import dataclasses
+import datetime
 import time
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -39,7 +40,7 @@ from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Int
 from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.options import System
-from a2tg_jax.training.reports import LearningCheck, ProgressBar, StageEffects
+from a2tg_jax.training.reports import Ahead, LearningCheck, ProgressBar, StageEffects
 from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import (
@@ -209,6 +210,8 @@ class StageRun:
         self.exchanges: dict[Size, Exchange] = {}
         """Room of devices that draw together; empty for one device."""
         self.started = time.perf_counter()
+        self.time_left: datetime.timedelta | None = None
+        """Remaining time of the run, about; None at the beginning."""
         self.num_regrown = self.num_compiled = 0
         self.num_refused = resume.num_refused if resume else 0
 
@@ -259,6 +262,7 @@ class StageRun:
         is_stopped: IsStopped = never,
         watch: Watch = unwatched,
         on_log: OnLog | None = None,
+        after: Ahead = Ahead(),  # noqa: B008 - immutable
     ) -> None:
         """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
         `Interrupted`.
@@ -268,7 +272,8 @@ class StageRun:
         # Several processes launch the same steps, and stop together.
         stops_launching = is_stopped if num_processes(self.mesh) == 1 else never
         may_grow = any(event.most_gaussians is not None for event in self.stage.events)
-        bar = ProgressBar(title or self.stage.name, iteration, end, is_shown=progress, may_grow=may_grow)
+        shown = title or self.stage.name
+        bar = ProgressBar(shown, iteration, end, is_shown=progress, may_grow=may_grow, after=after)
         with contextlib.closing(self.photographs), bar:
             while iteration < end:
                 # Python acts next after `launched` steps, an event, or a checkpoint.
@@ -285,6 +290,7 @@ class StageRun:
                     bar.update(info, self._rows[-1] if self._rows else None)
                 ahead = self.effects.programs_ahead(iteration)
                 bar.tell_pace(iteration, self.num_compiled, ahead, self.effects.seconds_a_program)
+                self.time_left = bar.left(iteration)
                 # Not where a step could not be taken, or training is being stopped.
                 if iteration == stop:
                     self._host_events(iteration)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, Self
 from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
 from a2tg_jax.core.checks import check_int, check_number, fields_of
 from a2tg_jax.events import EVERY_ITERATION, Event, StepEvent
-from a2tg_jax.host.text import did_you_mean, shortened
+from a2tg_jax.host.text import did_you_mean, in_bytes, shortened
 from a2tg_jax.io.config_json import changed_config, check_config, config_to_dict, flatten_config
 from a2tg_jax.rasterize.kernels.platforms import MAX_TILE_SIZE
 from a2tg_jax.training.corrections import BilateralGrid, Correction, Exposure, PoseRefinement
@@ -102,8 +102,10 @@ class Corrections:
                 getattr(self, name).check_options()
 
 
-FEW_GAUSSIANS = 100
+FEW_GAUSSIANS = 1_000
 """Number of Gaussians below which a memory budget is likely to be a mistake."""
+SENSIBLE_GAUSSIANS = 10_000
+"""Number of Gaussians of the memory budget that is then suggested."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -127,8 +129,9 @@ class System:
     """Opacity of the Gaussians that training starts from; billboards with alpha textures always start half opaque in
     the middle."""
     memory_budget: float | str | None = None
-    """Memory budget of the model: 1.5MB, 800kB, 2GB, or a number of MB (10^6 bytes). The model stays within it at every
-    iteration and ends within 0.5 % of it. It sets the number of Gaussians and texels, instead of densify.cap."""
+    """Budget of the model's bytes in memory, not in files: 1.5MB, 800kB, 2GB, or a number of MB (10^6 bytes). The
+    model stays within it at every iteration and ends within 0.5 % of it. It sets the number of Gaussians and texels,
+    instead of densify.cap."""
     background: Literal["black", "white", "random"] = "black"
     """Background of renders, and of transparent photographs."""
     sh_degree: int = 3
@@ -179,7 +182,11 @@ class System:
         """Number of Gaussians that fit into the memory budget, in words, if it is below `FEW_GAUSSIANS`; else empty."""
         if self.budget_bytes is None or self.budget_bytes >= FEW_GAUSSIANS * (size := self.initial_bytes):
             return ""
-        return f"memory_budget has room for {int(self.budget_bytes // size)} Gaussians of {size:,.0f} bytes"
+        sensible = in_bytes(SENSIBLE_GAUSSIANS * size).replace(" ", "")
+        return (
+            f"memory_budget has room for {int(self.budget_bytes // size)} Gaussians of {size:,.0f} bytes, and scenes "
+            f"need thousands: {sensible} holds {SENSIBLE_GAUSSIANS:,}"
+        )
 
     def budget_cap(self, floats: float = 0) -> int | None:
         """Return the number of Gaussians that the memory budget has room for; None without a budget.

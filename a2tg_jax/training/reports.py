@@ -10,7 +10,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,12 +35,24 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}
 """tqdm's format without its rate and remaining time, which count compilation."""
 
 
+class Ahead(NamedTuple):
+    """What follows a stage in its run."""
+
+    iterations: float = 0.0
+    """Its time as a number of the stage's iterations, without compilation."""
+    programs: int = 0
+    """Number of programs to compile."""
+
+
 class Pace:
     """Time of an iteration, and forecasts of a stage's duration: early, and at a half."""
 
-    def __init__(self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, may_grow: bool = True):
+    def __init__(
+        self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, may_grow: bool = True,
+        after: Ahead = Ahead(),  # noqa: B008 - immutable
+    ):  # fmt: skip
         """`first` iterations were done before, `total` is the last one, and `now` is a clock in seconds."""
-        self._total, self._now, self._may_grow = total, now, may_grow
+        self._total, self._now, self._may_grow, self._after = total, now, may_grow, after
         self._due = [first, (first + total) // 2]
         self._before: tuple[int, float, int] | None = None
         self._steps, self._seconds = 0, 0.0
@@ -60,7 +72,7 @@ class Pace:
 
     def told(self, done: int) -> str | None:
         """Return a forecast if one is due and enough was timed since the last, or None."""
-        left = self.left(done)
+        left, whole = self._left(done, Ahead()), self.left(done)
         is_due = self._due and done >= self._due[0] and self._steps >= TIMED_STEPS and self._seconds >= TIMED_SECONDS
         if left is None or not is_due or done >= self._total:
             return None
@@ -69,27 +81,34 @@ class Pace:
         self._due = [due for due in self._due[1:] if due > done]
         self._steps, self._seconds = 0, 0.0
         compiling = f"with {counted(self._ahead, 'program')} to compile" if self._ahead else "without compiling"
-        return f"{pace}, about {left} for the other {self._total - done:,}, {compiling}{growing}"
+        in_all = f"; about {whole} for the whole run" if self._after.iterations else ""
+        return f"{pace}, about {left} for the other {self._total - done:,}, {compiling}{growing}{in_all}"
 
     def left(self, done: int) -> datetime.timedelta | None:
-        """Return the remaining time, known compilations included; None before a step was timed."""
+        """Return the remaining time of the run, known compilations included; None before a step was timed."""
+        return self._left(done, self._after)
+
+    def _left(self, done: int, after: Ahead) -> datetime.timedelta | None:
         if self._steps == 0:
             return None
-        of_steps = (self._total - done) * self._seconds / self._steps
-        return datetime.timedelta(seconds=round(of_steps + self._ahead * self._seconds_a_program))
+        of_steps = (self._total - done + after.iterations) * self._seconds / self._steps
+        return datetime.timedelta(seconds=round(of_steps + (self._ahead + after.programs) * self._seconds_a_program))
 
 
 class ProgressBar:
     """A line with loss, PSNR, live Gaussians, memory and time left; a line for every tenth without a terminal."""
 
-    def __init__(self, title: str, done: int, total: int, *, is_shown: bool, may_grow: bool = True):
+    def __init__(
+        self, title: str, done: int, total: int, *, is_shown: bool, may_grow: bool = True,
+        after: Ahead = Ahead(),  # noqa: B008 - immutable
+    ):  # fmt: skip
         is_bar = is_shown and has_terminal()
         self._bar = tqdm(
             desc=f"{title} (compiling)", initial=done, total=total, disable=not is_bar, unit="it",
             dynamic_ncols=True, mininterval=0.5, bar_format=BAR,
         )  # fmt: skip
         self._title, self._done, self._total = title, done, total
-        self._pace = Pace(done, total, may_grow=may_grow)
+        self._pace = Pace(done, total, may_grow=may_grow, after=after)
         self._is_shown, self._is_plain = is_shown, is_shown and not is_bar
         self._last_line = done, time.perf_counter()
         self._loss: float | None = None
@@ -110,6 +129,10 @@ class ProgressBar:
         if forecast is not None and self._is_shown:
             self._bar.write(f"{self._title}: {forecast}")
 
+    def left(self, done: int) -> datetime.timedelta | None:
+        """Return the remaining time of the run (`Pace.left`)."""
+        return self._pace.left(done)
+
     def update(self, info: StepInfo, row: Mapping[str, float] | None) -> None:
         """Count one iteration; loss and PSNR are running means. `row` is the last one of the history."""
         loss, psnr = float(info.loss), float(info.psnr)
@@ -127,7 +150,7 @@ class ProgressBar:
 
     def _figures(self, row: Mapping[str, float] | None) -> str:
         left = self._pace.left(self._done)
-        words = [] if left is None or self._done == self._total else [f"{left} left"]
+        words = [] if not left or self._done == self._total else [f"{left} left"]
         words.append(f"loss {self._loss:.4f}, {self._psnr:.2f} dB")
         if row:
             words.append(f"{row['num_gaussians']:,} Gaussians, {in_bytes(1e6 * row['megabytes'])}")
