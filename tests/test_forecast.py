@@ -36,7 +36,7 @@ from a2tg_jax.training.corrections import BilateralGrid, sliced
 from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.options import Corrections
-from a2tg_jax.training.reports import Ahead, Pace
+from a2tg_jax.training.reports import Pace, RestOfRun
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import StepSettings, jitted_step
 
@@ -357,7 +357,7 @@ def test_a_downscale_that_leaves_few_pixels_is_questioned():
 
 
 def test_the_pace_counts_what_follows_the_stage():
-    pace = pace_of([10.0, 12.0], may_grow=False, after=Ahead(400, 3))
+    pace = pace_of([10.0, 12.0], may_grow=False, after=RestOfRun(400, 3))
     for done in (10, 50):
         pace.time(done, 1, 0, 5.0)
     assert pace.left(50).total_seconds() == 82  # 1,350 iterations of 50 ms, and 3 programs of 5 s.

@@ -30,7 +30,7 @@ from a2tg_jax.training.cost import (
     held_bytes,
     largest_view,
 )
-from a2tg_jax.training.reports import Ahead
+from a2tg_jax.training.reports import RestOfRun
 
 REPORT = 290 * MB
 """Bytes of programs and imports for evaluation, figures and the report."""
@@ -170,15 +170,15 @@ def _forecasts(scene: Scene, plan: RunPlan, num_given: int | None, num_devices: 
     return stages
 
 
-def time_after(scene: Scene, plan: RunPlan, names: Sequence[str]) -> dict[str, Ahead]:
+def time_after(scene: Scene, plan: RunPlan, names: Sequence[str]) -> dict[str, RestOfRun]:
     """Return what follows each of the stages that are to be trained, the evaluation of the run included."""
-    stages, found = _forecasts(scene, plan, None, 1), dict[str, Ahead]()
+    stages, found = _forecasts(scene, plan, None, 1), dict[str, RestOfRun]()
     drawn = DRAWN_SHARE * len(plan.names) * (len(scene.train) + len(scene.test))
     for index, name in enumerate(names):
         seconds = stages[name].seconds / plan[name].stage.iterations
         later = [stages[other] for other in names[index + 1 :]]
         iterations = sum(other.seconds for other in later) / seconds + drawn
-        found[name] = Ahead(iterations, sum(other.num_programs for other in later) + len(plan.names))
+        found[name] = RestOfRun(iterations, sum(other.num_programs for other in later) + len(plan.names))
     return found
 
 

@@ -16,7 +16,7 @@ from a2tg_jax.training.checkpoint import Checkpoint, History, check_resume
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, Watch, never, unwatched
 from a2tg_jax.training.options import System
-from a2tg_jax.training.reports import Ahead
+from a2tg_jax.training.reports import RestOfRun
 from a2tg_jax.training.stage import Background
 from a2tg_jax.training.start import check_loss_data, check_start, check_views
 
@@ -177,7 +177,7 @@ def fit_stage(
     num_restored: int | None = None,
     watch: Watch = unwatched,
     session: Session | None = None,
-    after: Ahead = Ahead(),  # noqa: B008 - immutable
+    after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
 ) -> StageResult:
     """Train one stage of a system. Arguments as in `fit`.
 

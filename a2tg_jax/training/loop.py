@@ -40,7 +40,7 @@ from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Int
 from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.options import System
-from a2tg_jax.training.reports import Ahead, LearningCheck, ProgressBar, StageEffects
+from a2tg_jax.training.reports import LearningCheck, ProgressBar, RestOfRun, StageEffects
 from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import (
@@ -262,7 +262,7 @@ class StageRun:
         is_stopped: IsStopped = never,
         watch: Watch = unwatched,
         on_log: OnLog | None = None,
-        after: Ahead = Ahead(),  # noqa: B008 - immutable
+        after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
     ) -> None:
         """Run the stage to its end, then release its photographs. If it is stopped, write a last checkpoint and raise
         `Interrupted`.

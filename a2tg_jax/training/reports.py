@@ -35,7 +35,7 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}
 """tqdm's format without its rate and remaining time, which count compilation."""
 
 
-class Ahead(NamedTuple):
+class RestOfRun(NamedTuple):
     """What follows a stage in its run."""
 
     iterations: float = 0.0
@@ -49,7 +49,7 @@ class Pace:
 
     def __init__(
         self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, may_grow: bool = True,
-        after: Ahead = Ahead(),  # noqa: B008 - immutable
+        after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
     ):  # fmt: skip
         """`first` iterations were done before, `total` is the last one, and `now` is a clock in seconds."""
         self._total, self._now, self._may_grow, self._after = total, now, may_grow, after
@@ -72,7 +72,7 @@ class Pace:
 
     def told(self, done: int) -> str | None:
         """Return a forecast if one is due and enough was timed since the last, or None."""
-        left, whole = self._left(done, Ahead()), self.left(done)
+        left, whole = self._left(done, RestOfRun()), self.left(done)
         is_due = self._due and done >= self._due[0] and self._steps >= TIMED_STEPS and self._seconds >= TIMED_SECONDS
         if left is None or not is_due or done >= self._total:
             return None
@@ -88,7 +88,7 @@ class Pace:
         """Return the remaining time of the run, known compilations included; None before a step was timed."""
         return self._left(done, self._after)
 
-    def _left(self, done: int, after: Ahead) -> datetime.timedelta | None:
+    def _left(self, done: int, after: RestOfRun) -> datetime.timedelta | None:
         if self._steps == 0:
             return None
         of_steps = (self._total - done + after.iterations) * self._seconds / self._steps
@@ -100,7 +100,7 @@ class ProgressBar:
 
     def __init__(
         self, title: str, done: int, total: int, *, is_shown: bool, may_grow: bool = True,
-        after: Ahead = Ahead(),  # noqa: B008 - immutable
+        after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
     ):  # fmt: skip
         is_bar = is_shown and has_terminal()
         self._bar = tqdm(
