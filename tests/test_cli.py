@@ -183,7 +183,7 @@ def help_of(capsys, name: str, *arguments: str) -> str:
 def flags_in(text: str) -> set[str]:
     """Flags of a help, without the help's own."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", text)
-    return set(re.findall(r"\n│ --([\w.-]+)", plain)) - {"help"}
+    return set(re.findall(r"\n[│ ] --(\w[\w.-]*)", plain)) - {"help"}
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
