@@ -127,8 +127,10 @@ def _misspelt_flag(name: str, arguments: Sequence[str]) -> str | None:
         return None
     for flag in given:
         if flag not in known and re.sub(r"(^|\.)no-", r"\1", flag) not in known:
-            near = did_you_mean(flag, known)
-            hint = near.replace("did you mean ", "did you mean --") if near else f"; a2tg {name} --help lists them"
+            # Of a group first, such as densify.cap for cap.
+            within = sorted(each for each in known if each.endswith(f".{flag}"))
+            near = f"; did you mean {' or '.join(within)}?" if within else did_you_mean(flag, known)
+            hint = re.sub(r"(mean|or) ", r"\1 --", near) if near else f"; a2tg {name} --help lists them"
             return f"a2tg {name} has no option --{flag}{hint}"
     return None
 
