@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 
+import choose_plain
 import efficiency
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from lab import pages, spreadsheet, tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.grid import Grid, Method, Run, read_grid
 from lab.jobs import Job
+from lab.kept import read_kept
 from lab.plan import duration
 from lab.scenes import SceneAt
 from run import experiments, main
@@ -142,7 +144,7 @@ def test_a_page_shows_the_tables_that_it_names(tmp_path, monkeypatch):
 MADE_OF_MODELS = {"decomposition", "efficiency", "comparison_pictures"}
 
 
-@pytest.mark.parametrize("scale", ["small", "long", "protocol", "protocol160"])
+@pytest.mark.parametrize("scale", ["small", "long", "protocol"])
 def test_committed_tables_are_those_of_the_committed_records(tmp_path, scale):
     committed = EXPERIMENTS / "results" / scale
     shutil.copytree(committed.parent, tmp_path / "results")
@@ -155,6 +157,13 @@ def test_committed_tables_are_those_of_the_committed_records(tmp_path, scale):
         lab.present(experiment, [lab.grid(grid) for grid in experiment.grids])
         text = (committed / f"{name}.md").read_text(encoding="utf-8")
         assert (lab.out / f"{name}.md").read_text(encoding="utf-8") == text, name
+
+
+def test_the_chosen_plain_methods_are_those_of_the_committed_validation_records():
+    records = read_kept(EXPERIMENTS / "results" / "protocol-validation" / "records.json")
+    grid = read_grid("choose_plain", "protocol", validation=True)
+    best = choose_plain.best_methods(tables.results_of(grid, records), 1 + len(grid.methods))
+    assert best == json.loads(choose_plain.FILE.read_text(encoding="utf-8"))
 
 
 def test_pages_show_the_committed_tables():

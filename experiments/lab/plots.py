@@ -86,7 +86,7 @@ def forest(found: Mapping[str, tuple[Sequence[float], float, float]], x_label: s
         axes.errorbar(mean, place, xerr=np.nan_to_num(half_width), fmt="D", color="#000000", markersize=4, capsize=3)
     axes.axvline(0.0, color="#888888", linewidth=0.8)
     axes.set_yticks(range(len(found)), list(found), fontsize=8)
-    axes.invert_yaxis()
+    axes.set_ylim(len(found) - 0.4, -0.6)  # The first on top.
     axes.set_xlabel(x_label)
     axes.grid(alpha=0.25, axis="x")
     return figure
