@@ -171,7 +171,7 @@ def test_pages_show_the_committed_tables():
         text = page.read_text(encoding="utf-8")
         assert text == pages.with_tables(text, EXPERIMENTS), f"{page} is old: python experiments/run.py pages"
     folder = EXPERIMENTS / "results"
-    shown = {folder / name for page in pages.PAGES for name in pages.names(page.read_text(encoding="utf-8"))}
+    shown = {EXPERIMENTS / name for page in pages.PAGES for name in pages.names(page.read_text(encoding="utf-8"))}
     assert shown <= set(folder.glob("*/*.md"))
 
 
