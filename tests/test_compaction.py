@@ -89,6 +89,9 @@ def test_the_command_on_a_model(tmp_path, monkeypatch, capsys):
     assert text.startswith("trying up to ") and "on a CPU this takes minutes\n" in text
     printed = f"{tmp_path / 'scene.a2tgz'}: {in_bytes(size)} on disk, {part} of the model's numbers, 0."
     assert text.splitlines()[-1].startswith(printed) and text.endswith(" dB of PSNR lost\n")
+    assert text.count("\n") == 2
+    assert cli.main(["compress", str(tmp_path / "scene.npz"), "--max-loss", "0.3", "--overwrite", "--verbose"]) == 0
+    text = capsys.readouterr().out
     assert "dB lost, if 30 dB" in text and "opacities 2 " in text and "texels" not in text
 
 
