@@ -157,8 +157,9 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     scale = "smoke" if lab.is_smoke else "protocol160"
     records = read_kept(lab.out.parent / scale / "records.json")
     degrees = {degree: tables.results_of(read_grid(f"degree_{degree}", scale), records) for degree in (3, 1, 0)}
-    rows = [*rows_of_bytewise(bytewise), *rows_of_parts(parts), *rows_of_degrees(degrees)]
-    dense = [row for row in rows_of_bytewise(bytewise) if "0.3 MB" in row.name and FEW not in row.name]
+    first = rows_of_bytewise(bytewise)
+    dense = [row for row in first if "0.3 MB" in row.name and FEW not in row.name]
+    rows = [*first, *rows_of_parts(parts), *rows_of_degrees(degrees)]
     lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(rows)}\n{endpoints(rows)}\n{scenes_table(dense)}")
     found = {row.name: row.compared("psnr") for row in rows}
     charted = {

@@ -7,13 +7,13 @@ from a2tg_jax.core.similarity import camera_centers
 
 NUM_NEIGHBOURS = 8
 MOST_CAMERAS = 64
-"""Largest number of cameras that are asked, evenly chosen."""
+"""Largest number of cameras that count, evenly chosen."""
 CELLS = 12
 """Number of cells along each side of a picture, each with its own typical depth."""
 FEWEST = 8
 """Number of Gaussians in a cell that count as much as the whole picture does."""
 FREE, LARGEST = 0.5, 2.5
-"""Octaves that do not count, which nine of ten Gaussians of a surface have at most, and those of the largest score."""
+"""Octaves at which scores leave 0 (nine of ten Gaussians of a surface have fewer) and reach their largest."""
 LEAST_DEPTH = 1e-6
 
 

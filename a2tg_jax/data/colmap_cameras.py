@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.observations import pinhole_pixels
 
 
 class CameraModel(NamedTuple):
@@ -91,7 +92,7 @@ class ColmapCamera:
     def pixels(self, points: np.ndarray) -> np.ndarray:
         """Return x and y [P, 2] in pixels of points [P, 3] in the camera's frame."""
         if self.is_undistorted:
-            return points[:, :2] / points[:, 2:] @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+            return pinhole_pixels(points, self.matrix)
         return np.asarray(self.colmap.img_from_cam(points))
 
     def slopes(self, pixels: np.ndarray) -> np.ndarray:

@@ -48,7 +48,7 @@ TICK = 0.5
 ADVICE = "take more, sharp and closer together: they should overlap by two thirds and show texture, unlike blank walls"
 NO_DEPTH = "photographs that match show no depth, as if taken from one spot or of a flat surface: walk between them"
 MOSTLY_FLAT = 0.9
-"""Least share of matching pairs without depth that is told. In six captures at most 0.71 of them have none."""
+"""Share of matching pairs without depth from which a warning follows. In six captures it is at most 0.71."""
 MOST_NAMED, MOST_GAPS = 24, 5
 """Largest numbers of photographs, and of gaps between photographs, that a message names."""
 FLAT = ("PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC")
@@ -268,7 +268,7 @@ def _map(database: Path, staged: Staged, work: Path, seed: int, progress: bool) 
 
 
 class Matches(NamedTuple):
-    """What the photographs have in common."""
+    """Pairs of photographs that match, and photographs in no such pair."""
 
     num_pairs: int
     """Number of pairs with matches enough for mapping that fit one motion of the camera."""

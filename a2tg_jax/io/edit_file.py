@@ -10,12 +10,9 @@ import numpy as np
 from a2tg_jax.core.floaters import floater_scores
 from a2tg_jax.core.origin import Color, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
-from a2tg_jax.host.json_text import MOST_BYTES, parse_json
-from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
+from a2tg_jax.io.saved_file import load_saved
 from a2tg_jax.model import Model
-
-FORMAT, VERSION = "a2tg-jax edit", 1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,21 +43,12 @@ class Edit:
 def load_edit(path: Path) -> Edit:
     """Return the edit of a file that the viewer saved. FileNotFoundError: there is no such file. ValueError, naming the
     file: it is invalid."""
-    path = Path(path)
-    if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such edit; the viewer's 'Save edit' makes one")
-    try:
-        data = parse_json(read_regular(path, MOST_BYTES))
-        if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
-            raise ValueError(f"is not an edit of version {VERSION} that the viewer saved")
-        if unknown := sorted(set(data) - {"format", "version", "crop", "floaters", "up", "background"}):
-            raise ValueError(f"has the unknown entry {shortened(unknown[0])}")
-        return _edit_of(data)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return load_saved(Path(path), "edit", _edit_of)
 
 
 def _edit_of(data: dict[str, Any]) -> Edit:
+    if unknown := sorted(set(data) - {"format", "version", "crop", "floaters", "up", "background"}):
+        raise ValueError(f"has the unknown entry {shortened(unknown[0])}")
     floaters = data.get("floaters", 0.0)
     if type(floaters) not in (int, float) or not 0 <= floaters <= 1:
         raise ValueError(f"floaters must be a number from 0 to 1; got {shortened(floaters)}")
@@ -87,7 +75,7 @@ def _edit_of(data: dict[str, Any]) -> Edit:
 
 
 def _numbers(name: str, values: object, instead: float | None = None) -> np.ndarray:
-    """Return three numbers; `instead` stands for null, if it is given."""
+    """Return three numbers; null becomes `instead`, if it is given."""
     kinds = (int, float) if instead is None else (int, float, type(None))
     if not isinstance(values, list) or len(values) != 3 or not all(type(x) in kinds for x in values):
         raise ValueError(f"{name} must be 3 numbers{'' if instead is None else ' or null'}; got {shortened(values)}")

@@ -2,16 +2,15 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera, check_calibration, check_camera
-from a2tg_jax.host.json_text import MOST_BYTES, parse_json
-from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
+from a2tg_jax.io.saved_file import load_saved
 
-FORMAT, VERSION = "a2tg-jax path", 1
 # A file may come from a stranger: sides decide how much memory a frame takes.
 LARGEST_SIDE, MOST_VIEWS = 16384, 10_000
 
@@ -19,18 +18,14 @@ LARGEST_SIDE, MOST_VIEWS = 16384, 10_000
 def load_views(path: Path) -> list[Camera]:
     """Return the cameras of a file, in the world of the viewed model, float32. FileNotFoundError: there is no such
     file. ValueError, naming the file: it is invalid."""
-    if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such path; the viewer's 'Save path' makes one")
-    try:
-        data = parse_json(read_regular(path, MOST_BYTES))
-        if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("version") != VERSION:
-            raise ValueError(f"is not a path of version {VERSION} that the viewer saved")
-        views = data.get("views")
-        if not isinstance(views, list) or not 1 <= len(views) <= MOST_VIEWS:
-            raise ValueError(f"must hold 1 to {MOST_VIEWS:,} views")
-        return [_camera(view, f"views[{index}]") for index, view in enumerate(views)]
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return load_saved(path, "path", _cameras)
+
+
+def _cameras(data: dict[str, Any]) -> list[Camera]:
+    views = data.get("views")
+    if not isinstance(views, list) or not 1 <= len(views) <= MOST_VIEWS:
+        raise ValueError(f"must hold 1 to {MOST_VIEWS:,} views")
+    return [_camera(view, f"views[{index}]") for index, view in enumerate(views)]
 
 
 def _camera(view: object, where: str) -> Camera:

@@ -36,7 +36,7 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}
 
 
 class RestOfRun(NamedTuple):
-    """What follows a stage in its run."""
+    """Work that is left in a run after a stage."""
 
     iterations: float = 0.0
     """Its time as a number of the stage's iterations, without compilation."""

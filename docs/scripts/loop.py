@@ -11,11 +11,11 @@ from PIL import Image
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.camera_paths import turntable
-from a2tg_jax.results.images import to_uint8
+from a2tg_jax.results.images import save_animation, to_uint8
 
 FROM, TO = -55.0, 85.0
 """Ends of the arc in degrees; 0 is the view of the most central camera."""
-NUM_FRAMES, MILLISECONDS, QUALITY = 37, 83, 72
+NUM_FRAMES, FRAMES_PER_SECOND, QUALITY = 37, 12, 72
 
 
 def main(model: pathlib.Path, out: pathlib.Path, num_frames: int = NUM_FRAMES) -> None:
@@ -27,8 +27,7 @@ def main(model: pathlib.Path, out: pathlib.Path, num_frames: int = NUM_FRAMES) -
     shares = (1 - np.cos(np.pi * np.arange(num_frames) / (num_frames - 1))) / 2
     degrees = np.rint(FROM + (TO - FROM) * shares).astype(int)
     frames = [Image.fromarray(to_uint8(draw(ring[angle % 360]).color)) for angle in degrees]
-    first, *others = frames + frames[-2:0:-1]
-    first.save(out, save_all=True, append_images=others, duration=MILLISECONDS, loop=0, quality=QUALITY, method=6)
+    save_animation(out, iter(frames + frames[-2:0:-1]), FRAMES_PER_SECOND, quality=QUALITY, method=6)
 
 
 if __name__ == "__main__":

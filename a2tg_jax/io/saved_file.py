@@ -1,0 +1,30 @@
+"""JSON files that the viewer saves: paths and edits."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from a2tg_jax.host.json_text import MOST_BYTES, parse_json
+from a2tg_jax.host.regular_files import is_regular, read_regular
+
+T = TypeVar("T")
+VERSION = 1
+
+
+def load_saved(path: Path, kind: str, parse: Callable[[dict[str, Any]], T]) -> T:
+    """Return what `parse` makes of the object in a file of a kind, "path" or "edit".
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: naming the file, if it is of another kind or version, or `parse` raises ValueError.
+    """
+    if not is_regular(path):
+        raise FileNotFoundError(f"{path}: no such {kind}; the viewer's 'Save {kind}' makes one")
+    try:
+        data = parse_json(read_regular(path, MOST_BYTES))
+        if not isinstance(data, dict) or (data.get("format"), data.get("version")) != (f"a2tg-jax {kind}", VERSION):
+            article = "an" if kind[0] in "aeiou" else "a"
+            raise ValueError(f"is not {article} {kind} of version {VERSION} that the viewer saved")
+        return parse(data)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
