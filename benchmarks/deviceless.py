@@ -22,7 +22,7 @@ NUM_GAUSSIANS, NUM_PAIRS = 1_000_000, 10_000_000
 WIDTH, HEIGHT, TILE_SIZE = 1920, 1088, 16
 STEPS = (("plain", "gaussians-2d-mcmc", 0, 500_000), ("textured", "a2tg", 1, 1_000_000))
 """Name, system and stage of each step, and the number of Gaussians."""
-STEP_SIZE, STEP_PHOTOGRAPHS = (1600, 1060), 8
+STEP_SIZE = 1600, 1060
 SIDES, SHARES = (1, 2, 4), (0.7, 0.2, 0.1)
 """Sides of the textures of a step, and the share of the Gaussians with each."""
 LAUNCH = re.compile(r"^  \S.*? = .*? (fusion|custom-call|copy|sort|while|conditional)\(", re.MULTILINE)
@@ -63,36 +63,12 @@ def step(name: str, index: int, num: int):
     import jax.numpy as jnp
     import numpy as np
 
-    from a2tg_jax.core.gaussians import init_from_points
-    from a2tg_jax.model import Model
-    from a2tg_jax.render import RenderSettings
     from a2tg_jax.texture import allocate_textures
-    from a2tg_jax.training import find_system
-    from a2tg_jax.training.batches import Photographs
-    from a2tg_jax.training.step import StepSettings, initial_state, train_step
+    from benchmarks.workload import training_step
 
-    rng, (width, height), views = np.random.default_rng(0), STEP_SIZE, STEP_PHOTOGRAPHS
-    stage = find_system(name).preset("paper").stages()[index]
-    gaussians = init_from_points(rng.normal(size=(num, 3)), np.full((num, 3), 0.5))
-    appearance = stage.appearance
-    if appearance.texture is not None:
-        sizes = np.repeat(rng.choice(SIDES, (num, 1), p=SHARES), 2, axis=1)
-        appearance = appearance.with_textures(allocate_textures(sizes))
-    model = Model(gaussians, appearance, num_live=jnp.asarray(num, jnp.int32))
-    clock = stage.clock()
-    due = tuple(times is None for times in clock.times)
-    settings = StepSettings(RenderSettings(capacity=10 * num, tile_size=TILE_SIZE, compositor="cuda"), "black", due)
-    photographs = Photographs(
-        np.zeros((views, 4, 4), np.float32), np.zeros((views, 3, 3), np.float32),
-        np.zeros((views, height, width, 3), np.uint8), None,
-    )  # fmt: skip
-    key = jax.random.key_data(jax.random.key(0))
-    arguments = stage, clock, initial_state(stage, model), photographs, np.zeros(1, np.int32), np.float32(1), key
-
-    def function(stage, clock, state, photographs, views, scale, key):
-        return train_step(settings, stage, clock, state, photographs, views, scale, jax.random.wrap_key_data(key))
-
-    return function, jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)), arguments)
+    sizes = np.repeat(np.random.default_rng(0).choice(SIDES, (num, 1), p=SHARES), 2, axis=1)
+    made = training_step(name, index, num, STEP_SIZE, allocate_textures(sizes), capacity=10 * num, compositor="cuda")
+    return made.run, jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)), made.given)
 
 
 def programs():

@@ -26,6 +26,7 @@ def main() -> None:
         "render": rendering.measure_render,
         "ratios": rendering.measure_ratios,
         "stages": stages.measure_stages,
+        "step": stages.measure_step,
         "limit": limit.measure_limit,
         "training": training.measure_training,
         "trained": training.measure_trained,

@@ -131,10 +131,10 @@ def gpu_section(args: argparse.Namespace) -> list[dict]:
         return []
     found = []
     for num in (100_000, 500_000, LARGEST):
+        kinds = [(case, kind, 16) for case in ("render", "step", "stages") for kind in ("none", "mixed")]
+        kinds += [("render", "mixed", 8)]
         cases = [
-            random_case(num, FULL_SIZE, textures=kind, tile_size=tile_size)
-            for kind in ("none", "mixed")
-            for tile_size in (8, 16)
+            {**random_case(num, FULL_SIZE, textures=kind, tile_size=side), "case": case} for case, kind, side in kinds
         ]
         found += measure_all(cases, args.largest)
         if args.gsplat is not None and num <= args.largest:

@@ -7,13 +7,12 @@ import jax.numpy as jnp
 
 import a2tg_jax
 from a2tg_jax.core.optim import adam_init, adam_update
-from a2tg_jax.rasterize.compositor import composite
-from a2tg_jax.rasterize.kernels.native import composite as native
+from a2tg_jax.rasterize.compositor import composite, list_tiles
 from a2tg_jax.rasterize.splats import project_gaussians, settings_of_pass
 from a2tg_jax.rasterize.tiles import TileGrid
 from a2tg_jax.render import appearance_of
 from benchmarks import timing
-from benchmarks.workload import random_scene, random_textures
+from benchmarks.workload import random_scene, random_textures, training_step
 
 timed = functools.partial(timing.timed, wait=jax.block_until_ready)
 
@@ -23,16 +22,17 @@ def measure_stages(case: dict) -> dict:
     num, width, height = case["num"], case["width"], case["height"]
     gaussians, camera = random_scene(num, width, height)
     textures = random_textures(num, case.get("textures", "none"))
-    settings = a2tg_jax.plan_render(gaussians, camera, textures)
+    settings = a2tg_jax.RenderSettings(tile_size=case.get("tile_size", 8))
+    settings = a2tg_jax.plan_render(gaussians, camera, textures, settings=settings)
     capacity = settings.capacity or 0
     appearance, grid = appearance_of(gaussians, textures, settings), TileGrid(width, height, settings.tile_size)
     project = jax.jit(lambda gaussians: project_gaussians(gaussians, camera, appearance, settings.near_plane, 3))
     splats, cutoff = project(gaussians)
-    find_lists = jax.jit(lambda M, cutoff: native.tile_lists(M, cutoff, settings.near_plane, grid, capacity))
-    lists = find_lists(splats.M, cutoff)
     compositing, texels, regions = settings_of_pass(
-        appearance, splats, grid, settings.near_plane, has_geometry=False, compositor="native", tile_batch=1
+        appearance, splats, grid, settings.near_plane, has_geometry=False, compositor="auto", tile_batch=None
     )
+    find_lists = jax.jit(lambda M, cutoff: list_tiles(compositing, M, cutoff, capacity))
+    lists = find_lists(splats.M, cutoff)
     jacobian, probe = camera.K @ camera.viewmat[:3, :3], jnp.zeros((num, 4))
 
     def colors(splats, texels):
@@ -59,3 +59,21 @@ def measure_stages(case: dict) -> dict:
         "Adam": timed(adam, gaussians, moments),
         "evaluated_pairs": float(lists.starts[-1]) * settings.tile_size**2,
     }
+
+
+def measure_step(case: dict) -> dict:
+    """Measure a whole training step, between two events."""
+    kind, tile_size = case.get("textures", "none"), case.get("tile_size", 8)
+    system, index = ("gaussians-2d-mcmc", 0) if kind == "none" else ("a2tg", 1)
+    textures = random_textures(case["num"], kind)
+    size = case["width"], case["height"]
+    made = training_step(system, index, case["num"], size, textures, tile_size=tile_size)
+    stage, clock, state, *others = jax.device_put(made.given)
+    run = jax.jit(made.run, donate_argnums=2)
+    latest = [state]
+
+    def step():
+        latest[0], info = run(stage, clock, latest[0], *others)
+        return info
+
+    return {"step": timed(step)}

@@ -1,12 +1,21 @@
 """The measured workload: random Gaussians as this library's arrays, and textures for them."""
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import a2tg_jax
+from a2tg_jax.model import Model
+from a2tg_jax.training import find_system
+from a2tg_jax.training.batches import Photographs
+from a2tg_jax.training.step import StepSettings, initial_state, train_step
 from benchmarks.arrays import camera_matrices, random_splats
+
+NUM_PHOTOGRAPHS = 8
 
 
 def random_scene(num: int, width: int, height: int) -> tuple[a2tg_jax.Gaussians, a2tg_jax.Camera]:
@@ -38,3 +47,46 @@ def random_textures(num: int, kind: str, seed: int = 1) -> a2tg_jax.Textures | N
     textures = a2tg_jax.allocate_textures(sizes)
     noise = lambda x: x + jnp.asarray(rng.normal(size=x.shape) * [0.2, 0.2, 0.2, 0], jnp.float32)  # noqa: E731
     return dataclasses.replace(textures, buckets=tuple(map(noise, textures.buckets)))
+
+
+class TrainingStep(NamedTuple):
+    """A training step between two events, of a preset "paper"."""
+
+    run: Callable
+    """(stage, clock, state, photographs, views, scene scale, key) to the next state and figures; the state may be
+    donated."""
+    given: tuple[Any, ...]
+    """Its arguments."""
+
+
+def training_step(
+    system: str,
+    index: int,
+    num: int,
+    size: tuple[int, int],
+    textures: a2tg_jax.Textures | None,
+    capacity: int | None = None,
+    **settings: Any,
+) -> TrainingStep:
+    """Return the step of a system's stage on the random scene and photographs of noise; further arguments are fields
+    of `RenderSettings`."""
+    width, height = size
+    gaussians, camera = random_scene(num, width, height)
+    stage = find_system(system).preset("paper").stages()[index]
+    appearance = stage.appearance if stage.appearance.texture is None else stage.appearance.with_textures(textures)
+    render = a2tg_jax.RenderSettings(capacity=capacity, **settings)
+    if capacity is None:
+        render = a2tg_jax.plan_render(gaussians, camera, textures, settings=render)
+    model = Model(gaussians, appearance, num_live=jnp.asarray(num, jnp.int32))
+    clock = stage.clock()
+    step = StepSettings(render, "black", tuple(times is None for times in clock.times))
+    stack = lambda matrix: np.repeat(np.asarray(matrix, np.float32)[None], NUM_PHOTOGRAPHS, axis=0)  # noqa: E731
+    noise = np.random.default_rng(1).integers(0, 256, (NUM_PHOTOGRAPHS, height, width, 3), dtype=np.uint8)
+    photographs = Photographs(stack(camera.viewmat), stack(camera.K), noise, None)
+    key = jax.random.key_data(jax.random.key(0))
+    given = stage, clock, initial_state(stage, model), photographs, np.zeros(1, np.int32), np.float32(1), key
+
+    def run(stage, clock, state, photographs, views, scale, key):
+        return train_step(step, stage, clock, state, photographs, views, scale, jax.random.wrap_key_data(key))
+
+    return TrainingStep(run, given)

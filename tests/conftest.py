@@ -85,7 +85,9 @@ def shared():
 
 @pytest.fixture
 def gpu_kernels(monkeypatch):
-    """Runs the GPU kernels on the CPU, as OpenCL."""
+    """Runs the GPU kernels: on JAX's GPU if it has one (JAX_PLATFORMS=cuda,cpu), else on the CPU, as OpenCL."""
+    if jax.default_backend() == "gpu":
+        return
     import opencl
 
     from a2tg_jax.rasterize.kernels import platforms
@@ -100,8 +102,11 @@ def gpu_kernels(monkeypatch):
 @pytest.fixture(autouse=True)
 def kernels_of_the_compositor(request):
     """The kernels that a test's parameter `compositor` asks for."""
-    if getattr(request.node, "callspec", None) and request.node.callspec.params.get("compositor") == "cuda":
+    wanted = request.node.callspec.params.get("compositor") if hasattr(request.node, "callspec") else None
+    if wanted == "cuda":
         request.getfixturevalue("gpu_kernels")
+    elif wanted == "native" and jax.default_backend() != "cpu":
+        pytest.skip("native loops run on CPUs")
 
 
 @pytest.fixture(scope="module")

@@ -259,7 +259,9 @@ def as_textures(scene: Scene, dtype: str) -> Textures | None:
 
 
 def as_settings(rules: Rules = DEFAULT_RULES, **changes: Any) -> RenderSettings:
-    """The oracle's rules as the package's settings, with further fields changed."""
+    """The oracle's rules as the package's settings, with further fields changed; on a GPU, its kernels are tested."""
+    if changes.get("compositor") == "native" and jax.default_backend() == "gpu":
+        changes["compositor"] = "cuda"
     plain = RenderSettings()
     options = {name: getattr(rules, name) for name in ("uv", "outside", "rgb", "alpha", "max_alpha")}
     texture = dataclasses.replace(plain.texture, **options)

@@ -23,7 +23,10 @@ def counted():
 
 def test_stages_of_a_step_can_be_measured(monkeypatch):
     monkeypatch.setattr(stages, "timed", jax.eval_shape)
-    assert stages.measure_stages({"num": 50, "width": 32, "height": 16})["evaluated_pairs"] > 0
+    case = {"num": 50, "width": 32, "height": 16}
+    assert stages.measure_stages(case)["evaluated_pairs"] > 0
+    monkeypatch.setattr(stages, "timed", lambda function, *_: function())
+    assert stages.measure_step({**case, "textures": "mixed"})["step"].loss > 0
 
 
 def test_operations_of_a_jaxpr_are_its_arithmetic():

@@ -90,7 +90,7 @@ def test_gpu_kernels_show_features():
         output = render_image(gaussians, camera, features=features, settings=settings)
         return jnp.sum(output.color**2) + jnp.sum(output.depth)
 
-    found, wanted = (jax.grad(loss, argnums=(0, 1))(features, gaussians, name) for name in ("cuda", "native"))
+    found, wanted = (jax.grad(loss, argnums=(0, 1))(features, gaussians, name) for name in ("cuda", "xla"))
     compare = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-3)
     jax.tree.map(compare, found, wanted)
 

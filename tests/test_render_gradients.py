@@ -159,7 +159,8 @@ def assert_leaves_match(gradient: Inputs, scene: Scene, rules: Rules, texels: li
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(
-    ("seed", "compositor"), quick_then_long([(53, "native")], [(161, "native"), (53, "xla"), (161, "xla")])
+    ("seed", "compositor"),
+    quick_then_long([(53, "native")], [(161, "native"), (53, "xla"), (161, "xla"), (53, "cuda"), (161, "cuda")]),
 )
 def test_every_leaf_against_differences(seed, compositor):
     scene = smooth_scene(seed, DEFAULT_RULES)
