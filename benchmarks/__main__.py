@@ -69,7 +69,7 @@ def named_command(text: str) -> tuple[str, list[str]]:
 def machine() -> dict:
     """Return the machine, the versions and the commit."""
     names = ("jax", "jaxlib", "numpy", "llvmlite")
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    commit = answer("git", "rev-parse", "--short", "HEAD")
     processor = platform.processor()
     cpuinfo = pathlib.Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -79,11 +79,20 @@ def machine() -> dict:
         "processor": processor,
         "cores": os.cpu_count(),
         "device": device(),
+        "gpu": answer("nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"),
         "python": platform.python_version(),
         "versions": {name: importlib.metadata.version(name) for name in names},
-        "commit": commit.stdout.strip(),
+        "commit": commit,
         "date": datetime.date.today().isoformat(),
     }
+
+
+def answer(*command: str) -> str:
+    """Return what a command prints; "" without it."""
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    except FileNotFoundError:
+        return ""
 
 
 if __name__ == "__main__":

@@ -139,8 +139,9 @@ def tile_lists(
     bounds, depths = screen_bounds(M, cutoff, near_plane), M[:, 2, 2]
     order = jnp.argsort(depths, stable=True)
     shown = grid if height is None else grid._replace(height=height)  # type: ignore[arg-type]
-    rectangles = jax.tree.map(lambda x: x[order], tile_rectangles(bounds, shown, pixels))
-    total = total_pairs(rectangles.counts)
+    unordered = tile_rectangles(bounds, shown, pixels)
+    # Of counts that are not in order: a GPU would sum and gather in one slow kernel.
+    total, rectangles = total_pairs(unordered.counts), jax.tree.map(lambda x: x[order], unordered)
     # The total is known to a relative error of about 2⁻²⁰.
     overflow = total + jnp.floor(total * 2.0**-20) > capacity
     # Empty lists instead of some that lack splats: an image that is plainly wrong, at no cost.

@@ -15,6 +15,7 @@
 #define SWAP_BITS atomic_cmpxchg
 #endif
 #define KERNEL(name) __kernel __attribute__((reqd_work_group_size(THREADS, 1, 1))) void name
+#define ALIGNED __attribute__((aligned(16)))
 #define INLINE static
 #define GLOBAL __global
 #define SHARED __local
@@ -27,6 +28,7 @@
 #define ANY_IN_BLOCK(flag) any_in_group(&votes, flag)
 #define ANY_IN_WARP(flag) any_in_group(&votes, flag)
 #define ADD_IN_WARP(row, numbers) add_in_group(numbers_of_warp, row, numbers)
+#define READ_TEXEL(row, numbers) for (int c = 0; c < NUM_COLUMNS; c++) (numbers)[c] = (row)[c]
 #define ADD_TEXEL(row, weight, numbers) add_texel(row, weight, numbers)
 #define ATOMIC_ADD(place, number) add_atomically(place, number)
 #define TOTALS_AGAIN

@@ -12,10 +12,13 @@ typedef struct {
   real x, y, tile_x, tile_y;  // The pixel, counted from the tile's centre; the centre, in pixels of the image.
 } Place;
 
-typedef struct {
-  int id, region[3];
+// Aligned, so that several numbers are read at once; the planes, which all pixels read, come first.
+typedef struct ALIGNED {
+  real planes[NUM_PLANES];
   real limit;  // Squared distance within which a pixel is looked at.
-  real numbers[NUM_NUMBERS], planes[NUM_PLANES];
+  int id, region[3];
+  real numbers[NUM_NUMBERS];
+  real texel[NUM_COLUMNS + 1];  // The texel of a texture that has only one.
 } Entry;
 
 // Pixels of a warp form a block of 8×4 if such blocks fill the tile: a compact block sees fewer splats than a row does.
@@ -41,7 +44,8 @@ INLINE Place place_of(GLOBAL const int *starts, GLOBAL const int *size) {
 }
 
 INLINE void load(
-  IN_SHARED Entry *entry, int id, Place at, GLOBAL const real *splats, GLOBAL const int *regions
+  IN_SHARED Entry *entry, int id, Place at, GLOBAL const real *splats, GLOBAL const int *regions,
+  GLOBAL const real *texels
 ) {
   GLOBAL const real *row = splats + (INDEX)id * (NUM_NUMBERS + 1);
   real numbers[NUM_NUMBERS], planes[NUM_PLANES];
@@ -51,6 +55,12 @@ INLINE void load(
   for (int k = 0; k < 3; k++) entry->region[k] = NUM_COLUMNS ? regions[(INDEX)id * 3 + k] : 0;
   entry->limit = row[NUM_NUMBERS] + (real)CUTOFF_SLACK;
   entry->id = id;
+#if NUM_COLUMNS
+  real texel[NUM_COLUMNS];
+  if (entry->region[1] * entry->region[2] != 1) return;
+  READ_TEXEL(texels + (INDEX)entry->region[0] * NUM_COLUMNS, texel);
+  for (int c = 0; c < NUM_COLUMNS; c++) entry->texel[c] = texel[c];
+#endif
 }
 
 // The splat of an entry as variables of a thread.
@@ -64,13 +74,20 @@ INLINE void load(
 #if NUM_COLUMNS
 // What a pixel reads of the splat's texture: C values, and their derivatives by x and by y.
 INLINE void look_up(
-  const int *region, const real *position, GLOBAL const real *texels, int *texel, real *weights, real *sample
+  IN_SHARED const Entry *entry, const int *region, const real *position, GLOBAL const real *texels, int *texel,
+  real *weights, real *sample
 ) {
   real at_corners[4 * NUM_COLUMNS];
+  int area = region[1] * region[2];
+  if (area == 1) { // The same at all positions; most textures have one texel.
+    for (int c = 0; c < NUM_COLUMNS; c++) sample[c] = entry->texel[c];
+    for (int c = NUM_COLUMNS; c < 3 * NUM_COLUMNS; c++) sample[c] = 0;
+    return;
+  }
   corners(region, position, texel, weights);
-  for (int k = 0; k < 4; k++)
-    for (int c = 0; c < NUM_COLUMNS; c++)
-      at_corners[k * NUM_COLUMNS + c] = region[1] * region[2] > 0 ? texels[(INDEX)texel[k] * NUM_COLUMNS + c] : 0;
+  for (int c = 0; c < 4 * NUM_COLUMNS; c++) at_corners[c] = 0;
+  for (int k = 0; k < 4 && area > 0; k++)
+    READ_TEXEL(texels + (INDEX)texel[k] * NUM_COLUMNS, at_corners + k * NUM_COLUMNS);
   interpolate(region, weights, at_corners, sample);
 }
 #endif
@@ -88,7 +105,7 @@ KERNEL(forward)(
   for (int start = at.first; start < at.last; start += BATCH) {
     if (!ANY_IN_BLOCK(is_live)) break;
     int count = at.last - start < BATCH ? at.last - start : BATCH;
-    for (int k = THREAD; k < count; k += THREADS) load(&batch[k], ids[start + k], at, splats, regions);
+    for (int k = THREAD; k < count; k += THREADS) load(&batch[k], ids[start + k], at, splats, regions, texels);
     BARRIER;
     for (int k = 0; k < count && is_live; k++) {
       UNPACK(batch[k]);
@@ -98,7 +115,7 @@ KERNEL(forward)(
 #if NUM_COLUMNS
       int texel[4];
       real weights[12];
-      look_up(region, position, texels, texel, weights, sample);
+      look_up(&batch[k], region, position, texels, texel, weights, sample);
 #endif
       blend(planes, numbers, sample, at.x, at.y, transmittance, is_live, channels, &transmittance, &is_live, channels);
     }
@@ -153,10 +170,11 @@ KERNEL(backward)(
   for (int start = at.first; start < at.last; start += BATCH) {
     if (!ANY_IN_BLOCK(is_live)) break;
     int count = at.last - start < BATCH ? at.last - start : BATCH;
-    for (int k = THREAD; k < count; k += THREADS) load(&batch[k], ids[start + k], at, splats, regions);
+    for (int k = THREAD; k < count; k += THREADS) load(&batch[k], ids[start + k], at, splats, regions, texels);
     for (int k = THREAD; k < BATCH * NUM_SUMS; k += THREADS) batch_sums[k] = 0;
     BARRIER;
-    for (int k = 0; k < count; k++) {
+    int is_warp_live = ANY_IN_WARP(is_live);
+    for (int k = 0; k < count && is_warp_live; k++) {
       UNPACK(batch[k]);
       real rho, position[2], sample[3 * NUM_COLUMNS + 1], d_values[NUM_COLUMNS + 1], sums[NUM_SUMS];
       int is_reached = 0, contributes = 0;
@@ -169,7 +187,7 @@ KERNEL(backward)(
 #if NUM_COLUMNS
       int texel[4];
       real weights[12];
-      if (is_reached) look_up(region, position, texels, texel, weights, sample);
+      if (is_reached) look_up(&batch[k], region, position, texels, texel, weights, sample);
 #endif
       if (is_reached)
         blend_vjp(planes, numbers, region, sample, at.x, at.y, transmittance, is_live, suffix_sum, cotangents, center,
