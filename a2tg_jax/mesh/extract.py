@@ -1,6 +1,7 @@
 """Mesh extraction from a model: depths of views, their fusion, marching cubes, and cleaning (host)."""
 
 import dataclasses
+import importlib
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -121,7 +122,7 @@ def extract_mesh(
 
     Raises:
       ValueError: if the model is empty or has no cameras, if an argument is out of its range, if the voxels need more
-        memory than `max_bytes`, or if there is no surface within the radius.
+        memory than `max_bytes`, if there is no surface within the radius, or if scikit-image is not installed.
     """
     start = time.perf_counter()
     check_is_model(model)
@@ -130,6 +131,7 @@ def extract_mesh(
         what = "the model has no Gaussians" if not model.num else "there are no cameras"
         raise ValueError(f"a mesh needs views of some Gaussians; {what}")
     check_lengths(resolution, voxel, radius)
+    _marching_cubes()  # It is used only after the views are fused, which takes minutes.
     if not 0 < max_bytes < np.inf:
         raise ValueError(f"max_bytes must be positive and finite; got {max_bytes}")
     if most_clusters < 1:
@@ -223,11 +225,17 @@ def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh
     return Mesh(positions, faces.astype(np.int32), colors)
 
 
+def _marching_cubes() -> Any:
+    """Return scikit-image's function. ValueError: it is not installed."""
+    try:
+        return importlib.import_module("skimage.measure").marching_cubes
+    except ImportError:
+        raise ValueError("a mesh needs scikit-image, which is not installed: pip install 'a2tg-jax[train]'") from None
+
+
 def _parts(grid: BlockGrid, least_weight: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield vertices in voxels, faces and colours of each brick that has a surface."""
-    from skimage import measure
-
-    marching_cubes: Any = measure.marching_cubes
+    marching_cubes = _marching_cubes()
     # The last cells of a brick need the first voxels of the next ones.
     blocks = np.stack(np.meshgrid(*[np.arange(BRICK + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     for brick in np.unique(grid.coordinates // BRICK, axis=0):
