@@ -14,7 +14,7 @@ PLENTY = 1 << 30
 
 
 def error_text(error: Exception, less_memory: str) -> str | None:
-    """Return the message of a user's error, a missing extra, or full memory or disk; None for an error of the program itself.
+    """Return the message of a user's error, or of full memory or disk; None for an error of the program itself.
 
     Args:
       error: any error.
