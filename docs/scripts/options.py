@@ -76,8 +76,6 @@ def options_of(*words: str) -> list[Option]:
         elif head := HEAD.match(inside):
             name, _, value = re.sub(r", --\S*no-\S+", "", head[1]).partition(" ")
             found.append(Option(group, name, value, head[2] or "", ""))
-        elif found and found[-1].value.count("{") > found[-1].value.count("}"):  # A long list of values.
-            found[-1] = found[-1]._replace(value=found[-1].value + inside.strip())
         elif found and re.match(r" {3,}\S", inside):
             found[-1] = found[-1]._replace(text=f"{found[-1].text} {inside.strip()}".strip())
     return [_with_default(option) for option in found if option.name not in ("-h,", "-h")]
