@@ -54,6 +54,7 @@ class Picture:
     is_held: bool = False
     """Whether they are in memory."""
     dtype: DTypeLike = np.uint8
+    """Type of the pixels."""
     is_remote: bool = False
     """Whether reading waits for object storage."""
 
@@ -111,6 +112,7 @@ class Mask:
     num: int
     """Number of pixels that count."""
     data: bytes = dataclasses.field(repr=False)
+    """Compressed bits; `read` decodes them."""
 
     @staticmethod
     def of(counts: "np.ndarray | Mask") -> "Mask":

@@ -100,19 +100,17 @@ def extract_mesh(
     The depths of each view are fused into a truncated signed distance function on sparse voxels. A depth is the mean of
     the splats on a ray, with less weight if they are far apart. Small connected parts are removed.
 
-        result = a2tg.extract_mesh(model, resolution=256)
-        a2tg.save_mesh("scene.glb", result.mesh, model.origin.transform)
-
     Args:
       model: a model of any appearance.
       cameras: the views to fuse; None takes the model's training views.
       resolution: number of voxels along the radius, 512 by default.
       voxel: side of a voxel in units of the model's world, instead of the resolution.
-      center, radius: the space to fuse, in the model's world; None is the point nearest to all optical axes, and twice
-        the cameras' median distance from it.
+      center: [3] centre of the space to fuse, in the model's world; None is the point nearest to all optical axes.
+      radius: radius of that space; None is twice the cameras' median distance from the centre.
       unbounded: extend the space beyond the radius, with voxels that grow in proportion to their distance.
       least_weight: voxels up to this weight have no surface. One view with a sharp depth has a weight of 1.
-      most_clusters, least_faces: largest number of connected parts to keep, and smallest number of triangles in one.
+      most_clusters: largest number of connected parts to keep.
+      least_faces: smallest number of triangles in a part.
       max_bytes: memory budget of the voxels. Extraction also needs memory for one view and for the mesh.
       settings: static options of the renderer.
       progress: show a progress bar.
@@ -123,6 +121,12 @@ def extract_mesh(
     Raises:
       ValueError: if the model is empty or has no cameras, if an argument is out of its range, if the voxels need more
         memory than `max_bytes`, if there is no surface within the radius, or if scikit-image is not installed.
+
+    Examples:
+      >>> cameras = [view.camera for view in scene.train]
+      >>> result = a2tg.extract_mesh(model, cameras, resolution=24, least_faces=1)
+      >>> a2tg.save_mesh("scene.glb", result.mesh)
+      [PosixPath('scene.glb')]
     """
     start = time.perf_counter()
     check_is_model(model)

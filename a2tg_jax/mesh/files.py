@@ -55,6 +55,12 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
 
     Raises:
       ValueError: if the path has another suffix.
+
+    Examples:
+      >>> vertices, faces = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)
+      >>> mesh = a2tg.Mesh(vertices, faces, colors=np.full((3, 3), 128, np.uint8))
+      >>> len(a2tg.save_mesh("triangle.obj", mesh))
+      1
     """
     check_mesh_suffix(path)
     path = Path(path)
