@@ -125,8 +125,8 @@ def extract_mesh(
     Examples:
       >>> cameras = [view.camera for view in scene.train]
       >>> result = a2tg.extract_mesh(model, cameras, resolution=24, least_faces=1)
-      >>> a2tg.save_mesh("scene.glb", result.mesh)
-      [PosixPath('scene.glb')]
+      >>> [path.name for path in a2tg.save_mesh("scene.glb", result.mesh)]
+      ['scene.glb']
     """
     start = time.perf_counter()
     check_is_model(model)
