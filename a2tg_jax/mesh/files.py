@@ -111,7 +111,8 @@ def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
             Image.fromarray(mesh.texture).save(temporary, "PNG")
         with replacing(material) as temporary:
             # Ka and Kd 1, illum 0: colours of the picture, without lights.
-            temporary.write_text(f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {picture.name}\n")
+            text = f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {picture.name}\n"
+            temporary.write_text(text, encoding="utf-8")
     with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
         rows = mesh.vertices
