@@ -29,8 +29,8 @@ def pycolmap() -> ModuleType:
         except ImportError as error:  # There are wheels for x86-64 Linux and Windows and for macOS on arm64.
             raise ValueError(
                 f"finding cameras and undistorting photographs need pycolmap, which is not installed ({error}): "
-                "pip install 'a2tg-jax[train]'; it has no wheel for this machine if that does not bring it: do this "
-                "step on another machine, with a2tg sfm or COLMAP's image_undistorter"
+                "pip install 'a2tg-jax[train]' or, if it has no wheel for this machine, do this step on another one, "
+                "with a2tg sfm or COLMAP's image_undistorter"
             ) from None
 
     return sys.modules["pycolmap"]
