@@ -155,8 +155,8 @@ def plan_growth(
     least: Array | int = 0,
     draw: DrawHosts | None = None,
 ) -> Moves:
-    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist, to at least `least` as
-    far as the cap allows. Hosts are drawn as in `plan_relocation`."""
+    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist, to at least `least`
+    where the cap allows it. Hosts are drawn as in `plan_relocation`."""
     index = jnp.arange(opacities.shape[0], dtype=jnp.int32)
     is_live = index < num_live
     is_host = is_live & (opacities > DEAD_OPACITY)

@@ -189,7 +189,7 @@ class Shelf:
 
     Beyond the memory limit, pixels of an unchanged image file are dropped: decoding it again takes less time than a
     training step of that size. Undistorted or resized pixels go to an unnamed file in `cache_folder()`, which
-    disappears with the process, however that ends. Those of remote files take a share of the disk; the others are
+    disappears with the process, however that ends. Pixels of remote files take a share of the disk; the others are
     made again.
     """
 

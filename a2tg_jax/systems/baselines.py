@@ -193,7 +193,7 @@ class BillboardOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BBSplat(TwoStages):
-    """Flat RGBA pictures, whose alpha takes the place of opacity and Gaussian."""
+    """Flat RGBA pictures, whose alpha replaces opacity and Gaussian."""
 
     stage2_iterations: int = 2_000
     """Further iterations without densification; 0: none."""
