@@ -44,7 +44,13 @@ class ReallocateResult(NamedTuple):
 
 @pytree
 class Upscale(HostEvent):
-    """Gradient-driven selection, then anisotropic upscaling, of textures (A²TG)."""
+    """Gradient-driven selection, then anisotropic upscaling, of textures (A²TG).
+
+    Examples:
+      >>> event = a2tg.Upscale(select="fraction", fraction=0.1, cap=8, at=(0.25, 0.5))
+      >>> event.iterations(1000)
+      (250, 500)
+    """
 
     select: Literal["fraction", "threshold", "budget"] = static(default="fraction")
     """Rule that chooses the Gaussians to upscale; a memory_budget sets "budget"."""
@@ -228,6 +234,11 @@ def next_sizes(
 
     Raises:
       ValueError: if the shapes differ, or a number is out of range.
+
+    Examples:
+      >>> a2tg.next_sizes([[1, 1], [1, 1]], [[0.1, 0.1], [0.1, 0.001]], k_a=4.0, k_s=0.01, cap=4)
+      array([[2, 2],
+             [1, 2]])
     """
     sizes = checked_sizes(sizes).astype(np.int64)
     check_shape("scales", scales, sizes.shape)
@@ -304,6 +315,11 @@ def select(
 
     Raises:
       ValueError: unless exactly one rule is given, in its range, and the shapes agree.
+
+    Examples:
+      >>> sizes, proposed = np.ones((3, 2), int), np.full((3, 2), 2)
+      >>> a2tg.select(np.array([0.3, 0.1, 0.2]), sizes, proposed, budget_bytes=100)
+      array([ True, False,  True])
     """
     statistic, sizes, proposed = np.asarray(statistic), np.asarray(sizes), np.asarray(proposed)
     check_shape("statistic", statistic, ("N",))
@@ -344,12 +360,21 @@ def reallocate(
       new_sizes: [N, 2] integers (Tv, Tu), each side 1 to 16, or both 0.
       moments: any pytree, such as the state of Adam: all `Textures` in it are rebuilt, other leaves stay
         unchanged.
-      known: shapes of buckets to prefer (`core.table.plan_places`).
+      known: shapes of buckets to prefer, since programs are compiled for them.
       kept: [N] bool, whose moments are kept, the others' being 0; None: all.
       room: shape of the buckets, if the textures fit; None: as small as possible, or one of `known`.
 
+    Returns:
+      The named tuple (textures, moments), both at the new sizes.
+
     Raises:
       ValueError: if `new_sizes` does not fit the textures or holds a side out of range.
+
+    Examples:
+      >>> textures = a2tg.allocate_textures(np.ones((3, 2), int))
+      >>> grown = a2tg.reallocate(textures, np.array([[1, 1], [2, 1], [2, 2]]), moments=())
+      >>> grown.textures.num_texels
+      7
     """
     check_textures(textures)
     new_sizes = checked_sizes(new_sizes, "new_sizes")

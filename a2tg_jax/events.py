@@ -37,8 +37,11 @@ class Times(NamedTuple):
     """Every `every` iterations, from 1, between a first and a last, both included. Host numbers, or traced."""
 
     first: Any
+    """Iteration before which it never happens."""
     last: Any
+    """Last iteration at which it may happen."""
     every: Any
+    """Number of iterations between two times; it happens at multiples of it."""
 
     def is_due(self, iteration: object) -> Array:
         """Return whether the event follows this iteration."""
@@ -123,10 +126,13 @@ class Change(NamedTuple):
     """Result of an event."""
 
     model: Model
+    """The model after the event."""
     moments: AdamState
     """Adam's moments of the model's floats."""
     state: Any
+    """State of the event, as `init` makes and `observe` updates it."""
     info: EventInfo = EventInfo()
+    """Whether training can continue, and how many Gaussians found no room."""
     rows: np.ndarray | None = None
     """[N] integers of an event on the host that moves rows: row i is the former row rows[i]; None: none has moved.
     Model, moments and state are in the new order; statistics of other events follow."""
@@ -171,7 +177,7 @@ class Event:
 
         It does not follow rows that another event moves inside the step: gather per row only in a stage in which none
         does. `gather` follows rows that move on the host. If several devices train together, they share the rows of
-        these arrays; arrays made by `parallel.sharded_rows.zeros_beside` are never on one device.
+        these arrays.
         """
         if self.statistic is None:
             return ()
@@ -282,10 +288,14 @@ def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | 
     All shapes stay: the rows of the Gaussians that are kept come first, in their order, and `Model.num_live` falls.
 
     Args:
-      model, moments: as given to `HostEvent.apply`.
-      state: of the event.
+      model: as given to `HostEvent.apply`.
+      moments: as given to `HostEvent.apply`.
+      state: state of the event.
       is_kept: mask of the Gaussians that stay, [num] bool for those that exist (`Model.num`), or [N] for all rows, such
         as `model.gaussians.opacities > 0.01`.
+
+    Returns:
+      The change, for `HostEvent.apply` to return.
 
     Raises:
       ValueError: if it is no such mask or keeps fewer than 2, or if textures or view dependence have blocks of several

@@ -55,7 +55,8 @@ class MoveResult(NamedTuple):
 def relocate(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Array | int) -> MoveResult:
     """Move each dead Gaussian (opacity at most 0.005) onto a live one, drawn with probability ∝ its opacity.
 
-    Host and moved ones share the opacity and size of `share`; everything else is copied from the host. The moments
+    Host and moved ones share opacity and size so that together they look like the host (3DGS-MCMC, Kheradmand et al.,
+    2024); everything else is copied from the host. The moments
     of a host become zero; the moved rows keep theirs.
 
     Args:
@@ -65,10 +66,17 @@ def relocate(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Arr
       num_live: rows in use, 0 to N; may be traced.
 
     Returns:
-      MoveResult, with `num_live` as given.
+      The named tuple (gaussians, moments, num_live, info): rows and moments after the moves, `num_live` as given, and
+      an `EventInfo`.
 
     Raises:
       ValueError: if a leaf of `moments` has another leading axis.
+
+    Examples:
+      >>> moments = jax.tree.map(jnp.zeros_like, gaussians)
+      >>> moved = a2tg.relocate(jax.random.key(0), gaussians, moments, gaussians.num)
+      >>> moved.gaussians.num, int(moved.num_live)
+      (200, 200)
     """
     _check_moments(gaussians, moments, num_live)
     num_live = jnp.asarray(num_live, jnp.int32)
@@ -88,10 +96,17 @@ def grow(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Array |
       cap: largest count, at most N; may be traced.
 
     Returns:
-      MoveResult, with the new `num_live`.
+      The named tuple (gaussians, moments, num_live, info): rows and moments with the copies, the new count, and an
+      `EventInfo`.
 
     Raises:
       ValueError: if a cap that is not traced exceeds N, or a leaf of `moments` has another leading axis.
+
+    Examples:
+      >>> moments = jax.tree.map(jnp.zeros_like, gaussians)
+      >>> grown = a2tg.grow(jax.random.key(0), gaussians, moments, 100, cap=200)
+      >>> int(grown.num_live)
+      105
     """
     _check_moments(gaussians, moments, num_live)
     check_shape("cap", cap, ())
@@ -140,8 +155,8 @@ def plan_growth(
     least: Array | int = 0,
     draw: DrawHosts | None = None,
 ) -> Moves:
-    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist, to at least `least` as
-    far as the cap allows. Hosts are drawn as in `plan_relocation`."""
+    """Plan what `grow` does to rows of these opacities [N], of which the first `num_live` exist, to at least `least`
+    where the cap allows it. Hosts are drawn as in `plan_relocation`."""
     index = jnp.arange(opacities.shape[0], dtype=jnp.int32)
     is_live = index < num_live
     is_host = is_live & (opacities > DEAD_OPACITY)
@@ -172,8 +187,16 @@ def perturb(
       lr: the current learning rate of the means, in world units; may be traced.
       scales: standard deviations along the first axes, [N, 2] or of ellipsoids [N, 3]; None: `gaussians.scales`.
 
+    Returns:
+      N Gaussians; only means of live rows differ.
+
     Raises:
       ValueError: if an argument has another shape than it must have.
+
+    Examples:
+      >>> noisy = a2tg.perturb(jax.random.key(0), gaussians, gaussians.num, lr=1e-4)
+      >>> noisy.means.shape
+      (200, 3)
     """
     check_gaussians(gaussians)
     check_shape("num_live", num_live, ())
@@ -266,7 +289,13 @@ class Noise(StepEvent):
 
 @pytree
 class Mcmc(StepEvent):
-    """Relocation of dead Gaussians and growth to a cap (`relocate`, `grow`), for any appearance."""
+    """Relocation of dead Gaussians and growth to a cap (`relocate`, `grow`), for any appearance.
+
+    Examples:
+      >>> a2tg.Mcmc(cap=5000).num_rows(1000, 30_000)
+      5000
+      >>> system = a2tg.Gaussians2dMcmc.preset("quick", densify=a2tg.Mcmc(cap=5000))
+    """
 
     cap: int = static(default=500_000)
     """Largest number of Gaussians; 0: none relocate, and their number stays. A memory_budget replaces it."""

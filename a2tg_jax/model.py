@@ -37,6 +37,14 @@ class Model:
     """Gaussians and their appearance, N rows each.
 
     Methods marked "(host)" read numbers of the device, and cannot be called under jit.
+
+    Examples:
+      >>> textures = a2tg.allocate_textures(np.full((gaussians.num, 2), 4))
+      >>> model = a2tg.Model(gaussians, a2tg.Appearance(texture=a2tg.Texture(textures)))
+      >>> model.num, model.num_bytes
+      (200, 68800)
+      >>> model[model.gaussians.means[:, 2] > 0].num < 200
+      True
     """
 
     gaussians: Gaussians
@@ -122,8 +130,17 @@ class Model:
         return self.appearance.textures
 
     def with_textures(self, textures: Textures) -> "Model":
-        """Return the same model with other textures. ValueError: it has none; the message says how to build one that
-        has."""
+        """Return the same model with other textures.
+
+        Args:
+          textures: textures of its allocated Gaussians.
+
+        Returns:
+          The model.
+
+        Raises:
+          ValueError: if it has none; the message says how to build one that has.
+        """
         return dataclasses.replace(self, appearance=self.appearance.with_textures(textures))
 
     @property
@@ -171,6 +188,12 @@ class Model:
           background: [3] colour, or [D] features; None is the model's own, or 0 behind features.
           settings: static options; `texture` is ignored, since the appearance has its own options. Under jit they
             need a capacity: `plan_render(model, cameras)`.
+
+        Returns:
+          The images of the view.
+
+        Raises:
+          ValueError: under jit or vmap without a capacity, or if an argument has a wrong shape.
         """
         background = self.background if background is None and features is None else background
         appearance = with_features(self.appearance, features, self.gaussians)

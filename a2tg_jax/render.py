@@ -59,6 +59,14 @@ def render_image(
     Raises:
       ValueError: under jit or vmap without a capacity, if there are textures of another number of Gaussians, or if an
         argument has a wrong shape.
+
+    Examples:
+      >>> output = a2tg.render_image(gaussians, camera)
+      >>> output.color.shape, output.depth.shape
+      ((36, 48, 3), (36, 48))
+      >>> darkness = lambda gaussians: -jnp.mean(a2tg.render_image(gaussians, camera).color)
+      >>> jax.grad(darkness)(gaussians).means.shape
+      (200, 3)
     """
     check_gaussians(gaussians)
     appearance = with_features(appearance_of(gaussians, textures, settings), features, gaussians)
@@ -74,7 +82,28 @@ def render_appearance(
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     num_live: Array | int | None = None,
 ) -> RenderOutput:
-    """Render a view as `render_image` does, with any appearance; of the first `num_live` rows, if given."""
+    """Render a view as `render_image` does, with any appearance; of the first `num_live` rows, if given.
+
+    Args:
+      gaussians: N Gaussians.
+      camera: the view.
+      appearance: their appearance, with a row for each of them.
+      background: [3] colour, or one number for each of the appearance's colours, behind everything; None is 0.
+      settings: static options, as in `render_image`; `texture` is ignored, since the appearance has its own options.
+      num_live: number of rows that exist, 0 to N, a Python or array integer; None: all. It may be traced.
+
+    Returns:
+      The images of the view, as `render_image` returns them.
+
+    Raises:
+      ValueError: under jit or vmap without a capacity, or if an argument has a wrong shape or kind.
+
+    Examples:
+      >>> textures = a2tg.allocate_textures(np.full((gaussians.num, 2), 4))
+      >>> appearance = a2tg.Appearance(texture=a2tg.Texture(textures))
+      >>> a2tg.render_appearance(gaussians, camera, appearance).color.shape
+      (36, 48, 3)
+    """
     check_gaussians(gaussians)
     check_camera(camera)
     check_is_appearance(appearance, gaussians)

@@ -47,9 +47,18 @@ def plan_render(
       head_room: factor, at least 1, on the pairs of the fullest view.
       settings: static options; their capacity is replaced.
 
+    Returns:
+      The settings, with a capacity of (splat, tile) pairs.
+
     Raises:
       ValueError: if there is no camera, an argument is of another kind or out of range, textures or an appearance are
         given besides a model or each other, or under jit and vmap, where shapes are fixed.
+
+    Examples:
+      >>> settings = a2tg.plan_render(model, [view.camera for view in scene.train])
+      >>> draw = jax.jit(lambda camera: model.render(camera, settings=settings).color)
+      >>> draw(camera).shape
+      (36, 48, 3)
     """
     check_kind("gaussians", gaussians, (Model, Gaussians))
     cameras = checked_cameras(cameras)
@@ -80,9 +89,12 @@ class Renderer:
     needs more is drawn again with at least three times the capacity. A long flight therefore compiles only a few times,
     and no camera is refused. Models of equal shapes share compiled programs.
 
-        renderer = Renderer(model)
-        for camera in smooth_path(cameras, 200):
-            image = renderer(camera).color
+    Examples:
+      >>> renderer = a2tg.Renderer(model)
+      >>> cameras = [view.camera for view in scene.train]
+      >>> frames = [renderer(camera).color for camera in a2tg.smooth_path(cameras, 3)]
+      >>> len(frames)
+      3
     """
 
     def __init__(

@@ -24,7 +24,13 @@ NEUTRAL_TEXEL = (0.0, 0.0, 0.0, 1.0)  # adds no colour, and multiplies alpha by 
 
 @pytree(repr=False)
 class Textures(Table):
-    """The textures of all Gaussians, [Tv, Tu, 4] each, bucketed by resolution."""
+    """The textures of all Gaussians, [Tv, Tu, 4] each, bucketed by resolution.
+
+    Examples:
+      >>> textures = a2tg.allocate_textures([[1, 1], [4, 2]])  # (Tv, Tu) of two Gaussians
+      >>> textures.num_texels, textures.bucket_sizes
+      (9, ((1, 1), (4, 2)))
+    """
 
     num_sides: ClassVar[int] = 2
     padding: ClassVar[tuple[float, ...]] = NEUTRAL_TEXEL
@@ -75,8 +81,16 @@ def allocate_textures(sizes: ArrayLike, *, rgb: float = 0.0, dtype: DTypeLike = 
       rgb: initial RGB residual.
       dtype: dtype of the texels.
 
+    Returns:
+      Textures of N Gaussians.
+
     Raises:
       ValueError: if a size is out of range, or the dtype is not one of floats.
+
+    Examples:
+      >>> textures = a2tg.allocate_textures(np.full((gaussians.num, 2), 4))
+      >>> a2tg.render_image(gaussians, camera, textures).color.shape
+      (36, 48, 3)
     """
     check_number("rgb", rgb)
     if not jnp.issubdtype(dtype, jnp.floating):
@@ -85,10 +99,22 @@ def allocate_textures(sizes: ArrayLike, *, rgb: float = 0.0, dtype: DTypeLike = 
 
 
 def textures_from_arrays(arrays: Sequence[ArrayLike]) -> Textures:
-    """Return the textures of N arrays [Tv, Tu, 4] of one float dtype; the inverse of `texture_arrays`.
+    """Return the textures of N arrays; the inverse of `texture_arrays`.
+
+    Args:
+      arrays: N arrays [Tv, Tu, 4] of one float dtype: signed RGB residual and alpha factor in [0, 1].
+
+    Returns:
+      Textures of N Gaussians, in the order of the arrays.
 
     Raises:
       ValueError: if an array is not floats [Tv, Tu, 4] with sides of 1 to 16, naming it.
+
+    Examples:
+      >>> arrays = [np.zeros((2, 3, 4), np.float32), np.ones((1, 1, 4), np.float32)]
+      >>> textures = a2tg.textures_from_arrays(arrays)
+      >>> [array.shape for array in a2tg.texture_arrays(textures)]
+      [(2, 3, 4), (1, 1, 4)]
     """
     given = [np.asarray(plain_array(f"texture {index}", array)) for index, array in enumerate(arrays)]
     for index, array in enumerate(given):
@@ -103,6 +129,16 @@ def textures_from_arrays(arrays: Sequence[ArrayLike]) -> Textures:
 
 
 def texture_arrays(textures: Textures) -> list[np.ndarray]:
-    """Return the N textures as NumPy arrays [Tv, Tu, 4], in the order of the Gaussians (host)."""
+    """Return the textures as NumPy arrays (host).
+
+    Args:
+      textures: textures of N Gaussians.
+
+    Returns:
+      N arrays [Tv, Tu, 4], in the order of the Gaussians: RGB residual and alpha factor.
+
+    Raises:
+      ValueError: if the argument is of another kind.
+    """
     check_textures(textures)
     return textures.blocks()

@@ -1,4 +1,4 @@
-"""Plots of docs/performance.md, from the JSON that `python -m benchmarks` wrote.
+"""Plot of docs/performance.md, from the JSON that `python -m benchmarks` wrote.
 
 python -m benchmarks.plots benchmarks/results/cpu.json docs/images
 """
@@ -17,9 +17,7 @@ STYLES = {"none": ("untextured", "C0"), "mixed": ("mixed sizes", "C1"), "4x4": (
 
 def main() -> None:
     report = json.loads(pathlib.Path(sys.argv[1]).read_text())
-    folder = pathlib.Path(sys.argv[2])
-    plot_growth(report["render"], folder / "performance-growth.png")
-    plot_stages(report["stages"], folder / "performance-stages.png")
+    plot_growth(report["render"], pathlib.Path(sys.argv[2]) / "performance-growth.png")
 
 
 def plot_growth(cases: list[dict], path: pathlib.Path) -> None:
@@ -39,30 +37,6 @@ def plot_growth(cases: list[dict], path: pathlib.Path) -> None:
         panel.grid(alpha=0.3)
     panels[0].set(ylabel="ms (solid: with backward, dotted: forward)")
     panels[0].legend()
-    figure.savefig(path, dpi=110)
-
-
-def plot_stages(cases: list[dict], path: pathlib.Path) -> None:
-    """Plot the time of each stage, per case, as stacked bars."""
-    stages = {
-        "tile lists": lambda case: case["tile lists"]["ms"],
-        "compositing": lambda case: case["compositing, forward and backward"]["ms"],
-        "projection": lambda case: case["projection, forward and backward"]["ms"],
-        "loss": lambda case: case["loss, value and gradient"]["ms"],
-        "Adam": lambda case: case["Adam"]["ms"],
-    }
-    cases = [case for case in cases if "failed" not in case]
-    figure, panel = plt.subplots(figsize=(9, 3.4), layout="constrained")
-    names = [f"{c['num'] // 1000}k, {STYLES[c['textures']][0]}\n{c['threads']} thread(s)" for c in cases]
-    start = [0.0] * len(cases)
-    for stage, of in stages.items():
-        widths = [of(case) for case in cases]
-        panel.barh(names, widths, left=start, label=stage)
-        start = [a + b for a, b in zip(start, widths, strict=True)]
-    panel.invert_yaxis()
-    panel.set(xlabel="ms, forward and backward")
-    panel.set_xscale("linear")
-    panel.legend(loc="upper right")
     figure.savefig(path, dpi=110)
 
 

@@ -1,18 +1,19 @@
-"""Tables of docs/performance.md, from the JSON that `python -m benchmarks` wrote.
+"""Tables of docs/performance.md and the notebook, from the JSON that `python -m benchmarks` wrote.
 
-    python -m benchmarks.tables benchmarks/results/cpu.json docs/performance.md
+    python -m benchmarks.tables benchmarks/results/cpu.json docs/performance.md experiments/NOTEBOOK.md
 
-replaces the text between `<!-- NAME -->` and `<!-- end -->` in the document by the table of that name.
+replaces the text between `<!-- NAME -->` and `<!-- end -->` in the documents by the table of that name.
 """
 
 import json
 import pathlib
+import re
 import sys
 from collections.abc import Callable, Iterable
 
 from experiments.lab.markdown import table
 
-TEXTURES = {"none": "none", "mixed": "mixed", "4x4": "all 4×4", "16x16": "all 16×16"}
+TEXTURES = {"none": "none", "mixed": "mixed", "4x4": "all 4×4"}
 STAGES = (
     "tile lists",
     "projection, forward and backward",
@@ -24,19 +25,21 @@ STAGES = (
 
 
 def main() -> None:
-    report, document = json.loads(pathlib.Path(sys.argv[1]).read_text()), pathlib.Path(sys.argv[2])
-    text = document.read_text()
+    report, documents = json.loads(pathlib.Path(sys.argv[1]).read_text()), [pathlib.Path(name) for name in sys.argv[2:]]
+    texts = [document.read_text() for document in documents]
     for name, (make, sections) in TABLES.items():
         missing = [section for section in sections if not report.get(section)]
         if missing:
             print(f"the table {name!r} stays as it is: {sys.argv[1]} has no {' and no '.join(missing)}")
             continue
-        before, marker, rest = text.partition(f"<!-- {name} -->\n")
-        _, end, after = rest.partition("<!-- end -->")
-        if not end:
-            sys.exit(f"{document} has no place for the table {name!r}: <!-- {name} --> and, below, <!-- end -->")
-        text = before + marker + make(report) + end + after
-    document.write_text(text)
+        place = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+        if not any(place.search(text) for text in texts):
+            wanted = f"<!-- {name} --> and, below, <!-- end -->"
+            sys.exit(f"no place for the table {name!r} in {', '.join(sys.argv[2:])}: {wanted}")
+        new = make(report)
+        texts = [place.sub(lambda found, new=new: found[1] + new + found[2], text) for text in texts]
+    for document, text in zip(documents, texts, strict=True):
+        document.write_text(text)
 
 
 def ms(figure: dict) -> str:
@@ -53,15 +56,6 @@ def measured(cases: Iterable[dict]) -> list[dict]:
     return [case for case in cases if "failed" not in case]
 
 
-def pairs_of_threads(cases: Iterable[dict]) -> list[dict[int, dict]]:
-    """Group the cases that differ in nothing but the threads, by threads."""
-    groups: dict[tuple, dict[int, dict]] = {}
-    for case in measured(cases):
-        key = (case["width"], case["num"], case["textures"])
-        groups.setdefault(key, {}).setdefault(case["threads"], case)
-    return list(groups.values())
-
-
 def machine(report: dict) -> str:
     found = report["machine"]
     versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
@@ -72,20 +66,17 @@ def machine(report: dict) -> str:
 
 
 def render(report: dict) -> str:
-    most = report["machine"]["cores"]
-    head = ["N", "image", "textures"]
-    head += [f"{which}, {threads} thr." for threads in ("1", str(most)) for which in ("forward", "+ backward")]
-    rows = []
-    for by_threads in pairs_of_threads([*report["render"], *report["pixels"]]):
-        case = next(iter(by_threads.values()))
-        columns = [by_threads.get(threads) for threads in (1, most)]
-        times = [ms(one[which]) if one else "–" for one in columns for which in ("forward", "both")]
-        pairs = case["composited_pairs"]
-        alone = by_threads.get(1)
-        per_pair = f"{alone['both']['ms'] * 1e6 / pairs:.0f}" if alone else "–"
-        name = TEXTURES[case["textures"]]
-        rows.append([f"{case['num']:,}", size(case), name, *times, f"{pairs / 1e6:.1f}", per_pair])
-    return table([*head, "composited", "ns per pair"], rows)
+    """Return the cases without textures on all threads; the smallest ones are shorter than their disturbances."""
+    cases: dict[tuple[int, int], dict] = {}
+    for case in measured([*report["render"], *report["pixels"], *report["full_size"]]):
+        is_long = case["num"] >= 10_000 and case["width"] >= 320
+        if is_long and case["textures"] == "none" and case["threads"] == report["machine"]["cores"]:
+            cases.setdefault((case["width"], case["num"]), case)
+    rows = (
+        [f"{case['num']:,}", size(case), ms(case["forward"]), ms(case["both"]), f"{case['peak_mb']:.0f}"]
+        for _, case in sorted(cases.items())
+    )
+    return table(["Gaussians", "image", "render", "render + gradients", "peak memory, MB"], rows)
 
 
 def ratios(report: dict) -> str:
@@ -162,14 +153,6 @@ def compositors(report: dict) -> str:
     return table(["textures", "compositor", "forward", "forward + backward"], rows)
 
 
-def full_size(report: dict) -> str:
-    rows = (
-        [f"{c['num']:,}", size(c), TEXTURES[c["textures"]], ms(c["forward"]), ms(c["both"]), f"{c['peak_mb']:.0f}"]
-        for c in measured(report["full_size"])
-    )
-    return table(["N", "image", "textures", "forward", "forward + backward", "peak memory, MB"], rows)
-
-
 def training(report: dict) -> str:
     head = ["image", "Gaussians", "stage 1", "stage 2, untextured", "stage 2, textured", "peak memory, MB", "again"]
     cases = measured(report["training"])
@@ -178,20 +161,13 @@ def training(report: dict) -> str:
     for case in cases:
         again = warm.get((case["downscale"], case["num"]))
         if case["cache"] == "cold" and again:
-            steps = [ms({"ms": again[name]}) for name in ("stage1_ms", "untextured_ms", "textured_ms")]
+            # Both starts time the same steps; other programs slow one of them.
+            names = ("stage1_ms", "untextured_ms", "textured_ms")
+            steps = [ms({"ms": min(case[name], again[name])}) for name in names]
             width, height = case["image"]
             peaks = [f"{one['peak_mb']:.0f}" for one in (case, again)]
             rows.append([f"{width}×{height}", f"{case['num_live']:,}", *steps, *peaks])
     return table(head, rows)
-
-
-def trained(report: dict) -> str:
-    rows = []
-    for case in measured(report["trained"]):
-        pairs = f"{case['composited_pairs'] / 1e6:.1f}"
-        name = TEXTURES.get(case["textures"], case["textures"])
-        rows.append([size(case), name, ms(case["forward"]), ms(case["both"]), pairs])
-    return table(["image", "textures", "forward", "forward + backward", "composited"], rows)
 
 
 def bounds(report: dict) -> str:
@@ -216,16 +192,14 @@ def _least(stage: dict) -> str:
 
 TABLES: dict[str, tuple[Callable[[dict], str], tuple[str, ...]]] = {
     "machine": (machine, ("machine",)),
-    "render": (render, ("render", "pixels")),
+    "render": (render, ("machine", "render", "pixels", "full_size")),
     "ratios": (ratios, ("ratios",)),
     "growth": (growth, ("growth",)),
     "stages": (stages, ("stages",)),
     "limit": (limit, ("limit", "render", "stages")),
     "others": (others, ("others",)),
     "compositors": (compositors, ("compositors",)),
-    "full_size": (full_size, ("full_size",)),
     "training": (training, ("training",)),
-    "trained": (trained, ("trained",)),
     "bounds": (bounds, ("bounds",)),
 }
 """Function of each table, with the sections of the report that it needs."""

@@ -1,4 +1,4 @@
-"""A model and a checkpoint of every system, of a dozen Gaussians, made without training."""
+"""A model and a checkpoint of every system, of a dozen Gaussians, made without training; random weights of LPIPS."""
 
 import jax
 import jax.numpy as jnp
@@ -48,3 +48,27 @@ def some_now(iteration, num_iterations, times=None, *, num_keys=1, scene_scale=1
     keys = jax.random.split(jax.random.key(0), num_keys)
     done, length = numbers
     return Now(keys, done, jnp.float32(1e-4), length, jnp.float32(scene_scale), times)
+
+
+def write_random_squeeze(path):
+    """A weights file of SqueezeNet's layout with random numbers in it."""
+    rng = np.random.default_rng(0)
+    arrays = {}
+
+    def add(name, out, inputs, size):
+        arrays[f"{name}.weight"] = rng.normal(0, (2 / (inputs * size**2)) ** 0.5, (out, inputs, size, size))
+        arrays[f"{name}.bias"] = np.zeros(out)
+
+    add("features.0", 64, 3, 3)
+    inputs = 64
+    widths = {3: 16, 4: 16, 6: 32, 7: 32, 9: 48, 10: 48, 11: 64, 12: 64}
+    for index, squeezed in widths.items():
+        expanded = 4 * squeezed
+        add(f"features.{index}.squeeze", squeezed, inputs, 1)
+        add(f"features.{index}.expand1x1", expanded, squeezed, 1)
+        add(f"features.{index}.expand3x3", expanded, squeezed, 3)
+        inputs = 2 * expanded
+    for index, channels in enumerate([64, 128, 256, 384, 384, 512, 512]):
+        arrays[f"lin{index}.weight"] = rng.uniform(0, 1, (1, channels, 1, 1))
+    np.savez(path, **{name: array.astype(np.float32) for name, array in arrays.items()})
+    return path

@@ -192,17 +192,22 @@ def test_lazy_names_are_those_that_type_checkers_see(name):
 
 
 def test_public_names_in_a_fresh_process():
-    """A star import, a function beside a module of its name, and modules as attributes."""
+    """A star import, a function beside a module of its name, modules as attributes; all without the extra [train]."""
     script = """
+import sys
+sys.modules |= dict.fromkeys(("matplotlib", "pycolmap", "skimage"))
 import a2tg_jax
 from a2tg_jax.training import fit as function
 assert callable(a2tg_jax.fit) and a2tg_jax.fit is function
 assert a2tg_jax.adapt.Upscale is a2tg_jax.Upscale and a2tg_jax.data.load_scene is a2tg_jax.load_scene
 from a2tg_jax import *
 assert fit is function and Model is a2tg_jax.model.Model
+from a2tg_jax.cli.main import main
+sys.exit(main(["demo"]))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    remedy = "a2tg: error: this command needs matplotlib, which is not installed: pip install 'a2tg-jax[train]'\n"
+    assert done.returncode == 2 and done.stderr == remedy, done.stderr
 
 
 def test_the_first_function_of_a_process_is_traced_once():

@@ -14,7 +14,7 @@ import surface_quality
 import a2tg_jax as a2tg
 from a2tg_jax.data.synthetic import exact_points
 from a2tg_jax.io.other_programs import upright
-from a2tg_jax.mesh import triangles
+from a2tg_jax.mesh import extract, triangles
 from a2tg_jax.mesh.extract import common_sphere, surface_of
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.mesh.fusion import BlockGrid, RenderedDepth, Space, fuse
@@ -375,13 +375,17 @@ def test_textures_are_read_back_by_another_library(textured, tmp_path, suffix):
     assert [path.suffix for path in files] == ([".glb"] if suffix == ".glb" else [".obj", ".mtl", ".png"])
 
 
-def test_missing_libraries_are_reported(sphere, monkeypatch):
+def test_missing_libraries_are_reported(sphere, model, monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     with pytest.raises(ValueError, match=r"xatlas, which is not installed: pip install 'a2tg-jax\[mesh\]'"):
         a2tg.texture_mesh(sphere, [], size=64)
     with pytest.raises(ValueError, match=r"fast-simplification, which is not installed"):
         a2tg.simplify_mesh(sphere, 10)
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
+    monkeypatch.setattr(extract, "fuse", lambda *_: pytest.fail("found before the views are fused"))
+    with pytest.raises(ValueError, match=r"scikit-image, which is not installed: pip install 'a2tg-jax\[train\]'"):
+        a2tg.extract_mesh(model)
 
 
 # Evaluation

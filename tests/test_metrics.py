@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from small_models import write_random_squeeze
 
 from a2tg_jax.appearance import Appearance, Texture
 from a2tg_jax.core.gaussians import init_from_points
@@ -54,28 +55,7 @@ def read_example(shared, name):
 
 @pytest.fixture(scope="module")
 def random_squeeze(tmp_path_factory):
-    """A weights file of SqueezeNet's layout with random numbers in it."""
-    rng = np.random.default_rng(0)
-    arrays = {}
-
-    def add(name, out, inputs, size):
-        arrays[f"{name}.weight"] = rng.normal(0, (2 / (inputs * size**2)) ** 0.5, (out, inputs, size, size))
-        arrays[f"{name}.bias"] = np.zeros(out)
-
-    add("features.0", 64, 3, 3)
-    inputs = 64
-    widths = {3: 16, 4: 16, 6: 32, 7: 32, 9: 48, 10: 48, 11: 64, 12: 64}
-    for index, squeezed in widths.items():
-        expanded = 4 * squeezed
-        add(f"features.{index}.squeeze", squeezed, inputs, 1)
-        add(f"features.{index}.expand1x1", expanded, squeezed, 1)
-        add(f"features.{index}.expand3x3", expanded, squeezed, 3)
-        inputs = 2 * expanded
-    for index, channels in enumerate([64, 128, 256, 384, 384, 512, 512]):
-        arrays[f"lin{index}.weight"] = rng.uniform(0, 1, (1, channels, 1, 1))
-    path = tmp_path_factory.mktemp("weights") / "squeeze.npz"
-    np.savez(path, **{name: array.astype(np.float32) for name, array in arrays.items()})
-    return path
+    return write_random_squeeze(tmp_path_factory.mktemp("weights") / "squeeze.npz")
 
 
 def test_lpips_is_a_symmetric_distance_of_clipped_images(random_squeeze):

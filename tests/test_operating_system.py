@@ -1,11 +1,14 @@
 """The machine: calls of each operating system without the modules of the others, signals, and numbers of threads."""
 
+import ast
 import gc
 import math
 import os
+import re
 import signal
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -16,6 +19,7 @@ from a2tg_jax import render_image
 from a2tg_jax.host import machine, operating_system, signals
 from a2tg_jax.rasterize.kernels.native import composite as native, ffi
 
+ROOT = Path(__file__).parents[1]
 NOT_LOCKED, TAKEN, NO_LOCKS = None, "taken", OSError(95, "Operation not supported")
 
 
@@ -114,6 +118,31 @@ def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_lost(number)
         assert time.monotonic() - start < 10, "waiting of the main thread is interrupted"
     finally:
         gc.callbacks.remove(callback)
+
+
+def without_encoding(path):
+    """Lines of a module that read or write text in the encoding of the system, which on Windows is not UTF-8."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and "encoding" not in {each.arg for each in node.keywords}:
+            name, mode = ast.unparse(node.func), [*map(ast.unparse, node.args[1:2]), "'r'"][0]
+            if name.endswith((".read_text", ".write_text")) or (name == "open" and "b" not in mode):
+                yield f"{path.name}:{node.lineno}"
+
+
+def test_text_is_utf8_on_every_system():
+    """Except what Linux, and what the package's metadata, say of themselves."""
+    modules = [path for path in (ROOT / "a2tg_jax").rglob("*.py") if path.stem not in ("machine", "source_commit")]
+    assert len(modules) > 100 and not [line for path in modules for line in without_encoding(path)]
+    assert list(without_encoding(ROOT / "a2tg_jax" / "host" / "machine.py"))
+
+
+def test_files_of_the_project_can_lie_on_every_system():
+    """macOS and Windows do not distinguish case; Windows has forbidden characters, reserved names and short paths."""
+    folders = ("a2tg_jax", "tests", "docs", "experiments", "benchmarks", "notebooks", "web/src")
+    names = [path.relative_to(ROOT).as_posix() for folder in folders for path in (ROOT / folder).rglob("*")]
+    assert len(names) > 500 and len({name.casefold() for name in names}) == len(names)
+    bad = re.compile(r'[:*?"<>|\\]|[. ](/|$)|(^|/)(con|prn|aux|nul|(com|lpt)\d)(\.|/|$)', re.IGNORECASE)
+    assert not [name for name in names if bad.search(name) or len(name) > 160]
 
 
 @pytest.mark.parametrize("num", [1, 2])

@@ -147,7 +147,7 @@ def test_the_report_names_the_commit(tmp_path, monkeypatch):
     assert source_commit() == f"{commit}-dirty"
     report = written_report(tmp_path / "run", some_result())
     assert f"commit <code>{commit}</code>, with local changes (version" in " ".join(report.split())
-    assert "<pre>pip install .\na2tg train --config" in report
+    assert "<pre>pip install '.[train]'\na2tg train --config" in report
     monkeypatch.setattr("a2tg_jax.host.source_commit.CHECKOUT", tmp_path / "site-packages")
     for note, commit in (({"vcs_info": {"commit_id": "abc"}}, "abc"), ({"dir_info": {}}, None)):
         found = SimpleNamespace(read_text=lambda _, note=note: json.dumps(note))

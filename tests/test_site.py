@@ -39,6 +39,13 @@ def test_the_page_of_options_is_current():
     assert options.page() == written, "run python docs/scripts/options.py"
 
 
+def test_the_page_of_options_has_every_command_with_its_arguments_and_choices():
+    written = (DOCS / "options.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## `a2tg (\w+)`$", written, re.MULTILINE) == list(options.command_line.COMMANDS)
+    assert "\n| `PHOTOS... SCENE` |" in written
+    assert "OPENCV_FISHEYE}` |" in written, "choices of more than a line"
+
+
 def test_the_flags_of_commands_are_those_of_the_page():
     written = (DOCS / "options.md").read_text(encoding="utf-8")
     found: dict[str, str] = {}

@@ -366,7 +366,19 @@ def _parts_of(appearance: Appearance) -> dict[str, Part]:
 
 
 def allocate_appearance(template: A, key: Array, gaussians: Gaussians) -> A:
-    """Return an appearance of the options of a template, with initial arrays for N Gaussians (host)."""
+    """Return an appearance of the options of a template, with initial arrays for N Gaussians (host).
+
+    Args:
+      template: an appearance without arrays, such as `Appearance(texture=Texture())`.
+      key: a random key, for appearances with random initial arrays.
+      gaussians: N Gaussians.
+
+    Returns:
+      An appearance of the same class, with a row for each Gaussian.
+
+    Raises:
+      ValueError: if it is no appearance, or makes arrays that do not fit its options.
+    """
     parts: Any = {name: part.allocate(gaussians) for name, part in _parts_of(template).items()}
     return dataclasses.replace(template, **parts).allocate(key, gaussians)
 

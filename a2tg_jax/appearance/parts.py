@@ -93,8 +93,10 @@ class TextureOptions:
 class TexelRates(NamedTuple):
     """Learning rates of texels by the size of their texture."""
 
-    larger: Any  # Of textures of more than one texel.
-    single: Any  # Of textures of one texel, which only change the colour and opacity of their Gaussian.
+    larger: Any
+    """Rate of textures of more than one texel."""
+    single: Any
+    """Rate of textures of one texel, which only change the colour and opacity of their Gaussian."""
 
 
 @pytree

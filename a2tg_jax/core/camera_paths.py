@@ -153,12 +153,21 @@ def look_at(
     Args:
       position: [3] position of the camera in the world.
       target: [3] point to look at, different from the position.
-      width, height: size of the image in pixels.
+      width: width of the image in pixels.
+      height: height of the image in pixels.
       fov: angle of view in degrees along the longer side of the image, between 0 and 180.
       up: [3] vertical of the world, near +z for the cameras of a scene.
 
+    Returns:
+      The camera.
+
     Raises:
       ValueError: if the target is at the position or along the vertical, or the angle of view is out of range.
+
+    Examples:
+      >>> camera = a2tg.look_at([0, -3, 1], [0, 0, 0], width=48, height=36, fov=50)
+      >>> model.render(camera).color.shape
+      (36, 48, 3)
     """
     vectors = {name: np.asarray(v, np.float64) for name, v in (("position", position), ("target", target), ("up", up))}
     for name, vector in vectors.items():
@@ -188,8 +197,16 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
       cameras: at least two; the first one's intrinsics and image size are used throughout.
       num_frames: number of cameras on the path, at least one.
 
+    Returns:
+      `num_frames` cameras.
+
     Raises:
       ValueError: if there are fewer than two cameras or no frames.
+
+    Examples:
+      >>> flight = a2tg.smooth_path([view.camera for view in scene.train], 5)
+      >>> [model.render(camera).color.shape for camera in flight][-1]
+      (36, 48, 3)
     """
     from scipy.ndimage import gaussian_filter1d  # Not at import, which models do.
 
@@ -233,6 +250,9 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     Args:
       views: at least one; the first one's image size is used throughout.
       num_frames: number of cameras on the path, at least one.
+
+    Returns:
+      `num_frames` cameras.
 
     Raises:
       ValueError: if there are no views or no frames.

@@ -39,6 +39,13 @@ class Camera:
     """One view: a pinhole camera in OpenCV's frame, x right, y down, z forward; pixel centres are at +0.5.
 
     `viewmat` and `K` are differentiable; the image size is static.
+
+    Examples:
+      >>> K = jnp.array([[50.0, 0, 24], [0, 50, 18], [0, 0, 1]])
+      >>> viewmat = jnp.eye(4).at[2, 3].set(4.0)  # 4 units behind the origin, looking along z
+      >>> camera = a2tg.Camera(viewmat, K, width=48, height=36)
+      >>> float(camera.center[2])
+      -4.0
     """
 
     viewmat: Array
@@ -161,8 +168,19 @@ def _numbers(values: np.ndarray) -> str:
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the same view at another image size: K scales with each side (pixel edges stay edges). ValueError: it is
-    not a camera, or a side is not a positive int."""
+    """Return the same view at another image size: K scales with each side (pixel edges stay edges).
+
+    Args:
+      camera: the view.
+      width: new image width in pixels.
+      height: new image height in pixels.
+
+    Returns:
+      The camera of that size.
+
+    Raises:
+      ValueError: if it is not a camera, or a side is not a positive int.
+    """
     check_is_camera(camera)
     check_int("width", width, 1)
     check_int("height", height, 1)

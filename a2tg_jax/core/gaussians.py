@@ -67,7 +67,19 @@ LEAST_INITIAL_COLOR = 0.05
 
 @pytree
 class Gaussians:
-    """N flat Gaussians as unconstrained arrays, all of one dtype: float32, or float64."""
+    """N flat Gaussians as unconstrained arrays, all of one dtype: float32, or float64.
+
+    Examples:
+      >>> gaussians = a2tg.Gaussians(
+      ...     means=jnp.zeros((2, 3)),
+      ...     quats=jnp.zeros((2, 4)).at[:, 0].set(1.0),
+      ...     log_scales=jnp.log(jnp.full((2, 2), 0.1)),
+      ...     logit_opacities=jnp.zeros(2),
+      ...     sh=jnp.zeros((2, 1, 3)),
+      ... )
+      >>> gaussians.num, gaussians.sh_degree, gaussians.floats_per_row
+      (2, 0, 13)
+    """
 
     means: Array
     """[N, 3] centres in the world."""
@@ -200,6 +212,11 @@ def init_from_points(
     Raises:
       ValueError: if the shapes disagree, there are fewer than two points, a number is not finite, colours are an array
         of integers or outside [0, 1], or another argument is outside its range.
+
+    Examples:
+      >>> gaussians = a2tg.init_from_points(scene.points, scene.colors, num=100, sh_degree=0)
+      >>> gaussians.means.shape, gaussians.sh.shape
+      ((100, 3), (100, 1, 3))
     """
     check_int("num", 2 if num is None else num, 2)
     check_int("sh_degree", sh_degree, 0, len(NUM_BASES) - 1)

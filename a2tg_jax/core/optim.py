@@ -36,7 +36,17 @@ class AdamState:
 
 
 def adam_init(params: object) -> AdamState:
-    """Return zero moments for a pytree of float arrays. ValueError, naming the leaf: it holds no floats."""
+    """Return Adam's state before the first step: zero moments.
+
+    Args:
+      params: pytree of float arrays.
+
+    Returns:
+      The number of steps, 0, and the moments `mu` and `nu`, each a pytree like `params`.
+
+    Raises:
+      ValueError: if a leaf holds no floats, naming it.
+    """
     _check_floats(params)
     zeros = jax.tree.map(jnp.zeros_like, params)
     return AdamState(mu=zeros, nu=jax.tree.map(jnp.zeros_like, params), count=jnp.zeros((), jnp.int32))
@@ -65,11 +75,18 @@ def adam_update(
       eps: ε ≥ 0.
 
     Returns:
-      jaxopt's `OptStep(params, state)`, the updated parameters and the `AdamState`.
+      The named tuple (params, state): the updated parameters, and the state for the next update.
 
     Raises:
       ValueError: if parameters are not floats, gradients, moments or rates do not fit them, naming the leaf, or a
         number is out of range.
+
+    Examples:
+      >>> floats, rest = a2tg.partition(model)
+      >>> gradient = jax.tree.map(jnp.ones_like, floats)
+      >>> floats, moments = a2tg.adam_update(floats, gradient, a2tg.adam_init(floats), 1e-2)
+      >>> a2tg.combine(floats, rest).num
+      200
     """
     check_kind("state", state, AdamState, "say adam_init(params)")
     for name, decay in (("b1", b1), ("b2", b2)):

@@ -37,7 +37,7 @@ class Origin:
     transform: Similarity
     """Transform from the original world to the world of the cameras."""
     corrections: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """[V, ...] learned values of each photograph (`training.corrections`), by the correction's name, in the world of
+    """[V, ...] learned values of each photograph, by the name of the `Correction`, in the world of
     the training. `viewmats` are corrected already."""
     up: np.ndarray | None = None
     """[3] unit vertical that was chosen (`apply_edit`); None: it is estimated from the cameras."""

@@ -17,7 +17,14 @@ MARK = "_registered_pytree"
 
 
 def static(*, default: object = dataclasses.MISSING) -> Any:
-    """Return a field that chooses shapes or code, and is not traced. Its values must be hashable."""
+    """Return a field that chooses shapes or code, and is not traced. Its values must be hashable.
+
+    Args:
+      default: its default value; none if left out.
+
+    Returns:
+      A field for a class that `pytree` decorates.
+    """
     return dataclasses.field(default=default, metadata={"static": True})
 
 
@@ -34,11 +41,17 @@ def pytree(*, kw_only: bool = False, repr: bool = True) -> Callable[[type[T]], t
 
 
 def pytree(cls: Any = None, /, **options: Any) -> Any:
-    """Decorate a class: make it a frozen dataclass, with options of `dataclasses.dataclass`, and a pytree of its
-    fields, except static ones. Its bases may be decorated as well.
+    """Decorate a class: make it a frozen dataclass and a pytree of its fields, except static ones.
 
     Transformations of JAX build instances without calling `__init__` and `__post_init__`, so that these may check and
     convert what a caller gives.
+
+    Args:
+      cls: the class, whose bases may be decorated as well.
+      **options: options of `dataclasses.dataclass`, such as `kw_only=True`.
+
+    Returns:
+      The class.
     """
     if cls is None:
         return lambda own: pytree(own, **options)
@@ -102,7 +115,14 @@ def num_compiled(jitted: Any) -> int:
 
 
 def partition(tree: T) -> tuple[T, T]:
-    """Return a pytree with its float arrays only, None for all other leaves, and one with the others only."""
+    """Split a pytree into its float arrays and the rest, as `jax.grad` needs it.
+
+    Args:
+      tree: any pytree, such as a model.
+
+    Returns:
+      Two pytrees of the structure of `tree`: one with None for all leaves but floats, and one with None for the floats.
+    """
 
     def is_float(leaf: object) -> bool:
         dtype = getattr(leaf, "dtype", None)
@@ -114,7 +134,15 @@ def partition(tree: T) -> tuple[T, T]:
 
 
 def combine(floats: T, rest: T) -> T:
-    """Return the pytree that `partition` split, or one with other floats."""
+    """Return the pytree that `partition` split, or one with other floats.
+
+    Args:
+      floats: the first pytree of `partition`, or a changed one.
+      rest: the second.
+
+    Returns:
+      A pytree of the same structure, with every leaf.
+    """
     return jax.tree.map(
         lambda one, other: other if one is None else one, floats, rest, is_leaf=lambda leaf: leaf is None
     )

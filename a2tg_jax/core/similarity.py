@@ -19,7 +19,15 @@ from a2tg_jax.core.sh import sh_basis
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Similarity:
-    """Map x' = scale·rotation·x + translation, from the original world to the normalised one (or back, `inverse`)."""
+    """Map x' = scale·rotation·x + translation, from the original world to the normalised one (or back, `inverse`).
+
+    Examples:
+      >>> twice = a2tg.Similarity(scale=2.0, rotation=np.eye(3), translation=np.array([0.0, 0.0, 1.0]))
+      >>> twice.apply(np.ones((1, 3)))
+      array([[2., 2., 3.]])
+      >>> model.transform(twice).num
+      200
+    """
 
     scale: float
     """Positive factor of lengths."""
@@ -84,6 +92,13 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
 
     The image of a camera carried along stays the same: means and scales follow the similarity, quaternions, unit in the
     result, and SH its rotation.
+
+    Args:
+      gaussians: N Gaussians.
+      similarity: map from their world to the new one.
+
+    Returns:
+      N Gaussians of the same dtype.
 
     Raises:
       ValueError: if a field of the Gaussians has a wrong shape, or the similarity is none.

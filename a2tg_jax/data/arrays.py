@@ -58,8 +58,22 @@ def scene_from_arrays(
     Warns of likely mistakes: camera-to-world matrices, OpenGL axes, intrinsics for another image size, and colours in
     [0, 1] that were converted without a factor of 255.
 
+    Returns:
+      The scene in its normalised world; `Scene.transform` leads there from the given one.
+
     Raises:
       ValueError: naming the argument, if one has another shape or kind, or the views make no scene.
+
+    Examples:
+      >>> cameras = [view.camera for view in scene.train]
+      >>> made = a2tg.scene_from_arrays(
+      ...     [view.image for view in scene.train],
+      ...     np.stack([camera.viewmat for camera in cameras]),
+      ...     cameras[0].K,
+      ...     points=scene.points,
+      ... )
+      >>> len(made.train) + len(made.test)
+      10
     """
     check_test_every(test_every)
     num = len(images)

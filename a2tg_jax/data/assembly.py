@@ -315,6 +315,12 @@ def with_validation_views(scene: Scene) -> Scene:
     Cameras, points and world of the whole scene stay. Test views are left out, so that no choice depends on them.
     The views of a panorama are held out together and count as one.
 
+    Args:
+      scene: a scene with two training views or more.
+
+    Returns:
+      A scene whose `test` are the validation views.
+
     Raises:
       ValueError: if there is only one training view or panorama.
     """

@@ -19,7 +19,7 @@ def pycolmap() -> ModuleType:
     one may import it.
 
     Raises:
-      ValueError: if it is not installed, since it has no wheel for some machines.
+      ValueError: if it is not installed. It is in the extra [train], and has no wheel for some machines.
     """
     import zlib  # noqa: F401
 
@@ -28,8 +28,9 @@ def pycolmap() -> ModuleType:
             import pycolmap  # noqa: F401
         except ImportError as error:  # There are wheels for x86-64 Linux and Windows and for macOS on arm64.
             raise ValueError(
-                f"finding cameras and undistorting photographs need pycolmap, which is not installed on this machine "
-                f"({error}): do this step on another machine, with a2tg sfm or COLMAP's image_undistorter"
+                f"finding cameras and undistorting photographs need pycolmap, which is not installed ({error}): "
+                "pip install 'a2tg-jax[train]' or, if it has no wheel for this machine, do this step on another one, "
+                "with a2tg sfm or COLMAP's image_undistorter"
             ) from None
 
     return sys.modules["pycolmap"]

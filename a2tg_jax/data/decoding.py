@@ -115,7 +115,7 @@ def _has_alpha(image: Image.Image) -> bool:
 def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> None:
     """Write an image file again with its pixels turned as EXIF says, as PNG or JPEG by the target's suffix.
 
-    A PNG keeps the alpha channel. EXIF data of the camera are kept, because the focal length is among them. Those of a
+    A PNG keeps the alpha channel. EXIF data of the camera are kept, because the focal length is among them. Data of a
     TIFF's layout would be wrong.
     """
     with _opened(path) as image:

@@ -103,7 +103,7 @@ def load_scene(
       test_every: every k-th of the name-sorted views, from the first, is a test view; 0 keeps none. The views of a
         panorama count as one. Has no effect if the scene names its own test views.
       room: bytes of memory for photographs, at 3 or 4 a pixel; those beyond it stay on disk and are read when
-        needed (`Shelf`), which changes no result. None takes a quarter of the process's memory.
+        needed, which changes no result. None takes a quarter of the process's memory.
       alpha: meaning of the alpha channel: "transparency" before a background, or a "mask", of which only opaque
         pixels count.
       mask_as: meaning of the pixels that masks exclude: "ignored" in training and metrics; or "background", transparent
@@ -121,6 +121,11 @@ def load_scene(
       OSError: if a store does not answer.
       ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left,
         or processes that load it together have other options or photographs than the first.
+
+    Examples:
+      >>> scene = a2tg.load_scene("scene", downscale=2)  # a folder with transforms.json, say
+      >>> len(scene.train), len(scene.test)
+      (7, 1)
     """
     source: SceneSource = SceneSource(path, downscale, test_every, alpha, mask_as, lens)  # type: ignore[arg-type]
     return _load(source, room, is_divided)

@@ -39,6 +39,9 @@ def observed_points(xy: np.ndarray, depths: np.ndarray, size: tuple[int, int]) -
       depths: [S] along the camera's z axis.
       size: (H, W).
 
+    Returns:
+      The points, in the order of their pixels.
+
     Raises:
       ValueError: if the arrays have other shapes.
     """

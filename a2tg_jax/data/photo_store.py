@@ -54,6 +54,7 @@ class Picture:
     is_held: bool = False
     """Whether they are in memory."""
     dtype: DTypeLike = np.uint8
+    """Type of the pixels."""
     is_remote: bool = False
     """Whether reading waits for object storage."""
 
@@ -111,6 +112,7 @@ class Mask:
     num: int
     """Number of pixels that count."""
     data: bytes = dataclasses.field(repr=False)
+    """Compressed bits; `read` decodes them."""
 
     @staticmethod
     def of(counts: "np.ndarray | Mask") -> "Mask":
@@ -187,7 +189,7 @@ class Shelf:
 
     Beyond the memory limit, pixels of an unchanged image file are dropped: decoding it again takes less time than a
     training step of that size. Undistorted or resized pixels go to an unnamed file in `cache_folder()`, which
-    disappears with the process, however that ends. Those of remote files take a share of the disk; the others are
+    disappears with the process, however that ends. Pixels of remote files take a share of the disk; the others are
     made again.
     """
 

@@ -47,7 +47,7 @@ LARGEST_MISFIT = 0.05
 NUM_ANGLES = 200
 """Number of angles at which they are compared."""
 HEAD_BYTES = 1 << 16
-"""Number of bytes of an XML file in which a chunk's sensors are looked for."""
+"""Number of bytes of an XML file that are searched for a chunk's sensors."""
 XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 FILM_WIDTH = 36.0
 """Width in mm of the film that FocalLength35mm refers to, for the longer side of an image."""

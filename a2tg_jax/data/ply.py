@@ -31,7 +31,7 @@ FLOAT_RANGES, INTEGER_RANGES = (1, 255, 65535), (255, 65535, 2**32 - 1)
 
 
 class PlyFile:
-    """An open PLY file, whose elements are read one after the other, as far as they are lists of numbers.
+    """An open PLY file, whose elements are read in order, if they are lists of numbers.
 
     Raises:
       ValueError: naming the file, if it is no PLY, or its header does not end.

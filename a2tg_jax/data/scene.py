@@ -95,6 +95,7 @@ class Scene:
     """Photographs, cameras and points in the normalised world. A value of numpy arrays, not a pytree."""
 
     name: str
+    """Name, such as the folder's."""
     train: tuple[View, ...]
     """Views to train on, sorted by name; at least one."""
     test: tuple[View, ...]
@@ -215,6 +216,11 @@ def view_image(view: View, background: Sequence[float] | np.ndarray | None = Non
 
     Raises:
       ValueError: if it is no view, or the background is neither a colour nor an image of the view's size.
+
+    Examples:
+      >>> photograph = a2tg.view_image(scene.test[0], model.background)
+      >>> photograph.shape, photograph.dtype
+      ((36, 48, 3), dtype('float32'))
     """
     check_kind("view", view, View)
     pixels = view.picture.read()

@@ -133,7 +133,7 @@ def stage(
             written, num_frames = extract_frames(source, place, frames, progress=progress)
             if written < least:
                 raise ValueError(
-                    f"{source}: its camera hardly moves, so that {written} of {num_frames} frames differ; walk around"
+                    f"{source}: its camera barely moves, so that {written} of {num_frames} frames differ; walk around"
                 )
             tell(f"{source}: {written} of {counted(num_frames, 'frame')} taken")
         files += [(number, place / name, prefix + name) for name in find_photos(place, least, chosen[source])]

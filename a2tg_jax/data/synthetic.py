@@ -55,7 +55,8 @@ def synthetic_scene(
     Args:
       seed: random seed for patterns, light and points; the arrangement is always the same.
       num_views: number of views, at least 2.
-      width, height: size of the images in pixels, before `downscale`.
+      width: width of the images in pixels, before `downscale`.
+      height: height of the images in pixels, likewise.
       num_points: points sampled evenly over the images, instead of a sparse reconstruction; at least 2.
       downscale: k >= 1; images have 1/k of the size.
       test_every: every k-th view is a test view; 0 keeps none.
@@ -65,6 +66,11 @@ def synthetic_scene(
 
     Raises:
       ValueError: if an argument is out of its range.
+
+    Examples:
+      >>> scene = a2tg.synthetic_scene(width=48, height=36, num_views=12)
+      >>> len(scene.train), len(scene.test), scene.test[0].image.shape
+      (10, 2, (36, 48, 3))
     """
     if num_views < 2 or num_points < 2 or downscale < 1 or min(width, height) < downscale:
         raise ValueError(

@@ -52,6 +52,10 @@ class CloneSplitPrune(StepEvent):
 
     It happens every max(10, n/300) of n iterations, from n/60 to n/2. The programs of 3DGS and 2DGS also have a largest
     radius on the screen. They reset the radii to 0 just before reading them, so it has no effect and is left out.
+
+    Examples:
+      >>> a2tg.CloneSplitPrune(cap=5000, threshold=2e-4).times(30_000)
+      Times(first=501, last=14999, every=100)
     """
 
     cap: int = static(default=500_000)

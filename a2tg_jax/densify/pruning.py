@@ -38,6 +38,10 @@ class Prune(HostEvent):
     """Event that prunes the Gaussians with the smallest blending weights, summed over the training views.
 
     It uses the cameras of the scene, not refined ones.
+
+    Examples:
+      >>> a2tg.Prune(share=0.1, at=(0.25, 0.5)).iterations(1000)
+      (250, 500)
     """
 
     share: float = 0.1

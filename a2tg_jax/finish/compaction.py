@@ -68,7 +68,20 @@ def loss_on_views(
     background: Color | None = None,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
 ) -> Loss:
-    """Return the loss of PSNR of models against the given one, as a mean over the photographs of views."""
+    """Return a measure of loss: PSNR of a model − PSNR of another, as a mean over photographs.
+
+    Args:
+      model: the model that others are compared with.
+      views: views with photographs, such as the training views.
+      background: [3] colour; None is the model's own.
+      settings: static options, without a capacity.
+
+    Returns:
+      A function of another model that returns the loss in dB.
+
+    Raises:
+      ValueError: if there are no views, or an argument is of another kind.
+    """
     check_is_model(model)
     check_are_views(views, "loss_on_views(model, scene.train)")
     background = model.background if background is None else background
@@ -95,10 +108,22 @@ def loss_beside_renders(
     assumed_psnr: float = ASSUMED_PSNR,
     settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
 ) -> Loss:
-    """Return the estimated loss of PSNR of models, if the given one has `assumed_psnr`.
+    """Return an estimate of the same loss without photographs, from renders of both models.
 
     10·log10(1 + e/E): e is the mean squared difference of two renders, E the error that the PSNR implies.
     Uncorrelated errors add up this way.
+
+    Args:
+      model: the model that others are compared with.
+      cameras: the views to render.
+      assumed_psnr: PSNR of the model on photographs, in dB.
+      settings: static options, without a capacity.
+
+    Returns:
+      A function of another model that returns the loss in dB.
+
+    Raises:
+      ValueError: if there are no cameras, or the model is of another kind.
     """
     check_is_model(model)
     draw = _drawing(model, cameras, model.background, settings)
@@ -158,7 +183,8 @@ def measure_choices(
       progress: show a progress bar.
 
     Returns:
-      Trials from coarse to fine, for each group that the model has.
+      Files tried, each with its `choices`, `num_bytes` and `losses` in dB, from coarse to fine, for each group that the
+      model has.
     """
     finest = finest_choices(ladder)
     tried: list[tuple[str, Precision]] = []
@@ -187,8 +213,11 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
       max_loss: in dB.
       trials: results of `measure_choices`.
 
+    Returns:
+      The file, with its `choices`, `num_bytes` and `losses`.
+
     Raises:
-      TooMuchLostError: if the finest choices lose more.
+      ValueError: if the finest choices lose more.
     """
     by_group: dict[str, list[Trial]] = {}
     for trial in trials:

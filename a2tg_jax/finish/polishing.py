@@ -62,8 +62,16 @@ def polish(
       ridge: weight of the squared changes, against squared errors summed over pixels.
       background: [3] colour; None is the model's own.
 
+    Returns:
+      The model with other colours; its geometry stays.
+
     Raises:
       ValueError: if there is no view, or a picture is not linear in the appearance parameters.
+
+    Examples:
+      >>> polished = a2tg.polish(model, scene.train, num_steps=2)
+      >>> a2tg.evaluate(scene.train, polished).psnr > a2tg.evaluate(scene.train, model).psnr
+      True
     """
     check_kind("model", model, Model, "say polish(model, scene.train)")
     check_are_views(views, "polish(model, scene.train)")

@@ -201,8 +201,11 @@ class Tuned:
     """A model whose numbers are on the grids of a compact file."""
 
     model: Model
+    """The model."""
     choices: CompactChoices
+    """Precision of its numbers."""
     grids: Grids
+    """Grids of the groups in bits, for `save_compact`."""
 
     @functools.cached_property
     def data(self) -> bytes:
@@ -236,6 +239,9 @@ def tune_compact(
       iterations: number of iterations, at least 1; all numbers are rounded in the last twentieth.
       progress: show a progress bar.
       title: title of the progress bar; None: "tuning".
+
+    Returns:
+      The tuned model, with what `save_compact` needs to write it.
 
     Raises:
       ValueError: if the model's appearance is not that stage's or does not fit a compact file, or the stage's learned

@@ -20,6 +20,8 @@ def error_text(error: Exception, less_memory: str) -> str | None:
       error: any error.
       less_memory: advice if the machine or a device has run out of memory.
     """
+    if isinstance(error, ModuleNotFoundError) and error.name == "matplotlib":  # What commands import first of [train].
+        return "this command needs matplotlib, which is not installed: pip install 'a2tg-jax[train]'"
     # JAX's errors are RuntimeErrors; jax.errors itself takes a second to import.
     is_of_device = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
     if is_of_device or isinstance(error, MemoryError):

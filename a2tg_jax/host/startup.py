@@ -24,9 +24,9 @@ def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> 
     compositing needs neither. GPUs are not affected. The command line calls this function.
 
     Args:
-      use_cache: whether to keep compiled programs in `compilation_cache_folder()`, so that the next process starts in
+      use_cache: whether to keep compiled programs in the user's cache folder, so that the next process starts in
         seconds, unless JAX has a cache already. If XLA would print pages for every cached program, its log is reduced
-        to fatal errors (`silence_xla`).
+        to fatal errors.
       num_threads: number of threads of native loops (`set_num_threads`); None: unchanged.
 
     Raises:

@@ -76,6 +76,7 @@ class CompactChoices:
     means: Precision = 14
     """Precision of each axis; with bits, steps grow with the distance from the median."""
     log_scales: Precision = 8
+    """Precision of the logarithms of both scales."""
     quats: Precision = 8
     """Precision of each of three numbers."""
     opacities: Precision = 6
@@ -141,6 +142,11 @@ def save_compact(
     Raises:
       ValueError: if the model has another appearance or a number that is not finite or too large, or a choice is
         invalid.
+
+    Examples:
+      >>> a2tg.save_compact("scene.a2tgz", model, choices=a2tg.CompactChoices(means=16, sh_rest=4))
+      >>> Path("scene.a2tgz").stat().st_size < model.num_bytes / 2
+      True
     """
     check_suffix(path, "save_compact")
     check_is_model(model)
@@ -150,11 +156,22 @@ def save_compact(
 
 
 def load_compact(path: str | os.PathLike[str]) -> Model:
-    """Return the model of a compact file, float32, its rows in the order of the file.
+    """Read the model of a compact file.
+
+    Args:
+      path: the file, conventionally *.a2tgz.
+
+    Returns:
+      The model, float32, its rows in the order of the file.
 
     Raises:
       FileNotFoundError: if there is no such file.
       ValueError: if it is not a compact scene, is damaged, or has another version.
+
+    Examples:
+      >>> a2tg.save_compact("scene.a2tgz", model)
+      >>> a2tg.load_compact("scene.a2tgz").num
+      200
     """
     check_suffix(path, "load_compact")
     return decode_model(existing_bytes(path, "compact scene"), os.fspath(path))

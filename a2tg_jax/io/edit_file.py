@@ -38,11 +38,22 @@ class Edit:
     up: np.ndarray | None = None
     """[3] unit vertical."""
     background: Color | None = None
+    """RGB in [0, 1] behind all splats."""
 
 
 def load_edit(path: Path) -> Edit:
-    """Return the edit of a file that the viewer saved. FileNotFoundError: there is no such file. ValueError, naming the
-    file: it is invalid."""
+    """Return the edit of a file that the viewer saved.
+
+    Args:
+      path: the file.
+
+    Returns:
+      The edit.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is invalid, naming the file.
+    """
     return load_saved(Path(path), "edit", _edit_of)
 
 
@@ -95,6 +106,13 @@ def apply_edit(model: Model, edit: Edit) -> Model:
 
     The vertical changes no number of the model. Files of other programs, meshes, orbits and the viewer are upright by
     it.
+
+    Args:
+      model: a model of any appearance.
+      edit: the changes.
+
+    Returns:
+      The changed model.
 
     Raises:
       ValueError: if no Gaussian would be left.

@@ -111,6 +111,12 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
 
     Ellipsoids of 3DGS files become flat, with a warning if that changes them.
 
+    Args:
+      path: the file, whose suffix is its format.
+
+    Returns:
+      The model.
+
     Raises:
       FileNotFoundError: if there is no such file.
       ValueError: if the suffix is unknown, an optional library is missing, or the file is damaged.
@@ -129,6 +135,11 @@ def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "o
 
     Raises:
       ValueError: if the suffix is unknown, an optional library is missing, or the format cannot hold the model.
+
+    Examples:
+      >>> a2tg.save_splats("scene.splat", model)
+      >>> a2tg.load_splats("scene.splat").num
+      200
     """
     options = {} if format_of(path).keeps_origin else {"world": world}
     writer_of(path)(Path(path), model, **options)

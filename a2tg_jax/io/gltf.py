@@ -72,6 +72,11 @@ def save_gltf(
     Raises:
       ValueError: if the model has no Gaussians, an appearance that the extension cannot hold, or a number that is not
         finite or too large.
+
+    Examples:
+      >>> a2tg.save_gltf("scene.glb", model)
+      >>> a2tg.load_gltf("scene.glb").num
+      200
     """
     if texels not in get_args(TexelKind):
         raise ValueError(f"texels must be {' or '.join(get_args(TexelKind))}; got {shortened(repr(texels))}")
@@ -159,6 +164,12 @@ def load_gltf(path: str | os.PathLike[str]) -> Model:
     All splats of the scene become one model. Files of `save_gltf` restore textures, degrees and origin, in the model's
     world. Splats of other programs are rotated so that +z is up. The thinnest axis of an ellipsoid becomes its normal,
     with a warning if that changes much.
+
+    Args:
+      path: the file, *.glb or *.gltf.
+
+    Returns:
+      The model, float32.
 
     Raises:
       FileNotFoundError: if there is no such file.

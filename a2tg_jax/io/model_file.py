@@ -46,11 +46,16 @@ def save_model(path: str | os.PathLike[str], model: Model, header: Mapping[str, 
     Args:
       path: the file, conventionally *.npz; an existing one is replaced once the new one is complete.
       model: any model.
-      header: JSON-able values to store with it; `read_archive_header` returns them.
+      header: further values that JSON can hold, to store with it.
 
     Raises:
       ValueError: if the suffix is another format's, the model is invalid (such as by numbers that are not finite), or
         the appearance's options cannot be written as JSON.
+
+    Examples:
+      >>> a2tg.save_model("scene.npz", model)
+      >>> a2tg.load_model("scene.npz").num_bytes == model.num_bytes
+      True
     """
     model = live_model(path, model, "save_model")
     arrays = {name: np.asarray(getattr(model.gaussians, name)) for name in FIELDS}
@@ -72,9 +77,17 @@ def load_model(path: str | os.PathLike[str], *, appearances: Sequence[type[Appea
       path: the file.
       appearances: appearance classes of other packages.
 
+    Returns:
+      The model, with its appearance and origin.
+
     Raises:
       FileNotFoundError: if there is no such file.
       ValueError: if it is not a model, is damaged, has another version, or an appearance of an unknown class.
+
+    Examples:
+      >>> a2tg.save_model("scene.npz", model)
+      >>> a2tg.load_model("scene.npz").render(camera).color.shape
+      (36, 48, 3)
     """
     check_suffix(path, "load_model")
     header, arrays = read_archive(path, format=FORMAT)

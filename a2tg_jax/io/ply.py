@@ -77,6 +77,11 @@ def save_ply(
 
     Raises:
       ValueError: if a field of the Gaussians has the wrong shape, or a number that is not finite or too large.
+
+    Examples:
+      >>> a2tg.save_ply("scene.ply", model)
+      >>> a2tg.load_ply("scene.ply").num
+      200
     """
     check_suffix(path, "save_ply")
     found = others.world_gaussians(gaussians, transform, world=world)
@@ -154,12 +159,20 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more than a thousandth
     of the others.
 
+    Args:
+      path: the file.
+
     Returns:
       float32 Gaussians in the world of the file.
 
     Raises:
       FileNotFoundError: if there is no such file.
       ValueError: if it is not a PLY, is cut off, lacks an attribute, or has no finite Gaussian.
+
+    Examples:
+      >>> a2tg.save_ply("scene.ply", gaussians)
+      >>> a2tg.load_ply("scene.ply").sh_degree
+      1
     """
     check_suffix(path, "load_ply")
     model = load_ply_model(path)

@@ -119,6 +119,12 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
     Files of `save_usd` restore the origin and the model's world. Fields of other programs are rotated so that +z is up,
     in metres. The thinnest axis of an ellipsoid becomes its normal, with a warning if that changes much.
 
+    Args:
+      path: the file, *.usd, *.usda, *.usdc or *.usdz.
+
+    Returns:
+      The model, float32.
+
     Raises:
       FileNotFoundError: if there is no such file.
       ValueError: if usd-core is missing, or the file is not USD, is damaged, or holds no splats.

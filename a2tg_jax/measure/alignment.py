@@ -82,6 +82,9 @@ def align_poses(
       settings: static options without a capacity.
       num_steps: number of Adam steps.
 
+    Returns:
+      The views, with the cameras found.
+
     Raises:
       ValueError: if an argument has the wrong type, or there are no views.
     """

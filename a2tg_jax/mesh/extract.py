@@ -1,6 +1,7 @@
 """Mesh extraction from a model: depths of views, their fusion, marching cubes, and cleaning (host)."""
 
 import dataclasses
+import importlib
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -99,19 +100,17 @@ def extract_mesh(
     The depths of each view are fused into a truncated signed distance function on sparse voxels. A depth is the mean of
     the splats on a ray, with less weight if they are far apart. Small connected parts are removed.
 
-        result = a2tg.extract_mesh(model, resolution=256)
-        a2tg.save_mesh("scene.glb", result.mesh, model.origin.transform)
-
     Args:
       model: a model of any appearance.
       cameras: the views to fuse; None takes the model's training views.
       resolution: number of voxels along the radius, 512 by default.
       voxel: side of a voxel in units of the model's world, instead of the resolution.
-      center, radius: the space to fuse, in the model's world; None is the point nearest to all optical axes, and twice
-        the cameras' median distance from it.
+      center: [3] centre of the space to fuse, in the model's world; None is the point nearest to all optical axes.
+      radius: radius of that space; None is twice the cameras' median distance from the centre.
       unbounded: extend the space beyond the radius, with voxels that grow in proportion to their distance.
       least_weight: voxels up to this weight have no surface. One view with a sharp depth has a weight of 1.
-      most_clusters, least_faces: largest number of connected parts to keep, and smallest number of triangles in one.
+      most_clusters: largest number of connected parts to keep.
+      least_faces: smallest number of triangles in a part.
       max_bytes: memory budget of the voxels. Extraction also needs memory for one view and for the mesh.
       settings: static options of the renderer.
       progress: show a progress bar.
@@ -121,7 +120,13 @@ def extract_mesh(
 
     Raises:
       ValueError: if the model is empty or has no cameras, if an argument is out of its range, if the voxels need more
-        memory than `max_bytes`, or if there is no surface within the radius.
+        memory than `max_bytes`, if there is no surface within the radius, or if scikit-image is not installed.
+
+    Examples:
+      >>> cameras = [view.camera for view in scene.train]
+      >>> result = a2tg.extract_mesh(model, cameras, resolution=24, least_faces=1)
+      >>> [path.name for path in a2tg.save_mesh("scene.glb", result.mesh)]
+      ['scene.glb']
     """
     start = time.perf_counter()
     check_is_model(model)
@@ -130,6 +135,7 @@ def extract_mesh(
         what = "the model has no Gaussians" if not model.num else "there are no cameras"
         raise ValueError(f"a mesh needs views of some Gaussians; {what}")
     check_lengths(resolution, voxel, radius)
+    _marching_cubes()  # It is used only after the views are fused, which takes minutes.
     if not 0 < max_bytes < np.inf:
         raise ValueError(f"max_bytes must be positive and finite; got {max_bytes}")
     if most_clusters < 1:
@@ -223,11 +229,17 @@ def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh
     return Mesh(positions, faces.astype(np.int32), colors)
 
 
+def _marching_cubes() -> Any:
+    """Return scikit-image's function. ValueError: it is not installed."""
+    try:
+        return importlib.import_module("skimage.measure").marching_cubes
+    except ImportError:
+        raise ValueError("a mesh needs scikit-image, which is not installed: pip install 'a2tg-jax[train]'") from None
+
+
 def _parts(grid: BlockGrid, least_weight: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield vertices in voxels, faces and colours of each brick that has a surface."""
-    from skimage import measure
-
-    marching_cubes: Any = measure.marching_cubes
+    marching_cubes = _marching_cubes()
     # The last cells of a brick need the first voxels of the next ones.
     blocks = np.stack(np.meshgrid(*[np.arange(BRICK + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     for brick in np.unique(grid.coordinates // BRICK, axis=0):

@@ -55,6 +55,12 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
 
     Raises:
       ValueError: if the path has another suffix.
+
+    Examples:
+      >>> vertices, faces = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)
+      >>> mesh = a2tg.Mesh(vertices, faces, colors=np.full((3, 3), 128, np.uint8))
+      >>> len(a2tg.save_mesh("triangle.obj", mesh))
+      1
     """
     check_mesh_suffix(path)
     path = Path(path)
@@ -105,7 +111,8 @@ def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
             Image.fromarray(mesh.texture).save(temporary, "PNG")
         with replacing(material) as temporary:
             # Ka and Kd 1, illum 0: colours of the picture, without lights.
-            temporary.write_text(f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {picture.name}\n")
+            text = f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {picture.name}\n"
+            temporary.write_text(text, encoding="utf-8")
     with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
         rows = mesh.vertices

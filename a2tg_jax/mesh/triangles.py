@@ -110,6 +110,13 @@ def check_simplifying(num_faces: int) -> ModuleType:
 def simplify_mesh(mesh: Mesh, num_faces: int) -> Mesh:
     """Return a mesh of about `num_faces` triangles, by quadric decimation; unchanged if it has no more.
 
+    Args:
+      mesh: a mesh.
+      num_faces: number of triangles, at least 4.
+
+    Returns:
+      A mesh with vertex colours, without a texture.
+
     Raises:
       ValueError: if fast-simplification is not installed, the number is less than 4, or no face would be left.
     """
@@ -178,7 +185,15 @@ def surface_distance(
 
 
 def sample_surface(mesh: Mesh, spacing: float, seed: int = 0) -> np.ndarray:
-    """Return random points [P, 3] on a mesh, evenly by area, one for each square of side `spacing`.
+    """Return random points on a mesh, evenly by area, one for each square of side `spacing`.
+
+    Args:
+      mesh: a mesh.
+      spacing: side of the square, in units of the mesh's world.
+      seed: random seed.
+
+    Returns:
+      [P, 3] points.
 
     Raises:
       ValueError: if these are more than 200,000,000.

@@ -7,7 +7,7 @@ transposes it, which brings the gradients back. A splat that reaches two bands t
 the devices that have them in an even cut of the image, because JAX divides arrays evenly; usually only a few rows go to
 neighbours.
 
-The received rows keep the order of the model, so that a band is composited as it is on one device.
+The received rows keep the order of the model, so that a band is composited as on one device.
 """
 
 import dataclasses
@@ -153,8 +153,8 @@ class ImageBands(NamedTuple):
     def to_even(self, image: Array, borders: Array, device: Array, num_views: int, axis: str) -> Array:
         """Return the pixels [C, `even_height`, W] of this device in an even cut, from the bands of all devices.
 
-        The image [C, `own.height`, W] begins with the first row of this device's band, of which the borders are those
-        of its view. Devices of several views follow each other along the axis, inside `shard_map`.
+        The image [C, `own.height`, W] begins with the first row of this device's band, in the borders of its
+        view. Devices of several views follow each other along the axis, inside `shard_map`.
         """
         band, height = device % self.num, self.even_height
         first, end = self.pixels_of(borders, band)

@@ -19,7 +19,13 @@ from a2tg_jax.rasterize.splats import Wanted
 
 @dataclasses.dataclass(frozen=True)
 class RenderSettings:
-    """Static options of a rendering; hashable, so that jit can close over them or take them as static."""
+    """Static options of a rendering; hashable, so that jit can close over them or take them as static.
+
+    Examples:
+      >>> settings = a2tg.RenderSettings(sh_degree=0, supersample=2)
+      >>> model.render(camera, settings=settings).color.shape
+      (36, 48, 3)
+    """
 
     tile_size: int = 8
     """Side of a tile in pixels, 1 to 64; it does not change the image."""
@@ -45,7 +51,7 @@ class RenderSettings:
     """Factor k by which views are drawn larger; each pixel is the mean over k × k. It lets a model be seen much smaller
     than it was trained without aliasing, at k² times the cost."""
     exchange: Exchange | None = None
-    """Devices that render together, an image or several at once (`exchange_among`); None: one."""
+    """Devices that render together, an image or several at once; None: one."""
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range; convert numpy's integers to Python's, which are static for jit."""

@@ -246,7 +246,7 @@ def photographs_line(result: RunResult) -> str:
 
 
 def sizes_line(run: RunFolder, result: RunResult) -> str:
-    """Return the bytes of the main model in memory and of its files, as far as there are any."""
+    """Return the bytes of the main model in memory and of the files that it has."""
     sizes = [f"{in_bytes(result.models[result.main].num_bytes)} in memory"]
     files = {"as a page": run.viewer, "compressed": run.model(result.main).with_suffix(".a2tgz")}
     sizes += [f"{in_bytes(path.stat().st_size)} {what} ({path.name})" for what, path in files.items() if path.is_file()]

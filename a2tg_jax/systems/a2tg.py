@@ -27,7 +27,13 @@ of the Gaussians. Gaussians then take four fifths of the bytes."""
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class A2tg(TwoStages):
-    """Adaptive anisotropic textured Gaussians: MCMC densification, then textures that grow."""
+    """Adaptive anisotropic textured Gaussians: MCMC densification, then textures that grow.
+
+    Examples:
+      >>> system = a2tg.A2tg.preset("quick", memory_budget="300kB", texture={"cap": 8})
+      >>> [stage.name for stage in system.stages()]
+      ['gaussians', 'textures']
+    """
 
     densify: Mcmc = Mcmc()
     """MCMC densification (3DGS-MCMC)."""

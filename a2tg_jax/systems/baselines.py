@@ -60,7 +60,13 @@ class Gaussians2d(TwoStages):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Gaussians2dMcmc(TwoStages):
-    """Plain 2D Gaussians, densified by MCMC."""
+    """Plain 2D Gaussians, densified by MCMC.
+
+    Examples:
+      >>> system = a2tg.Gaussians2dMcmc.preset("smoke", sh_degree=0, densify={"cap": 500})
+      >>> [stage.iterations for stage in system.stages()]
+      [200]
+    """
 
     stage2_iterations: int = 0
     """Further iterations without densification; 0: none."""
@@ -187,7 +193,7 @@ class BillboardOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BBSplat(TwoStages):
-    """Flat RGBA pictures, whose alpha takes the place of opacity and Gaussian."""
+    """Flat RGBA pictures, whose alpha replaces opacity and Gaussian."""
 
     stage2_iterations: int = 2_000
     """Further iterations without densification; 0: none."""
@@ -196,6 +202,7 @@ class BBSplat(TwoStages):
     densify: Mcmc = Mcmc(cap=160_000)
     """MCMC densification. A billboard of 16 × 16 texels has as many bytes as 18.6 plain Gaussians."""
     billboard: BillboardOptions = BillboardOptions()
+    """Size and learning rates of the pictures."""
 
     name: ClassVar[str] = "bbsplat"
     version: ClassVar[int] = 2

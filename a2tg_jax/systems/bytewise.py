@@ -51,7 +51,13 @@ QUICK_CAP, SMOKE_CAP = 40_000, 2_000
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bytewise(TwoStages):
-    """Gaussians of degree 0 first, then degrees and textures for those with the largest gradients."""
+    """Gaussians of degree 0 first, then degrees and textures for those with the largest gradients.
+
+    Examples:
+      >>> system = a2tg.Bytewise.preset("quick", memory_budget="300kB", texture_share=0.0)
+      >>> system.memory_budget, len(system.stages())
+      (0.3, 2)
+    """
 
     base_degree: int = 0
     """Degree of spherical harmonics of all Gaussians; some rise up to sh_degree."""

@@ -37,6 +37,7 @@ class History:
     iteration: np.ndarray
     """Iteration within its stage, from 1."""
     loss: np.ndarray
+    """Loss of that iteration, the sum of `terms`."""
     psnr: np.ndarray
     """PSNR of the training views of that iteration, in dB."""
     num_gaussians: np.ndarray
@@ -109,9 +110,11 @@ class Checkpoint:
     """A training run stopped between two iterations."""
 
     system: System
+    """System that is trained."""
     stage: int
     """Index of the stage in its system, from 0."""
     state: TrainState
+    """State of the stage: `state.model`, with spare rows, Adam's moments, and what events and corrections keep."""
     history: History
     """History of this stage."""
     num_restored: int = 0
@@ -159,7 +162,12 @@ class Interrupted(KeyboardInterrupt):
 
 
 def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; an older file of that name is replaced once the new one is complete."""
+    """Write a checkpoint.
+
+    Args:
+      path: the file; an older one is replaced once the new one is complete.
+      checkpoint: from `fit`, by `on_checkpoint`.
+    """
     state, model = checkpoint.state, checkpoint.state.model
     header = {
         "system": system_to_dict(checkpoint.system),
@@ -186,6 +194,9 @@ def load_checkpoint(path: str | os.PathLike[str], system: type[System] | None = 
     Args:
       path: the file.
       system: class of its system. Only needed for a custom system whose module is not imported.
+
+    Returns:
+      The checkpoint, for `resume` of `fit`.
 
     Raises:
       FileNotFoundError: if there is no such file.

@@ -112,7 +112,7 @@ class Exposure(FadingCorrection):
 
 @pytree
 class PoseRefinement(FadingCorrection):
-    """A small rigid motion per view, a twist [6] in the camera's frame (`core.rigid.moved_viewmat`)."""
+    """A small rigid motion per view, a twist [6] in the camera's frame (rotation vector, then translation)."""
 
     rate: float = 1e-3
     """Adam's learning rate of the camera motions, in radians and in units of the normalised world, in which cameras are
@@ -277,7 +277,7 @@ LARGEST_GRID = 64
 
 @pytree
 class BilateralGrid(FadingCorrection):
-    """An affine map of colours per view, position and luminance, [L, Gy, Gx, 3, 4]; see `sliced`.
+    """An affine map of colours per view, position and luminance, [L, Gy, Gx, 3, 4].
 
     It follows what an affine map cannot: vignettes, local tone mapping, curves of a camera's processing (Chen et al.,
     2007; Wang et al., 2024, Bilateral Guided Radiance Field Processing). A pixel's map is interpolated trilinearly at

@@ -29,9 +29,11 @@ class StageResult:
     """Result of one stage."""
 
     name: str
+    """Name of the stage."""
     model: Model
     """The Gaussians that exist, in the normalised world of the scene, with its cameras."""
     history: History
+    """What the stage logged."""
     seconds: float
     """Training time, compilation included."""
     num_regrown: int
@@ -46,6 +48,7 @@ class FitResult:
     """Result of training."""
 
     system: System
+    """The system that was trained."""
     stages: tuple[StageResult, ...]
     """Stages that were trained; if training was resumed in a later stage, the earlier ones are missing."""
 
@@ -109,10 +112,21 @@ def fit(
         `Interrupted` is raised. The first Ctrl-C does the same, unless the program handles it.
       session: what trainings of this process share, compiled shapes and devices; None: a new one.
 
+    Returns:
+      The trained model, `result.model`, and what its stages logged.
+
     Raises:
       Interrupted: if training is stopped; a KeyboardInterrupt with the `checkpoint` to resume from.
       DivergedError: if the loss or a gradient is not finite, or the loss explodes; the error holds the state before.
       ValueError: if options contradict each other, the scene or the checkpoint.
+
+    Examples:
+      >>> system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=20)
+      >>> result = a2tg.fit(scene, system, progress=False)
+      >>> result.model.render(camera).color.shape
+      (36, 48, 3)
+      >>> result.history.iteration
+      array([10, 20])
     """
     _check_arguments(scene, system, resume, checkpoint_every)
     stages, first = system.all_stages(), 0 if resume is None else resume.stage
@@ -179,16 +193,38 @@ def fit_stage(
     session: Session | None = None,
     after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
 ) -> StageResult:
-    """Train one stage of a system. Arguments as in `fit`.
+    """Train one stage of a system.
 
     Args:
+      scene: as in `fit`.
+      system: as in `fit`.
       index: stage, from 0.
       start: the model to start from; None: Gaussians at the scene's points.
-      title: of the progress bar; None: the stage's name.
+      resume: a checkpoint of this stage; None: begin it.
+      on_checkpoint: as in `fit`.
+      checkpoint_every: as in `fit`.
+      on_log: as in `fit`.
+      progress: show a progress bar.
+      title: title of the progress bar; None: the stage's name.
+      is_stopped: as in `fit`.
       num_restored: number of times the stage went back because it diverged; each number gives another order of the
         views. None: the checkpoint's number, or 0.
-      watch: called between steps with the stage under way (`training.loop.Watch`).
+      watch: function of the stage under way and of `is_stopped`, called between steps. It returns the seconds that it
+        waited, which do not count as training time.
+      session: as in `fit`.
       after: what follows the stage, for the remaining time that is shown.
+
+    Returns:
+      The model after the stage, and its history.
+
+    Raises:
+      ValueError: if there is no such stage, and otherwise as `fit` raises, the other errors of `fit` included.
+
+    Examples:
+      >>> system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=20)
+      >>> result = a2tg.fit_stage(scene, system, 0, progress=False)
+      >>> len(result.history.psnr)
+      2
     """
     _check_arguments(scene, system, resume, checkpoint_every)
     stages = system.all_stages()

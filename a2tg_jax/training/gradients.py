@@ -70,11 +70,22 @@ def view_gradients(
       settings: with a capacity under jit (`plan_render`); an eager call finds its own.
       has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
       sh_degree: overrides the settings' degree; may be traced.
-      statistic: kind of position that it differentiates by (`rasterize.pixel.positional_gradient`).
+      statistic: position by which the norms differentiate: "position", the mean in the world, as in A²TG; "screen",
+        its projection, pixel by pixel in absolute value; "center", its projection, signed, as in 2DGS.
+
+    Returns:
+      Loss, gradient and statistic of the view.
 
     Raises:
       ValueError: if an argument is of another kind or has a wrong shape, if there is no such statistic, or under jit
         without a capacity.
+
+    Examples:
+      >>> photograph = jnp.asarray(a2tg.view_image(scene.test[0]))
+      >>> loss = lambda model, output: a2tg.photometric_loss(output.color, photograph)
+      >>> found = a2tg.view_gradients(loss, model, camera)
+      >>> found.gradient.gaussians.means.shape, found.norms.shape
+      ((200, 3), (200,))
     """
     check_literal("statistic", statistic, Statistic)
     check_is_model(model)
@@ -108,6 +119,16 @@ def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callab
     Args:
       loss: of a model, and of any further arguments, which are not differentiated; a scalar.
       has_aux: whether the loss returns (scalar, anything) instead.
+
+    Returns:
+      A function of the loss's arguments that returns the loss's value and the gradient, a model. It raises ValueError
+      if its first argument is no model.
+
+    Examples:
+      >>> brightness = lambda model: jnp.mean(model.render(camera).color)
+      >>> value, gradient = a2tg.value_and_grad(brightness)(model)
+      >>> gradient.gaussians.sh.shape
+      (200, 4, 3)
     """
 
     def of_floats(floats: Model, rest: Model, *args: object, **kwargs: object) -> Any:

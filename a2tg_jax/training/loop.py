@@ -110,7 +110,7 @@ class Session:
         self, after_compiling: Callable[[], object] = lambda: None, devices: Sequence[jax.Device] | None = None
     ):
         """Args:
-        after_compiling: called after a step was compiled, such as `host.machine.tidy_memory`.
+        after_compiling: called after a step was compiled, such as `gc.collect`.
         devices: two or more devices that train one scene together, each with a share of the Gaussians and of the
           pixels, such as `jax.devices()`; None: JAX's default device. If they are of several processes, each of these
           makes the same calls.

@@ -141,13 +141,16 @@ class System:
     tile_size: int = 8
     """Side of a tile in pixels. Results do not depend on it."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
+    """Weights of the loss."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
+    """Adam's learning rates of the Gaussians."""
     exposure: bool = False
     """Learn an affine map of colours for each training photograph, for captures whose exposure or white balance
     changes."""
     refine_poses: bool = False
     """Learn a small rigid motion of each training camera, for captures whose poses are not exact."""
     corrections: Corrections = dataclasses.field(default_factory=Corrections)
+    """Options of exposures and poses."""
     more: tuple[int, ...] = ()
     """Iterations of further stages. Each repeats the last stage on its model, without growth. With --resume, they are
     added to a finished run."""
@@ -179,7 +182,7 @@ class System:
 
     @property
     def small_budget(self) -> str:
-        """Number of Gaussians that fit into the memory budget, in words, if it is below `FEW_GAUSSIANS`; else empty."""
+        """Number of Gaussians that fit into the memory budget, in words, if they are few; else empty."""
         if self.budget_bytes is None or self.budget_bytes >= FEW_GAUSSIANS * (size := self.initial_bytes):
             return ""
         sensible = in_bytes(SENSIBLE_GAUSSIANS * size).replace(" ", "")
@@ -418,6 +421,9 @@ def like(kind: Any, other: object) -> Any:
     Args:
       kind: system or its class, which gives all other options.
       other: the other system.
+
+    Returns:
+      The system or group of class `kind`.
     """
     value = kind() if isinstance(kind, type) else kind
     hints, other_hints = (typing.get_type_hints(type(config)) for config in (value, other))

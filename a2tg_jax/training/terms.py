@@ -29,6 +29,7 @@ class Target:
     """Target that a render is compared with."""
 
     camera: Camera
+    """The view."""
     image: Array
     """[H, W, 3] photograph, composed over the background."""
     background: Array
@@ -64,14 +65,17 @@ LossFunction = Callable[[Model, Target, RenderOutput], Array]
 class Term:
     """Function of model, target and render, times a weight.
 
-    def roughness(model, target, output):
-        return jnp.mean(jnp.abs(jnp.diff(output.depth, axis=0)))
-
-    Term(roughness, weight=0.1, has_geometry=True)
+    Examples:
+      >>> def roughness(model, target, output):
+      ...     return jnp.mean(jnp.abs(jnp.diff(output.depth, axis=0)))
+      >>> a2tg.Term(roughness, weight=0.1, has_geometry=True).name
+      'roughness'
     """
 
     function: LossFunction = static()
+    """Function of the model, the `Target` and the `RenderOutput`; a scalar."""
     weight: float = 1.0
+    """Weight of the function's value in the loss."""
     has_geometry: bool = static(default=False)
     """Whether the function reads `output.depth`, `normal` or `distortion`, which are rendered only on demand: unless a
     term of the stage needs them, reading them raises ValueError."""

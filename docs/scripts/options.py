@@ -22,8 +22,8 @@ Written by docs/scripts/options.py.
 '''
 OPENING = """# Options
 
-Every option of every command, with its default, as `a2tg COMMAND --help-all` prints them. This page is
-written by `python docs/scripts/options.py`. [The command line](command-line.md) explains what they
+Arguments and options of every command, with their defaults, as `a2tg COMMAND --help-all` prints them. This page
+is written by `python docs/scripts/options.py`. [The command line](command-line.md) explains what they
 are for. Options that are on or off have a second form, `--no-…`.
 """
 OF_SYSTEMS = """
@@ -34,7 +34,7 @@ OF_SYSTEMS = """
 """
 WIDTH = "110"
 """Columns of a terminal in which the help has one column of boxes."""
-HEAD = re.compile(r" (-\S+(?: \S+)*?|[A-Z_]+)(?: {2,}(\S.*))?$")
+HEAD = re.compile(r" (-\S+(?: \S+)*?|[A-Z_.]+(?: [A-Z_.]+)*)(?: {2,}(\S.*))?$")
 """First line of an option: its name and value, and where there is room its text."""
 
 
@@ -71,7 +71,9 @@ def options_of(*words: str) -> list[Option]:
         if title := re.match(r"╭─ (.+?) ─", line):
             group = title[1]
         inside = line.strip("│").rstrip()
-        if head := HEAD.match(inside):
+        if found and found[-1].value.count("{") > found[-1].value.count("}"):  # choices of more than a line
+            found[-1] = found[-1]._replace(value=found[-1].value + inside.strip())
+        elif head := HEAD.match(inside):
             name, _, value = re.sub(r", --\S*no-\S+", "", head[1]).partition(" ")
             found.append(Option(group, name, value, head[2] or "", ""))
         elif found and re.match(r" {3,}\S", inside):
@@ -86,6 +88,8 @@ def _with_default(option: Option) -> Option:
 
 
 def table(options: list[Option]) -> str:
+    if not options:
+        return "No options.\n"
     rows = [f"| {_code(o)} | {_cell(o.default)} | {_cell(o.text)} |" for o in options]
     return "\n".join(["| option | default | |", "| --- | --- | --- |", *rows]) + "\n"
 
@@ -107,8 +111,7 @@ def page() -> str:
         options = options_of(name)
         if name == "train":
             options = [option for option in options if option not in own[DEFAULT_SYSTEM]]
-        if options:
-            parts.append(f"\n## `a2tg {name}`\n\n{table(options)}")
+        parts.append(f"\n## `a2tg {name}`\n\n{table(options)}")
     parts.append(OF_SYSTEMS)
     parts += [f"\n### `{name}`\n\n{table(options)}" for name, options in own.items() if options]
     return "".join(parts)

@@ -133,7 +133,7 @@ def _capsule(address: int | None, destructor: int | None = None) -> object:
 
 GATE = """
 define ptr @{name}(ptr %frame) {{
-  ; Counted before the gate is looked at: the end closes it and then waits until nobody is inside, so misses no thread.
+  ; Counted before the gate is looked at: the end closes it and then waits until no thread is inside, so misses none.
   atomicrmw add ptr inttoptr (i64 {num_inside} to ptr), i32 1 seq_cst
   %closed = load atomic i32, ptr inttoptr (i64 {is_closed} to ptr) seq_cst, align 4
   %is_open = icmp eq i32 %closed, 0
