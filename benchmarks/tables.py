@@ -170,28 +170,23 @@ def training(report: dict) -> str:
     return table(head, rows)
 
 
-def bounds(report: dict) -> str:
-    """Return the least milliseconds of each stage, with what needs them."""
-    found = report["bounds"]
-    head = ["stage", *(f"{case['num']:,}{', textured' if case['textures'] == 'mixed' else ''}" for case in found)]
-    rows = []
-    for index, stage in enumerate(found[0]["stages"]):
-        rows.append([stage["stage"], *(_least(case["stages"][index]) for case in found)])
-    total = (sum(max(_kinds(stage).values()) for stage in case["stages"]) for case in found)
-    return table(head, [*rows, ["*sum*", *(f"{value:.2f}" for value in total)]])
-
-
-def _kinds(stage: dict) -> dict[str, float]:
-    return {kind: value for kind, value in stage.items() if kind != "stage"}
-
-
-def _least(stage: dict) -> str:
-    kind, value = max(_kinds(stage).items(), key=lambda item: item[1])
-    return f"{value:.3f} {kind}"
+def gpu(report: dict) -> str:
+    cases = measured(report["gpu"])
+    head = ["N", "program", "textures", "forward", "forward + backward", "training step", "memory of the step, MB"]
+    names, rows = {"render": "this library", "gsplat": "gsplat, 2D Gaussians"}, []
+    steps = {(case["num"], case["textures"]): case for case in cases if case["case"] == "step"}
+    for case in cases:
+        if case["case"] in names:
+            step = steps.get((case["num"], case.get("textures")))
+            of_step = [ms(step["step"]), f"{step['device_peak_mb']:.0f}"] if step else ["–", "–"]
+            passes = [ms(case["forward"]), ms(case["both"])]
+            textures = TEXTURES[case.get("textures", "none")]
+            rows.append([f"{case['num']:,}", names[case["case"]], textures, *passes, *of_step])
+    return table(head, rows)
 
 
 TABLES: dict[str, tuple[Callable[[dict], str], tuple[str, ...]]] = {
-    "machine": (machine, ("machine",)),
+    "machine": (machine, ("machine", "render")),
     "render": (render, ("machine", "render", "pixels", "full_size")),
     "ratios": (ratios, ("ratios",)),
     "growth": (growth, ("growth",)),
@@ -200,7 +195,7 @@ TABLES: dict[str, tuple[Callable[[dict], str], tuple[str, ...]]] = {
     "others": (others, ("others",)),
     "compositors": (compositors, ("compositors",)),
     "training": (training, ("training",)),
-    "bounds": (bounds, ("bounds",)),
+    "gpu": (gpu, ("gpu",)),
 }
 """Function of each table, with the sections of the report that it needs."""
 

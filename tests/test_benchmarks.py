@@ -1,24 +1,17 @@
-"""The benchmarks run, and bounds count what they say."""
+"""The benchmarks run, and their tables say what they measured."""
 
-import dataclasses
 import sys
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 sys.path.append(str(Path(__file__).parents[1]))  # Last, so that the installed package comes first.
 
 from a2tg_jax.data.synthetic import still_life
-from benchmarks import bounds, meshes, scaling, stages
-from benchmarks.tables import bounds as bounds_table
-
-
-@pytest.fixture(scope="module")
-def counted():
-    return bounds.count(300, "mixed", 40, 24)
+from benchmarks import meshes, scaling, stages
+from benchmarks.tables import gpu as gpu_table
 
 
 def test_stages_of_a_step_can_be_measured(monkeypatch):
@@ -29,43 +22,14 @@ def test_stages_of_a_step_can_be_measured(monkeypatch):
     assert stages.measure_step({**case, "textures": "mixed"})["step"].loss > 0
 
 
-def test_operations_of_a_jaxpr_are_its_arithmetic():
-    def function(x, y):
-        return jax.jit(lambda x: jnp.exp(x) + y)(x * y), jnp.stack([x, y]) * 2
-
-    assert bounds.operations(jax.make_jaxpr(function)(1.0, 2.0)) == 3 + 2
-
-
-@pytest.mark.long
-def test_pairs_beyond_the_last_visible_splat_are_not_taken(monkeypatch):
-    seen = []
-    monkeypatch.setattr(bounds.View, "taken", lambda view, lists: seen.append((view, lists)) or np.zeros(1))
-    bounds.count(300, "none", 40, 24)
-    monkeypatch.undo()
-    ((view, lists),) = seen
-    ids, starts = np.asarray(lists.ids), np.asarray(lists.starts)
-    probe = jnp.zeros((300, 4))
-
-    def transmittance(lengths):
-        return np.asarray(view._by_tile(view._composite(bounds.beginning(lists, ids, starts, lengths), probe)[1]))
-
-    whole, taken = transmittance(np.diff(starts)), view.taken(lists)
-    np.testing.assert_array_equal(transmittance(taken), whole)
-    fewer = np.maximum(taken - 1, 0)
-    assert (taken > 0).any() and (transmittance(fewer) != whole).any(axis=1)[taken > 0].all()
-
-
-@pytest.mark.long
-def test_bounds_add_up(counted):
-    work, spec = counted
-    assert 0 < work.textured < work.composited <= work.taken * bounds.TILE_SIZE**2 and work.taken <= work.listed
-    assert work.listed <= work.boxes and work.num_texels > 300
-    found = {stage.name: stage for stage in bounds.stages(work, spec)}
-    twice = bounds.stages(dataclasses.replace(work, composited=2 * work.composited), spec)
-    assert found["Adam"].bytes == 7 * 4 * (58 * 300 + 4 * work.num_texels)
-    assert [one.flops > found[one.name].flops for one in twice] == ["compositing" in name for name in found]
-    case = {"num": 300, "textures": "mixed", "stages": [stage.told for stage in found.values()]}
-    assert "| 300, textured |" in bounds_table({"bounds": [case]})
+def test_the_table_of_gpus_joins_passes_and_steps():
+    case = {"num": 3000, "textures": "mixed"}
+    passes = {"case": "render", **case, "forward": {"ms": 1.21}, "both": {"ms": 3.4}}
+    step = {"case": "step", **case, "step": {"ms": 4.4}, "device_peak_mb": 446.2}
+    other = {"case": "gsplat", "num": 3000, "forward": {"ms": 2.0}, "both": {"ms": 7.0}}
+    *_, ours, theirs = gpu_table({"gpu": [passes, step, other, {"case": "gsplat", "failed": "took long"}]}).splitlines()
+    assert ours == "| 3,000 | this library | mixed | 1.2 | 3.4 | 4.4 | 446 |"
+    assert theirs == "| 3,000 | gsplat, 2D Gaussians | none | 2.0 | 7.0 | – | – |"
 
 
 @pytest.mark.long
