@@ -8,11 +8,13 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from PIL import Image
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.results.model_source import Source
 
 ROOT = pathlib.Path(__file__).parents[1]
 sys.path.append(str(ROOT))  # Last, so that the installed package comes first.
@@ -110,3 +112,22 @@ def test_the_loop_of_the_readme_is_drawn(tmp_path):
     loop.main(tmp_path / "model.npz", tmp_path / "loop.webp", num_frames=3)
     with Image.open(tmp_path / "loop.webp") as picture:
         assert picture.n_frames == 4 and picture.size == (24, 16)
+
+
+@pytest.mark.long
+def test_pictures_of_the_viewer_and_of_meshes_are_drawn(tmp_path, monkeypatch):
+    import pictures
+
+    monkeypatch.setattr(pictures, "MODELS", tmp_path)
+    monkeypatch.setattr(pictures, "ITERATIONS", 100)
+    scene = a2tg.synthetic_scene(num_views=8, width=64, height=48)
+    model = pictures.trained(scene, pictures.surfaces(pictures.NORMALS), "mesh")
+    drawn = [
+        pictures.picture_of_mesh(scene, model, resolution=64, size=256),
+        pictures.picture_of_losses([model, model], resolution=64),
+    ]
+    if chromium := pictures.find_chromium():
+        drawn.append(pictures.picture_of_viewer(Source(model, "small"), chromium, (400, 300)))
+        assert drawn[-1].size == (400, 300)
+    for picture in drawn:
+        assert np.asarray(picture)[50:250, 50:350].std() > 10
