@@ -102,9 +102,9 @@ class Upscale(HostEvent):
         if self.budget_mb is not None:
             check_number("budget_mb", self.budget_mb, least=1e-6)
         if self.select == "budget" and self.budget_mb is None:
-            raise ValueError("select is 'budget', so budget_mb must say how many MB (10^6 bytes)")
+            raise ValueError("select is 'budget', so it needs budget_mb, in MB (10^6 bytes)")
         if self.select == "threshold" and self.threshold is None:
-            raise ValueError("select is 'threshold', so threshold must say which average gradient")
+            raise ValueError("select is 'threshold', so it needs threshold, an average gradient")
         # The threshold of the authors' program may stay when another rule is chosen.
         for rule, name, usual in (("budget", "budget_mb", None), ("threshold", "threshold", PAPER_THRESHOLD)):
             number = getattr(self, name)
@@ -244,7 +244,7 @@ def next_sizes(
     check_shape("scales", scales, sizes.shape)
     scales = np.asarray(scales)
     if (scales < 0).any():
-        raise ValueError(f"scales must be positive standard deviations; got {scales.min():g}: say gaussians.scales")
+        raise ValueError(f"scales must be positive standard deviations; got {scales.min():g}: use gaussians.scales")
     check_number("k_a", k_a, least=0)
     check_number("k_s", k_s, least=0)
     check_int("cap", cap, 1, MAX_SIDE)

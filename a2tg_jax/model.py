@@ -250,7 +250,7 @@ def _indices(rows: ArrayLike | slice, num: int) -> np.ndarray:
         if not -num <= rows < num:
             raise ValueError(f"rows must choose among {num} Gaussians; got {rows}")
         end = f"{rows + 1}" if rows != -1 else ""
-        raise ValueError(f"rows must be a mask [{num}], indices or a slice; for one Gaussian say model[{rows}:{end}]")
+        raise ValueError(f"rows must be a mask [{num}], indices or a slice; for one Gaussian use model[{rows}:{end}]")
     check_unmasked("rows", rows)
     chosen = np.asarray(rows)
     if chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "biu"):
@@ -264,7 +264,7 @@ def _indices(rows: ArrayLike | slice, num: int) -> np.ndarray:
 
 def check_is_model(model: object) -> None:
     """Raise ValueError unless a value is a model."""
-    check_kind("model", model, Model, "say Model(gaussians)" if isinstance(model, Gaussians) else "")
+    check_kind("model", model, Model, "use Model(gaussians)" if isinstance(model, Gaussians) else "")
 
 
 def concatenate(models: Sequence[Model]) -> Model:

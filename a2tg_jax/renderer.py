@@ -69,7 +69,7 @@ def plan_render(
     num_live = None
     if isinstance(gaussians, Model):
         if appearance is not None or textures is not None:
-            raise ValueError("a model has an appearance already: say plan_render(model, cameras)")
+            raise ValueError("a model has an appearance already: use plan_render(model, cameras)")
         model, gaussians = gaussians, gaussians.gaussians
         appearance, num_live = model.appearance, model.num_live
     check_gaussians(gaussians)

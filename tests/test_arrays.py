@@ -76,26 +76,26 @@ def test_points_may_be_left_out(given):
 PICTURE = "must be an array uint8 [H, W, 3], or [H, W, 4] with alpha; got "
 NO_DEPTHS = [None] * 4
 WRONG = [
-    (f"images[0]: a picture {PICTURE}float32 [30, 40, 3]: say", "images", [np.zeros((30, 40, 3), np.float32)] * 6),
+    (f"images[0]: a picture {PICTURE}float32 [30, 40, 3]: use", "images", [np.zeros((30, 40, 3), np.float32)] * 6),
     (f"{PICTURE}uint8 [3, 30, 40]", "images", [np.zeros((3, 30, 40), np.uint8)] * 6),
-    ("say np.clip(np.rint(image), 0, 255).astype(np.uint8) of [0, 255]", "images", [np.full((30, 40, 3), 255.0)] * 6),
-    ("got int64 [30, 40, 3]: say np.clip(np.rint(image), 0, 255)", "images", [np.full((30, 40, 3), 200)] * 6),
-    ("say (image // 257).astype", "images", [np.full((30, 40, 3), 65535, np.uint16)] * 6),
+    ("use np.clip(np.rint(image), 0, 255).astype(np.uint8) of [0, 255]", "images", [np.full((30, 40, 3), 255.0)] * 6),
+    ("got int64 [30, 40, 3]: use np.clip(np.rint(image), 0, 255)", "images", [np.full((30, 40, 3), 200)] * 6),
+    ("use (image // 257).astype", "images", [np.full((30, 40, 3), 65535, np.uint16)] * 6),
     ("viewmats must be [6, 4, 4]; got [6, 3, 4]", "viewmats", np.zeros((6, 3, 4))),
     ("viewmats[0]: its pose is not a rigid motion", "viewmats", np.stack([np.diag([2.0, 2, 2, 1])] * 6)),
     ("end with the row 0, 0, 0, 1: transpose", "viewmats", np.stack([np.eye(4) + np.eye(4, k=-1)] * 6)),
     ("Ks must be [6, 3, 3]; got [2, 3, 3]", "Ks", np.zeros((2, 3, 3))),
     ("points must be [P, 3]; got [5, 2]", "points", np.zeros((5, 2))),
     ("colors needs points", "points", None),
-    ("colors must be uint8; got float64: say np.rint(255", "colors", np.zeros((200, 3))),
-    ("got float64: say np.clip(np.rint(colors), 0, 255)", "colors", np.full((200, 3), 99.0)),
+    ("colors must be uint8; got float64: use np.rint(255", "colors", np.zeros((200, 3))),
+    ("got float64: use np.clip(np.rint(colors), 0, 255)", "colors", np.full((200, 3), 99.0)),
     ("colors must be [200, 3]; got [2, 3]", "colors", np.zeros((2, 3), np.uint8)),
     ("names must hold one item for each of 6 images; got 1", "names", ["a"]),
     ("lists a twice", "names", ["a"] * 6),
     ("names[0] must be a str; got NoneType", "names", [None] * 6),
     ("observed[1] must hold integers [S] from 0 to 199, indices of points; got int64 [1]", "observed",
      [[0], [200], *[[]] * 4]),
-    ("; got bool [200]: say np.flatnonzero of a mask", "observed", [np.ones(200, bool)] * 6),
+    ("; got bool [200]: use np.flatnonzero of a mask", "observed", [np.ones(200, bool)] * 6),
     ("masks[0]: a mask must be an array bool", "masks", [np.ones((30, 40))] * 6),
     ("masks[0] must be as large as its image, [30, 40]; got [3, 4]", "masks", [np.ones((3, 4), bool)] * 6),
     ("depths[1] must be as large as its image, [30, 40]; got [3, 4]", "depths", [None, np.ones((3, 4)), *NO_DEPTHS]),
@@ -179,5 +179,5 @@ def test_a_transparent_photograph_is_compared_on_the_background_of_the_model():
     hidden = a2tg.init_from_points(scene.points, scene.colors, opacity=1e-4)
     model, view = a2tg.Model(hidden, background=(1.0, 1.0, 1.0)), scene.train[0]
     assert a2tg.psnr(model.render(view.camera).color, a2tg.view_image(view, model.background)) > 50
-    with pytest.warns(UserWarning, match=r"transparent and was put on black: say view_image\(view, model.background\)"):
+    with pytest.warns(UserWarning, match=r"transparent and was put on black: use view_image\(view, model.background\)"):
         assert not np.asarray(a2tg.view_image(view)).any()

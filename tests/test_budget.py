@@ -256,7 +256,7 @@ def unchosen(name: str, select: str) -> str:
         ),
         (
             "a2tg", {"memory_budget": 1.5, "texture": {"select": "budget", "budget_mb": 1.5}},
-            "texture.budget_mb both say .* give one",
+            "texture.budget_mb both set .* give one",
         ),
         ("a2tg", {"memory_budget": 1.5, "densify": {"cap": 0}}, "densify.cap is 0"),
         ("a2tg", {"texture": {"budget_mb": 1.0}}, unchosen("budget_mb", "budget")),

@@ -225,7 +225,7 @@ def test_a_limit_below_all_exponents_changes_none_and_needs_exponents():
         ({"base_degree": 2, "sh_degree": 1}, "base_degree must be at least 0 and at most 1; got 2"),
         ({"base_degree": 3}, "view_dependence_share must be 0 where all Gaussians have the highest degree, 3"),
         ({"details": {"at": [0.5, 0.2]}}, "details.at must be ascending"),
-        ({"details": {"at": []}}, "details.at must say when"),
+        ({"details": {"at": []}}, "details.at must hold fractions"),
         ({"prune": {"share": 1.0}}, "prune.share must be at least 0 and below 1; got 1.0"),
         ({"prune": {"at": [0.5, 0.83]}}, "prune.at must hold fractions up to 0.8, .* lower the last"),
         ({"prune": {"at": []}}, "prune.at must hold fractions"),

@@ -20,6 +20,7 @@ PLAINER = {
     r"(left|leaves?|leaving) aside": "ignored",
     r"(is|are) looked for": "is searched",
     r"nobody|somebody": "the noun",
+    r"must say|(?<=[:;] )say": "must be, use",
     r"tells|told|mends?|hears?": "reports, prints, fixes",
     r"(program|run|message|page|viewer|command|file|event|option|library|system) (sees|wants|asks|knows)":
         "checks, needs",

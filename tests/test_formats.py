@@ -119,7 +119,7 @@ def test_a_damaged_file_is_one_clear_line(tmp_path):
     needs_gaussforge()
     for suffix in (".spz", ".sog"):
         (tmp_path / f"a{suffix}").write_bytes(b"nothing of the kind")
-        with pytest.raises(ValueError, match="gaussforge says"):
+        with pytest.raises(ValueError, match="gaussforge reports"):
             load_splats(tmp_path / f"a{suffix}")
 
 

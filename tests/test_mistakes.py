@@ -608,13 +608,13 @@ ADVICE = {
 
 @pytest.mark.parametrize("mistake", ADVICE)
 def test_what_a_message_says_to_write_works(mistake, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="say ") as printed_text:
+    with pytest.raises(ValueError, match="use ") as printed_text:
         eval(mistake, NAMES)
     monkeypatch.chdir(tmp_path)
     write_colmap(tmp_path / "fox")
     given = {"gaussians": GAUSSIANS, "model": MODEL, "image": np.zeros((12, 16, 3)), "key": jax.random.key(0)}
     given["appearance"] = TEMPLATE.appearance
-    for code in str(printed_text.value).rpartition("say ")[2].partition(" of ")[0].split(" or "):
+    for code in str(printed_text.value).rpartition("use ")[2].partition(" of ")[0].split(" or "):
         assert isinstance(eval(code, NAMES | given), ADVICE[mistake])
 
 

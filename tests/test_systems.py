@@ -288,8 +288,8 @@ def test_a_file_imports_nothing():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"texture": {"select": "threshold"}}, "so threshold must say"),
-        ({"texture": {"select": "budget"}}, "budget_mb must say"),
+        ({"texture": {"select": "threshold"}}, "so it needs threshold"),
+        ({"texture": {"select": "budget"}}, "so it needs budget_mb"),
         ({"texture": {"cap": 32}}, "texture.cap"),
         ({"texture": {"at": [0.5, 0.2]}}, "at"),
         ({"texture": {"fraction": 2.0}}, "texture.fraction must be at least 0 and at most 1; got 2.0"),

@@ -429,7 +429,7 @@ def check_arrays_given(appearance: Appearance) -> None:
         missing += [f"{name}.{field}" for field in array_fields(part) if getattr(part, field) is None]
     if missing:
         raise ValueError(
-            f"model.appearance.{missing[0]} is None: this appearance is a template, without arrays; say "
+            f"model.appearance.{missing[0]} is None: this appearance is a template, without arrays; use "
             "Model(gaussians, allocate_appearance(appearance, key, gaussians))"
         )
 

@@ -38,7 +38,7 @@ def check_kind(name: str, value: object, kind: type | tuple[type, ...], hint: st
     if isinstance(value, kind):
         return
     if not hint and isinstance(value, type) and issubclass(value, kind):
-        hint = f"say {value.__name__}(…)"
+        hint = f"use {value.__name__}(…)"
     nouns = []
     for own in (each.__name__ for each in (kind if isinstance(kind, tuple) else (kind,))):
         article = "" if own.endswith("s") else "an " if own[0] in "AEIOUaeiou" else "a "  # Gaussians have none.

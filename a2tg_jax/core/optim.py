@@ -88,7 +88,7 @@ def adam_update(
       >>> a2tg.combine(floats, rest).num
       200
     """
-    check_kind("state", state, AdamState, "say adam_init(params)")
+    check_kind("state", state, AdamState, "use adam_init(params)")
     for name, decay in (("b1", b1), ("b2", b2)):
         check_number(name, decay, least=0, below=1)
     check_number("eps", eps, least=0)

@@ -227,7 +227,7 @@ def _chosen(points: np.ndarray, indices: ArrayLike, what: str) -> np.ndarray:
     # NumPy makes float64 of an empty list.
     is_index = indices.ndim == 1 and (np.issubdtype(indices.dtype, np.integer) or not indices.size)
     if not is_index or (indices.size and not 0 <= indices.min() <= indices.max() < len(points)):
-        advice = ": say np.flatnonzero of a mask" if indices.dtype == bool else ""
+        advice = ": use np.flatnonzero of a mask" if indices.dtype == bool else ""
         wanted = f"{what} must hold integers [S] from 0 to {len(points) - 1}, indices of points"
         raise ValueError(f"{wanted}; got {indices.dtype} {[*indices.shape]}{advice}")
     return points[indices.astype(int)]

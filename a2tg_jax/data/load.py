@@ -123,7 +123,7 @@ def load_scene(
         or processes that load it together have other options or photographs than the first.
 
     Examples:
-      >>> scene = a2tg.load_scene("scene", downscale=2)  # a folder with transforms.json, say
+      >>> scene = a2tg.load_scene("scene", downscale=2)  # such as a folder with transforms.json
       >>> len(scene.train), len(scene.test)
       (7, 1)
     """

@@ -37,10 +37,10 @@ def how_to_convert(values: object, name: str) -> str:
     is_float, is_integer = (np.issubdtype(values.dtype, kind) for kind in (np.floating, np.integer))
     largest = np.nanmax(values, initial=0)
     if is_float and largest <= 1:
-        return f": say np.rint(255 * {name}).astype(np.uint8) of [0, 1]"
+        return f": use np.rint(255 * {name}).astype(np.uint8) of [0, 1]"
     if (is_float or is_integer) and largest <= 255:
-        return f": say np.clip(np.rint({name}), 0, 255).astype(np.uint8) of [0, 255]"
-    return f": say ({name} // 257).astype(np.uint8) of 16 bits" if values.dtype == np.uint16 else ""
+        return f": use np.clip(np.rint({name}), 0, 255).astype(np.uint8) of [0, 255]"
+    return f": use ({name} // 257).astype(np.uint8) of 16 bits" if values.dtype == np.uint16 else ""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

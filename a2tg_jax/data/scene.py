@@ -144,7 +144,7 @@ def check_are_views(views: Sequence[View], call: str) -> None:
     is_list = isinstance(views, list | tuple)
     odd = next((item for item in views if not isinstance(item, View)), None) if is_list else views
     if odd is not None:
-        raise ValueError(f"views must be views, such as scene.train; got {type(odd).__name__}: say {call}")
+        raise ValueError(f"views must be views, such as scene.train; got {type(odd).__name__}: use {call}")
 
 
 def origin_of_scene(scene: Scene) -> Origin:
@@ -228,7 +228,7 @@ def view_image(view: View, background: Sequence[float] | np.ndarray | None = Non
     if background is None:
         if view.has_alpha:
             warnings.warn(
-                "the image is transparent and was put on black: say view_image(view, model.background) to compare it "
+                "the image is transparent and was put on black: use view_image(view, model.background) to compare it "
                 "with a model, or give another background",
                 stacklevel=2,
             )

@@ -73,7 +73,7 @@ def polish(
       >>> a2tg.evaluate(scene.train, polished).psnr > a2tg.evaluate(scene.train, model).psnr
       True
     """
-    check_kind("model", model, Model, "say polish(model, scene.train)")
+    check_kind("model", model, Model, "use polish(model, scene.train)")
     check_are_views(views, "polish(model, scene.train)")
     if not views:
         raise ValueError("views must hold at least one view; got none")

@@ -256,7 +256,7 @@ def tune_compact(
         wanted, shown = in_words(stage.appearance), in_words(model.appearance)
         shown = f"{shown} with other options" if shown == wanted else shown
         raise ValueError(
-            f"model must show what the last stage of the system, {stage.name!r}, trains, {wanted}; it shows {shown}"
+            f"model must have what the last stage of the system, {stage.name!r}, trains, {wanted}; it has {shown}"
         )
     learned = {} if model.origin is None else model.origin.corrections
     if missing := [correction.name for correction in stage.corrections if correction.name not in learned]:

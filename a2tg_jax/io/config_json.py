@@ -47,7 +47,7 @@ def config_from_dict(
             # Dotted names are the command line's; files nest tables.
             group, _, option = name.partition(".")
             instead = did_you_mean(name, fields) or f"; it has {', '.join(fields)}"
-            instead = f"; say {group}={{{option!r}: …}}" if option and group in fields else instead
+            instead = f"; use {group}={{{option!r}: …}}" if option and group in fields else instead
             raise ValueError(f"{within}{shortened(name)} is an unknown key{instead}")
     for name, field in fields.items():
         if name in data:
@@ -76,7 +76,7 @@ def check_config(config: Any, prefix: str = "") -> None:
         name, hint, value = prefix + field.name, hints[field.name], getattr(config, field.name)
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
             given = ", ".join(f"{key}={item!r}" for key, item in value.items()) if isinstance(value, Mapping) else "…"
-            check_kind(name, value, hint, f"say {hint.__name__}({shortened(given)})")
+            check_kind(name, value, hint, f"use {hint.__name__}({shortened(given)})")
             check_config(value, f"{name}.")
         # The round trip through JSON's types is the check; its result is not needed.
         elif _is_plain(hint):

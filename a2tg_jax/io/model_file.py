@@ -162,7 +162,7 @@ def appearance_from_dict(data: Mapping[str, Any], appearances: Sequence[type[App
         found = getattr(sys.modules.get(module), name, None)
     if not (isinstance(found, type) and issubclass(found, Appearance)):
         raise ValueError(
-            f"shows the appearance {name} of the module {module}, which is unknown: import that module first, "
+            f"has the appearance {name} of the module {module}, which is unknown: import that module first, "
             f"or pass the class, load_model(path, appearances=({name.rpartition('.')[2]},))"
         )
     return _appearance_of(found, data)

@@ -63,7 +63,7 @@ def check_encodable(
     """Raise ValueError, with the alternative, unless a file can hold an appearance."""
     if not appearance.is_portable:
         raise ValueError(
-            f"model shows {in_words(appearance)}: {file} holds Gaussians with or without textures, exponents and "
+            f"model has {in_words(appearance)}: {file} holds Gaussians with or without textures, exponents and "
             f"bands; {instead}"
         )
 

@@ -130,7 +130,7 @@ def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
     converted: bytes = result.get("data", b"")
     if not converted:
         reason = shortened(str(result.get("error", "no splats in it")), 200)
-        raise ValueError(f"{path}: gaussforge says: {reason}; the file is damaged, or of another format")
+        raise ValueError(f"{path}: gaussforge reports: {reason}; the file is damaged, or of another format")
     return converted
 
 

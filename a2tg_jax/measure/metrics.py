@@ -165,7 +165,7 @@ def parameter_bytes(gaussians: Gaussians, textures: Textures | None = None) -> i
     Raises:
       ValueError: if an argument has the wrong type.
     """
-    check_kind("gaussians", gaussians, Gaussians, "say model.num_bytes" if hasattr(gaussians, "num_bytes") else "")
+    check_kind("gaussians", gaussians, Gaussians, "use model.num_bytes" if hasattr(gaussians, "num_bytes") else "")
     if textures is not None:
         check_kind("textures", textures, Textures)
     texels = 0 if textures is None else textures.num_texels

@@ -130,7 +130,7 @@ class RenderOutput:
     def _rendered(self, name: str) -> Geometry:
         if self.geometry is None:
             raise ValueError(
-                f"{name} was not rendered: say has_geometry=True, as in Term(function, has_geometry=True) for a custom "
+                f"{name} was not rendered: use has_geometry=True, as in Term(function, has_geometry=True) for a custom "
                 "loss term"
             )
         return self.geometry

@@ -61,7 +61,7 @@ def finish_run(source: RunFolder, out: Path, options: FinishOptions, *, lpips_we
     if can_polish and planned.system.exposure:  # Photographs of changing exposure would pull at the colours.
         raise ValueError("the run learned exposures, which polishing does not support: add `polish_steps` 0")
     if not can_polish and not (options.max_loss and can_shrink(model)):
-        raise ValueError(f"{planned.name} shows nothing that these options can shrink or polish")
+        raise ValueError(f"{planned.name} has nothing that these options can shrink or polish")
     # Raises before any work if a model that the evaluation needs is missing.
     finished_stages(source, record.plan)
     # Each change is made and measured; before them the model is measured, and at the end the run.

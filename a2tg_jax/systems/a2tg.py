@@ -55,9 +55,7 @@ class A2tg(TwoStages):
         texture = self.texture
         if self.memory_budget is not None:
             if texture.budget_mb is not None:
-                raise ValueError(
-                    "memory_budget and texture.budget_mb both say how much memory there is: give one of them"
-                )
+                raise ValueError("memory_budget and texture.budget_mb both set the memory: give one of them")
             budget = megabytes_of(self.memory_budget)
             # Thresholds belong to another rule, and custom ones would be rejected.
             texture = dataclasses.replace(texture, select="budget", threshold=None, budget_mb=budget)

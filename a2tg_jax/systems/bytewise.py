@@ -192,7 +192,7 @@ class Bytewise(TwoStages):
         }
         for path, found in times.items():
             if not found:
-                raise ValueError(f"{path}.at must say when its share of the bytes is spent; it is empty")
+                raise ValueError(f"{path}.at must hold fractions at which its share of the bytes is spent; it is empty")
         if len(times) == 2 and times["view_dependence"][-1] > times["details"][0]:
             raise ValueError(
                 "view_dependence.at must be over when textures begin to take the rest of the bytes, at "

@@ -214,7 +214,7 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], option
         raise ValueError(f"stage must be a number in 0..{len(stages) - 1}; got {shortened(index)}")
     stage = stages[index]
     if not isinstance(is_ahead, list) or len(is_ahead) != len(stage.events) or {type(x) for x in is_ahead} - {bool}:
-        raise ValueError(f"is_ahead must say true or false of {len(stage.events)} events; got {shortened(is_ahead)}")
+        raise ValueError(f"is_ahead must hold true or false for {len(stage.events)} events; got {shortened(is_ahead)}")
     # Any leaves: only the paths of the fields count.
     (gaussians,) = _filled((Gaussians(*range(5)),), arrays)
     check_gaussians(gaussians)

@@ -157,17 +157,17 @@ def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None, ch
     example = ""
     if isinstance(scene, is_path):
         path = os.fspath(scene)
-        example = "say synthetic_scene()" if path == "synthetic" else f"say load_scene({path!r})"
+        example = "use synthetic_scene()" if path == "synthetic" else f"use load_scene({path!r})"
     check_kind("scene", scene, Scene, example)
     if not isinstance(system, System):
         found, example = kind_of(system), ""
         if isinstance(system, str):
-            found, example = "a name", f": say find_system({shortened(system)!r}).preset('quick')"
+            found, example = "a name", f": use find_system({shortened(system)!r}).preset('quick')"
         elif isinstance(system, type) and issubclass(system, System):
-            example = f": say {system.__name__}() or {system.__name__}.preset('quick')"
+            example = f": use {system.__name__}() or {system.__name__}.preset('quick')"
         raise ValueError(f"system must be a System; got {found}{example}")
     if resume is not None:
-        check_kind("resume", resume, Checkpoint, "say load_checkpoint(path)" if isinstance(resume, is_path) else "")
+        check_kind("resume", resume, Checkpoint, "use load_checkpoint(path)" if isinstance(resume, is_path) else "")
     if checkpoint_every is not None and checkpoint_every < 1:
         raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
     system.check()

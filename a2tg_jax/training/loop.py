@@ -119,7 +119,7 @@ class Session:
           ValueError: if there is one device or none.
         """
         if devices is not None and len(devices) < 2:
-            raise ValueError(f"devices must be two or more; got {len(devices)}: for one say jax.default_device(device)")
+            raise ValueError(f"devices must be two or more; got {len(devices)}: for one use jax.default_device(device)")
         self.after_compiling = after_compiling
         self.exchange = None if devices is None else exchange_among(devices)
         """Devices that render together; None: one."""
@@ -308,7 +308,7 @@ class StageRun:
             advice = f": raise {' or '.join(caps)}" if caps else ""
             warnings.warn(
                 f"stage {self.stage.name}: {self.num_refused:,} times there was no room for a Gaussian that should "
-                f"have been added, all {self.state.model.gaussians.num:,} rows being taken{advice}",
+                f"have been added, all {self.state.model.gaussians.num:,} rows being in use{advice}",
                 stacklevel=2,
             )
 

@@ -146,8 +146,8 @@ def live_mean(values: Array, num_live: Array) -> Array:
 def check_same_shape(image: Array, target: Array) -> None:
     """Raise ValueError unless both are floats [H, W, 3] of one shape."""
     for name, value in (("image", image), ("target", target)):
-        hint = "say view_image(view, background)" if hasattr(value, "picture") else ""
-        check_array(name, value, "say output.color" if hasattr(value, "color") else hint)
+        hint = "use view_image(view, background)" if hasattr(value, "picture") else ""
+        check_array(name, value, "use output.color" if hasattr(value, "color") else hint)
     if image.shape != target.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image and target must both be [H, W, 3]; got {image.shape} and {target.shape}")
     if not (jnp.issubdtype(image.dtype, jnp.floating) and jnp.issubdtype(target.dtype, jnp.floating)):

@@ -43,7 +43,7 @@ def checked_change(change: Any) -> Change:
     Raises:
       ValueError: unless it is a change whose moments fit its model.
     """
-    check_kind("the result", change, Change, "say Change(model, moments, state)")
+    check_kind("the result", change, Change, "use Change(model, moments, state)")
     check_kind("model", change.model, Model)
     check_kind("moments", change.moments, AdamState)
     check_gaussians(change.model.gaussians, "model.gaussians")

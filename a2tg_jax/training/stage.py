@@ -207,7 +207,7 @@ class Stage:
                 if kind:
                     check_kind(label, part, kind)
                 elif isinstance(part, type) or is_function or not callable(part):
-                    hint = f": say Term({part.__name__})" if is_function else ""
+                    hint = f": use Term({part.__name__})" if is_function else ""
                     raise ValueError(f"{label} must be a loss term, such as Term(function); got {kind_of(part)}{hint}")
                 check_pytree(label, part)
                 for leaf in jax.tree.leaves(part):

@@ -146,7 +146,7 @@ def check_loss_data(views: tuple[View, ...], stages: Sequence[Stage]) -> None:
     if extras.points and all(view.points is None for view in views):
         raise ValueError(
             "loss.points_weight, or a custom term, needs points that photographs observed, but no training view "
-            "has any: load a COLMAP model whose images list them (in Python, say scene_from_arrays(…, observed=…)), or "
+            "has any: load a COLMAP model whose images list them (in Python, use scene_from_arrays(…, observed=…)), or "
             "leave it out"
         )
 

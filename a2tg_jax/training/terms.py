@@ -21,7 +21,7 @@ from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import live_mean, normal_consistency, photometric_loss, photometric_parts
 from a2tg_jax.training.returned import check_scalar
 
-NOT_LOADED = "target.{name} was not loaded: say {flag}=True, as in Term(function, {flag}=True) for a custom loss term"
+NOT_LOADED = "target.{name} was not loaded: use {flag}=True, as in Term(function, {flag}=True) for a custom loss term"
 
 
 @pytree

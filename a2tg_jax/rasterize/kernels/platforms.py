@@ -56,7 +56,7 @@ def choose(wanted: Wanted, platform: str) -> Compositor:
             return "native"
         return "cuda" if platform == PLATFORMS["cuda"] and not wants_determinism() and has_cuda() else "xla"
     if wanted in PLATFORMS and not is_available(wanted, platform):
-        raise ValueError(f"compositor={wanted!r} needs {REMEDIES[wanted]}, or say 'auto'")
+        raise ValueError(f"compositor={wanted!r} needs {REMEDIES[wanted]}, or 'auto'")
     return wanted
 
 
