@@ -17,6 +17,7 @@ from a2tg_jax.cli.main import main
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.ply import read_ply_points
+from a2tg_jax.io.other_programs import upright
 from a2tg_jax.results.model_source import write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource
 
@@ -252,6 +253,8 @@ def test_files_whose_nodes_lie_in_a_map_are_read_without_rounding(tmp_path, suff
     means = np.asarray(gaussians.means, np.float64)
     if suffix == ".glb":  # Numbers stand in the file as in the model, and +y is up there.
         means = means @ np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
+    else:  # The referred file has −y of the model up.
+        means = means @ upright(None, "z").rotation.T
     true = np.concatenate([means + UTM, means + UTM + [0, 0, 5]])
     assert np.abs(in_original_world(found) - true).max() < 1e-5
 

@@ -1,6 +1,7 @@
 """Files of other programs are upright, whatever the axes of the capture; what they show does not change."""
 
 import dataclasses
+import json
 
 import jax.numpy as jnp
 import numpy as np
@@ -65,6 +66,31 @@ def test_pictures_of_an_upright_file_are_the_same(tmp_path):
     back, direct = (a2tg.load_ply(tmp_path / name) for name in ("c.ply", "d.ply"))
     np.testing.assert_allclose(back.means, direct.means, atol=1e-5)
     np.testing.assert_allclose(back.sh, direct.sh, atol=1e-5)
+
+
+def test_gltf_and_meshes_have_the_vertical_of_splats(tmp_path):
+    """Not the cameras' mean up; without cameras −y is up, as in the viewer."""
+    model = captured(some_world())
+    half = Origin.of_cameras(model.origin.cameras[:7], transform=model.origin.transform)
+    assert np.abs(half.viewmats[:, 1, :3].mean(axis=0))[:2].max() > 0.1
+    for origin, up in ((half, [0, 0, 1]), (None, FILE_UP)):
+        a2tg.save_gltf(tmp_path / "m.glb", dataclasses.replace(model, origin=origin))
+        np.testing.assert_allclose(
+            node_matrix(tmp_path / "m.glb")[:3, :3] @ up,
+            [0, half.transform.scale**-1, 0] if origin else [0, 1, 0],
+            atol=1e-6,
+        )
+        assert a2tg.load_gltf(tmp_path / "m.glb").origin == origin
+    triangle = a2tg.Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32))
+    a2tg.save_mesh(tmp_path / "n.glb", triangle, half)
+    a2tg.save_gltf(tmp_path / "m.glb", dataclasses.replace(model, origin=half))
+    np.testing.assert_array_equal(node_matrix(tmp_path / "n.glb"), node_matrix(tmp_path / "m.glb"))
+
+
+def node_matrix(path) -> np.ndarray:
+    glb = path.read_bytes()
+    described = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
+    return np.reshape(described["nodes"][0]["matrix"], (4, 4)).T
 
 
 @pytest.mark.parametrize("suffix", [".splat", ".ksplat", ".spz", ".sog", ".compressed.ply"])

@@ -45,7 +45,8 @@ def test_the_stage_is_as_the_schema_says(tmp_path, ellipsoids):
     kernels = [UsdVol.ParticleFieldKernelGaussianSurfletAPI, UsdVol.ParticleFieldKernelGaussianEllipsoidAPI]
     assert [prim.HasAPI(kernel) for kernel in kernels] == [not ellipsoids, ellipsoids]
     matrix = UsdGeom.XformCache().GetLocalToWorldTransform(prim)
-    np.testing.assert_allclose(matrix, np.diag([*[1 / some_world().scale] * 3, 1]), atol=1e-12)
+    np.testing.assert_allclose(np.transpose(matrix), matrix_of(upright(model.origin, "z")), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(matrix) ** (-1 / 3), some_world().scale)
     harmonics = UsdVol.ParticleFieldSphericalHarmonicsAttributeAPI(prim)
     assert harmonics.GetRadianceSphericalHarmonicsDegreeAttr().Get() == 2
     coefficients = np.asarray(harmonics.GetRadianceSphericalHarmonicsCoefficientsAttr().Get())

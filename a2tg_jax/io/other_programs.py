@@ -1,7 +1,7 @@
 """Models as files of other programs hold them: ellipsoids in a world with other axes, and numbers of limited range.
 
-A model's world has +z up, and its cameras at a distance of about 1. A file's world has the original lengths and its
-format's up axis; the model keeps its place in it. Positions that a format would round too far, such as map coordinates,
+A model's world has its cameras at a distance of about 1. A file's world has the original lengths and its format's up
+axis; the model keeps its place in it. Positions that a format would round too far, such as map coordinates,
 are relative to an offset.
 """
 
@@ -140,13 +140,14 @@ def upright_turn(model: Model) -> np.ndarray:
     coordinates are not turned.
     """
     origin = model.origin
-    if origin is None or has_map_coordinates(model):
-        return np.eye(3)
+    return np.eye(3) if origin is None or has_map_coordinates(model) else upright_rotation(_vertical_of_files(origin))
+
+
+def _vertical_of_files(origin: Origin) -> np.ndarray:
+    """Return the vertical [3] of all files of other programs, in the original world."""
     up = origin.transform.rotation.T @ origin.vertical
-    if origin.up is not None:
-        return upright_rotation(up)
     # Captures that know their vertical keep their axes: the estimate is off by a few degrees.
-    return upright_rotation(np.rint(up) if np.abs(up).max() > LEVEL else up)
+    return np.rint(up) if origin.up is None and np.abs(up).max() > LEVEL else up
 
 
 def has_map_coordinates(model: Model) -> bool:
@@ -305,13 +306,16 @@ def degree_to_read(degree: int, name: str) -> int:
 def upright(origin: Origin | Similarity | None, up: Up) -> Similarity:
     """Return the similarity from a model's world, given its origin or transform, to a file's with this axis up.
 
-    +z of the model is up, or the vertical that was chosen.
+    The vertical is the one of `upright_turn`: −y of a model without cameras. With a transform alone, +z is up, as in
+    the worlds of scenes.
     """
-    transform = origin.transform if isinstance(origin, Origin) else origin
-    turn = UPRIGHT[up]
-    if isinstance(origin, Origin) and origin.up is not None:
-        turn = turn @ upright_rotation(np.array([0.0, 0.0, 1.0])).T @ upright_rotation(origin.up)
-    return Similarity(1.0 if transform is None else 1.0 / float(transform.scale), turn, np.zeros(3))
+    if isinstance(origin, Similarity):
+        return Similarity(1.0 / float(origin.scale), UPRIGHT[up], np.zeros(3))
+    vertical, scale = np.array([0.0, -1.0, 0.0]), 1.0
+    if origin is not None:
+        vertical, scale = origin.transform.rotation @ _vertical_of_files(origin), 1.0 / float(origin.transform.scale)
+    turn = UPRIGHT[up] @ upright_rotation(np.array([0.0, 0.0, 1.0])).T @ upright_rotation(vertical)
+    return Similarity(scale, turn, np.zeros(3))
 
 
 def matrix_of(similarity: Similarity) -> np.ndarray:
@@ -339,7 +343,7 @@ def similarity_of(matrix: np.ndarray, what: str) -> Similarity:
 
 
 def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
-    """Return the parts of a file as one model in its own world, which has +z up (host).
+    """Return the parts of a file as one model in its own world, in which +z is up if its file does not say (host).
 
     A part that its file places where it was written does not change. Otherwise it moves together with its origin.
     Positions that float32 would round too far, as in map coordinates, are relative to an offset, which becomes the
@@ -349,16 +353,20 @@ def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
       parts: models as the file holds them, and the matrices from there to the world of the file.
       up: the axis that is up there.
     """
-    origin, offset, models = None, None, list[Model]()
+    placed, is_known, offset, models = UNMOVED, True, None, list[Model]()
     for model, matrix in parts:
         # A file may refer to one mesh from any number of nodes.
         if len(models) == MOST_PARTS:
             raise ValueError(f"holds more than {MOST_PARTS} sets of splats")
-        origin = origin or model.origin
         world = similarity_of(matrix, "the transform of its splats")
-        move = world.then(upright(origin, up).inverse())
+        if not models:
+            placed = upright(model.origin, up)
+            # Models without an origin come back as they were written.
+            is_known = model.origin is not None or _is_same(world, placed)
+            placed = placed if is_known else Similarity(1.0, UPRIGHT[up], np.zeros(3))
+        move = world.then(placed.inverse())
         # A file written here must come back with the same numbers: rounding in its matrix must not move it.
-        if is_same := np.allclose(matrix_of(move), np.eye(4), rtol=0, atol=SAME_PLACE):
+        if is_same := _is_same(move, UNMOVED):
             move = UNMOVED
         check_similarity(move, "its transform")
         # One offset for all parts, by the first: they must share a world.
@@ -371,8 +379,15 @@ def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
     if not models or offset is None:
         raise ValueError("holds no splats")
     if models[0].origin is None:
-        models[0] = dataclasses.replace(models[0], origin=origin_at(offset))
+        found = origin_at(offset)
+        if not is_known:
+            found = dataclasses.replace(found or Origin.of_cameras([]), up=np.array([0.0, 0.0, 1.0]))
+        models[0] = dataclasses.replace(models[0], origin=found)
     return models[0] if len(models) == 1 else concatenate(models)
+
+
+def _is_same(one: Similarity, other: Similarity) -> bool:
+    return np.allclose(matrix_of(one), matrix_of(other), rtol=0, atol=SAME_PLACE)
 
 
 def origin_to_json(origin: Origin) -> dict[str, Any]:

@@ -49,6 +49,7 @@ def encode_web_scene(
     check_encodable(model.appearance, "a file for browsers")
     model = model.live
     check_model(model)
+    scores = scores_of(model)  # Of the model as `apply_edit` has it.
     texture = model.appearance.texture
     if texture is not None and model.num:
         # Baked into the texels, so that shaders need only one rule for textures.
@@ -68,7 +69,6 @@ def encode_web_scene(
         is_test = model.origin.is_test
         candidates = np.flatnonzero(~is_test) if not np.all(is_test) else np.arange(len(is_test))
         page["first"] = int(candidates[central_camera(model.origin.viewmats[candidates])])
-    scores = scores_of(model)
     # Stable, so that the same model gives the same file.
     order = np.argsort(-importance(model), kind="stable")
     return encode_model(model, dataclasses.replace(CHOICES, coder=coder), order=order, page=page, floaters=scores)

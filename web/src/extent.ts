@@ -24,7 +24,7 @@ export interface Clip {
   readonly axes: Mat3;
   readonly low: Vec3;
   readonly high: Vec3;
-  /** Largest score of floaters, which are from 0 to 255. */
+  /** Largest score of floaters, which are whole numbers from 0 to 255. */
   readonly floating: number;
 }
 
@@ -61,7 +61,9 @@ export function clipOf(extent: Extent, up: Vec3, { from, to }: Crop, floaters: n
     (2 * share - 1) * REACH * halfAlong(extent, axis);
   const low = (k: 0 | 1 | 2): number => (from[k] > 0 ? place(from[k], axes[k]) : -UNLIMITED);
   const high = (k: 0 | 1 | 2): number => (to[k] < 1 ? place(to[k], axes[k]) : UNLIMITED);
-  return { axes, low: [low(0), low(1), low(2)], high: [high(0), high(1), high(2)], floating: 255 * (1 - floaters) };
+  // A whole number, since float32 would round 255 · (1 − 0.8) up to a score (a2tg_jax/io/edit_file.py).
+  const floating = Math.floor(255 * (1 - floaters) + 0.5);
+  return { axes, low: [low(0), low(1), low(2)], high: [high(0), high(1), high(2)], floating };
 }
 
 /** Return horizontal axes, the first one close to the world's x (or y), and the vertical. */

@@ -62,6 +62,6 @@ describe("the crop box", () => {
 });
 
 test("the stricter, the fewer floaters are shown", () => {
-  const limits = [0, 0.2, 1].map((floaters) => clipOf(EXTENT, UP, WHOLE, floaters).floating);
-  expectClose(limits, [255, 204, 0]);
+  const limits = [0, 0.2, 0.5, 0.8, 0.9, 1].map((floaters) => clipOf(EXTENT, UP, WHOLE, floaters).floating);
+  expect(limits).toEqual([255, 204, 128, 51, 25, 0]); // As in tests/test_edits.py.
 });
