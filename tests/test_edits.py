@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from small_values import some_gaussians
-from test_upright import captured
+from test_upright import captured, node_matrix
 from viewer_cases import small_model
 
 import a2tg_jax as a2tg
@@ -18,8 +18,9 @@ from a2tg_jax.core.floaters import floater_scores
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.io.columns import decode
 from a2tg_jax.io.compact import decode_model, unframed
-from a2tg_jax.io.edit_file import scores_of
+from a2tg_jax.io.edit_file import largest_score, scores_of
 from a2tg_jax.io.web_scene import encode_web_scene
+from a2tg_jax.results.editing import EditOptions
 
 NOWHERE = Similarity(1.0, np.eye(3), np.zeros(3))
 TILTED = Rotation.from_euler("xy", [25, 10], degrees=True).as_matrix()
@@ -45,6 +46,11 @@ def test_a_crop_keeps_what_is_in_the_box(tmp_path):
     assert (edited.background, edited.origin) == ((1, 0, 0.5), model.origin)
     with pytest.raises(ValueError, match="the edit would remove all 300 Gaussians"):
         a2tg.apply_edit(model, a2tg.load_edit(edit_file(tmp_path, crop={"low": [50, None, None], "high": [None] * 3})))
+
+
+def test_limits_of_floaters_are_whole_numbers():
+    """As in web/test/extent.test.ts: float32 and float64 must hide the same."""
+    assert [largest_score(strictness) for strictness in (0, 0.2, 0.5, 0.8, 0.9, 1)] == [255, 204, 128, 51, 25, 0]
 
 
 def test_floaters_are_what_floats_not_what_is_faint():
@@ -103,10 +109,7 @@ def test_a_chosen_vertical_turns_files_and_orbits_but_no_number(tmp_path):
     a2tg.save_ply(tmp_path / "m.ply", edited, world="upright")
     found = a2tg.load_splats(tmp_path / "m.ply")
     np.testing.assert_allclose(found.origin.transform.rotation @ up, [0, -1, 0], atol=1e-12)
-    glb = (tmp_path / "m.glb").read_bytes()
-    described = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
-    matrix = np.reshape(described["nodes"][0]["matrix"], (4, 4)).T
-    np.testing.assert_allclose(matrix[:3, :3] @ up, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(node_matrix(tmp_path / "m.glb")[:3, :3] @ up, [0, 1, 0], atol=1e-12)
     orbit = turntable(edited.origin.cameras, 8, edited.origin.up)
     np.testing.assert_allclose([camera.viewmat[0, :3] @ up for camera in orbit], 0, atol=1e-6)
 
@@ -127,6 +130,39 @@ def test_commands_take_an_edit(tmp_path, capsys):
     assert page.origin == edited.origin
     assert main([*words[:2], str(tmp_path / "o.npz"), "--edit", str(tmp_path / "none.json")]) == 2
     assert "no such edit; the viewer's 'Save edit' makes one" in capsys.readouterr().err
+
+
+def test_an_edit_from_flags(tmp_path, capsys):
+    """The file has what the flags say, and a model written directly is the same as with the file."""
+    model = captured(Similarity(2.0, TILTED, np.ones(3)))
+    a2tg.save_model(tmp_path / "m.npz", model)
+    flags = ["--crop", "40:100", "0:55", "0:100", "--floaters", "20", "--upright", "3", "--background", "#ff0080"]
+    for name in ("e.json", "a.npz"):
+        assert main(["edit", str(tmp_path / "m.npz"), "--out", str(tmp_path / name), *flags]) == 0
+    edit = a2tg.load_edit(tmp_path / "e.json")
+    assert (edit.floaters, edit.background) == (0.2, (1, 0, 128 / 255))
+    # The cameras are level against the vertical of their world.
+    np.testing.assert_allclose(edit.up, [0, 0, 1], atol=1e-6)
+    edited = a2tg.apply_edit(model, edit)
+    assert f"an edit that keeps {edited.num} of 60 Gaussians" in capsys.readouterr().out and 5 < edited.num < 55
+    np.testing.assert_array_equal(a2tg.load_model(tmp_path / "a.npz").gaussians.means, edited.gaussians.means)
+    edit = EditOptions(upright="-y").edit_of(model)
+    np.testing.assert_allclose(model.origin.transform.inverse().rotation @ edit.up, [0, -1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (EditOptions(), "nothing to change"),
+        (EditOptions(crop=("0:100", "60:40", "0:100")), "`crop` must be .*; got '60:40'"),
+        (EditOptions(floaters=101), "`floaters` must be a percentage from 0 to 100; got 101"),
+        (EditOptions(upright="q"), "`upright` must be .*; got 'q'; the first is 0"),
+        (EditOptions(background="whit"), "`background` must be a colour .*; got 'whit'"),
+    ],
+)
+def test_flags_of_edits_are_checked(options, message):
+    with pytest.raises(ValueError, match=message):
+        options.edit_of(captured(NOWHERE))
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import pytest
 from viewer_cases import shaped_model, small_model, small_numbers, write_case
 
 import a2tg_jax as a2tg
+from a2tg_jax.io.edit_file import crop_box
 from a2tg_jax.io.ply import ATTRIBUTES, SCALES
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.results.model_source import Source, open_source
@@ -123,6 +124,9 @@ def test_the_page_itself(node, tmp_path):
     """An edit that it saves shows in Python what the page shows."""
     run_node("test:browser", "--", "page", "adjust", A2TG_EDIT=str(tmp_path))
     edit, model = a2tg.load_edit(tmp_path / "edit.json"), small_model()
+    box = crop_box(model, edit.up, np.zeros(3), np.array([1, 1, 0.55]))
+    for found, wanted in ((edit.crop.axes, box.axes), (edit.crop.low, box.low), (edit.crop.high, box.high)):
+        np.testing.assert_allclose(found, wanted, atol=1e-6)
     edited, (camera,) = a2tg.apply_edit(model, edit), model.origin.cameras
     assert edited.background == pytest.approx((1, 128 / 255, 0))
     without = a2tg.apply_edit(model, dataclasses.replace(edit, floaters=0.0))

@@ -13,6 +13,7 @@ from a2tg_jax.host.text import counted
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.compression import compress
 from a2tg_jax.results.conversion import BakeOptions, check_ply, convert, export_ply
+from a2tg_jax.results.editing import EditOptions, write_edit
 from a2tg_jax.results.finishing import finish_run
 from a2tg_jax.results.folder import (
     RunFolder,
@@ -351,6 +352,30 @@ class Convert:
                 overwrite=self.overwrite,
             )
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class EditCommand:
+    """Crop and turn a model, remove floaters and set the background, without a browser.
+
+    --out is an edit for --edit of other commands, as a2tg view saves it (*.json), or the edited model in any format of
+    a2tg convert.
+
+    Examples:
+      a2tg edit runs/fox --out fox.sog --crop 35:65 35:65 0:100 --floaters 40
+      a2tg edit runs/fox --out edit.json --upright IMG_0012.jpg --background white
+    """
+
+    source: RunOrFile
+    out: Annotated[Path, arg(metavar="FILE")]
+    """Output file."""
+    options: Annotated[EditOptions, arg(name="")] = EditOptions()
+    model: LastModel = None
+    overwrite: bool = False
+    """Replace the output file."""
+
+    def run(self) -> None:
+        print(write_edit(self.source, self.out, self.options, self.model, overwrite=self.overwrite))
 
 
 @dataclasses.dataclass(frozen=True)

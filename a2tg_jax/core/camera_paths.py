@@ -70,6 +70,14 @@ def vertical_of(viewmats: np.ndarray) -> np.ndarray:
     return np.asarray(axis * np.sign(axis @ up))
 
 
+def vertical_in(viewmat: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return the vertical [3] against which a camera is level, at the pitch that it has against the vertical `up`
+    [3]; as in web/src/vertical.ts."""
+    _, down, forward = viewmat[:3, :3]
+    pitch = np.clip(forward @ up, -0.99, 0.99)
+    return np.asarray(pitch * forward - np.sqrt(1 - pitch**2) * down)
+
+
 def upright_rotation(vertical: np.ndarray) -> np.ndarray:
     """Return the rotation [3, 3] from a world with this vertical [3] to one whose −y is up, as programs for splats
     expect.

@@ -11,8 +11,15 @@ from a2tg_jax.core.floaters import floater_scores
 from a2tg_jax.core.origin import Color, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.saved_file import load_saved
+from a2tg_jax.io.columns import AxisSteps
+from a2tg_jax.io.saved_file import load_saved, save_saved
 from a2tg_jax.model import Model
+
+# As in web/src/extent.ts.
+PERCENTILES_PER_SPREAD = 1.2
+"""Half the range from the 5th to the 95th percentile over the spread, for evenly spread positions."""
+REACH = 2.5
+"""Half the length of the largest crop box over half the scene's extent."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,6 +62,39 @@ def load_edit(path: Path) -> Edit:
       ValueError: if it is invalid, naming the file.
     """
     return load_saved(Path(path), "edit", _edit_of)
+
+
+def save_edit(path: Path, edit: Edit) -> None:
+    """Write an edit as the viewer does, for `load_edit`."""
+    changes: dict[str, Any] = {}
+    if edit.crop is not None:
+        sides = {"low": edit.crop.low.tolist(), "high": edit.crop.high.tolist()}
+        limits = {name: [x if math.isfinite(x) else None for x in side] for name, side in sides.items()}
+        changes["crop"] = {"axes": edit.crop.axes.tolist(), **limits}
+    changes |= {"floaters": edit.floaters} if edit.floaters else {}
+    changes |= {} if edit.up is None else {"up": edit.up.tolist()}
+    changes |= {} if edit.background is None else {"background": list(edit.background)}
+    save_saved(path, "edit", changes)
+
+
+def crop_box(model: Model, up: np.ndarray, low: np.ndarray, high: np.ndarray) -> Box:
+    """Return the upright box of the viewer's crop sliders (web/src/extent.ts).
+
+    Args:
+      model: the model to crop.
+      up: [3] unit vertical.
+      low, high: [3] shares, 0 to 1, of the largest box along width, depth and height; 0 and 1 cut nothing.
+    """
+    steps = [AxisSteps.of(axis, 16) for axis in np.asarray(model.live.gaussians.means).T]
+    centre = np.array([step.centre for step in steps])
+    half = np.maximum(PERCENTILES_PER_SPREAD * np.array([step.spread for step in steps]), 1e-6)
+    near = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]
+    across = near - (near @ up) * up
+    across /= np.linalg.norm(across)
+    axes = np.stack([across, np.cross(up, across), up])
+    middle, reach = axes @ centre, REACH * np.linalg.norm(axes * half, axis=1)
+    begin, end = (middle + (2 * share - 1) * reach for share in (low, high))
+    return Box(axes, np.where(low > 0, begin, -math.inf), np.where(high < 1, end, math.inf))
 
 
 def _edit_of(data: dict[str, Any]) -> Edit:
@@ -133,6 +173,6 @@ def apply_edit(model: Model, edit: Edit) -> Model:
     return model if edit.background is None else dataclasses.replace(model, background=edit.background)
 
 
-def largest_score(strictness: float) -> float:
-    """Return the largest score of a floater that is kept."""
-    return 255 * (1 - strictness)
+def largest_score(strictness: float) -> int:
+    """Return the largest score of a floater that is kept, the same whole number as in web/src/extent.ts."""
+    return math.floor(255 * (1 - strictness) + 0.5)

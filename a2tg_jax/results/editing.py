@@ -1,0 +1,103 @@
+"""Edits without the viewer: crop, floaters, vertical and background from options, as the viewer saves them."""
+
+import dataclasses
+import re
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from PIL import ImageColor
+from tyro.conf import arg
+
+from a2tg_jax.core.camera_paths import vertical_in
+from a2tg_jax.core.origin import Color, Origin
+from a2tg_jax.host.text import did_you_mean
+from a2tg_jax.io.edit_file import Edit, apply_edit, crop_box, save_edit
+from a2tg_jax.model import Model
+from a2tg_jax.results.conversion import convert
+from a2tg_jax.results.folder import check_new, check_output
+from a2tg_jax.results.model_source import open_source
+
+AXES = dict(zip("xyz", np.eye(3), strict=True))
+AXES |= {f"-{name}": -axis for name, axis in AXES.items()}
+"""Directions by their names on the command line."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EditOptions:
+    """What an edit changes. Percentages are those of the viewer's sliders."""
+
+    crop: Annotated[tuple[str, str, str] | None, arg(metavar="LOW:HIGH")] = None
+    """Upright box to keep: from and to along width, depth and height, in percent of the largest box; 50 is the middle
+    of the scene, and 0 and 100 cut nothing. Such as 35:65 35:65 0:100."""
+    floaters: float = 0.0
+    """Strictness in percent with which floaters are removed; 0 removes none."""
+    upright: Annotated[str | None, arg(metavar="PHOTOGRAPH")] = None
+    """What is up: the name of a photograph that was held level, or an axis of the original world, such as
+    y; write --upright=-y for one with a minus."""
+    background: Annotated[str | None, arg(metavar="COLOR")] = None
+    """Colour behind the scene, such as white or #ff8000."""
+
+    def edit_of(self, model: Model) -> Edit:
+        """Return the edit of a model. Raises ValueError, naming the option, if one is invalid or none is given."""
+        if self == EditOptions():
+            raise ValueError("nothing to change: give `crop`, `floaters`, `upright` or `background`")
+        if not 0 <= self.floaters <= 100:
+            raise ValueError(f"`floaters` must be a percentage from 0 to 100; got {self.floaters:g}")
+        up = None if self.upright is None else _vertical(self.upright, model)
+        crop = None
+        if self.crop is not None:
+            low, high = np.array([_shares(text) for text in self.crop]).T
+            # Like the sliders, upright by the vertical that the edit leads to.
+            crop = crop_box(model, (model.origin or Origin.of_cameras([])).vertical if up is None else up, low, high)
+        return Edit(crop, self.floaters / 100, up, None if self.background is None else _color(self.background))
+
+
+def write_edit(
+    source: Path, out: Path, options: EditOptions, name: str | None = None, *, overwrite: bool = False
+) -> str:
+    """Write an edit as *.json, or a source's edited model in any format that `convert` writes, and return a summary.
+    Arguments and errors otherwise as in `convert`."""
+    if out.suffix.lower() == ".json":
+        check_output(out)
+        check_new(out, "`out`", overwrite=overwrite)
+    model = open_source(source, name).model
+    edit = options.edit_of(model)
+    if out.suffix.lower() == ".json":
+        edited = apply_edit(model, edit)
+        save_edit(out, edit)
+        return f"{out}: an edit that keeps {edited.num:,} of {model.num:,} Gaussians; --edit {out} applies it"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "edit.json"
+        save_edit(path, edit)
+        return convert(source, out, name, edit=path, overwrite=overwrite)
+
+
+def _shares(text: str) -> tuple[float, float]:
+    found = re.fullmatch(r"(\d+(?:\.\d+)?):(\d+(?:\.\d+)?)", text)
+    low, high = map(float, found.groups()) if found else (1.0, 0.0)
+    if not 0 <= low < high <= 100:
+        raise ValueError(
+            f"`crop` must be LOW:HIGH, percentages from 0 to 100, for width, depth and height; got {text!r}"
+        )
+    return low / 100, high / 100
+
+
+def _vertical(text: str, model: Model) -> np.ndarray:
+    """Return the vertical [3] in a model's world that an axis of the original world or a photograph names."""
+    origin = model.origin or Origin.of_cameras([])
+    if text in AXES:
+        return origin.transform.rotation @ AXES[text]
+    if text not in origin.names:
+        near = did_you_mean(text, origin.names) or (f"; the first is {origin.names[0]}" if origin.names else "")
+        raise ValueError(f"`upright` must be x, -x, y, -y, z, -z or a photograph of the model; got {text!r}{near}")
+    return vertical_in(origin.viewmats[origin.names.index(text)], origin.vertical)
+
+
+def _color(text: str) -> Color:
+    try:
+        red, green, blue = ImageColor.getrgb(text)[:3]
+    except ValueError:
+        raise ValueError(f"`background` must be a colour such as white or #ff8000; got {text!r}") from None
+    return red / 255, green / 255, blue / 255
