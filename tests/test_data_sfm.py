@@ -273,6 +273,23 @@ def test_masks_come_with_the_photographs(tmp_path):
             assert (~view.mask.read()).mean() == pytest.approx(corner.mean(), rel=0.1)
 
 
+def test_masked_pixels_have_no_features(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
+    for folder in ("photos", "cut"):
+        (tmp_path / folder).mkdir()
+    for name in ("0", "1", "2"):
+        picture = Image.fromarray(noise).resize((256, 192), Image.Resampling.BICUBIC)
+        picture.save(tmp_path / "photos" / f"{name}.png")
+    Image.fromarray(np.arange(256) >= 128 * np.ones((192, 1))).convert("L").save(tmp_path / "cut" / "0.png")
+    with pytest.warns(UserWarning, match="2 of 3 photographs have no mask"):
+        found = staged([tmp_path / "photos"], tmp_path / "work", masks=tmp_path / "cut")
+    cameras_of(found, tmp_path)
+    sfm._extract_features(tmp_path / "database.db", found.folder, found.names, False)
+    with contextlib.closing(pycolmap().Database.open(tmp_path / "database.db")) as opened:
+        masked, whole, _ = (opened.read_keypoints(image.image_id)[:, 0] for image in opened.read_all_images())
+    assert masked.min() >= 128 > whole.min() and len(whole) > len(masked) > 20
+
+
 def test_what_is_wrong_with_masks_of_photographs(tmp_path):
     random = np.random.default_rng(0)
     for index in range(3):

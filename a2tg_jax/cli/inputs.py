@@ -32,7 +32,7 @@ class Sfm:
 
     Examples:
       a2tg sfm photos/fox scenes/fox
-      a2tg train scenes/fox --out runs/fox --system bytewise --preset quick --downscale 4
+      a2tg train scenes/fox --out runs/fox --preset quick --downscale 4
       a2tg sfm fox.mp4 scenes/fox --frames 200
       a2tg sfm photos/phone photos/drone --out scenes/house
       a2tg sfm photos/fox/00*.jpg scenes/fox
@@ -44,8 +44,8 @@ class Sfm:
     out: Annotated[Path | None, defaulting_to("the last of PHOTOS... SCENE", "SCENE")] = None
     """New scene folder."""
     masks: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Folder of masks of the photographs, NAME.jpg.png or NAME.png for NAME.jpg, black where a pixel does not count.
-    They are undistorted into SCENE/masks."""
+    """Folder of masks of the photographs, NAME.jpg.png or NAME.png for NAME.jpg, black where a pixel does not count,
+    neither for the cameras nor in training. They are undistorted into SCENE/masks."""
     matching: Matching = "auto"
     """Pairs of photographs to match. auto: all pairs up to 200 photographs, neighbours by name beyond. exhaustive: all
     pairs. sequential: neighbours by name, for many photographs named in the order of taking."""
@@ -83,7 +83,7 @@ class Sfm:
             f"mean reprojection error {found.mean_error:.2f} pixels"
         )
         run = ["a2tg", "train", str(out), "--out", f"runs/{out.resolve().name}"]
-        command = f"{shlex.join(run)} --system bytewise {quick_flags(found.longest_side)}"
+        command = f"{shlex.join(run)} {quick_flags(found.longest_side)}"
         print(f"cameras: {out / CAMERA_PICTURE}\nscene: {out}; continue with: {command}")
 
     def _places(self) -> tuple[list[Path], Path]:

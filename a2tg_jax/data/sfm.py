@@ -93,7 +93,7 @@ def run_sfm(
         single photographs.
       out: new folder for `images`, `sparse/0` and `masks`, if any.
       masks: folder of masks of the photographs, NAME.EXT.png or NAME.png for NAME.EXT, black at excluded pixels. They
-        are undistorted into the folder `masks` of the scene. Cameras are found from all pixels.
+        are undistorted into the folder `masks` of the scene. Cameras are found without the excluded pixels.
       seed: random seed of COLMAP, at least 0.
       camera_model: COLMAP's name of the camera model to estimate; the FISHEYE models are for action cameras.
       matching: pairs of photographs to match; "auto" takes all pairs of up to 200, and neighbours by name of more.
@@ -223,12 +223,17 @@ def list_photos(database: Path, staged: Staged, camera_model: str) -> None:
 
 def _extract_features(database: Path, folder: Path, names: list[str], progress: bool) -> None:
     colmap = pycolmap()
-    together = PHOTOS_PER_CORE * num_threads()
+    together, masks = PHOTOS_PER_CORE * num_threads(), folder.with_name(MASKS)
+    masked = [name for name in names if (masks / f"{name}.png").exists()]
+    # Of photographs without a mask COLMAP would take no features.
+    readers = [(colmap.ImageReaderOptions(mask_path=masks), masked)]
+    readers.append((colmap.ImageReaderOptions(), sorted(set(names) - set(masked))))
     with counting("features", len(names), "photo", is_shown=progress) as bar:
-        for start in range(0, len(names), together):
-            some = names[start : start + together]
-            colmap.extract_features(database, folder, some, device=colmap.Device.cpu)
-            bar.update(len(some))
+        for reader, chosen in readers:
+            for start in range(0, len(chosen), together):
+                some = chosen[start : start + together]
+                colmap.extract_features(database, folder, some, reader_options=reader, device=colmap.Device.cpu)
+                bar.update(len(some))
 
 
 def _match_features(database: Path, num_photos: int, seed: int, matching: Matching, progress: bool) -> None:
