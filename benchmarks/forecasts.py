@@ -22,20 +22,21 @@ from experiments.lab import markdown
 
 SHORT = ("--stage1-iterations", "20", "--stage2-iterations", "20")
 CASES: dict[str, tuple[str, ...]] = {
-    "synthetic, a2tg": ("synthetic", "--preset", "smoke", *SHORT),
+    "synthetic, a2tg": ("synthetic", "--system", "a2tg", "--preset", "smoke", *SHORT),
     "synthetic, gaussians-2d, 200,000 rows": (
         "synthetic", "--system", "gaussians-2d", "--preset", "smoke", "--densify.cap", "200000", *SHORT,
     ),
     "fox, a2tg, texture side 8": (
-        "fox", "--preset", "smoke", "--densify.cap", "20000", "--initial-gaussians", "20000", "--texture.cap", "8",
-        *SHORT,
+        "fox", "--system", "a2tg", "--preset", "smoke", "--densify.cap", "20000", "--initial-gaussians", "20000",
+        "--texture.cap", "8", *SHORT,
     ),
     "fox / 2, bbsplat": ("fox", "--downscale", "2", "--system", "bbsplat", "--preset", "smoke", *SHORT),
     "herz_jesus_p25, supergaussians": (
         "herz_jesus_p25", "--system", "supergaussians", "--preset", "smoke", "--densify.cap", "50000", *SHORT,
     ),
     "herz_jesus_p25, a2tg, batches of 8, normals": (
-        "herz_jesus_p25", "--preset", "smoke", "--batch-size", "8", "--loss.normal-weight", "0.05", *SHORT,
+        "herz_jesus_p25", "--system", "a2tg", "--preset", "smoke", "--batch-size", "8", "--loss.normal-weight", "0.05",
+        *SHORT,
     ),
     "lego / 2, textured-gaussians": (
         "lego", "--downscale", "2", "--system", "textured-gaussians", "--preset", "smoke", "--initial-gaussians",

@@ -23,7 +23,7 @@ from a2tg_jax.results.folder import RunFolder, iteration_of
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.record import read_record
 
-SMOKE = ("--preset", "smoke", "--downscale", "4", "--compare", "gaussians-2d-mcmc")
+SMOKE = ("--system", "a2tg", "--preset", "smoke", "--downscale", "4", "--compare", "gaussians-2d-mcmc")
 FOLDERS = ("checkpoints", "models", "history")
 POLL_SECONDS = 2e-4
 FIRST_SECONDS = 10.0

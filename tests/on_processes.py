@@ -43,7 +43,7 @@ SYSTEMS = {
     "streamed": lambda length: system(Gaussians2dMcmc, **SHARED, stage1_iterations=2 * length, batch_size=6),
 }
 """The second one does not leave its photographs on the devices."""
-SMALL = ("--preset", "smoke", "--downscale", "4", "--densify.cap", "60")
+SMALL = ("--system", "a2tg", "--preset", "smoke", "--downscale", "4", "--densify.cap", "60")
 PRUNING = ("--floaters.min-views", "2", "--floaters.at", "0.25")
 """Options with which process 0 prunes for all."""
 SHORT = (*SMALL, *PRUNING, "--texture.at", "0.5", "--stage1-iterations", "20", "--stage2-iterations", "10")

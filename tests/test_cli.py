@@ -39,7 +39,7 @@ from a2tg_jax.results.viewing import routes_of
 from a2tg_jax.training import SYSTEMS, find_system
 
 TINY = [
-    *("--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
+    *("--system", "a2tg", "--downscale", "5", "--stage1-iterations", "20", "--stage2-iterations", "20", "--baseline"),
     *("--initial-gaussians", "60", "--densify.cap", "60", "--texture.cap", "2", "--texture.at", "0.5"),
 ]
 """One upscaling event and few shapes: what takes time is compiling."""
@@ -99,7 +99,7 @@ def fails(capsys, *arguments: str) -> str:
 def test_nothing_is_overwritten_before_the_new_run_is_checked(capsys, tmp_path, mistake):
     run = create_run(tmp_path / "run")
     run.own(run.report).write_text("old")
-    fails(capsys, "train", "synthetic", "--out", run.path, "--overwrite", *mistake)
+    fails(capsys, "train", "synthetic", "--system", "a2tg", "--out", run.path, "--overwrite", *mistake)
     assert run.report.read_text() == "old"
 
 
@@ -207,6 +207,9 @@ def test_the_help_of_training(capsys, monkeypatch):
     whole = help_of(capsys, "train")
     flags = set(re.findall(r"--[\w.-]*\w", text)) - {"--help", "--help-all"}
     assert text.count("\n") <= 45 and len(flags) > 12
+    assert "Defaults of bytewise with the preset paper: --stage1-iterations 30000" in text
+    assert cli.main(["train", "--help", "--preset", "quick", "--system", "a2tg"]) == 0
+    assert "Defaults of a2tg with the preset quick: --stage1-iterations 2000" in capsys.readouterr().out
     assert flags <= set(re.findall(r"--[\w.-]*\w", whole))
     assert "it needs more. Photographs beyond" in whole
     assert "Adam's learning rates of the Gaussians." in whole, "groups keep their description"

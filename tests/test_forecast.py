@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import re
+import sys
 from types import SimpleNamespace
 
 import jax
@@ -13,6 +14,7 @@ from toy_system import Toy
 
 import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli
+from a2tg_jax.cli.train import ask
 from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.data import Picture
 from a2tg_jax.densify.pruning import Prune
@@ -23,12 +25,12 @@ from a2tg_jax.results.forecast import (
     RunForecast,
     allowed_memory,
     bytes_allowed,
+    doubts_about,
     forecast_run,
     print_forecast,
     quick_flags,
     room_for_photographs,
     time_after,
-    warn_of_small_photographs,
 )
 from a2tg_jax.results.record import RunRecord, SceneSource, plan_run
 from a2tg_jax.training import SYSTEMS, cost, reports
@@ -347,13 +349,24 @@ def test_the_pace_counts_the_programs_ahead(seconds, dones, programs, expected):
     assert told.startswith(expected) and "Gaussians" not in told
 
 
-def test_a_downscale_that_leaves_few_pixels_is_questioned():
-    scene = a2tg.synthetic_scene(width=80, height=60)
-    with pytest.warns(
-        UserWarning, match=r"^`downscale` 40 leaves photographs of 80×60 pixels, .*: `downscale` 5 makes"
-    ):
-        warn_of_small_photographs(scene, 40)
-    warn_of_small_photographs(scene, 1)
+def test_what_would_show_little_is_asked_about(monkeypatch, capsys):
+    """Without a terminal it is an error, with one a question."""
+    scene, record = a2tg.synthetic_scene(width=80, height=60), RunRecord(SceneSource("fox", downscale=40))
+    assert doubts_about(scene, RunRecord(SceneSource("fox"))) == []
+    small = dataclasses.replace(record, options=a2tg.A2tg(memory_budget="20kB"))
+    budget, photographs = doubts_about(scene, small)
+    assert budget.startswith("memory_budget has room for") and budget.endswith("in bytes of the model in memory")
+    assert re.match(r"`downscale` 40 leaves photographs of 80×60 pixels, .*: `downscale` 5 makes", photographs)
+    with pytest.raises(ValueError, match=r"has room .*; `downscale` 40 .*; to train all the same, add `yes`"):
+        ask([budget, photographs])
+    for stream in (sys.stdin, sys.stderr):
+        monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(sys.stdin, "readline", iter(["Y\n", "\n"]).__next__, raising=False)
+    with pytest.warns(UserWarning, match="leaves photographs"):
+        ask([photographs])
+    with pytest.warns(UserWarning, match="has room"), pytest.raises(ValueError, match="nothing was trained"):
+        ask([budget])
+    assert capsys.readouterr().err.count("Train all the same? [y/N]") == 2
 
 
 def test_the_pace_counts_what_follows_the_stage():

@@ -4,7 +4,7 @@ import pytest
 from kills import kill_runs
 
 TINY = (
-    *("--downscale", "6", "--stage1-iterations", "60", "--stage2-iterations", "40"),
+    *("--system", "a2tg", "--downscale", "6", "--stage1-iterations", "60", "--stage2-iterations", "40"),
     *("--initial-gaussians", "60", "--densify.cap", "60", "--texture.cap", "2", "--texture.at", "0.5"),
 )
 

@@ -52,7 +52,7 @@ def cases(table, takes_long):
 
 # On the command line: one line or one box of tyro on stderr, exit code 2, and nothing is trained or written.
 
-NEW = "train synthetic --out new"
+NEW = "train synthetic --system a2tg --out new"
 COMMANDS = {
     # Commands, flags and their values
     "trian": "no command 'trian' … did you mean train? … demo",
@@ -220,7 +220,9 @@ def test_a_deleted_current_folder(capsys, monkeypatch):
 
 @pytest.mark.parametrize("words, value", [(["0.1", "0.2"], (0.1, 0.2)), (["None"], None), ([], ())])
 def test_values_that_may_be_none(words, value):
-    command = cli.parsed("train", ["s", "--out", "o", "--texture.at", *words, "--memory-budget", "None"])
+    command = cli.parsed(
+        "train", ["s", "--system", "a2tg", "--out", "o", "--texture.at", *words, "--memory-budget", "None"]
+    )
     assert command.record.options.texture.at == value and command.record.options.memory_budget is None
 
 

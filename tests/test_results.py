@@ -209,7 +209,7 @@ def test_sizes_have_three_digits_and_a_suitable_unit():
 
 
 def test_info_shows_what_is_intact_and_names_what_is_damaged(tmp_path):
-    run = with_record(tmp_path / "run", RunRecord(SceneSource("synthetic")))
+    run = with_record(tmp_path / "run", RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
     run.metrics.write_text("{")
     run.model("a2tg-gaussians").parent.mkdir()
     run.model("a2tg-gaussians").write_bytes(b"PK")
@@ -220,7 +220,7 @@ def test_info_shows_what_is_intact_and_names_what_is_damaged(tmp_path):
 
 
 def test_info_is_json_on_request(tmp_path, capsys):
-    run = with_record(tmp_path / "run", RunRecord(SceneSource("synthetic")))
+    run = with_record(tmp_path / "run", RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
     run.metrics.write_text(json.dumps({"models": {"a2tg-gaussians": {"test": {"psnr": 20.5}}}}))
     run.model("a2tg-gaussians").parent.mkdir()
     a2tg.save_model(run.model("a2tg-gaussians"), a_model())
@@ -322,13 +322,22 @@ def test_the_mesh_of_a_run_is_replaced_by_default_once_the_command_has_written_i
         ('scene = "a"\nscenes = "b"', r"run\.toml: scenes is an unknown key; did you mean scene\?"),
         ("scene = 3", r"run\.toml: scene must be str; got 3"),
         ('scene = "a"\ncompare = [1]', r"run\.toml: compare must be list of str; got \[1\]"),
-        ('scene = "a"\n[options.texture]\ncaps = 4', r"options\.texture\.caps is an unknown key; did you mean cap\?"),
+        (
+            'scene = "a"\n[options.details]\ncaps = 4',
+            r"options\.details\.caps is an unknown key; did you mean cap\?",
+        ),
         ('scene = "a"\n[options]\nseed = 0.5', r"run\.toml: options\.seed must be int; got 0\.5"),
-        ('scene = "a"\n[options]\ntexture = 1', r"run\.toml: options\.texture must hold the fields of Upscale"),
-        ('scene = "a"\n[options.texture]\nat = ["1"]', r"run\.toml: options\.texture\.at must be"),
-        ('scene = "a"\n[options.texture]\naxes = "both"', r"options\.texture\.axes must be one of paper, authors"),
+        (
+            'scene = "a"\n[options]\ndetails = 1',
+            r"run\.toml: options\.details must hold the fields of Upscale",
+        ),
+        ('scene = "a"\n[options.details]\nat = ["1"]', r"run\.toml: options\.details\.at must be"),
+        (
+            'scene = "a"\n[options.details]\naxes = "both"',
+            r"options\.details\.axes must be one of paper, authors",
+        ),
         ('scene = "a"\nsystem = "b2tg"', "there is no system 'b2tg'; the systems are a2tg, "),
-        ('scene = "a"\npreset = "fast"', "a2tg has the presets paper, .*; got 'fast'"),
+        ('scene = "a"\npreset = "fast"', "bytewise has the presets paper, .*; got 'fast'"),
         (
             'scene = "a"\n[options]\ninitial_opacity = 3',
             r"initial_opacity must .* got 3.0.*another version",
@@ -347,7 +356,7 @@ def test_a_configuration_file_may_be_partial_and_its_paths_start_from_its_folder
     monkeypatch.chdir(tmp_path)
     (tmp_path / "files").mkdir()
     file = Path("files/mine.toml")
-    text = 'preset = "quick"\ninit = "a.ply"\n[options.texture]\nk_a = 9\nat = [0.25, 0.5]\n'
+    text = 'system = "a2tg"\npreset = "quick"\ninit = "a.ply"\n[options.texture]\nk_a = 9\nat = [0.25, 0.5]\n'
     file.write_text('scene = "../fox"\n' + text)
     record = read_run_file(file)
     assert record.scene == SceneSource(str(tmp_path / "fox")) and record.init == str(tmp_path / "files/a.ply")

@@ -27,7 +27,7 @@ FLAGS = {
         "texture.axes texture.budget-mb texture.cap texture.fraction texture.gradient texture.k-a texture.k-s "
         "texture.moments texture.select texture.threshold tile-size validation view view-dependence-rate "
         "view-dependence-share view-dependence.at view-dependence.budget-mb view-dependence.highest "
-        "view-dependence.idle "
+        "view-dependence.idle yes "
     ),
     "eval": "json lpips-weights",
     "finish": "lpips-weights max-loss out polish-steps",
@@ -38,6 +38,7 @@ FLAGS = {
     "view": "edit host model open port",
     "export": "edit float64 model overwrite photographs ply single-file web world",
     "convert": "bake bake-growth bake-iterations edit float64 model overwrite world",
+    "edit": "background crop floaters model out overwrite upright",
     "compress": "max-loss out overwrite tune-iterations verbose",
     "info": "json",
     "sfm": "camera-model frames masks matching out panorama",

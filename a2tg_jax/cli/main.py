@@ -26,7 +26,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg demo                            train a built-in scene, about a minute on two cores
   a2tg sfm photos/ scene/              find camera poses for photographs or a video with COLMAP
   a2tg download --list                 benchmark data sets that can be downloaded
-  a2tg train scene/ --out runs/scene --system bytewise --preset quick --downscale 4
+  a2tg train scene/ --out runs/scene --preset quick --downscale 4
                                        train a scene in minutes, evaluate it, write a report
   a2tg eval runs/scene                 evaluate a run again
   a2tg finish runs/scene --out runs/f  shrink and polish the trained model, in a new run folder
@@ -36,19 +36,20 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg export runs/scene --web out/    write the viewer for a web server, or as one HTML file
   a2tg export runs/scene --ply x.ply   write the Gaussians for other programs
   a2tg convert runs/scene scene.sog    convert splats to and from PLY, SPZ, SOG, glTF and others
+  a2tg edit runs/scene --out x.npz     crop, turn upright, remove floaters, without a browser
   a2tg compress runs/scene             write a small file of the trained model
   a2tg info runs/scene                 print what a run folder holds
   a2tg doctor                          print what this machine computes with, and test it
 
 Run a2tg COMMAND --help for a command, a2tg train --system NAME --help-all for the options of a system,
-and a2tg --version for the version. The systems: a2tg, gaussians-2d, gaussians-2d-mcmc,
-textured-gaussians, supergaussians, bbsplat, bytewise.
+and a2tg --version for the version. The systems: bytewise, a2tg, gaussians-2d,
+gaussians-2d-mcmc, textured-gaussians, supergaussians, bbsplat.
 Set A2TG_DEBUG=1 to see the traceback of an error."""
 COMMANDS = {
     "demo": "train:Demo", "train": "train:Train", "eval": "runs:Eval", "finish": "runs:Finish", "render": "runs:Render",
     "mesh": "runs:MeshCommand", "view": "runs:ViewCommand", "export": "runs:Export", "convert": "runs:Convert",
-    "compress": "runs:Compress", "info": "runs:Info", "sfm": "inputs:Sfm", "download": "inputs:Download",
-    "doctor": "doctor:Doctor",
+    "edit": "runs:EditCommand", "compress": "runs:Compress", "info": "runs:Info", "sfm": "inputs:Sfm",
+    "download": "inputs:Download", "doctor": "doctor:Doctor",
 }  # fmt: skip
 """Module of `a2tg_jax.cli` and dataclass of each command."""
 SMALLER = {
@@ -89,7 +90,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             if here not in sys.path:  # Custom systems are modules there. At the end, it hides no other module.
                 sys.path.append(here)
             if name == "train" and {"-h", "--help"} & set(arguments):
+                from a2tg_jax.cli.train import defaults_line
+
                 print(f"usage: a2tg train SCENE --out RUN [OPTIONS]\n\n{inspect.getdoc(command_class(name))}")
+                print(f"\n{defaults_line(arguments)}")
                 return 0
             try:
                 command = parsed(name, arguments)

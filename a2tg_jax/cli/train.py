@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import math
 import re
+import sys
 import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -21,13 +22,13 @@ from a2tg_jax.data.load import SYNTHETIC, SceneSource
 from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.host.text import counted
+from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.parallel.processes import AUTO, ProcessPlace, joined
 from a2tg_jax.results.folder import RunFolder, open_run, opened, resuming_command
 from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs
 from a2tg_jax.results.history import check_tensorboard
 from a2tg_jax.results.record import (
-    DEFAULT_SYSTEM,
     RunRecord,
     contradictions,
     is_finished,
@@ -36,7 +37,7 @@ from a2tg_jax.results.record import (
     write_record,
 )
 from a2tg_jax.results.report import RunResult, sizes_line, summary_text
-from a2tg_jax.results.run_training import RunOptions, begin_run, follow_first_process, resume_run, unseen
+from a2tg_jax.results.run_training import RunOptions, begin_run, follow_first_process, resume_run, unseen, warn
 from a2tg_jax.results.viewing import shown_live
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.training import Session
@@ -47,6 +48,8 @@ HEARTBEAT_TIMEOUT = 60.0
 """Default of --heartbeat-timeout-seconds."""
 ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+(%[\w.-]+)?\]|[^:\[\]]+):\d+")
 """HOST:PORT, with IPv6 addresses in brackets."""
+IMPORTANT = ("stage1_iterations", "stage2_iterations", "densify.cap", "sh_degree")
+"""Options whose defaults the short help shows."""
 DEMO_SYSTEM = A2tg(
     stage1_iterations=400,
     stage2_iterations=250,
@@ -80,7 +83,7 @@ class Demo:
         if self.resume:
             resume(self.out, options)
             return
-        record = RunRecord(SceneSource(SYNTHETIC), DEFAULT_SYSTEM, DEMO_SYSTEM, (BASELINE,))
+        record = RunRecord(SceneSource(SYNTHETIC), A2tg.name, DEMO_SYSTEM, (BASELINE,))
         print_result(begin_run(record, self.out, options), self.out)
 
 
@@ -90,7 +93,7 @@ class Train:
 
       SCENE                  scene folder with photographs and cameras, its URL, or "synthetic"
       --out RUN              run folder for models, checkpoints, metrics, pictures and report.html
-      --system NAME          method: bytewise (the best picture for its bytes), a2tg (default; the paper's), ...
+      --system NAME          method: bytewise (default; the best picture for its bytes), a2tg (the paper's), ...
       --preset NAME          paper (default), quick (minutes on two cores) or smoke (half a minute)
       --downscale K          divide the width and height of the photographs by K
       --memory-budget SIZE   cap the model's size in memory during training, such as 20MB
@@ -102,6 +105,7 @@ class Train:
       --resume               continue from the newest checkpoint in the run folder
       --resume --more N      train a finished run on, for N more iterations of the last stage
       --overwrite            replace an earlier run in that folder
+      --yes                  train without a question about tiny photographs or budgets
       --quiet                hide the progress of training
 
     a2tg train --help-all lists every option by group, with its default; add --system NAME for the options of another
@@ -111,7 +115,7 @@ class Train:
     newest two are kept until the stage is finished.
 
     Examples:
-      a2tg train scenes/fox --out runs/fox --system bytewise --preset quick --downscale 2
+      a2tg train scenes/fox --out runs/fox --preset quick --downscale 2
       a2tg train --out runs/fox --resume
       a2tg train scenes/fox --out runs/small --memory-budget 20MB --baseline
       a2tg train synthetic --out runs/three --preset smoke --compare textured-gaussians --compare bbsplat
@@ -130,6 +134,9 @@ class Train:
     overwrite: bool = False
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
     lpips_weights: LpipsWeights = None
+    yes: bool = False
+    """Train even if the photographs or the memory budget are so small that little can be seen. Without it you are
+    asked."""
     quiet: bool = False
     """Hide the progress of training, but not forecasts, warnings and results."""
     tensorboard: bool = False
@@ -171,6 +178,7 @@ class Train:
                 tensorboard=self.tensorboard,
                 progress=not self.quiet,
                 watched=in_browser if self.view else unseen,
+                confirm=warn if self.yes else ask,
                 session=session,
             )
             if self.resume:
@@ -289,6 +297,14 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     return Train(dataclasses.replace(record, scene=scene), tyro.MISSING)
 
 
+def defaults_line(arguments: Sequence[str]) -> str:
+    """Return the most important defaults of the given system and preset."""
+    record = train_defaults(arguments).record
+    options, system = flatten_config(record.options), record.system
+    found = [f"--{name.replace('_', '-')} {options[name]}" for name in IMPORTANT if name in options]
+    return f"Defaults of {system} with the preset {record.preset or 'paper'}: {' '.join(found)}"
+
+
 def resume(folder: Path, options: RunOptions, check: Callable[[RunFolder], object] = lambda run: None) -> None:
     """Continue a run, once `check` has accepted it, and print its results.
 
@@ -300,6 +316,17 @@ def resume(folder: Path, options: RunOptions, check: Callable[[RunFolder], objec
     with opened(folder) as run:
         check(run)
         print_result(resume_run(run, options), folder)
+
+
+def ask(doubts: Sequence[str]) -> None:
+    """Ask on the terminal whether to train in spite of `doubts`. Raises ValueError if there is none, or the answer is
+    not yes."""
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise ValueError(f"{'; '.join(doubts)}; to train all the same, add `yes`")
+    warn(doubts)
+    print("Train all the same? [y/N] ", end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise ValueError("nothing was trained, as you answered")
 
 
 def devices_named(text: str) -> list[jax.Device] | None:

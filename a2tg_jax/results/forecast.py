@@ -4,7 +4,6 @@ import dataclasses
 import math
 import os
 import shutil
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import jax
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.data import Scene
+from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.host.machine import default_platform, memory_limit
 from a2tg_jax.host.text import in_bytes
@@ -204,16 +204,21 @@ def print_forecast(
         print(f"quicker on CPUs: {quick_flags(side, record.scene.downscale)} takes minutes", flush=True)
 
 
-def warn_of_small_photographs(scene: Scene, downscale: int) -> None:
-    """Warn if a downscale leaves few pixels, with one that leaves more."""
+def doubts_about(scene: Scene, record: RunRecord) -> list[str]:
+    """Return why a run would show little, with better values: a small memory budget, or a downscale that leaves few
+    pixels."""
+    found, downscale = [], record.scene.downscale
+    if record.options.small_budget:
+        found.append(f"{record.options.small_budget}; it is in bytes of the model in memory")
     size = max(((view.camera.width, view.camera.height) for view in scene.train), key=max)
-    if downscale > 1 and max(size) < SMALL_SIDE:
+    # The built-in scene is drawn as small as tests need it.
+    if record.scene.path != SYNTHETIC and downscale > 1 and max(size) < SMALL_SIDE:
         sensible = math.ceil(max(size) * downscale / QUICK_SIDE)
         advice = f"`downscale` {sensible} makes the longer side {max(size) * downscale // sensible:,}"
-        warnings.warn(
-            f"`downscale` {downscale} leaves photographs of {size[0]}×{size[1]} pixels, which show little: {advice}",
-            stacklevel=3,
+        found.append(
+            f"`downscale` {downscale} leaves photographs of {size[0]}×{size[1]} pixels, which show little: {advice}"
         )
+    return found
 
 
 def quick_flags(longest_side: int, downscale: int = 1) -> str:

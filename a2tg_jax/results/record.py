@@ -37,12 +37,12 @@ from a2tg_jax.host.remote_files import checked_url, path_here
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.results.folder import RunFolder, read_json
-from a2tg_jax.systems.a2tg import A2tg
+from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.training import Stage, System, find_system, like
 from a2tg_jax.training.options import own_options
 from a2tg_jax.training.registry import differences
 
-DEFAULT_SYSTEM = "a2tg"
+DEFAULT_SYSTEM = "bytewise"
 LONGEST_REASON = 500
 OnNan = Literal["stop", "restore"]
 """Action on divergence: end with an error, or restore the newest checkpoint and reorder the views."""
@@ -59,7 +59,7 @@ class RunRecord:
     scene: Annotated[SceneSource, arg(name="")]
     system: Annotated[str, arg(metavar="NAME")] = DEFAULT_SYSTEM
     """System to train: a name listed by a2tg --help, or your own as package.module:NAME. Its options follow below."""
-    options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=A2tg)
+    options: Annotated[System, arg(name="")] = dataclasses.field(default_factory=Bytewise)
     compare: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = ()
     """System to train for comparison; may be repeated. It takes every option above and below that it has."""
     preset: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: paper)")] = None
@@ -181,7 +181,7 @@ def read_run_file(path: Path) -> RunRecord:
     scene = config_from_dict(SceneSource, source, where)
     # The options' class depends on system and preset, so they are read last.
     options = table.pop("options", {})
-    record = config_from_dict(RunRecord, table, where, given={"scene": scene, "options": A2tg()})
+    record = config_from_dict(RunRecord, table, where, given={"scene": scene, "options": Bytewise()})
     tables = {"options": options, **{f"compare_options.{key}": value for key, value in record.compare_options.items()}}
     for key, value in tables.items():
         if not isinstance(value, Mapping):

@@ -43,12 +43,7 @@ from a2tg_jax.results.folder import (
     resuming_command,
     set_aside,
 )
-from a2tg_jax.results.forecast import (
-    print_forecast,
-    room_for_photographs,
-    time_after,
-    warn_of_small_photographs,
-)
+from a2tg_jax.results.forecast import doubts_about, print_forecast, room_for_photographs, time_after
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.model_source import check_init, write_first_stage
 from a2tg_jax.results.record import OnNan, PlannedStage, RunRecord, is_finished, read_record, write_record
@@ -85,6 +80,12 @@ def unseen(scene: Scene) -> AbstractContextManager[Watch]:
     return contextlib.nullcontext(unwatched)
 
 
+def warn(doubts: Sequence[str]) -> None:
+    """Warn of each doubt."""
+    for doubt in doubts:
+        warnings.warn(doubt, stacklevel=3)
+
+
 @dataclasses.dataclass(frozen=True)
 class RunOptions:
     """Options of a run's execution. They do not affect the model, except for last bits on other devices."""
@@ -100,6 +101,8 @@ class RunOptions:
     progress: bool = True
     """Show progress bars."""
     watched: Watched = unseen
+    confirm: Callable[[Sequence[str]], None] = warn
+    """Function called with the doubts about a new run (`doubts_about`), if there are any; it may raise ValueError."""
     session: Session = dataclasses.field(default_factory=Session)
 
 
@@ -125,10 +128,8 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     for system in record.systems.values():
         check_loss_data(scene.train, system.all_stages())
         check_start(scene, system, num_given if system is record.options else None)
-    if record.options.small_budget:
-        warnings.warn(f"{record.options.small_budget}; it is in bytes of the model in memory", stacklevel=2)
-    if record.scene.path != SYNTHETIC:
-        warn_of_small_photographs(scene, record.scene.downscale)
+    if doubts := doubts_about(scene, record):
+        options.confirm(doubts)
     print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given, out)
     run = RunFolder(out)
     with claimed(run):
