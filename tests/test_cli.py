@@ -442,7 +442,9 @@ def test_render(run, tmp_path, monkeypatch, capsys):
     assert [path.name for path in frames] == [f"frame_{index:04d}.png" for index in range(3)]
     words = (run.path / "frames" / "flight.mp4").read_text()
     assert all(pair in words for pair in ("-framerate 12.0 ", "-frames:v 3 ", f"-i {run.path}/frames/frame_%04d.png "))
-    assert np.asarray(Image.open(frames[0])).std() > 1
+    assert "right=0:bottom=0:mode=smear" in words
+    with Image.open(frames[0]) as frame:
+        assert frame.size == (1280, 720) and np.asarray(frame).std() > 1
     assert cli.main(["render", str(run.path), "--path", "test", "--out", str(tmp_path / "test")]) == 0
     assert len(list((tmp_path / "test").glob("*.png"))) == len(list(run.test.glob("*.png")))
     capsys.readouterr()
@@ -452,8 +454,9 @@ def test_render(run, tmp_path, monkeypatch, capsys):
 def test_render_a_path_saved_in_the_viewer(run, tmp_path, capsys):
     view = {"viewmat": np.eye(4).ravel().tolist(), "K": [20, 0, 10, 0, 20, 8, 0, 0, 1], "size": [20, 16]}
     path, out = tmp_path / "path.json", tmp_path / "out"
+    to = ("--out", str(out))
     path.write_text(json.dumps({"format": "a2tg-jax path", "version": 1, "views": [view, view]}))
-    assert cli.main(["render", str(run.path), "--path", str(path), "--frames", "2", "--out", str(out)]) == 0
+    assert cli.main(["render", str(run.path), "--path", str(path), "--frames", "2", "--size", "20x16", *to]) == 0
     with Image.open(out / "frame_0001.png") as frame:
         assert frame.size == (20, 16)
     assert f"wrote 2 frames to {out}/\n" in capsys.readouterr().out

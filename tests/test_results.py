@@ -219,6 +219,19 @@ def test_info_shows_what_is_intact_and_names_what_is_damaged(tmp_path):
     assert printed.endswith(f"training is not finished; continue with: a2tg train --out {run.path} --resume")
 
 
+def test_info_of_a_folder_lists_its_runs(tmp_path, capsys):
+    run = with_record(tmp_path / "b", RunRecord(SceneSource("synthetic")))
+    other = with_record(tmp_path / "a", RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
+    other.record.write_text("scene = {")
+    run.viewer.write_bytes(b"12345")
+    size = in_bytes(run.record.stat().st_size + run.marker.stat().st_size + 5)
+    assert cli.main(["info", str(tmp_path)]) == 0
+    damaged, begun = capsys.readouterr().out.splitlines()
+    assert damaged.startswith("a ") and "is not valid TOML" in damaged
+    assert re.split(r"  +", begun) == ["b", "bytewise", size, "not begun"]
+    assert f"page     {run.viewer}, 5 bytes\ndisk     {size}" in describe_run(run)
+
+
 def test_info_is_json_on_request(tmp_path, capsys):
     run = with_record(tmp_path / "run", RunRecord(SceneSource("synthetic"), "a2tg", A2tg()))
     run.metrics.write_text(json.dumps({"models": {"a2tg-gaussians": {"test": {"psnr": 20.5}}}}))

@@ -25,6 +25,7 @@ from a2tg_jax.results.folder import (
     json_text,
     open_run,
     opened,
+    runs_in,
 )
 from a2tg_jax.results.frames import (
     FRAMES_PER_SECOND,
@@ -36,7 +37,7 @@ from a2tg_jax.results.frames import (
     video_name,
     write_video,
 )
-from a2tg_jax.results.info import describe_run, run_facts
+from a2tg_jax.results.info import describe_run, describe_runs, run_facts
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import FinishOptions
@@ -107,7 +108,7 @@ class Render:
 
     Examples:
       a2tg render runs/fox --frames 240 --fps 60
-      a2tg render runs/fox --size 1280x720
+      a2tg render runs/fox --size 1920x1080
       a2tg render runs/fox --path orbit --frames 240 --out fox-orbit
       a2tg render runs/fox --path test --out fox-test
       a2tg render runs/fox --path path.json --out fox-flight
@@ -121,8 +122,13 @@ class Render:
     """Number of frames of the flight."""
     fps: float = FRAMES_PER_SECOND
     """Frames per second of the video."""
-    size: Annotated[str | None, arg(metavar="WxH"), defaulting_to("size of the cameras' images")] = None
-    """Width and height of the frames in pixels, such as 1280x720. Views of another aspect are cropped."""
+    size: Annotated[
+        str | None,
+        arg(metavar="WxH"),
+        defaulting_to("1280x720, or 720x1280 if the photographs are upright"),
+    ] = None
+    """Width and height of the frames in pixels, such as 1920x1080; test views keep theirs by default. Views of another
+    aspect are cropped."""
     supersample: int = 1
     """Factor k by which frames are drawn larger and averaged: without aliasing where frames are smaller than the
     photographs, at k² times the cost."""
@@ -422,10 +428,12 @@ class Compress:
 
 @dataclasses.dataclass(frozen=True)
 class Info:
-    """Print the scene, the progress of each stage, the models and the metrics of a run.
+    """Print the scene, the progress of each stage, the models, metrics and disk use of a run, or a line for each
+    run in a folder.
 
-    Example:
+    Examples:
       a2tg info runs/fox --json
+      a2tg info runs
     """
 
     folder: RunFolderPath
@@ -433,5 +441,9 @@ class Info:
     """Print JSON, for programs."""
 
     def run(self) -> None:
+        runs = [] if RunFolder(self.folder).record.is_file() else runs_in(self.folder)
+        if runs:
+            print(json_text([run_facts(run) for run in runs]) if self.json else describe_runs(runs))
+            return
         run = open_run(self.folder)
         print(json_text(run_facts(run)) if self.json else describe_run(run))

@@ -200,6 +200,12 @@ def open_run(path: Path) -> RunFolder:
     return run
 
 
+def runs_in(folder: Path) -> list[RunFolder]:
+    """Return the runs whose folders are in a folder, sorted by name."""
+    entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [run for run in map(RunFolder, entries) if run.record.is_file()]
+
+
 def resuming_command(run: RunFolder, devices: Devices | None = None) -> str:
     """Return the command line that continues a training on these devices; None: its newest checkpoint's devices."""
     if devices is None:

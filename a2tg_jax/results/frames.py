@@ -28,6 +28,8 @@ from a2tg_jax.results.images import picture_names, save_animation, to_uint8, wri
 from a2tg_jax.results.model_source import open_source
 
 Route = Literal["test", "smooth", "orbit"]
+FLIGHT_SIZE = (1280, 720)
+"""Default width and height of the frames of flights, in pixels."""
 FRAMES_PER_SECOND = 30
 LARGEST_SIDE = 8192
 WEBP_QUALITY = 80
@@ -113,7 +115,8 @@ def render_frames(
         a file that the viewer saved.
       name: model to render; None: the last one of the run's main system.
       edit: file of an edit that is applied before.
-      size: width and height of the frames, views being cropped to their aspect; None: the cameras' sizes.
+      size: width and height of the frames, views being cropped to their aspect; None: the cameras' sizes for test
+        views, otherwise `FLIGHT_SIZE`, or upright if the first camera is.
 
     Raises:
       ValueError, OSError: if that stage is not finished, the views or the path are missing, or a file is in the way.
@@ -124,6 +127,9 @@ def render_frames(
         raise FileExistsError(f"{out} is a file; choose a folder for the frames with `out`")
     source = open_source(run.path, name, edit)
     cameras = dict(_cameras(source.model, route, num_frames))
+    if size is None and route != "test":
+        first = next(iter(cameras.values()))
+        size = FLIGHT_SIZE if first.width >= first.height else FLIGHT_SIZE[::-1]
     if size is not None:
         cameras = {file_name: crop_camera(camera, *size) for file_name, camera in cameras.items()}
     folder = FrameFolder(out)
@@ -165,8 +171,10 @@ def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER
         if program is None:
             save_animation(temporary, opened(), frames_per_second, quality=WEBP_QUALITY)
             return path
-        # Most players decode yuv420p only, which needs even sides.
-        even_sides = "pad=ceil(iw/2)*2:ceil(ih/2)*2"
+        # Most players decode yuv420p only, which needs even sides: the last row or column is repeated.
+        with Image.open(frames[0]) as first:
+            right, bottom = first.width % 2, first.height % 2
+        even_sides = f"format=gbrp,pad=iw+{right}:ih+{bottom},fillborders=right={right}:bottom={bottom}:mode=smear"
         source = ["-framerate", str(frames_per_second), "-i", str(frames[0].with_name(FRAME_NAME))]
         # Otherwise ffmpeg continues with whatever numbered files follow.
         made = ["-frames:v", str(len(frames)), "-vf", even_sides, "-pix_fmt", "yuv420p", "-f", "mp4"]

@@ -1,7 +1,7 @@
 """Summary of a run folder in a few lines of text."""
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ def describe_run(run: RunFolder) -> str:
         f"repeat   {repeating_command(run)}",
         *(f"model    {stage['name']:<{width}}  {_stage_text(stage)}" for stage in stages),
         f"report   {facts['report'] or 'none yet: a2tg eval writes it'}",
+        *([f"page     {facts['page']}, {in_bytes(run.viewer.stat().st_size)}"] if facts["page"] else []),
+        f"disk     {in_bytes(facts['disk_bytes'])}",
         *([f"damaged  {damage}: {shlex.join(['a2tg', 'eval', str(run.path)])} rewrites it"] if damage else []),
     ]
     if not facts["is_finished"]:
@@ -38,6 +40,21 @@ def describe_run(run: RunFolder) -> str:
     if old is not None:
         lines.append(f"replaces a run that is kept in {old.path} until this one has its report")
     return "\n".join(lines)
+
+
+def describe_runs(runs: Sequence[RunFolder]) -> str:
+    """Return a line for each run: its name, system, last model and disk use, or what is damaged."""
+    rows = []
+    for run in runs:
+        try:
+            facts = run_facts(run)
+        except ValueError as error:
+            rows.append((run.path.name, "", "", str(error)))
+            continue
+        last = facts["stages"][len(read_record(run).plan.main) - 1]
+        rows.append((run.path.name, facts["system"], in_bytes(facts["disk_bytes"]), _stage_text(last)))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
 
 
 def run_facts(run: RunFolder) -> dict[str, Any]:
@@ -57,6 +74,8 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
         "is_finished": is_finished(run, record),
         "stages": [{"name": name, **_stage_facts(run, name), "psnr": measured.get(name)} for name in names],
         "report": str(run.report) if run.report.is_file() else None,
+        "page": str(run.viewer) if run.viewer.is_file() else None,
+        "disk_bytes": sum(file.stat().st_size for file in run.path.rglob("*") if file.is_file()),
         "damage": damage,
     }
 

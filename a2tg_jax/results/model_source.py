@@ -25,7 +25,7 @@ from a2tg_jax.io.other_programs import plain_gaussians
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
-from a2tg_jax.results.folder import RunFolder, open_run, resuming_command
+from a2tg_jax.results.folder import RunFolder, open_run, resuming_command, runs_in
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import PlannedStage, RunRecord, read_record
 from a2tg_jax.training import History, System
@@ -141,10 +141,10 @@ def _run_at(folder: Path) -> RunFolder:
     if is_scene(folder):
         command = ["a2tg", "train", str(folder), "--out", f"runs/{folder.resolve().name}", "--preset", "quick"]
         raise FileNotFoundError(f"{folder} is a scene that must be trained first: {shlex.join(command)}")
-    runs = sorted(below for below in folder.iterdir() if RunFolder(below).record.is_file())
+    runs = runs_in(folder)
     if not runs:
         raise FileNotFoundError(f"{folder} is not a run folder (it has no run.toml); give {SHOWN}")
-    listed = [shlex.quote(str(run)) for run in runs[:MOST_LISTED]] + ["…"] * (len(runs) > MOST_LISTED)
+    listed = [shlex.quote(str(run.path)) for run in runs[:MOST_LISTED]] + ["…"] * (len(runs) > MOST_LISTED)
     raise FileNotFoundError(f"{folder} holds run folders; give one of them: {', '.join(listed)}")
 
 
