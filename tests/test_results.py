@@ -501,7 +501,8 @@ def test_options_of_compared_systems_take_precedence(tmp_path):
 
 def test_a_configuration_file_may_set_options_of_compared_systems(tmp_path):
     file = tmp_path / "mine.toml"
-    text = 'scene = "synthetic"\nsystem = "a2tg"\ncompare = ["bytewise"]\n[compare_options.bytewise.exponents]\nleast = 0.5\n'
+    text = 'scene = "synthetic"\nsystem = "a2tg"\ncompare = ["bytewise"]\n'
+    text += "[compare_options.bytewise.exponents]\nleast = 0.5\n"
     file.write_text(text)
     found = parsed("--config", file, "--seed", "3")
     assert found.systems["bytewise"].exponents.least == 0.5 and found.systems["bytewise"].seed == 3
