@@ -142,6 +142,28 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.close();
   });
 
+  test("sliders set the lens and the exposure, and the address keeps them", async () => {
+    const page = await opened(DESK);
+    expect(await page.isHidden("#fly")).toBe(true); // It takes two cameras.
+    await page.click("#leveling > summary");
+    await page.fill("#angle", "90");
+    await page.fill("#exposure", "1");
+    const stateOf = (of: Page): Promise<readonly (number | undefined)[]> =>
+      of.evaluate(() => {
+        const viewer = window.a2tg?.viewer;
+        return [(viewer?.image.fx ?? NaN) / (viewer?.image.width ?? NaN), viewer?.exposure];
+      });
+    expectClose((await stateOf(page)).map(Number), [0.5, 1]);
+    expect(await page.textContent("#angle-value")).toBe("90°");
+    await page.waitForFunction(() => location.hash.includes("&exposure=1"));
+    const other = await opened(DESK, new URL(page.url()).hash);
+    expectClose((await stateOf(other)).map(Number), [0.5, 1]);
+    await page.click("#start");
+    expect((await stateOf(page))[1]).toBe(0);
+    await page.close();
+    await other.close();
+  });
+
   test("what is hidden, turned and coloured is saved as an edit, and the address keeps it", async () => {
     const page = await opened(DESK);
     expect(await page.isDisabled("#save-edit")).toBe(true);

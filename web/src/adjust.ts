@@ -1,5 +1,6 @@
-/** The panel's sections that adjust what is shown: roll and vertical, crop box, floaters and background. */
+/** The panel's sections that adjust what is shown: roll, lens and exposure; crop box, floaters and background. */
 
+import type { Lens } from "./camera";
 import { colorOf, hexOf } from "./edit";
 import { WHOLE } from "./extent";
 import type { Header } from "./format";
@@ -10,16 +11,23 @@ import type { Viewer } from "./viewer";
 
 const DEGREES = 180 / Math.PI;
 
-/** Buttons and slider that turn the view upright, or call it so. */
+/** Buttons and slider that turn the view upright, or call it so, and sliders of its lens and exposure. */
 export class LevelControls {
   private readonly viewer: Viewer;
   private readonly roll = element("roll", HTMLInputElement);
+  private readonly angle = element("angle", HTMLInputElement);
+  private readonly exposure = element("exposure", HTMLInputElement);
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
     this.roll.addEventListener("input", () => this.turn(-Number(this.roll.value) / DEGREES));
     element("level", HTMLButtonElement).addEventListener("click", () => this.level());
     element("upright", HTMLButtonElement).addEventListener("click", () => this.callUpright());
+    this.angle.addEventListener("input", () => this.widen(Number(this.angle.value) / DEGREES));
+    this.exposure.addEventListener("input", () => {
+      viewer.exposure = Number(this.exposure.value);
+      viewer.onMove();
+    });
     viewer.onFrame = () => this.tell();
   }
 
@@ -41,10 +49,25 @@ export class LevelControls {
     viewer.onMove();
   }
 
+  /** Set the angle across the longer side of the image. */
+  private widen(angle: number): void {
+    const { viewer } = this;
+    const factor = Math.tan(angleOf(viewer.image) / 2) / Math.tan(angle / 2);
+    viewer.image = { ...viewer.image, fx: viewer.image.fx * factor, fy: viewer.image.fy * factor };
+    viewer.onMove();
+  }
+
   private tell(): void {
+    const { image, exposure } = this.viewer;
+    element("angle-value", HTMLOutputElement).value = `${(angleOf(image) * DEGREES).toFixed(0)}°`;
+    element("exposure-value", HTMLOutputElement).value = exposure.toFixed(1);
+    if (!this.angle.matches(":active")) this.angle.value = String(angleOf(image) * DEGREES);
+    if (!this.exposure.matches(":active")) this.exposure.value = String(exposure);
     if (!this.roll.matches(":active")) this.roll.value = String(-rollOf(this.viewer.pose, this.viewer.up) * DEGREES);
   }
 }
+
+const angleOf = ({ fx, fy, width, height }: Lens): number => 2 * Math.atan(Math.max(width / fx, height / fy) / 2);
 
 /** Sliders of the crop box and of the floaters, and the background. */
 export class CropControls {

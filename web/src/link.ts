@@ -19,13 +19,16 @@ export interface View {
   readonly floaters: number;
   /** The background; null if it is the scene's. */
   readonly background: Vec3 | null;
+  readonly exposure: number;
+  /** Whether the page flies past the cameras. */
+  readonly isFlying: boolean;
 }
 
 /** Position, right, forward; focus; fx, fy, cx, cy, skew, width, height. */
 type ViewNumbers = readonly [...Vec3, ...Vec3, ...Vec3, number, ...Vec3, ...Vec3, number];
 
 /** Return the fragment of a view, such as #view=…&mode=depth. */
-export function linkOf({ pose, lens, mode, fit, up, crop, floaters, background }: View): string {
+export function linkOf({ pose, lens, mode, fit, up, crop, floaters, ...rest }: View): string {
   const numbers: ViewNumbers = [
     ...pose.position,
     ...pose.rotation[0],
@@ -45,7 +48,9 @@ export function linkOf({ pose, lens, mode, fit, up, crop, floaters, background }
   if (up !== null) fields.push(`up=${textOf(up)}`);
   if (isCropped(crop)) fields.push(`crop=${textOf([...crop.from, ...crop.to])}`);
   if (floaters > 0) fields.push(`floaters=${textOf([floaters])}`);
-  if (background !== null) fields.push(`background=${textOf(background)}`);
+  if (rest.background !== null) fields.push(`background=${textOf(rest.background)}`);
+  if (rest.exposure !== 0) fields.push(`exposure=${textOf([rest.exposure])}`);
+  if (rest.isFlying) fields.push("fly=yes");
   return `#${fields.join("&")}`;
 }
 
@@ -73,6 +78,8 @@ export function viewOf(hash: string): View | null {
     crop: cropOf(fields.get("crop")),
     floaters: sharesOf(fields.get("floaters"), 1)?.[0] ?? 0,
     background: sharesOf<Vec3>(fields.get("background"), 3),
+    exposure: Math.min(Math.max(Number(fields.get("exposure")) || 0, -4), 4),
+    isFlying: fields.get("fly") === "yes",
   };
 }
 

@@ -81,7 +81,6 @@ function tell(splats: Splats): void {
       "Gaussians",
       splats.num < header.num ? `${countText(splats.num)} of ${countText(header.num)}` : countText(header.num),
     ],
-    ["Texels", countText(header.numTexels)],
     ["File", bytesText(header.numBytes)],
     ["GPU memory", bytesText(splats.numBytes)],
   ];

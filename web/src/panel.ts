@@ -4,6 +4,7 @@ import { CropControls, LevelControls } from "./adjust";
 import { intrinsicsOf, viewmatOf } from "./camera";
 import type { Intrinsics, Viewmat } from "./camera";
 import { textOfEdit } from "./edit";
+import { Flight } from "./flight";
 import type { Header } from "./format";
 import { linkOf, viewOf } from "./link";
 import type { Vec2 } from "./math";
@@ -42,6 +43,7 @@ export class Panel {
   private linkTimer = 0;
   private readonly leveling: LevelControls;
   private readonly cropping: CropControls;
+  private readonly flight: Flight;
 
   constructor(viewer: Viewer) {
     this.viewer = viewer;
@@ -65,6 +67,8 @@ export class Panel {
     this.leveling = new LevelControls(viewer);
     this.cropping = new CropControls(viewer);
     this.cropping.onChange = () => this.noteLink();
+    this.flight = new Flight(viewer);
+    this.flight.onChange = () => this.leave();
     viewer.onLeave = () => this.leave();
     addEventListener("keydown", (event) => this.pressKey(event));
     addEventListener("resize", () => this.placePhotograph());
@@ -81,6 +85,7 @@ export class Panel {
     setText("note", header.note);
     element("cameras", HTMLElement).hidden = header.cameras.length === 0;
     this.cropping.begin(header);
+    this.flight.begin(header.cameras);
     const choices = header.cameras.map(
       (camera, index) => new Option(camera.isTest ? `${camera.name} (test)` : camera.name, String(index)),
     );
@@ -110,6 +115,7 @@ export class Panel {
   private restart(): void {
     const { splats } = this.viewer;
     if (splats === null) return;
+    this.flight.stop();
     this.viewer.settle(splats);
     this.tellEdit();
     this.setCurrent(splats.header.cameras.length > 0 ? splats.header.first : null);
@@ -133,6 +139,7 @@ export class Panel {
   private goTo(index: number): void {
     const camera = this.header?.cameras.at(index);
     if (index < 0 || camera === undefined) return;
+    this.flight.stop();
     this.viewer.goTo(camera);
     this.setCurrent(index);
     this.noteLink();
@@ -197,8 +204,11 @@ export class Panel {
   }
 
   private get link(): string {
-    const { pose, image, mode, fit, up, isUpChosen, crop, floaters, background } = this.viewer;
-    return linkOf({ pose, lens: image, mode, fit, up: isUpChosen ? up : null, crop, floaters, background });
+    const { pose, image, mode, fit, up, isUpChosen, crop, floaters } = this.viewer;
+    const { background, exposure } = this.viewer;
+    const { isOn: isFlying } = this.flight;
+    const chosen = isUpChosen ? up : null;
+    return linkOf({ pose, lens: image, mode, fit, up: chosen, crop, floaters, background, exposure, isFlying });
   }
 
   private async copyLink(): Promise<void> {
@@ -224,10 +234,12 @@ export class Panel {
     [viewer.pose, viewer.image, viewer.fit] = [view.pose, view.lens, view.fit];
     if (view.up !== null) viewer.chooseUp(view.up);
     [viewer.crop, viewer.floaters, viewer.background] = [view.crop, view.floaters, view.background];
+    viewer.exposure = view.exposure;
     if (this.header !== null) this.cropping.show(this.header);
     this.setMode(view.mode);
     this.setCurrent(null);
     viewer.draw();
+    if (view.isFlying && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.flight.start();
     return true;
   }
 

@@ -72,7 +72,7 @@ export class Renderer {
   }
 
   /** Copy the picture to the canvas. */
-  present(background: Vec3, mode: Mode, depths: Vec2, divided: number | null = null): void {
+  present(background: Vec3, mode: Mode, depths: Vec2, divided: number | null = null, gain = 1): void {
     const { gl, screen } = this;
     const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -85,6 +85,7 @@ export class Renderer {
     gl.uniform1i(screen.at("height"), height);
     gl.uniform3fv(screen.at("background"), background);
     gl.uniform2fv(screen.at("depths"), depths);
+    gl.uniform1f(screen.at("gain"), gain);
     gl.uniform1i(screen.at("mode"), MODES.indexOf(mode));
     gl.uniform1f(screen.at("divider"), divided === null ? -1 : Math.round(divided * width));
     gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -346,6 +346,7 @@ uniform vec3 background;
 uniform vec2 depths;
 uniform int mode;
 uniform float divider;
+uniform float gain;
 out vec4 fragment;
 
 // Colour ramp: near is bright, far is dark.
@@ -357,7 +358,7 @@ vec3 ramp(float t) {
 void main() {
   ivec2 place = ivec2(gl_FragCoord.xy);
   vec4 found = texelFetch(picture, ivec2(place.x, height - 1 - place.y), 0);
-  vec3 color = found.rgb + (1.0 - found.a) * background;
+  vec3 color = gain * found.rgb + (1.0 - found.a) * background;
   if (mode == DEPTH) {
     float depth = found.a > 0.02 ? found.r / found.a : depths.y;
     color = ramp(clamp(log(depth / depths.x) / log(depths.y / depths.x), 0.0, 1.0));

@@ -61,6 +61,8 @@ export class Viewer implements Steered {
   floaters = 0;
   /** The background that the user has chosen; null shows the scene's own. */
   background: Vec3 | null = null;
+  /** Stops by which colours are brighter. */
+  exposure = 0;
   mode: Mode = "full";
   /** Share of the width left of which textures are shown; null shows them everywhere. */
   divided: number | null = null;
@@ -123,7 +125,7 @@ export class Viewer implements Steered {
   settle({ header }: Splats): void {
     const first = header.cameras.at(header.first);
     const extent = extentOf(header.means);
-    [this.up, this.isUpChosen] = [verticalOfScene(header), false];
+    [this.up, this.isUpChosen, this.exposure] = [verticalOfScene(header), false, 0];
     this.extent = first !== undefined ? 1 : Math.max(...extent.half);
     if (first !== undefined) {
       this.goTo(first, "close");
@@ -153,8 +155,14 @@ export class Viewer implements Steered {
   }
 
   onMove(): void {
-    this.movedAt = performance.now();
     this.onLeave();
+    this.move(this.pose);
+  }
+
+  /** Show another view, in motion. */
+  move(pose: Pose): void {
+    this.pose = pose;
+    this.movedAt = performance.now();
     this.draw();
   }
 
@@ -264,7 +272,9 @@ export class Viewer implements Steered {
   private present(splats: Splats, { lens: { width, height } }: Shown): void {
     const { canvas } = this;
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    this.renderer.present(this.background ?? splats.header.background, this.mode, this.depths, this.divided);
+    const { mode, depths, divided } = this;
+    const gain = mode === "full" || mode === "plain" ? 2 ** this.exposure : 1;
+    this.renderer.present(this.background ?? splats.header.background, mode, depths, divided, gain);
     this.onFrame();
   }
 
