@@ -4,6 +4,7 @@ import base64
 import contextlib
 import dataclasses
 import hashlib
+import html
 import http.client
 import importlib
 import io
@@ -22,6 +23,8 @@ from test_compact import textured
 
 from a2tg_jax.appearance import parts
 from a2tg_jax.cli.main import main
+from a2tg_jax.core.origin import Origin
+from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data import synthetic_scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.host.text import in_bytes
@@ -32,7 +35,7 @@ from a2tg_jax.results import viewing
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
-from a2tg_jax.results.viewing import ServedPhotographs, export_web, losses_of, routes_of
+from a2tg_jax.results.viewing import ServedPhotographs, export_comparison, export_web, losses_of, routes_of
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serve, served
@@ -316,6 +319,26 @@ def test_a_folder_and_a_single_file(tmp_path):
         export_web(source, tmp_path / "with", photographs=True)
     with pytest.raises(ValueError, match="leave out `single_file`"):
         export_web(source, tmp_path / "with.html", photographs=True)
+
+
+def test_a_page_compares_two_models_of_one_scene(tmp_path):
+    """Its frames hold both pages as they are, and titles are text."""
+    sources = [Source(textured(), "<b>a</b>", path=tmp_path / name / "models" / "m.npz") for name in "xy"]
+    page = tmp_path / "c.html"
+    assert "x · <b>a</b> against y · <b>a</b>" in export_comparison(sources, page)
+    text = page.read_text(encoding="utf-8")
+    frames = re.findall(r'<iframe title="([^"]*)" srcdoc="([^"]*)">', text)
+    assert [html.unescape(title) for title, _ in frames] == ["x · <b>a</b>", "y · <b>a</b>"] and "<b>" not in text
+    wanted = [viewer_html_with(source.encoded) for source in sources]
+    assert [html.unescape(inside) for _, inside in frames] == wanted
+    with pytest.raises(FileExistsError, match="add `overwrite`"):
+        export_comparison(sources, page)
+    with pytest.raises(ValueError, match=r"`out` must .* \.html; got .*c\.htm$"):
+        export_comparison(sources, tmp_path / "c.htm")
+    elsewhere = Origin.of_cameras([], transform=Similarity(2.0, np.eye(3), np.zeros(3)))
+    moved = dataclasses.replace(sources[1], model=dataclasses.replace(textured(), origin=elsewhere))
+    with pytest.raises(ValueError, match="are in different worlds"):
+        export_comparison([sources[0], moved], page, overwrite=True)
 
 
 def test_a_failed_export_leaves_the_photographs_of_the_old_page(tmp_path, monkeypatch):

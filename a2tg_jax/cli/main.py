@@ -35,6 +35,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg view runs/scene                 show a run in a browser; also *.npz, *.ply, *.spz, ...
   a2tg export runs/scene --web out/    write the viewer for a web server, or as one HTML file
   a2tg export runs/scene --ply x.ply   write the Gaussians for other programs
+  a2tg compare runs/scene runs/b       write a page that shows two runs with a divider
   a2tg convert runs/scene scene.sog    convert splats to and from PLY, SPZ, SOG, glTF and others
   a2tg edit runs/scene --out x.npz     crop, turn upright, remove floaters, without a browser
   a2tg compress runs/scene             write a small file of the trained model
@@ -48,8 +49,8 @@ Set A2TG_DEBUG=1 to see the traceback of an error."""
 COMMANDS = {
     "demo": "train:Demo", "train": "train:Train", "eval": "runs:Eval", "finish": "runs:Finish", "render": "runs:Render",
     "mesh": "runs:MeshCommand", "view": "runs:ViewCommand", "export": "runs:Export", "convert": "runs:Convert",
-    "edit": "runs:EditCommand", "compress": "runs:Compress", "info": "runs:Info", "sfm": "inputs:Sfm",
-    "download": "inputs:Download", "doctor": "doctor:Doctor",
+    "edit": "runs:EditCommand", "compare": "runs:Compare", "compress": "runs:Compress", "info": "runs:Info",
+    "sfm": "inputs:Sfm", "download": "inputs:Download", "doctor": "doctor:Doctor",
 }  # fmt: skip
 """Module of `a2tg_jax.cli` and dataclass of each command."""
 SMALLER = {

@@ -43,7 +43,7 @@ from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import FinishOptions
 from a2tg_jax.results.report import metrics_json
 from a2tg_jax.results.run_evaluation import check_weights, evaluate_run
-from a2tg_jax.results.viewing import check_page, export_web, routes_of
+from a2tg_jax.results.viewing import check_page, export_comparison, export_web, routes_of
 from a2tg_jax.web.server import LOOPBACK, serve
 
 
@@ -301,6 +301,27 @@ class Export:
             print(export_web(source, self.web, **page))
         if self.ply is not None:
             print(export_ply(source, self.ply, float64=self.float64, world=self.world))
+
+
+@dataclasses.dataclass(frozen=True)
+class Compare:
+    """Write a page that shows two runs or models of one scene with a divider between them.
+
+    Example:
+      a2tg compare runs/fox runs/small --out compare.html
+    """
+
+    first: RunOrFile
+    second: RunOrFile
+    out: Annotated[Path, arg(metavar="FILE")] = Path("compare.html")
+    """Output file, *.html."""
+    overwrite: bool = False
+    """Replace the output file."""
+
+    def run(self) -> None:
+        check_output(self.out)
+        sources = [open_source(self.first), open_source(self.second)]
+        print(export_comparison(sources, self.out, overwrite=self.overwrite))
 
 
 @dataclasses.dataclass(frozen=True)

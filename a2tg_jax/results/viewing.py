@@ -11,7 +11,7 @@ import io
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_o
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.compact import decode_model
+from a2tg_jax.io.other_programs import matrix_of
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.folder import check_new, read_json, remove_if_empty
@@ -34,7 +35,15 @@ from a2tg_jax.results.model_source import Source
 from a2tg_jax.results.report import loss_text
 from a2tg_jax.training.fitting import BACKGROUNDS
 from a2tg_jax.training.loop import IsStopped, StageRun
-from a2tg_jax.web.page import PHOTOGRAPHS_NAME, SCENE_NAME, STATUS_NAME, photograph_name, viewer_html, viewer_html_with
+from a2tg_jax.web.page import (
+    PHOTOGRAPHS_NAME,
+    SCENE_NAME,
+    STATUS_NAME,
+    comparison_html,
+    photograph_name,
+    viewer_html,
+    viewer_html_with,
+)
 from a2tg_jax.web.server import Route, served
 
 JPEG_QUALITY = 90
@@ -246,6 +255,30 @@ def export_web(
     lines += [f"{loss_text(loss)}, {measure}" for measure, loss in losses_of(source).items()]
     others_text = f" with {counted(len(files) - 1, 'file')} next to it" if others else ""
     return "\n".join([*lines, f"{page}: {in_bytes(total)}{others_text}"])
+
+
+def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool = False) -> str:
+    """Write a page that shows two models with one camera and a divider, and return a summary.
+
+    Raises:
+      FileExistsError: if the file exists.
+      ValueError: if it does not end in .html, or the models are not in one world.
+    """
+    if out.suffix.lower() != ".html" or out.is_dir():
+        raise ValueError(f"`out` must be the path of a file that ends in .html; got {out}")
+    check_new(out, "`out`", overwrite=overwrite)
+    first, second = sources
+    origins = [source.model.origin or Origin.of_cameras([]) for source in sources]
+    if not np.allclose(*(matrix_of(origin.transform) for origin in origins), rtol=1e-6, atol=1e-4):
+        raise ValueError(f"{first.title} and {second.title} are in different worlds: give models of one scene")
+    titles = [source.title for source in sources]
+    if titles[0] == titles[1]:
+        titles = [f"{source.path.parent.parent.name or source.path.stem} · {source.title}" for source in sources]
+    scenes = [(title, source.encoded) for title, source in zip(titles, sources, strict=True)]
+    page = comparison_html(*scenes).encode()
+    with replacing(out) as temporary:
+        temporary.write_bytes(page)
+    return f"{out}: {in_bytes(len(page))}, {' against '.join(titles)}"
 
 
 def losses_of(source: Source) -> dict[str, float]:

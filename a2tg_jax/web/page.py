@@ -1,6 +1,8 @@
 """The viewer's page, one HTML file with script and style inside, and the files next to it."""
 
 import base64
+import html
+import re
 from importlib import resources
 
 SCENE_NAME = "scene.a2tgz"
@@ -24,6 +26,16 @@ def viewer_html_with(scene: bytes) -> str:
     data = f'<script type="text/plain" id="scene-data">{base64.b64encode(scene).decode("ascii")}</script>\n  '
     head, script, rest = viewer_html().partition('<script type="module">')
     return f"{head}{data}{script}{rest}"
+
+
+def comparison_html(first: tuple[str, bytes], second: tuple[str, bytes]) -> str:
+    """Return a page with two scenes, each a title and a file, and a divider between them."""
+    page = resources.files(__package__).joinpath("compare.html").read_text(encoding="utf-8")
+    values = {"title": f"{first[0]} | {second[0]}"}
+    for name, (title, scene) in (("first", first), ("second", second)):
+        values |= {name: title, f"{name}_page": viewer_html_with(scene)}
+    # In one pass, so that no text is taken for the place of another.
+    return re.sub(r"\{(\w+)\}", lambda found: html.escape(values[found[1]]), page)
 
 
 def photograph_name(index: int) -> str:
