@@ -33,8 +33,7 @@ FLAGS = {
     "finish": "lpips-weights max-loss out polish-steps",
     "render": "edit fps frames model out overwrite path size supersample",
     "mesh": (
-        "clusters edit faces max-memory model out overwrite radius resolution texture texture-size unbounded "
-        "voxel "
+        "clusters edit faces max-memory model out overwrite radius resolution texture texture-size unbounded voxel "
     ),
     "view": "edit host model open port",
     "export": "edit float64 model overwrite photographs ply single-file web world",

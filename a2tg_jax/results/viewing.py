@@ -268,8 +268,8 @@ def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool =
         raise ValueError(f"`out` must be the path of a file that ends in .html; got {out}")
     check_new(out, "`out`", overwrite=overwrite)
     first, second = sources
-    origins = [source.model.origin or Origin.of_cameras([]) for source in sources]
-    if not np.allclose(*(matrix_of(origin.transform) for origin in origins), rtol=1e-6, atol=1e-4):
+    one, other = (matrix_of((source.model.origin or Origin.of_cameras([])).transform) for source in sources)
+    if not np.allclose(one, other, rtol=1e-6, atol=1e-4):
         raise ValueError(f"{first.title} and {second.title} are in different worlds: give models of one scene")
     titles = [source.title for source in sources]
     if titles[0] == titles[1]:
