@@ -60,9 +60,17 @@ export class Splats {
 
   /** Request a sort by the depth row · (x, y, z, 1). A later request replaces a pending one. */
   sort(row: Row4): void {
-    if (this.sorted !== null && this.sorted.num === this.num && row.every((x, i) => x === this.sorted?.row[i])) return;
+    if (this.isSorted(row)) return;
     this.wanted = row;
     this.next();
+  }
+
+  /** Resolve once sorted by a row, whatever frames request meanwhile. */
+  async sortNow(row: Row4): Promise<void> {
+    while (!this.isSorted(row)) {
+      this.sort(row);
+      await this.settled();
+    }
   }
 
   /** Resolve when the last request is done. */
@@ -74,6 +82,11 @@ export class Splats {
   delete(): void {
     this.worker.terminate();
     for (const texture of [this.order, this.rows, this.harmonics, this.texels]) texture.delete();
+  }
+
+  private isSorted(row: Row4): boolean {
+    const { sorted } = this;
+    return sorted !== null && sorted.num === this.num && row.every((x, i) => x === sorted.row[i]);
   }
 
   private next(): void {

@@ -195,8 +195,7 @@ export class Viewer implements Steered {
   async read(pose: Pose, lens: Lens, mode: Mode): Promise<Float32Array> {
     const { splats } = this;
     if (splats === null) throw new SceneError("No scene is loaded yet.");
-    splats.sort(projection(pose, lens)[2]);
-    await splats.settled();
+    await splats.sortNow(projection(pose, lens)[2]);
     this.renderer.draw(splats, { pose, lens, clip: this.clip, mode });
     const found = this.renderer.target.read(0, 0, lens.width, lens.height);
     this.draw();
