@@ -15,7 +15,6 @@ from a2tg_jax.results.figures import save_figure
 
 DENSE, FEW = "dense", "few views"
 BEST, MCMC, BYTEWISE = "Best plain method", "2DGS*-MCMC", "Bytewise"
-WEIGHED = "Bytewise, opacities weighed"
 EQUAL_TIME = ", equal time"
 PRIMARY = "bytewise − best plain method, 0.3 MB"
 SECONDARY = {
@@ -68,8 +67,6 @@ def rows_of_bytewise(results: Sequence[Result]) -> list[Row]:
                 place = f"{budget:g} MB" + ("" if stratum == DENSE else f", {FEW}")
                 place += EQUAL_TIME if label.endswith(EQUAL_TIME) else ""
                 rows.append(Row(f"bytewise − {wording}, {place}", own, BYTEWISE, label))
-                if label == BEST:
-                    rows.append(Row(f"bytewise now − {wording}, {place}", own, WEIGHED, label))
     return rows
 
 

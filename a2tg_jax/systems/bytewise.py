@@ -21,7 +21,6 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import Noise, densify_times
 from a2tg_jax.model import Model
 from a2tg_jax.systems.two_stages import PRUNING, TwoStages, pruned
-from a2tg_jax.training.options import LossConfig
 from a2tg_jax.training.stage import Stage
 
 
@@ -48,7 +47,6 @@ class LimitExponents(StepEvent):
 
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
-OPACITY_LOSS = LossConfig(opacity_weight=0.01)  # +0.4 dB over nine captures (experiments/NOTEBOOK.md)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,8 +59,6 @@ class Bytewise(TwoStages):
       (0.3, 2)
     """
 
-    loss: LossConfig = OPACITY_LOSS
-    """Losses. The weight of opacities, with which Gaussians that show little die and move, is for the first stage."""
     base_degree: int = 0
     """Degree of spherical harmonics of all Gaussians; some rise up to sh_degree."""
     densify: SplitByGradient = SplitByGradient(cap=2_000_000)
@@ -121,9 +117,7 @@ class Bytewise(TwoStages):
             rates |= {"texture": TexelRates(self.texel_rate, 0.0)}
             # Without texels at first: one texel would add to the Gaussian's colour and opacity only.
             detailed = dataclasses.replace(detailed, texture=Texture(None, (0, 0), self.lookup), max_alpha=None)
-        # Nothing moves in the second stage, so opacities are free.
-        free = dataclasses.replace(self, loss=dataclasses.replace(self.loss, opacity_weight=0.0))
-        return first, free.later_stage("details", detailed, (*events, *limits), rates)
+        return first, self.later_stage("details", detailed, (*events, *limits), rates)
 
     @property
     def _share(self) -> float:
