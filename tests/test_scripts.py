@@ -115,6 +115,7 @@ def test_the_loop_of_the_readme_is_drawn(tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings("ignore:.* there was no room")
 def test_pictures_of_the_viewer_and_of_meshes_are_drawn(tmp_path, monkeypatch):
     import pictures
 

@@ -26,7 +26,7 @@ AXES |= {f"-{name}": -axis for name, axis in AXES.items()}
 
 @dataclasses.dataclass(frozen=True)
 class EditOptions:
-    """What an edit changes. Percentages are those of the viewer's sliders."""
+    """What an edit changes. Percentages are as on the viewer's sliders."""
 
     crop: Annotated[tuple[str, str, str] | None, arg(metavar="LOW:HIGH")] = None
     """Upright box to keep: from and to along width, depth and height, in percent of the largest box; 50 is the middle
