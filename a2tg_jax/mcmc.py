@@ -56,8 +56,7 @@ def relocate(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Arr
     """Move each dead Gaussian (opacity at most 0.005) onto a live one, drawn with probability ∝ its opacity.
 
     Host and moved ones share opacity and size so that together they look like the host (3DGS-MCMC, Kheradmand et al.,
-    2024); everything else is copied from the host. The moments
-    of a host become zero; the moved rows keep theirs.
+    2024); everything else is copied from the host. The moments of a host become zero; the moved rows keep theirs.
 
     Args:
       key: a random key.
@@ -85,6 +84,8 @@ def relocate(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Arr
 
 def grow(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Array | int, cap: Array | int) -> MoveResult:
     """Grow the live count n to min(cap, max(n + 1, ⌊1.05·n⌋)) by copies of hosts drawn as in `relocate`.
+
+    3DGS-MCMC (Kheradmand et al., 2024).
 
     Hosts and added rows start with zero moments. A count at the cap or above stays.
 
@@ -176,6 +177,8 @@ def perturb(
     key: Array, gaussians: Gaussians, num_live: Array | int, lr: Array | float, scales: Array | None = None
 ) -> Gaussians:
     """Add exploration noise to the means of the live rows: Σ·ε·sigmoid(100·((1 - o) - 0.995))·lr·5e5.
+
+    3DGS-MCMC (Kheradmand et al., 2024).
 
     Σ = R S Sᵀ Rᵀ is the covariance of the flat splat (its third scale is 0), ε is standard normal: the noise stays
     in the splat's plane and dies out on opaque Gaussians.
@@ -280,7 +283,10 @@ def densify_times(num_iterations: int) -> Times:
 
 @pytree
 class Noise(StepEvent):
-    """Exploration noise on the means, after every iteration (`perturb`)."""
+    """Exploration noise on the means, after every iteration (`perturb`).
+
+    3DGS-MCMC (Kheradmand et al., 2024).
+    """
 
     def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
         gaussians = perturb(now.keys[0], model.gaussians, model.live_count, now.rate_of_means)
@@ -290,6 +296,8 @@ class Noise(StepEvent):
 @pytree
 class Mcmc(StepEvent):
     """Relocation of dead Gaussians and growth to a cap (`relocate`, `grow`), for any appearance.
+
+    3DGS-MCMC (Kheradmand et al., 2024).
 
     Examples:
       >>> a2tg.Mcmc(cap=5000).num_rows(1000, 30_000)

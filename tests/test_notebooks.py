@@ -12,23 +12,27 @@ import a2tg_jax as a2tg
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 SMALL = {
+    "a_scene_in_five_minutes": {
+        "width": 40, "height": 30, "num_views": 9, "iterations": 90, "budget": "40kB",
+        "findings": FOLDER.parent / "experiments" / "results" / "protocol" / "findings.md",
+    },
+    "inverse_problems": {
+        "width": 40, "height": 30, "num_views": 11, "iterations": 20, "num_gaussians": 150, "pose_iterations": 3,
+        "light_iterations": 10, "texture_iterations": 10, "all_degrees": (6,),
+    },
     "training_by_hand": {
         "width": 40, "height": 30, "num_views": 4, "num_gaussians": 60, "num_iterations": 24, "upscale_after": (12,),
-        "pose_iterations": 10,
     },
-    "a_system_of_your_own": {
-        "width": 40, "height": 30, "num_views": 4, "num_points": 120, "iterations": 24, "cap": 60,
-    },
-    "fitting_one_image": {"width": 32, "height": 24, "num_gaussians": 40, "num_iterations": 20},
-    "refining_poses": {"width": 40, "height": 30, "num_views": 5, "iterations": 20, "pose_iterations": 3,
-        "all_degrees": (6,)},
+    "a_custom_system": {"width": 40, "height": 30, "num_views": 4, "num_points": 120, "iterations": 24, "cap": 60},
     "gradients_and_differences": {"width": 12, "height": 9, "num_gaussians": 5},
     "a_sweep_and_its_table": {
         "width": 24, "height": 18, "num_views": 12, "iterations": 8, "budgets": (20,), "methods": ("MCMC, degree 0",),
     },
 }  # fmt: skip
 """Values for the cell that is tagged "parameters"."""
-MOST_BYTES = 300_000
+MOST_BYTES = 400_000
+MOST_LINES, MOST_COLUMNS = 25, 100
+"""Size of a cell; wider lines are cut off where notebooks are read."""
 
 
 def code_cells(name: str) -> list[dict]:
@@ -62,13 +66,11 @@ def test_training_by_hand_learns_and_grows_textures(monkeypatch):
     assert names["losses_after"][-4:].mean() < 0.9 * names["losses_after"][:4].mean()
     assert names["before"].textures.bucket_sizes == ((1, 1),)
     assert names["after"].textures.sizes.max() == 2
-    disturbed = a2tg.photometric_loss(names["after"].render(names["disturbed"]).color, names["photograph"])
-    assert names["value"] < 0.95 * disturbed, "the camera descends"
 
 
 @pytest.mark.long
-def test_a_system_of_your_own_trains_beside_others_and_is_loaded_again(monkeypatch):
-    names = run("a_system_of_your_own", monkeypatch)
+def test_a_custom_system_trains_beside_others_and_is_loaded_again(monkeypatch):
+    names = run("a_custom_system", monkeypatch)
     models = names["models"]
     assert abs(models["edges"].appearance.edges[:, 3:]).max() > 1e-3
     assert max(model.num_bytes for model in models.values()) <= names["budget"]
@@ -76,24 +78,40 @@ def test_a_system_of_your_own_trains_beside_others_and_is_loaded_again(monkeypat
 
 
 @pytest.mark.long
-def test_one_image_is_fitted(monkeypatch):
-    names = run("fitting_one_image", monkeypatch)
-    losses = {name: losses for name, (_, losses) in names["fits"].items()}
-    assert all(each[-1] < 0.8 * each[0] for each in losses.values())
-    assert losses["4×4 texels"][-1] < losses["plain"][-1]
-    assert names["starts"]["plain, equal bytes"].num_bytes == pytest.approx(names["textured"].num_bytes, rel=0.05)
+def test_a_scene_is_trained_drawn_differentiated_and_shown(monkeypatch):
+    drawn = []
+    live = types.SimpleNamespace(update=drawn.append)
+    monkeypatch.setitem(
+        sys.modules, "IPython.display", types.SimpleNamespace(HTML=str, display=lambda display_id: live)
+    )
+    names = run("a_scene_in_five_minutes", monkeypatch)
+    assert len(drawn) >= 2 and {picture.color.shape for picture in drawn} == {(30, 40, 3)}
+    assert abs(names["by_camera"].viewmat).max() > 0 and abs(names["change"]).max() > 0
+    assert names["by_background"][0] == pytest.approx(float(names["difference"]), rel=0.05)
+    assert names["frames"].shape == (6, 30, 40, 3)
+    assert "scene-data" in names["page"] and len(names["gains"]) == 9
 
 
 @pytest.mark.long
-def test_poses_descend(monkeypatch):
-    """So short a training and descent find no pose; they take cameras nearer in the picture."""
-    names = run("refining_poses", monkeypatch)
+def test_pose_light_and_texture_descend(monkeypatch):
+    """So short a training and descent find nothing; they come nearer to the photograph."""
+    names = run("inverse_problems", monkeypatch)
+
+    def error(camera, photograph):
+        return float(abs(names["model"].render(camera).color - photograph).mean())
+
     starts, ends, _ = names["results"][6, "coarse to fine"]
-    before, after = (
-        [float(abs(names["model"].render(camera).color - photo).mean()) for camera, photo in pairs]
-        for pairs in (zip(starts, names["photographs"], strict=True), zip(ends, names["photographs"], strict=True))
+    before, after = (sum(map(error, cameras, names["photographs"])) for cameras in (starts, ends))
+    assert after < before
+    guess, found = (
+        abs(names["lit"](camera, lamp) - names["lamplit"]).mean()
+        for camera, lamp in ((names["start"], names["guess"]), (names["end"], names["lamp"]))
     )
-    assert sum(after) < sum(before)
+    assert found < guess
+    unpainted, painted = (
+        a2tg.psnr(names[model].render(names["camera"]).color, names["writing"]) for model in ("textured", "by_texels")
+    )
+    assert painted > unpainted
 
 
 def test_gradients_agree_with_differences(monkeypatch):
@@ -126,3 +144,12 @@ def test_outputs_are_committed_and_small(name):
     outputs = [output for cell in cells for output in cell["outputs"]]
     assert not any(output["output_type"] == "error" for output in outputs)
     assert any("image/png" in output.get("data", {}) for output in outputs)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_cells_are_short_and_pictures_described(name):
+    for cell in code_cells(name):
+        lines = "".join(cell["source"]).splitlines()
+        assert len(lines) <= MOST_LINES and max(map(len, lines)) <= MOST_COLUMNS, lines[0]
+        if any("image/png" in output.get("data", {}) for output in cell["outputs"]):
+            assert len(cell["metadata"]["alt"]) > 20, lines[0]

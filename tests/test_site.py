@@ -81,13 +81,13 @@ def test_a_notebook_becomes_text_code_and_outputs():
     outputs = [{"text": ["1\n"]}, {"data": {"image/png": "AA=="}}, {"data": {"text/html": ["<b>2</b>"]}}]
     cells = [
         {"cell_type": "markdown", "source": ["# [Title](../docs/a.md)"]},
-        {"cell_type": "code", "source": ["print(1)"], "outputs": outputs},
+        {"cell_type": "code", "metadata": {"alt": "two dots"}, "source": ["print(1)"], "outputs": outputs},
     ]
     text = site_pages.notebook_text(json.loads(json.dumps({"cells": cells})))
     assert text.split("\n\n") == [
         "# [Title](../a.md)",
         "```python\nprint(1)\n```",
         "```text\n1\n```",
-        '<img alt="" src="data:image/png;base64,AA==">',
+        '<img alt="two dots" src="data:image/png;base64,AA==">',
         "<b>2</b>",
     ]

@@ -69,6 +69,9 @@ LEAST_INITIAL_COLOR = 0.05
 class Gaussians:
     """N flat Gaussians as unconstrained arrays, all of one dtype: float32, or float64.
 
+    A Gaussian at (u, v), in standard deviations from its centre, has the weight exp(−(u² + v²)/2) (2DGS, Huang et al.,
+    2024).
+
     Examples:
       >>> gaussians = a2tg.Gaussians(
       ...     means=jnp.zeros((2, 3)),

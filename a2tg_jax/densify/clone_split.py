@@ -50,6 +50,8 @@ class CloneSplitPlan(NamedTuple):
 class CloneSplitPrune(StepEvent):
     """Event that clones small Gaussians and splits large ones with large gradients, and prunes faint or too large ones.
 
+    Adaptive density control of 3DGS (Kerbl et al., 2023), as 2DGS (Huang et al., 2024) uses it.
+
     It happens every max(10, n/300) of n iterations, from n/60 to n/2. The programs of 3DGS and 2DGS also have a largest
     radius on the screen. They reset the radii to 0 just before reading them, so it has no effect and is left out.
 
@@ -209,7 +211,10 @@ def reset_interval(num_iterations: Array | int) -> Array:
 
 @pytree
 class OpacityReset(StepEvent):
-    """Event that resets opacities above `most` to `most`: every max(500, n/10) of n iterations, until n/2."""
+    """Event that resets opacities above `most` to `most`: every max(500, n/10) of n iterations, until n/2.
+
+    3DGS (Kerbl et al., 2023).
+    """
 
     most: float = 0.01
     """Largest opacity after a reset, every max(500, n/10) of n iterations until n/2."""

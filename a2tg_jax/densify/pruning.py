@@ -37,6 +37,8 @@ from a2tg_jax.renderer import plan_render
 class Prune(HostEvent):
     """Event that prunes the Gaussians with the smallest blending weights, summed over the training views.
 
+    After Mini-Splatting (Fang and Wang, 2024).
+
     It uses the cameras of the scene, not refined ones.
 
     Examples:

@@ -72,6 +72,8 @@ def align_poses(
 ) -> tuple[View, ...]:
     """Return the views with cameras from which the model looks most like their photographs (host).
 
+    After BARF (Lin et al., 2021).
+
     Adam minimises the photometric loss over a twist of the camera in its own frame; each view keeps its best step, so
     that no loss increases.
 

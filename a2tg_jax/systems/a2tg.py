@@ -29,6 +29,8 @@ of the Gaussians. Gaussians then take four fifths of the bytes."""
 class A2tg(TwoStages):
     """Adaptive anisotropic textured Gaussians: MCMC densification, then textures that grow.
 
+    A²TG, *Adaptive Anisotropic Textured Gaussians for Efficient 3D Scene Representation*; `Upscale` has its rule.
+
     Examples:
       >>> system = a2tg.A2tg.preset("quick", memory_budget="300kB", texture={"cap": 8})
       >>> [stage.name for stage in system.stages()]

@@ -33,7 +33,10 @@ from a2tg_jax.training.stage import LearningRates, Stage
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Gaussians2d(TwoStages):
-    """Plain 2D Gaussians: clone, split, prune, opacity reset."""
+    """Plain 2D Gaussians: clone, split, prune, opacity reset.
+
+    2DGS (Huang et al., 2024), with the adaptive density control of 3DGS (Kerbl et al., 2023).
+    """
 
     stage2_iterations: int = 0
     """Further iterations without densification; 0: none."""
@@ -62,6 +65,8 @@ class Gaussians2d(TwoStages):
 class Gaussians2dMcmc(TwoStages):
     """Plain 2D Gaussians, densified by MCMC.
 
+    2DGS (Huang et al., 2024), with the densification of 3DGS-MCMC (Kheradmand et al., 2024).
+
     Examples:
       >>> system = a2tg.Gaussians2dMcmc.preset("smoke", sh_degree=0, densify={"cap": 500})
       >>> [stage.iterations for stage in system.stages()]
@@ -88,7 +93,10 @@ class Gaussians2dMcmc(TwoStages):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TexturedGaussians(TwoStages):
-    """MCMC densification, then a second stage with textures of one size."""
+    """MCMC densification, then a second stage with textures of one size.
+
+    Textured Gaussians, as A²TG compares with it.
+    """
 
     densify: Mcmc = Mcmc()
     """MCMC densification (3DGS-MCMC)."""
@@ -143,7 +151,10 @@ class KernelRates:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SuperGaussians(TwoStages):
-    """Splats with four movable kernels each: clone, split, prune, opacity reset."""
+    """Splats with four movable kernels each: clone, split, prune, opacity reset.
+
+    SuperGaussians (Xu et al., 2024).
+    """
 
     stage2_iterations: int = 0
     """Further iterations without densification; 0: none."""
@@ -193,7 +204,10 @@ class BillboardOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BBSplat(TwoStages):
-    """Flat RGBA pictures, whose alpha replaces opacity and Gaussian."""
+    """Flat RGBA pictures, whose alpha replaces opacity and Gaussian.
+
+    BBSplat (Svitov et al., 2024).
+    """
 
     stage2_iterations: int = 2_000
     """Further iterations without densification; 0: none."""

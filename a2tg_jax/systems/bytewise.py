@@ -53,6 +53,8 @@ QUICK_CAP, SMOKE_CAP = 40_000, 2_000
 class Bytewise(TwoStages):
     """Gaussians of degree 0 first, then degrees and textures for those with the largest gradients.
 
+    This library's own method, without a paper; its `Exponents` are after GES (Hamdi et al., 2024).
+
     Examples:
       >>> system = a2tg.Bytewise.preset("quick", memory_budget="300kB", texture_share=0.0)
       >>> system.memory_budget, len(system.stages())

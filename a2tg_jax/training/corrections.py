@@ -112,7 +112,10 @@ class Exposure(FadingCorrection):
 
 @pytree
 class PoseRefinement(FadingCorrection):
-    """A small rigid motion per view, a twist [6] in the camera's frame (rotation vector, then translation)."""
+    """A small rigid motion per view, a twist [6] in the camera's frame (rotation vector, then translation).
+
+    After BARF (Lin et al., 2021).
+    """
 
     rate: float = 1e-3
     """Adam's learning rate of the camera motions, in radians and in units of the normalised world, in which cameras are

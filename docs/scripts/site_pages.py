@@ -1,5 +1,6 @@
 """Hooks of mkdocs: pages of the site that are no files of docs/, and links from docs/ to the rest of the repository."""
 
+import html
 import json
 import posixpath
 import re
@@ -80,15 +81,16 @@ def _cell_parts(cell: dict[str, Any]) -> list[str]:
     source = "".join(cell["source"])
     if cell["cell_type"] != "code":
         return [with_places(source, NOTEBOOK)]
-    shown = (_shown(output) for output in cell["outputs"])
+    alt = cell["metadata"].get("alt", "")
+    shown = (_shown(output, alt) for output in cell["outputs"])
     return [f"```python\n{source}\n```", *(part for part in shown if part)]
 
 
-def _shown(output: dict[str, Any]) -> str:
-    """Return one output of a cell: a picture, a table, or text."""
+def _shown(output: dict[str, Any], alt: str) -> str:
+    """Return one output of a cell: a picture, which `alt` describes, a table, or text."""
     data = output.get("data", {})
     if "image/png" in data:
-        return f'<img alt="" src="data:image/png;base64,{"".join(data["image/png"]).strip()}">'
+        return f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{"".join(data["image/png"]).strip()}">'
     if "text/html" in data:
         return "".join(data["text/html"])
     text = "".join(output.get("text", data.get("text/plain", ""))).rstrip()
