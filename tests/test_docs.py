@@ -5,6 +5,7 @@ import importlib
 import io
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,16 @@ def test_links_lead_somewhere(page):
         file = (page.parent / name).resolve() if name else page
         assert file.exists(), f"{target} leads nowhere"
         assert not anchor or anchor in anchors(file), f"{target}: no such heading"
+
+
+def test_the_version_is_one():
+    """Of the package, of the citation, and the changelog's newest."""
+    package, citation, changes = (
+        (ROOT / name).read_text(encoding="utf-8") for name in ("pyproject.toml", "CITATION.cff", "CHANGELOG.md")
+    )
+    version = tomllib.loads(package)["project"]["version"]
+    assert re.findall(r"^version: (\S+)$", citation, re.MULTILINE) == [version]
+    assert re.findall(r"^## \[(\d.*?)\] - \d{4}-\d\d-\d\d$", changes, re.MULTILINE)[:1] == [version]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
