@@ -125,7 +125,7 @@ def flags_module(text: str) -> str:
         found.setdefault(command[1] if command else "train", set()).update(re.findall(r"\n\| `--([\w.-]+)", part))
     lines = ["FLAGS = {"]
     for name in command_line.COMMANDS:
-        wrapped = textwrap.wrap(" ".join(sorted(found.get(name, ()))), 100, break_on_hyphens=False)
+        wrapped = textwrap.wrap(" ".join(sorted(found.get(name, ()))), 109, break_on_hyphens=False)
         lines += (
             [f'    "{name}": (', *(f'        "{line} "' for line in wrapped), "    ),"]
             if wrapped[1:]
