@@ -88,10 +88,10 @@ def machine() -> dict:
 
 
 def answer(*command: str) -> str:
-    """Return what a command prints; "" without it."""
+    """Return what a command prints; "" if it fails or does not exist."""
     try:
-        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-    except FileNotFoundError:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (FileNotFoundError, subprocess.CalledProcessError):
         return ""
 
 

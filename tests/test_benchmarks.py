@@ -1,5 +1,6 @@
 """The benchmarks run, and their tables say what they measured."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -30,6 +31,12 @@ def test_the_table_of_gpus_joins_passes_and_steps():
     *_, ours, theirs = gpu_table({"gpu": [passes, step, other, {"case": "gsplat", "failed": "took long"}]}).splitlines()
     assert ours == "| 3,000 | this library | mixed | 1.2 | 3.4 | 4.4 | 446 |"
     assert theirs == "| 3,000 | gsplat, 2D Gaussians | none | 2.0 | 7.0 | – | – |"
+
+
+def test_the_table_of_gpus_is_current():
+    root = Path(__file__).parents[1]
+    report = json.loads((root / "benchmarks" / "results" / "gpu.json").read_text())
+    assert gpu_table(report) in (root / "docs" / "performance.md").read_text()
 
 
 @pytest.mark.long

@@ -62,16 +62,16 @@ def test_nvrtc_compiles_them(has_textures, dtype, tile_size):
 
 
 @pytest.mark.usefixtures("has_nvrtc")
-@pytest.mark.parametrize(("has_textures", "most"), [(False, 96), (True, 128)])
-def test_they_fit_the_registers_of_two_blocks(tmp_path, has_textures, most):
-    """128 registers of 256 threads are half of those that an H200's processor has; none are spilled."""
+@pytest.mark.parametrize("has_textures", [False, True])
+def test_they_fit_the_registers_of_three_blocks(tmp_path, has_textures):
+    """80 registers of 256 threads are a third of those that a processor of an H100 has; few bytes are spilled."""
     if shutil.which("ptxas") is None:
         pytest.skip("ptxas is not installed; it comes with CUDA's compiler")
     (tmp_path / "tiles.ptx").write_text(nvrtc.ptx(source_of(has_textures), "9.0"))
     command = ["ptxas", "-v", "-arch=sm_90", "tiles.ptx", "-o", "tiles.cubin"]
     log = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stderr
-    assert max(map(int, re.findall(r"Used (\d+) registers", log))) <= most
-    assert set(re.findall(r"(\d+) bytes spill", log)) == {"0"}
+    assert max(map(int, re.findall(r"Used (\d+) registers", log))) <= 80
+    assert max(map(int, re.findall(r"(\d+) bytes spill", log))) <= 64
 
 
 def test_nvrtc_tells_what_it_refuses(has_nvrtc):

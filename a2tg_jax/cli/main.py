@@ -1,5 +1,6 @@
 """The command line `a2tg`. Commands are imported when they run, so that help and a mistyped name need no JAX."""
 
+import contextlib
 import importlib
 import inspect
 import os
@@ -94,7 +95,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 from a2tg_jax.cli.train import defaults_line
 
                 print(f"usage: a2tg train SCENE --out RUN [OPTIONS]\n\n{inspect.getdoc(command_class(name))}")
-                print(f"\n{defaults_line(arguments)}")
+                with contextlib.suppress(ValueError, OSError, SystemExit):  # Help also with a wrong system or file.
+                    print(f"\n{defaults_line(arguments)}")
                 return 0
             try:
                 command = parsed(name, arguments)

@@ -37,7 +37,7 @@ from a2tg_jax.results.frames import (
     video_name,
     write_video,
 )
-from a2tg_jax.results.info import describe_run, describe_runs, run_facts
+from a2tg_jax.results.info import describe_run, describe_runs, facts_or_damage, run_facts
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import FinishOptions
@@ -464,7 +464,7 @@ class Info:
     def run(self) -> None:
         runs = [] if RunFolder(self.folder).record.is_file() else runs_in(self.folder)
         if runs:
-            print(json_text([run_facts(run) for run in runs]) if self.json else describe_runs(runs))
+            print(json_text([facts_or_damage(run) for run in runs]) if self.json else describe_runs(runs))
             return
         run = open_run(self.folder)
         print(json_text(run_facts(run)) if self.json else describe_run(run))

@@ -75,9 +75,24 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
         "stages": [{"name": name, **_stage_facts(run, name), "psnr": measured.get(name)} for name in names],
         "report": str(run.report) if run.report.is_file() else None,
         "page": str(run.viewer) if run.viewer.is_file() else None,
-        "disk_bytes": sum(file.stat().st_size for file in run.path.rglob("*") if file.is_file()),
+        "disk_bytes": sum(map(_size_of, run.path.rglob("*"))),
         "damage": damage,
     }
+
+
+def facts_or_damage(run: RunFolder) -> dict[str, Any]:
+    """Return the content of a run folder, or only its path and damage if run.toml cannot be read."""
+    try:
+        return run_facts(run)
+    except ValueError as error:
+        return {"path": str(run.path), "damage": str(error)}
+
+
+def _size_of(path: Path) -> int:
+    try:
+        return path.stat().st_size if path.is_file() else 0
+    except FileNotFoundError:  # A run in progress replaces its checkpoints.
+        return 0
 
 
 def read_psnrs(path: Path) -> dict[str, dict[str, float]]:

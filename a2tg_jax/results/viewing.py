@@ -273,7 +273,9 @@ def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool =
         raise ValueError(f"{first.title} and {second.title} are in different worlds: give models of one scene")
     titles = [source.title for source in sources]
     if titles[0] == titles[1]:
-        titles = [f"{source.path.parent.parent.name or source.path.stem} · {source.title}" for source in sources]
+        folders = [source.path.parent for source in sources]
+        folders = [folder.parent if folder.name == "models" else folder for folder in folders]
+        titles = [f"{folder.name or folder} · {title}" for folder, title in zip(folders, titles, strict=True)]
     scenes = [(title, source.encoded) for title, source in zip(titles, sources, strict=True)]
     page = comparison_html(*scenes).encode()
     with replacing(out) as temporary:

@@ -78,7 +78,7 @@ export function viewOf(hash: string): View | null {
     crop: cropOf(fields.get("crop")),
     floaters: sharesOf(fields.get("floaters"), 1)?.[0] ?? 0,
     background: sharesOf<Vec3>(fields.get("background"), 3),
-    exposure: Math.min(Math.max(Number(fields.get("exposure")) || 0, -4), 4),
+    exposure: Math.min(Math.max(Number(fields.get("exposure")) || 0, -3), 3),
     isFlying: fields.get("fly") === "yes",
   };
 }

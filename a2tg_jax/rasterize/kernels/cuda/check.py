@@ -101,8 +101,11 @@ def _inputs() -> tuple[PassSettings, tuple[Any, ...]]:
     M: Any = np.moveaxis(depth * np.asarray(rows, np.float32), -1, 0)
     normals, nothing = draw(-1, 1, 3), draw(0, 0, 0)
     splats = Splats(M, draw(0, 1, 3), draw(0.05, 0.6), normals, nothing)
-    texels, sides, first = draw(0.1, 0.9, 4, 4).reshape(-1, 4), *(draw(n, n).astype(np.int32) for n in (2, 0))
-    regions = TextureRegion(first + 4 * np.arange(NUM, dtype=np.int32), sides, sides)
+    texels = draw(0.1, 0.9, 4, 4).reshape(-1, 4)
+    # Textures of one texel have a path of their own.
+    sides: Any = 1 + np.arange(NUM, dtype=np.int32) % 2
+    first: Any = 4 * np.arange(NUM, dtype=np.int32)
+    regions = TextureRegion(first, sides, sides)
     static = StaticShading.of(Appearance(texture=Texture()))
     settings = PassSettings(static, 0, 4, 3, "float32", GRID, 0.2, True, "position", tile_batch=0)
     g = rng.normal(size=(GRID.num, settings.num_channels, settings.num_pixels)).astype(np.float32)

@@ -1,6 +1,6 @@
 // What tiles.c needs of CUDA C++.
-// Registers for 24 warps on a processor, if a few numbers fit: an H100 takes 1.1 times as long with 20 warps.
-#define WARPS_AT_ONCE (IS_FLOAT && NUM_SUMS <= 32 ? 24 : 8)
+// Registers for 24 warps on a processor: with 20, an H100 takes 1.1 times as long. Older ones lack the shared memory.
+#define WARPS_AT_ONCE (IS_FLOAT && NUM_SUMS <= 32 && __CUDA_ARCH__ >= 900 ? 24 : 8)
 #define KERNEL(name) extern "C" __global__ void __launch_bounds__(THREADS, WARPS_AT_ONCE * 32 / THREADS) name
 #define ALIGNED __align__(16)
 #define INLINE static __device__ __forceinline__

@@ -6,8 +6,8 @@ import importlib.util
 import re
 from pathlib import Path
 
-LEAST_ISA = {7: "8.3", 8: "8.3", 9: "8.3", 10: "8.8", 12: "8.8"}
-"""PTX version that the kernels need, by the major compute capability: NVRTC marks bytes that a load leaves unused."""
+LEAST_ISA = {7: "8.1", 8: "8.1", 9: "8.1", 10: "8.8", 12: "8.8"}
+"""PTX version that the kernels need, by the major compute capability: 8.1 brought atomic sums of four floats."""
 
 
 class CompilationError(RuntimeError):
@@ -58,6 +58,8 @@ def ptx(source: str, capability: str) -> str:
         if library.nvrtcCompileProgram(program, len(options), array):
             raise CompilationError(f"NVRTC refused a kernel:\n{_text(program, 'ProgramLog')}")
         text, least = _text(program, "PTX"), LEAST_ISA.get(int(capability.split(".")[0]))
+        # A hint that needs version 8.3: bytes of a load that are not used.
+        text = re.sub(r'\.pragma "used_bytes_mask[^;]*;', "", text)
         # The version that the kernels need instead of NVRTC's own, which a driver refuses if it is older.
         declared = r"\g<0>" if least is None else f".version {least}"
         return re.sub(r"^\.version \S+", declared, text, count=1, flags=re.MULTILINE)
