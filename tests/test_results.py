@@ -234,6 +234,9 @@ def test_info_of_a_folder_lists_its_runs(tmp_path, capsys):
     assert damaged.startswith("a ") and "is not valid TOML" in damaged
     assert re.split(r"  +", begun) == ["b", "bytewise", size, "not begun"]
     assert f"page     {run.viewer}, 5 bytes\ndisk     {size}" in describe_run(run)
+    assert cli.main(["info", str(tmp_path), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert "is not valid TOML" in facts[0]["damage"] and facts[1]["damage"] is None
 
 
 def test_info_is_json_on_request(tmp_path, capsys):

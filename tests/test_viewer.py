@@ -325,7 +325,11 @@ def test_a_page_compares_two_models_of_one_scene(tmp_path):
     """Its frames hold both pages as they are, and titles are text."""
     sources = [Source(textured(), "<b>a</b>", path=tmp_path / name / "models" / "m.npz") for name in "xy"]
     page = tmp_path / "c.html"
-    assert "x · <b>a</b> against y · <b>a</b>" in export_comparison(sources, page)
+    files = [
+        dataclasses.replace(source, path=tmp_path / name / "m.npz") for source, name in zip(sources, "xy", strict=True)
+    ]
+    for given in (files, sources):
+        assert "x · <b>a</b> against y · <b>a</b>" in export_comparison(given, page, overwrite=True)
     text = page.read_text(encoding="utf-8")
     frames = re.findall(r'<iframe title="([^"]*)" srcdoc="([^"]*)">', text)
     assert [html.unescape(title) for title, _ in frames] == ["x · <b>a</b>", "y · <b>a</b>"] and "<b>" not in text
