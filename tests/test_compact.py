@@ -359,7 +359,7 @@ def test_models_that_a_file_cannot_hold_are_refused(encode_it, file):
     gaussians = some_gaussians()
     for template in (MovableKernels(bands=Bands()), Billboards()):
         appearance = allocate_appearance(template, jax.random.key(0), gaussians)
-        with pytest.raises(ValueError, match=f"shows {in_words(template)}: a .*{file} holds .*save_model"):
+        with pytest.raises(ValueError, match=f"has {in_words(template)}: a .*{file} holds .*save_model"):
             encode_it(Model(gaussians, appearance))
     for field in dataclasses.fields(Gaussians):
         name = field.name

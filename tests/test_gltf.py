@@ -133,7 +133,7 @@ def test_what_the_extension_cannot_hold_is_refused_or_left_out(tmp_path):
     gaussians = some_gaussians()
     template = MovableKernels(exponents=Exponents())
     model = Model(gaussians, allocate_appearance(template, jax.random.key(0), gaussians))
-    with pytest.raises(ValueError, match=r"shows MovableKernels with .*: a glTF file holds .*textures=False here"):
+    with pytest.raises(ValueError, match=r"has MovableKernels with .*: a glTF file holds .*textures=False here"):
         save_gltf(tmp_path / "m.glb", model)
     save_gltf(tmp_path / "m.glb", model, textures=False)
     a2tg.save_ply(tmp_path / "m.ply", model)

@@ -120,7 +120,7 @@ def test_systems_that_cannot_be_shown_are_reported():
     live = LiveView(SCENE, "scene")
     live(run, never)
     encoded(live)
-    assert "shows Billboards" in status(live)["message"] and status(live)["version"] == 0
+    assert "has Billboards" in status(live)["message"] and status(live)["version"] == 0
 
 
 def test_a_training_that_is_looked_at_gives_the_same_bits():

@@ -463,7 +463,7 @@ def origin_at(offset: np.ndarray, turn: np.ndarray = UNMOVED.rotation) -> Origin
 def warn_of_offset(kind: Kind, offset: np.ndarray, path: str | os.PathLike[str]) -> None:
     """Warn that the positions of a file are relative to an offset [3], unless it is zero."""
     if offset.any():
-        place = OFFSET_PLACES.get(kind, "the file cannot hold this: write it down")
+        place = OFFSET_PLACES.get(kind, "the file has no place for this: write it down")
         message = (
             f"{os.fspath(path)}: positions are relative to ({', '.join(number_words(offset))}), because the format "
             f"would round such large coordinates too far; {place}"
