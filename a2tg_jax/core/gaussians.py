@@ -155,7 +155,9 @@ def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
     num, dtype = gaussians.num, dtype_of(gaussians.means)
     if str(dtype) not in FLOATS:
         raise ValueError(f"{name} must be {' or '.join(FLOATS)}; got {dtype}")
-    bases = gaussians.sh.shape[1] if np.ndim(gaussians.sh) == 3 and gaussians.sh.shape[1] in NUM_BASES else 16
+    check_floats(f"{name}.sh", gaussians.sh, (num, "K", 3))
+    if (bases := gaussians.sh.shape[1]) not in NUM_BASES:
+        raise ValueError(f"{name}.sh must be [{num}, K, 3] with K = 1, 4, 9 or 16, for degrees 0 to 3; got K = {bases}")
     shapes = {"quats": (num, 4), "log_scales": (num, 2), "logit_opacities": (num,), "sh": (num, bases, 3)}
     for field, shape in shapes.items():
         value = getattr(gaussians, field)

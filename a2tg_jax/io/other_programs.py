@@ -361,9 +361,10 @@ def joined_parts(parts: Iterable[tuple[Model, np.ndarray]], up: Up) -> Model:
         world = similarity_of(matrix, "the transform of its splats")
         if not models:
             placed = upright(model.origin, up)
-            # Models without an origin come back as they were written.
+            # In files of version 0.2 and of other programs, +z of the model is up.
+            earlier = Similarity(placed.scale, UPRIGHT[up], np.zeros(3))
             is_known = model.origin is not None or _is_same(world, placed)
-            placed = placed if is_known else Similarity(1.0, UPRIGHT[up], np.zeros(3))
+            placed = earlier if not is_known or _is_same(world, earlier) else placed
         move = world.then(placed.inverse())
         # A file written here must come back with the same numbers: rounding in its matrix must not move it.
         if is_same := _is_same(move, UNMOVED):
