@@ -162,7 +162,7 @@ def shaped_model():
             shaped_model,
             5,
             ValueError,
-            "stage of the system, .gaussians., trains, .* shows Gaussians with exponents",
+            "stage of the system, .gaussians., trains, .* it has Gaussians with exponents",
         ),
         (a_model, 3, DivergedError, "stage tuning"),
     ],
