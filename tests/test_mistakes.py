@@ -374,7 +374,7 @@ FIELDS = {
     "quats=jnp.zeros((6, 4))": "quats … [7, 4] … [6, 4]",
     "log_scales=jnp.zeros((7, 3))": "log_scales … [7, 2] … [7, 3]",
     "logit_opacities=jnp.zeros((7, 1))": "logit_opacities … [7] … [7, 1]",
-    "sh=jnp.zeros((7, 2, 3))": "sh … [7, 16, 3] … [7, 2, 3]",
+    "sh=jnp.zeros((7, 2, 3))": "sh … [7, K, 3] … K = 2",
     "sh=jnp.zeros((7, 16, 3), int)": "sh … floats … int32",
     "sh=jnp.zeros((7, 16, 3), jnp.float16)": "sh … float32 … float16",
 }
@@ -410,7 +410,7 @@ CALLS = {
     "plan_render(GAUSSIANS, None)": "cameras … Camera or an Iterable … NoneType",
     "plan_render(GAUSSIANS, [VIEW])": "cameras[0] … Camera … View … view.camera",
     "plan_render(MODEL, [CAMERA], appearance=MODEL.appearance)": "plan_render(model, cameras)",
-    "Renderer(FLAT_SH)": "gaussians.sh … [7, 16, 3]",
+    "Renderer(FLAT_SH)": "gaussians.sh … [7, K, 3] … K = 2",
     "Renderer(GAUSSIANS, CAMERA)": "appearance … Appearance … Camera",
     "view_gradients(lambda m, o: 0.0, GAUSSIANS, CAMERA)": "model … Gaussians … Model(gaussians)",
     "view_gradients(lambda m, o: 0.0, MODEL, CAMERA, statistic='foo')": "statistic … position, screen, center … 'foo'",
