@@ -62,7 +62,21 @@ def convert(
     `edit` is as in `open_source`; `baking` turns textured splats into plain ones (None: no baking); `float64` and
     `world` are as in `save_ply`. Raises ValueError or OSError if a format is unknown, or a file cannot be read or
     written."""
-    writer_of(out)  # Baking takes minutes.
+    check_conversion(source, out, float64=float64, world=world, overwrite=overwrite)  # Baking takes minutes.
+    if baking is not None:
+        baking.check()
+    start = time.perf_counter()
+    opened = open_source(source, name, edit)
+    model, baked = (opened.model, "") if baking is None else _kept_or_baked(source, opened, baking, edit)
+    lines = [baked] if baked else []
+    return "\n".join([*lines, write_converted(opened.path, model, out, start, float64=float64, world=world)])
+
+
+def check_conversion(
+    source: Path, out: Path, *, float64: bool = False, world: World = "upright", overwrite: bool = False
+) -> None:
+    """Raise ValueError or OSError unless `out` can be written from a source. Arguments as in `convert`."""
+    writer_of(out)
     if float64 and format_of(out).save is not save_ply:
         raise ValueError(f"`float64` needs an OUT that ends in .ply and is not packed; got {out}")
     if world == "original" and format_of(out).keeps_origin:
@@ -79,19 +93,20 @@ def convert(
             raise ValueError(f"{file} is {whole}: choose another name")
         check_new(file, "OUT", overwrite=overwrite)
     check_output(out)
-    if baking is not None:
-        baking.check()
-    start = time.perf_counter()
-    opened = open_source(source, name, edit)
-    model, baked = (opened.model, "") if baking is None else _kept_or_baked(source, opened, baking, edit)
+
+
+def write_converted(
+    source_file: Path, model: Model, out: Path, start: float, *, float64: bool = False, world: World = "upright"
+) -> str:
+    """Write a model that was read from a file, after `check_conversion`, and return a summary with the seconds since
+    `start` (`time.perf_counter`). Other arguments as in `convert`."""
     if float64:
         save_ply(out, model, float64=True, world=world)
     else:
         save_splats(out, model, world=world)
-    before, after, seconds = file_bytes(opened.path), file_bytes(out), time.perf_counter() - start
+    before, after, seconds = file_bytes(source_file), file_bytes(out), time.perf_counter() - start
     sizes = f"{in_bytes(after)} from {in_bytes(before)} ({after / max(before, 1):.2f} times)"
-    lines = [baked] if baked else []
-    lines.append(f"{out}: {counted(model.num, 'Gaussian')}, {sizes}, {seconds:.1f} s")
+    lines = [f"{out}: {counted(model.num, 'Gaussian')}, {sizes}, {seconds:.1f} s"]
     if lost := lost_by(model, out):
         lines.append(f"not kept by this format: {', '.join(lost)}")
     if unseen := unseen_elsewhere(model, out):

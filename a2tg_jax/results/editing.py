@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-import tempfile
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +15,7 @@ from a2tg_jax.core.origin import Color, Origin
 from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.io.edit_file import Edit, apply_edit, crop_box, save_edit
 from a2tg_jax.model import Model
-from a2tg_jax.results.conversion import convert
+from a2tg_jax.results.conversion import check_conversion, write_converted
 from a2tg_jax.results.folder import check_new, check_output
 from a2tg_jax.results.model_source import open_source
 
@@ -26,7 +26,7 @@ AXES |= {f"-{name}": -axis for name, axis in AXES.items()}
 
 @dataclasses.dataclass(frozen=True)
 class EditOptions:
-    """What an edit changes. Percentages are as on the viewer's sliders."""
+    """Changes to a model, with the percentages of the viewer's sliders."""
 
     crop: Annotated[tuple[str, str, str] | None, arg(metavar="LOW:HIGH")] = None
     """Upright box to keep: from and to along width, depth and height, in percent of the largest box; 50 is the middle
@@ -34,7 +34,7 @@ class EditOptions:
     floaters: float = 0.0
     """Strictness in percent with which floaters are removed; 0 removes none."""
     upright: Annotated[str | None, arg(metavar="PHOTOGRAPH")] = None
-    """What is up: the name of a photograph that was held level, or an axis of the original world, such as
+    """The vertical: the name of a photograph that was held level, or an axis of the original world that is up, such as
     y; write --upright=-y for one with a minus."""
     background: Annotated[str | None, arg(metavar="COLOR")] = None
     """Colour behind the scene, such as white or #ff8000."""
@@ -59,19 +59,19 @@ def write_edit(
 ) -> str:
     """Write an edit as *.json, or a source's edited model in any format that `convert` writes, and return a summary.
     Arguments and errors otherwise as in `convert`."""
-    if out.suffix.lower() == ".json":
+    is_edit, start = out.suffix.lower() == ".json", time.perf_counter()
+    if is_edit:
         check_output(out)
         check_new(out, "`out`", overwrite=overwrite)
-    model = open_source(source, name).model
-    edit = options.edit_of(model)
-    if out.suffix.lower() == ".json":
-        edited = apply_edit(model, edit)
-        save_edit(out, edit)
-        return f"{out}: an edit that keeps {edited.num:,} of {model.num:,} Gaussians; --edit {out} applies it"
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "edit.json"
-        save_edit(path, edit)
-        return convert(source, out, name, edit=path, overwrite=overwrite)
+    else:
+        check_conversion(source, out, overwrite=overwrite)
+    opened = open_source(source, name)
+    edit = options.edit_of(opened.model)
+    edited = apply_edit(opened.model, edit)
+    if not is_edit:
+        return write_converted(opened.path, edited, out, start)
+    save_edit(out, edit)
+    return f"{out}: an edit that keeps {edited.num:,} of {opened.model.num:,} Gaussians; --edit {out} applies it"
 
 
 def _shares(text: str) -> tuple[float, float]:

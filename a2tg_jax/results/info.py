@@ -46,10 +46,9 @@ def describe_runs(runs: Sequence[RunFolder]) -> str:
     """Return a line for each run: its name, system, last model and disk use, or what is damaged."""
     rows = []
     for run in runs:
-        try:
-            facts = run_facts(run)
-        except ValueError as error:
-            rows.append((run.path.name, "", "", str(error)))
+        facts = facts_or_damage(run)
+        if "system" not in facts:
+            rows.append((run.path.name, "", "", facts["damage"]))
             continue
         last = facts["stages"][len(read_record(run).plan.main) - 1]
         rows.append((run.path.name, facts["system"], in_bytes(facts["disk_bytes"]), _stage_text(last)))

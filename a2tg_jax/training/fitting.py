@@ -33,7 +33,7 @@ class StageResult:
     model: Model
     """The Gaussians that exist, in the normalised world of the scene, with its cameras."""
     history: History
-    """What the stage logged."""
+    """Loss, PSNR and sizes that the stage logged."""
     seconds: float
     """Training time, compilation included."""
     num_regrown: int

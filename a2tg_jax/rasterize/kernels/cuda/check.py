@@ -102,7 +102,7 @@ def _inputs() -> tuple[PassSettings, tuple[Any, ...]]:
     normals, nothing = draw(-1, 1, 3), draw(0, 0, 0)
     splats = Splats(M, draw(0, 1, 3), draw(0.05, 0.6), normals, nothing)
     texels = draw(0.1, 0.9, 4, 4).reshape(-1, 4)
-    # Textures of one texel have a path of their own.
+    # The kernels read textures of one texel in another way than larger ones.
     sides: Any = 1 + np.arange(NUM, dtype=np.int32) % 2
     first: Any = 4 * np.arange(NUM, dtype=np.int32)
     regions = TextureRegion(first, sides, sides)
