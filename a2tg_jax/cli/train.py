@@ -128,7 +128,7 @@ class Train:
     config: Annotated[Path | None, arg(metavar="FILE")] = None
     """Configuration file (TOML), such as run.toml of another run. Flags take precedence over it."""
     baseline: bool = False
-    """Compare with gaussians-2d-mcmc, the same iterations without textures."""
+    """Compare with plain Gaussians, gaussians-2d-mcmc. With --memory-budget both get the same bytes."""
     resume: bool = False
     """Continue from the newest checkpoint in the run folder."""
     overwrite: bool = False

@@ -145,11 +145,15 @@ def chosen_system(name: str, preset: str | None = None) -> System:
 
 def compared_system(name: str, other: System, preset: str | None = None) -> System:
     """Return a system by name, with another's options where names match and its own preset's otherwise, if it has that
-    preset. Options set by an instance take precedence. Raises ValueError if there is no such system."""
+    preset. A system of one degree of spherical harmonics takes the other's first: plain Gaussians are strongest at
+    equal bytes with the degree that `bytewise` starts from. Options set by an instance take precedence. Raises
+    ValueError if there is no such system."""
     found = find_system(name)
     kind = type(found)
-    start = kind() if preset is None else kind.presets().get(preset, kind())
-    return changed_config(like(start, other), differences(found), name)
+    system = like(kind() if preset is None else kind.presets().get(preset, kind()), other)
+    if system.initial_sh_degree == system.sh_degree:
+        system = dataclasses.replace(system, sh_degree=other.initial_sh_degree)
+    return changed_config(system, differences(found), name)
 
 
 def scene_place(scene: str, folder: Path = Path()) -> str:
