@@ -178,7 +178,7 @@ def summary_table(result: RunResult, names: Sequence[str]) -> tuple[list[str], l
             ),
             "padding (MB)": megabytes(found.num_padding_bytes) if found.num_padding_bytes else "",
             "frames a second": f"{found.shown.frames_per_second:.1f}",
-            "training time": minutes(found.seconds),
+            "time of the stage": minutes(found.seconds),
         }
         for found in models
     ]

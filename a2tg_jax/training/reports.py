@@ -72,27 +72,24 @@ class Pace:
 
     def told(self, done: int) -> str | None:
         """Return a forecast if one is due and enough was timed since the last, or None."""
-        left, whole = self._left(done, RestOfRun()), self.left(done)
+        left = self.left(done)
         is_due = self._due and done >= self._due[0] and self._steps >= TIMED_STEPS and self._seconds >= TIMED_SECONDS
         if left is None or not is_due or done >= self._total:
             return None
         growing = "; more if Gaussians are added" if self._may_grow and len(self._due) > 1 else ""
+        compiling = f", with {counted(self._ahead, 'program')} to compile" if self._ahead else ""
         pace = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration"
         self._due = [due for due in self._due[1:] if due > done]
         self._steps, self._seconds = 0, 0.0
-        compiling = f"with {counted(self._ahead, 'program')} to compile" if self._ahead else "without compiling"
-        in_all = f"; about {whole} for the whole run" if self._after.iterations else ""
-        return f"{pace}, about {left} for the other {self._total - done:,}, {compiling}{growing}{in_all}"
+        return f"{pace}, about {left} left{compiling}{growing}"
 
     def left(self, done: int) -> datetime.timedelta | None:
         """Return the remaining time of the run, known compilations included; None before a step was timed."""
-        return self._left(done, self._after)
-
-    def _left(self, done: int, after: RestOfRun) -> datetime.timedelta | None:
         if self._steps == 0:
             return None
-        of_steps = (self._total - done + after.iterations) * self._seconds / self._steps
-        return datetime.timedelta(seconds=round(of_steps + (self._ahead + after.programs) * self._seconds_a_program))
+        of_steps = (self._total - done + self._after.iterations) * self._seconds / self._steps
+        programs = self._ahead + self._after.programs
+        return datetime.timedelta(seconds=round(of_steps + programs * self._seconds_a_program))
 
 
 class ProgressBar:
