@@ -55,7 +55,7 @@ def test_the_flags_of_commands_are_those_of_the_page():
 
 def test_options_beside_those_of_other_programs_exist():
     text = (DOCS / "coming-from.md").read_text(encoding="utf-8")
-    here = [row.rsplit("|", 2)[1] for row in re.findall(r"^\|.*\|$", text.partition("## Folders")[0], re.MULTILINE)]
+    here = [row.rsplit("|", 2)[1] for row in re.findall(r"^\|.*\|$", text.partition("## Cameras")[0], re.MULTILINE)]
     flags = {flag for cell in here for flag in re.findall(r"--[\w.-]+", cell) if flag.strip("-")}
     known = set(re.findall(r"`(--[\w.-]+)", (DOCS / "options.md").read_text(encoding="utf-8")))
     assert len(flags) > 20 and flags <= known
