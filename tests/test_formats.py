@@ -119,7 +119,7 @@ def test_a_damaged_file_is_one_clear_line(tmp_path):
     needs_gaussforge()
     for suffix in (".spz", ".sog"):
         (tmp_path / f"a{suffix}").write_bytes(b"nothing of the kind")
-        with pytest.raises(ValueError, match="gaussforge reports"):
+        with pytest.raises(ValueError, match=r"gaussforge reports|is damaged or no SOG file"):
             load_splats(tmp_path / f"a{suffix}")
 
 
@@ -194,6 +194,42 @@ def test_what_a_format_does_not_keep():
     assert format_of("a.compressed.ply").name != format_of("a.ply").name
     with pytest.raises(ValueError, match=r"known are \.npz"):
         format_of("a.xyz")
+
+
+def test_an_unknown_suffix_to_write_is_answered_with_those_that_can_be_written(tmp_path):
+    with pytest.raises(ValueError, match=r"known are \.npz(?!.*\.pt)"):
+        save_splats(tmp_path / "a.xyz", Model(some_gaussians()))
+
+
+def test_a_damaged_sog_is_refused_before_gaussforge_reads_it(tmp_path):
+    """It would crash, or return other numbers."""
+    needs_gaussforge()
+    path = tmp_path / "a.sog"
+    save_splats(path, small_scene())
+    data = path.read_bytes()
+    for place in (0, len(data) // 4, len(data) // 2, len(data) - 10):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 255]) + data[place + 1 :])
+        with pytest.raises(ValueError, match=r"a\.sog: is damaged"):
+            load_splats(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("other.txt", "")
+    with pytest.raises(ValueError, match=r"a\.sog: is not SOG: it has no meta\.json"):
+        load_splats(path)
+
+
+def test_libraries_print_nothing_on_the_standard_output(tmp_path, capfd):
+    needs_gaussforge()
+    save_splats(tmp_path / "a.spz", small_scene())
+    load_splats(tmp_path / "a.spz")
+    assert capfd.readouterr().out == ""
+
+
+@pytest.mark.parametrize("data", [b"", b"glXF\x02\xb0\xff", b"{"])
+def test_files_that_are_no_gltf_are_refused_in_plain_words(tmp_path, data):
+    path = tmp_path / "a.glb"
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.glb: is not glTF, or is damaged"):
+        load_splats(path)
 
 
 def test_convert_on_the_command_line(tmp_path, capsys):

@@ -255,6 +255,18 @@ def test_info_is_json_on_request(tmp_path, capsys):
     assert "a2tg-gaussians  3 Gaussians; 696 bytes; test 20.50 dB" in describe_run(run)
 
 
+def test_info_of_a_file_says_what_it_holds(tmp_path, capsys):
+    path = tmp_path / "a.ply"
+    a2tg.save_ply(path, a_model())
+    assert cli.main(["info", str(path)]) == 0
+    size = in_bytes(path.stat().st_size)
+    lines = [f"file     {path}, PLY, {size}", "model    3 Gaussians; 696 bytes; degree 3", "cameras  none"]
+    assert capsys.readouterr().out.splitlines() == lines
+    assert cli.main(["info", str(path), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["format"], facts["num_gaussians"], facts["num_bytes"], facts["num_cameras"]) == ("PLY", 3, 696, 0)
+
+
 def a_model():
     return a2tg.Model(init_from_points(np.eye(3), np.full((3, 3), 0.5)))
 

@@ -40,7 +40,7 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg convert runs/scene scene.sog    convert splats to and from PLY, SPZ, SOG, glTF and others
   a2tg edit runs/scene --out x.npz     crop, turn upright, remove floaters, without a browser
   a2tg compress runs/scene             write a small file of the trained model
-  a2tg info runs/scene                 print what a run folder holds
+  a2tg info runs/scene                 print what a run folder, or a file of splats, holds
   a2tg doctor                          print what this machine computes with, and test it
 
 Run a2tg COMMAND --help for a command, a2tg train --system NAME --help-all for the options of a system,

@@ -9,6 +9,7 @@ from tyro.conf import Positional, arg
 
 from a2tg_jax.cli.arguments import EditFile, FileWorld, LastModel, LpipsWeights, RunFolderPath, RunOrFile, defaulting_to
 from a2tg_jax.cli.train import open_browser, print_result
+from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import counted
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.compression import compress
@@ -37,7 +38,7 @@ from a2tg_jax.results.frames import (
     video_name,
     write_video,
 )
-from a2tg_jax.results.info import describe_run, describe_runs, facts_or_damage, run_facts
+from a2tg_jax.results.info import describe_file, describe_run, describe_runs, facts_or_damage, file_facts, run_facts
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import open_source
 from a2tg_jax.results.record import FinishOptions
@@ -449,19 +450,23 @@ class Compress:
 
 @dataclasses.dataclass(frozen=True)
 class Info:
-    """Print the scene, the progress of each stage, the models, metrics and disk use of a run, or a line for each
-    run in a folder.
+    """Print the scene, the progress of each stage, the models, metrics and disk use of a run, a line for each run in a
+    folder, or what a file of splats holds.
 
     Examples:
       a2tg info runs/fox --json
       a2tg info runs
+      a2tg info scene.sog
     """
 
-    folder: RunFolderPath
+    folder: RunOrFile
     json: bool = False
     """Print JSON, for programs."""
 
     def run(self) -> None:
+        if is_regular(self.folder):
+            print(json_text(file_facts(self.folder)) if self.json else describe_file(self.folder))
+            return
         runs = [] if RunFolder(self.folder).record.is_file() else runs_in(self.folder)
         if runs:
             print(json_text([facts_or_damage(run) for run in runs]) if self.json else describe_runs(runs))

@@ -85,20 +85,21 @@ FORMATS = {
 """Formats by suffix. If two match a name, the first is used."""
 
 
-def format_of(path: str | os.PathLike[str]) -> FileFormat:
-    """Return the format of a file by its suffix. ValueError: the suffix is unknown."""
+def format_of(path: str | os.PathLike[str], *, is_written: bool = False) -> FileFormat:
+    """Return the format of a file, to read or to be written, by its suffix. ValueError: the suffix is unknown."""
     # Not Path.suffix: .compressed.ply has two dots.
     name = Path(path).name.lower()
     for suffix, found in FORMATS.items():
         if name.endswith(suffix):
             return found
-    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix; known are {', '.join(FORMATS)}")
+    known = ", ".join(suffix for suffix, found in FORMATS.items() if not is_written or found.save is not None)
+    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix; known are {known}")
 
 
 def writer_of(path: str | os.PathLike[str]) -> Writer:
     """Return the function that writes a file, by its suffix, after importing what it needs. ValueError: the suffix is
     unknown, an optional library is missing, or the format is read-only."""
-    found = format_of(path)
+    found = format_of(path, is_written=True)
     if found.save is None:
         raise ValueError(f"{shortened(os.fspath(path))}: {found.name} files can be read, but not written")
     if found.import_library is not None:
@@ -126,7 +127,9 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
 
 
 def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "original") -> None:
-    """Write a model in the format of the suffix. Other programs' formats hold its Gaussians in the original world.
+    """Write a model in the format of the suffix, and replace a file of that name.
+
+    Other programs' formats hold its Gaussians in the original world.
 
     Args:
       path: the file.
@@ -141,7 +144,7 @@ def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "o
       >>> a2tg.load_splats("scene.splat").num
       200
     """
-    options = {} if format_of(path).keeps_origin else {"world": world}
+    options = {} if format_of(path, is_written=True).keeps_origin else {"world": world}
     writer_of(path)(Path(path), model, **options)
 
 

@@ -126,7 +126,10 @@ class Document:
         self.path = Path(path)
         data = existing_bytes(path, "glTF file")
         text, self._binary = _split_glb(data) if data[:4] == MAGIC else (data, None)
-        self.json = parse_json(text)
+        try:
+            self.json = parse_json(text)
+        except ValueError as error:
+            raise ValueError(f"is not glTF, or is damaged: {error}") from error
         if not isinstance(self.json, dict) or not isinstance(self.json.get("asset"), dict):
             raise ValueError("is not glTF")
         if (version := self.json["asset"].get("version")) != "2.0":

@@ -14,7 +14,6 @@ buckets. Its splats are in bucket order, full buckets first. Files are written a
 GaussianSplats3D reads.
 """
 
-import contextlib
 import dataclasses
 import importlib
 import io
@@ -22,6 +21,7 @@ import json
 import os
 import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.ply import OFFSET, ROTATION, turn_of
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.operating_system import printing_to_stderr
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.columns import morton
@@ -94,21 +95,29 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
       ValueError: if gaussforge is not installed or cannot read the file, or a number is not finite.
     """
     kind, path, data = _kind_of(path), Path(path), existing_bytes(path, "file")
-    header: dict[str, Any] = {}
-    if kind == "sog":
-        with (
-            contextlib.suppress(zipfile.BadZipFile, KeyError, ValueError, OSError, NotImplementedError, RuntimeError),
-            zipfile.ZipFile(io.BytesIO(data)) as archive,
-            archive.open(SOG_HEADER) as entry,
-        ):
-            found = json.loads(entry.read(MOST_HEADER_BYTES))
-            header = found if isinstance(found, dict) else {}
+    header = _sog_header(data, path) if kind == "sog" else {}
     converted = _converted(data, kind, "ply", path)
     gaussians = decode_ply(io.BytesIO(converted), path, is_flat=header.get("model") == SOG_FLAT).gaussians
     with reading(path):
         quat = np.array(header.get(ROTATION, (1, 0, 0, 0)), np.float64).reshape(4)
         origin = others.origin_at(np.array(header.get(OFFSET, (0, 0, 0)), np.float64).reshape(3), turn_of(quat))
     return Model(gaussians, origin=origin)
+
+
+def _sog_header(data: bytes, path: Path) -> dict[str, Any]:
+    """Return the header of a SOG file, a ZIP. ValueError: a checksum in it is wrong; gaussforge would not notice, and
+    crash or return other numbers."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            damaged = archive.testzip()
+            found = json.loads(archive.open(SOG_HEADER).read(MOST_HEADER_BYTES))
+    except KeyError:
+        raise ValueError(f"{path}: is not SOG: it has no {SOG_HEADER}") from None
+    except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, NotImplementedError, RuntimeError) as error:
+        raise ValueError(f"{path}: is damaged or no SOG file: {shortened(str(error))}") from error
+    if damaged is not None:
+        raise ValueError(f"{path}: is damaged: the checksum of {shortened(damaged)} in it is wrong")
+    return found if isinstance(found, dict) else {}
 
 
 def import_gaussforge(path: Path) -> Any:
@@ -126,7 +135,9 @@ def _kind_of(path: str | os.PathLike[str]) -> str:
 
 def _converted(data: bytes, before: str, after: str, path: Path) -> bytes:
     """Return the bytes of one format as another's."""
-    result = import_gaussforge(path).GaussForge().convert(data, before, after)
+    library = import_gaussforge(path)
+    with printing_to_stderr():
+        result = library.GaussForge().convert(data, before, after)
     converted: bytes = result.get("data", b"")
     if not converted:
         reason = shortened(str(result.get("error", "no splats in it")), 200)

@@ -1,4 +1,4 @@
-"""Summary of a run folder in a few lines of text."""
+"""Summary of a run folder, or of a file of splats, in a few lines of text."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,9 @@ import numpy as np
 
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import in_bytes
+from a2tg_jax.io.formats import file_bytes, format_of, load_splats
 from a2tg_jax.io.model_file import load_model
+from a2tg_jax.model import Model
 from a2tg_jax.results.folder import RunFolder, iteration_of, old_run, read_json, resuming_command
 from a2tg_jax.results.record import is_finished, read_record, repeating_command
 
@@ -40,6 +42,33 @@ def describe_run(run: RunFolder) -> str:
     if old is not None:
         lines.append(f"replaces a run that is kept in {old.path} until this one has its report")
     return "\n".join(lines)
+
+
+def file_facts(path: Path) -> dict[str, Any]:
+    """Return what a file of splats holds as JSON values. Raises as `load_splats`."""
+    model = load_splats(path)
+    return {
+        "path": str(path),
+        "format": format_of(path).name,
+        "file_bytes": file_bytes(path),
+        "appearance": type(model.appearance).__name__,
+        "sh_degree": model.gaussians.sh_degree,
+        **model_facts(model),
+        "num_cameras": 0 if model.origin is None else len(model.origin.cameras),
+    }
+
+
+def describe_file(path: Path) -> str:
+    """Return what a file of splats holds as text. Raises as `load_splats`."""
+    facts = file_facts(path)
+    degree = "" if "degrees" in facts else f"; degree {facts['sh_degree']}"
+    shown = "" if facts["appearance"] == "Appearance" else f", {facts['appearance']}"
+    cameras = facts["num_cameras"]
+    return "\n".join([
+        f"file     {path}, {facts['format']}, {in_bytes(facts['file_bytes'])}",
+        f"model    {_counts_text(facts)}{degree}{shown}",
+        f"cameras  {cameras or 'none'}",
+    ])  # fmt: skip
 
 
 def describe_runs(runs: Sequence[RunFolder]) -> str:
@@ -122,7 +151,12 @@ def _stage_facts(run: RunFolder, name: str) -> dict[str, Any]:
     # A damaged file must not hide the other stages.
     except ValueError as error:
         return {"state": "damaged", "damage": str(error)}
-    facts = {"state": "finished", "model": str(path), "num_gaussians": model.num, "num_bytes": model.num_bytes}
+    return {"state": "finished", "model": str(path), **model_facts(model)}
+
+
+def model_facts(model: Model) -> dict[str, Any]:
+    """Return the numbers of Gaussians and bytes of a model, of its degrees, and of its textures by size."""
+    facts: dict[str, Any] = {"num_gaussians": model.num, "num_bytes": model.num_bytes}
     if model.appearance.bands is not None:
         facts["degrees"] = np.bincount(model.degrees).tolist()
     if model.textures is not None:
@@ -138,10 +172,16 @@ def _stage_text(stage: Mapping[str, Any]) -> str:
         case "damaged":
             return f"damaged: {stage['damage']}; delete it, and a2tg train --resume trains the stage again"
         case "finished":
-            parts = [f"{stage['num_gaussians']:,} Gaussians", in_bytes(stage["num_bytes"])]
-            counts = {"degrees": dict(enumerate(stage.get("degrees", ()))), "textures": stage.get("textures", {})}
-            for noun, found in counts.items():
-                if found:
-                    parts.append(f"{noun} " + ", ".join(f"{kind}: {num:,}" for kind, num in found.items()))
-            return "; ".join([*parts, *(f"{split} {psnr:.2f} dB" for split, psnr in (stage["psnr"] or {}).items())])
+            psnrs = [f"{split} {psnr:.2f} dB" for split, psnr in (stage["psnr"] or {}).items()]
+            return "; ".join([_counts_text(stage), *psnrs])
     return str(stage["state"])
+
+
+def _counts_text(facts: Mapping[str, Any]) -> str:
+    """Return the numbers of `model_facts` as text."""
+    parts = [f"{facts['num_gaussians']:,} Gaussians", in_bytes(facts["num_bytes"])]
+    counts = {"degrees": dict(enumerate(facts.get("degrees", ()))), "textures": facts.get("textures", {})}
+    for noun, found in counts.items():
+        if found:
+            parts.append(f"{noun} " + ", ".join(f"{kind}: {num:,}" for kind, num in found.items()))
+    return "; ".join(parts)

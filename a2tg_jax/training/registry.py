@@ -51,6 +51,8 @@ def find_system(reference: str) -> System:
         kind = "" if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: "
         near = did_you_mean(attribute, vars(sys.modules[path]) if path in sys.modules else {})
         reason = shortened(f"{kind}{error}", LONGEST_REASON)
+        if isinstance(error, ModuleNotFoundError) and path.partition(".")[0] == str(error.name).partition(".")[0]:
+            reason += ": install it, add its folder to PYTHONPATH, or start in that folder"
         raise ValueError(f"the system {name} cannot be imported: {reason}{near}") from error
     if isinstance(found, type) and issubclass(found, System):
         try:

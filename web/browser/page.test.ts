@@ -129,7 +129,9 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     await page.selectOption("#mode", "normals");
     await page.waitForFunction(() => location.hash.includes("mode=normals"));
     const hash = new URL(page.url()).hash;
-    const other = await opened(hash);
+    const other = await opened(`${hash}&panel=no`);
+    expect(await page.isVisible("#panel")).toBe(true);
+    expect(await other.page.isVisible("#panel")).toBe(false);
     const [here, there] = [await poseOn(page), await poseOn(other.page)];
     expectClose(there.position, here.position, 4);
     expect(await other.page.inputValue("#mode")).toBe("normals");

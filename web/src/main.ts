@@ -101,6 +101,10 @@ async function findPhotographs(panel: Panel): Promise<void> {
 }
 
 function begin(): void {
+  // For pages that embed this one.
+  if (new URLSearchParams(location.hash.slice(1)).get("panel") === "no") {
+    for (const id of ["panel", "hint"]) element(id, HTMLElement).hidden = true;
+  }
   const viewer = new Viewer(element("view", HTMLCanvasElement));
   const panel = new Panel(viewer);
   viewer.onFail = (reason) => {
