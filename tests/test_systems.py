@@ -316,7 +316,7 @@ def test_impossible_options_are_refused(changes, message):
 def test_unknown_systems_are_named():
     with pytest.raises(ValueError, match="there is no system 'nerf'; the systems are a2tg"):
         a2tg.find_system("nerf")
-    with pytest.raises(ValueError, match="cannot be imported: .*: install it, add its folder to PYTHONPATH, or start"):
+    with pytest.raises(ValueError, match=r"cannot be imported: .*: install it, add its folder to PYTHONPATH, or start"):
         a2tg.find_system("no_such_module:X")
     with pytest.raises(ValueError, match="is no system"):
         a2tg.find_system("toy_system:Rings")
