@@ -122,6 +122,7 @@ def test_a_mistyped_command_is_one_line_and_imports_no_jax():
     ("words", "found"),
     [
         ("train x --dwnscale 4", "a2tg train has no option --dwnscale; did you mean --downscale?"),
+        ("export x --sog y", "a2tg export has no option --sog: a2tg convert writes such files, by the suffix of OUT"),
         ("render x --zz=1", "a2tg render has no option --zz; a2tg render --help lists them"),
         ("train x --max_memory 1GB --no-baseline --texture.no-anisotropic --help-all", None),
         ("train x --system own:Own --strength 2", None),

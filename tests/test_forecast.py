@@ -318,7 +318,7 @@ def pace_of(seconds, **options) -> Pace:
 
 
 def test_the_pace_is_reported_once_when_enough_was_timed():
-    pace = pace_of([10.0, 10.5, 12.5, 13.0, 30.0, 31.0, 41.0])
+    pace = pace_of([10.0, 10.5, 12.5, 13.0, 30.0, 31.0, 41.0], most_gaussians=9_000)
 
     def told(done, num_compiled=1):
         pace.time(done, num_compiled)
@@ -326,7 +326,7 @@ def test_the_pace_is_reported_once_when_enough_was_timed():
 
     assert told(10) is None  # The steps of the compilation.
     assert told(20) is None
-    growing = "; more if Gaussians are added"
+    growing = "; more as Gaussians are added, up to 9,000"
     assert told(60) == f"50 ms an iteration, about 0:00:47 left{growing}"
     assert told(70) is None
     assert told(80, num_compiled=2) is None and told(90, num_compiled=2) is None
@@ -342,7 +342,7 @@ def test_the_pace_is_reported_once_when_enough_was_timed():
 )
 def test_the_pace_counts_the_programs_ahead(seconds, dones, programs, expected):
     """950 iterations of 50 ms, and 39 programs of 10 s; without growth, growth is not mentioned."""
-    pace = pace_of(seconds, may_grow=False)
+    pace = pace_of(seconds)
     for done in dones:
         pace.time(done, 1, *programs)
     told = pace.told(dones[-1])
@@ -359,6 +359,9 @@ def test_what_would_show_little_is_asked_about(monkeypatch, capsys):
     assert re.match(r"`downscale` 40 leaves photographs of 80×60 pixels, .*: `downscale` 5 makes", photographs)
     with pytest.raises(ValueError, match=r"has room .*; `downscale` 40 .*; to train all the same, add `yes`"):
         ask([budget, photographs])
+    huge = dataclasses.replace(record, options=a2tg.Bytewise(memory_budget="100MB"), scene=SceneSource("fox"))
+    found = "has room for 1,785,714 Gaussians, but the photographs have 115,200 pixels: 0.65 MB is a Gaussian for ten"
+    assert doubts_about(scene, huge) == [f"memory_budget {found}"]
     for stream in (sys.stdin, sys.stderr):
         monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(sys.stdin, "readline", iter(["Y\n", "\n"]).__next__, raising=False)
@@ -370,7 +373,7 @@ def test_what_would_show_little_is_asked_about(monkeypatch, capsys):
 
 
 def test_the_pace_counts_what_follows_the_stage():
-    pace = pace_of([10.0, 12.0], may_grow=False, after=RestOfRun(400, 3))
+    pace = pace_of([10.0, 12.0], after=RestOfRun(400, 3))
     for done in (10, 50):
         pace.time(done, 1, 0, 5.0)
     assert pace.left(50).total_seconds() == 82  # 1,350 iterations of 50 ms, and 3 programs of 5 s.

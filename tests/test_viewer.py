@@ -303,7 +303,7 @@ def test_a_folder_and_a_single_file(tmp_path):
     scene = synthetic_scene(num_views=4, width=24, height=16, num_points=20)
     source = Source(dataclasses.replace(textured(), origin=origin_of_scene(scene)), "a")
     text, page = export_web(source, tmp_path / "site"), tmp_path / "site" / "index.html"
-    assert page.read_text(encoding="utf-8") == viewer_html()
+    assert page.read_text(encoding="utf-8") == viewer_html(is_exported=True) != viewer_html()
     scene = (tmp_path / "site" / "scene.a2tgz").read_bytes()
     assert f"whose scene takes {in_bytes(len(scene))}, " in text and "dB of PSNR lost, for a model of 30 dB" in text
     assert unframed(scene)[0]["num"] == source.model.num
@@ -323,16 +323,14 @@ def test_a_folder_and_a_single_file(tmp_path):
 
 def test_a_page_compares_two_models_of_one_scene(tmp_path):
     """Its frames hold both pages as they are, and titles are text."""
-    sources = [Source(textured(), "<b>a</b>", path=tmp_path / name / "models" / "m.npz") for name in "xy"]
     page = tmp_path / "c.html"
-    files = [
-        dataclasses.replace(source, path=tmp_path / name / "m.npz") for source, name in zip(sources, "xy", strict=True)
-    ]
-    for given in (files, sources):
-        assert "x · <b>a</b> against y · <b>a</b>" in export_comparison(given, page, overwrite=True)
+    files = [Source(textured(), "a", path=tmp_path / name / "m.npz") for name in "xy"]
+    assert f"{files[0].path} against {files[1].path}" in export_comparison(files, page)
+    sources = [Source(textured(), "a", path=tmp_path / name / "models" / "<b>.npz") for name in "xy"]
+    assert "x · <b> against y · <b>" in export_comparison(sources, page, overwrite=True)
     text = page.read_text(encoding="utf-8")
     frames = re.findall(r'<iframe title="([^"]*)" srcdoc="([^"]*)">', text)
-    assert [html.unescape(title) for title, _ in frames] == ["x · <b>a</b>", "y · <b>a</b>"] and "<b>" not in text
+    assert [html.unescape(title) for title, _ in frames] == ["x · <b>", "y · <b>"] and "<b>" not in text
     wanted = [viewer_html_with(source.encoded) for source in sources]
     assert [html.unescape(inside) for _, inside in frames] == wanted
     with pytest.raises(FileExistsError, match="add `overwrite`"):

@@ -54,6 +54,8 @@ COMMANDS = {
     "sfm": "inputs:Sfm", "download": "inputs:Download", "doctor": "doctor:Doctor",
 }  # fmt: skip
 """Module of `a2tg_jax.cli` and dataclass of each command."""
+CONVERTED = ("sog", "spz", "splat", "ksplat", "glb", "gltf", "usdz", "usda", "usdc", "npz", "a2tgz")
+"""Suffixes that are taken for flags of export."""
 SMALLER = {
     "train": "close other programs, or give a larger --downscale, or a smaller --memory-budget or --batch-size",
     "render": "lower --size or --supersample",
@@ -137,6 +139,8 @@ def _misspelt_flag(name: str, arguments: Sequence[str]) -> str | None:
             # Of a group first, such as densify.cap for cap.
             within = sorted(each for each in known if each.endswith(f".{flag}"))
             near = f"; did you mean {' or '.join(within)}?" if within else did_you_mean(flag, known)
+            if name == "export" and flag in CONVERTED:
+                return f"a2tg export has no option --{flag}: a2tg convert writes such files, by the suffix of OUT"
             hint = re.sub(r"(mean|or) ", r"\1 --", near) if near else f"; a2tg {name} --help lists them"
             return f"a2tg {name} has no option --{flag}{hint}"
     return None

@@ -273,6 +273,8 @@ class Export:
     """Write one HTML file, whatever its name."""
     photographs: bool = False
     """Add the photographs of the run's cameras to the page."""
+    title: str | None = None
+    """Title of the page, instead of the names of scene and model."""
     model: LastModel = None
     edit: EditFile = None
     overwrite: bool = False
@@ -281,9 +283,9 @@ class Export:
     def run(self) -> None:
         if self.web is None and (self.ply is None or self.single_file or self.photographs):
             raise ValueError("give --web PATH for a page, or --ply FILE for other programs")
-        for name in ("float64", "world"):
-            if getattr(self, name) != getattr(Export, name) and self.ply is None:
-                raise ValueError(f"--{name} has no effect without --ply: add it")
+        for name, other in (("float64", "ply"), ("world", "ply"), ("title", "web")):
+            if getattr(self, name) != getattr(Export, name) and getattr(self, other) is None:
+                raise ValueError(f"--{name} has no effect without --{other}: add it")
         # All outputs are checked before the first one is written.
         if self.ply is not None:
             check_output(self.ply)
@@ -299,7 +301,8 @@ class Export:
             check_not_source(files, self.source, "--web")
         source = open_source(self.source, self.model, self.edit)
         if self.web is not None:
-            print(export_web(source, self.web, **page))
+            titled = source if self.title is None else dataclasses.replace(source, title=self.title)
+            print(export_web(titled, self.web, **page))
         if self.ply is not None:
             print(export_ply(source, self.ply, float64=self.float64, world=self.world))
 

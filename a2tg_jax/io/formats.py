@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gltf import load_gltf, save_gltf
 from a2tg_jax.io.gltf_container import buffer_files
@@ -93,7 +93,8 @@ def format_of(path: str | os.PathLike[str], *, is_written: bool = False) -> File
         if name.endswith(suffix):
             return found
     known = ", ".join(suffix for suffix, found in FORMATS.items() if not is_written or found.save is not None)
-    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix; known are {known}")
+    near = did_you_mean(Path(name).suffix, FORMATS)
+    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix{near or ';'} known are {known}")
 
 
 def writer_of(path: str | os.PathLike[str]) -> Writer:

@@ -79,7 +79,8 @@ def _shares(text: str) -> tuple[float, float]:
     low, high = map(float, found.groups()) if found else (1.0, 0.0)
     if not 0 <= low < high <= 100:
         raise ValueError(
-            f"`crop` must be LOW:HIGH, percentages from 0 to 100, for width, depth and height; got {text!r}"
+            "`crop` must be LOW:HIGH for width, depth and height, percentages from 0 to 100, LOW below HIGH; got "
+            f"{text!r}"
         )
     return low / 100, high / 100
 

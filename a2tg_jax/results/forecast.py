@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax
 
-from a2tg_jax.core.budget import bytes_of, megabytes_of
+from a2tg_jax.core.budget import MEGABYTE, bytes_of, megabytes_of
 from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
@@ -205,11 +205,18 @@ def print_forecast(
 
 
 def doubts_about(scene: Scene, record: RunRecord) -> list[str]:
-    """Return why a run would show little, with better values: a small memory budget, or a downscale that leaves few
-    pixels."""
+    """Return why a run would show little or take long, with better values: a small or huge memory budget, or a
+    downscale that leaves few pixels."""
     found, downscale = [], record.scene.downscale
     if record.options.small_budget:
         found.append(f"{record.options.small_budget}; it is in bytes of the model in memory")
+    pixels, budget = sum(view.camera.width * view.camera.height for view in scene.train), record.options.budget_bytes
+    one = record.options.initial_bytes
+    if record.scene.path != SYNTHETIC and budget is not None and budget > pixels * one:
+        found.append(
+            f"memory_budget has room for {budget / one:,.0f} Gaussians, but the photographs have {pixels:,} pixels: "
+            f"{0.1 * pixels * one / MEGABYTE:.2g} MB is a Gaussian for ten"
+        )
     size = max(((view.camera.width, view.camera.height) for view in scene.train), key=max)
     # The built-in scene is drawn as small as tests need it.
     if record.scene.path != SYNTHETIC and downscale > 1 and max(size) < SMALL_SIDE:

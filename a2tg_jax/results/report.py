@@ -5,6 +5,7 @@ import dataclasses
 import hashlib
 import inspect
 import platform
+import shlex
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -368,6 +369,9 @@ def write_report(
         versions=versions(),
         commit=source_commit(),
         command=repeating_command(run),
+        final=shlex.join(
+            ["a2tg", "train", "--config", str(run.record), "--test-every", "0", "--out", f"{run.path}-final"]
+        ),
         record=read_regular(run.record, MOST_TOML_BYTES).decode() if is_regular(run.record) else "",
     )
     with replacing(run.own(run.report)) as temporary:

@@ -237,7 +237,7 @@ def export_web(
                 raise ValueError("there are no photographs of the model's cameras: leave out `photographs`")
             files |= {out / photograph_name(index): found.jpeg(index) or b"" for index in views}
         files[out / PHOTOGRAPHS_NAME] = json.dumps(views).encode()
-        files[page] = viewer_html().encode()  # Last, so that the page never refers to missing files.
+        files[page] = viewer_html(is_exported=True).encode()  # Last, so that the page never refers to missing files.
         for path in files:
             check_new(path, "`web`", overwrite=overwrite)
         with contextlib.suppress(OSError, ValueError, TypeError):  # There may be no page.
@@ -271,16 +271,19 @@ def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool =
     one, other = (matrix_of((source.model.origin or Origin.of_cameras([])).transform) for source in sources)
     if not np.allclose(one, other, rtol=1e-6, atol=1e-4):
         raise ValueError(f"{first.title} and {second.title} are in different worlds: give models of one scene")
-    titles = [source.title for source in sources]
+    titles = [_place_of(source.path) for source in sources]
     if titles[0] == titles[1]:
-        folders = [source.path.parent for source in sources]
-        folders = [folder.parent if folder.name == "models" else folder for folder in folders]
-        titles = [f"{folder.name or folder} · {title}" for folder, title in zip(folders, titles, strict=True)]
+        titles = [str(source.path) for source in sources]
     scenes = [(title, source.encoded) for title, source in zip(titles, sources, strict=True)]
     page = comparison_html(*scenes).encode()
     with replacing(out) as temporary:
         temporary.write_bytes(page)
     return f"{out}: {in_bytes(len(page))}, {' against '.join(titles)}"
+
+
+def _place_of(path: Path) -> str:
+    """Return the run and the model of a run's file, or the name of another file."""
+    return f"{path.parent.parent.name} · {path.stem}" if path.parent.name == "models" else path.name
 
 
 def losses_of(source: Source) -> dict[str, float]:

@@ -271,9 +271,9 @@ class StageRun:
         self.effects.warn_of_never()
         # Several processes launch the same steps, and stop together.
         stops_launching = is_stopped if num_processes(self.mesh) == 1 else never
-        may_grow = any(event.most_gaussians is not None for event in self.stage.events)
+        most = max((event.most_gaussians or 0 for event in self.stage.events), default=0)
         shown = title or self.stage.name
-        bar = ProgressBar(shown, iteration, end, is_shown=progress, may_grow=may_grow, after=after)
+        bar = ProgressBar(shown, iteration, end, is_shown=progress, most_gaussians=most, after=after)
         with contextlib.closing(self.photographs), bar:
             while iteration < end:
                 # Python acts next after `launched` steps, an event, or a checkpoint.

@@ -48,11 +48,12 @@ class Pace:
     """Time of an iteration, and forecasts of a stage's duration: early, and at a half."""
 
     def __init__(
-        self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, may_grow: bool = True,
+        self, first: int, total: int, now: Callable[[], float] = time.perf_counter, *, most_gaussians: int = 0,
         after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
     ):  # fmt: skip
-        """`first` iterations were done before, `total` is the last one, and `now` is a clock in seconds."""
-        self._total, self._now, self._may_grow, self._after = total, now, may_grow, after
+        """`first` iterations were done before, `total` is the last one, and `now` is a clock in seconds. Gaussians grow
+        to at most `most_gaussians`; 0: they do not."""
+        self._total, self._now, self._most, self._after = total, now, most_gaussians, after
         self._due = [first, (first + total) // 2]
         self._before: tuple[int, float, int] | None = None
         self._steps, self._seconds = 0, 0.0
@@ -76,7 +77,7 @@ class Pace:
         is_due = self._due and done >= self._due[0] and self._steps >= TIMED_STEPS and self._seconds >= TIMED_SECONDS
         if left is None or not is_due or done >= self._total:
             return None
-        growing = "; more if Gaussians are added" if self._may_grow and len(self._due) > 1 else ""
+        growing = f"; more as Gaussians are added, up to {self._most:,}" if self._most and len(self._due) > 1 else ""
         compiling = f", with {counted(self._ahead, 'program')} to compile" if self._ahead else ""
         pace = f"{1e3 * self._seconds / self._steps:,.0f} ms an iteration"
         self._due = [due for due in self._due[1:] if due > done]
@@ -96,7 +97,7 @@ class ProgressBar:
     """A line with loss, PSNR, live Gaussians, memory and time left; a line for every tenth without a terminal."""
 
     def __init__(
-        self, title: str, done: int, total: int, *, is_shown: bool, may_grow: bool = True,
+        self, title: str, done: int, total: int, *, is_shown: bool, most_gaussians: int = 0,
         after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
     ):  # fmt: skip
         is_bar = is_shown and has_terminal()
@@ -105,7 +106,7 @@ class ProgressBar:
             dynamic_ncols=True, mininterval=0.5, bar_format=BAR,
         )  # fmt: skip
         self._title, self._done, self._total = title, done, total
-        self._pace = Pace(done, total, may_grow=may_grow, after=after)
+        self._pace = Pace(done, total, most_gaussians=most_gaussians, after=after)
         self._is_shown, self._is_plain = is_shown, is_shown and not is_bar
         self._last_line = done, time.perf_counter()
         self._loss: float | None = None

@@ -13,9 +13,11 @@ STATUS_NAME = "training.json"
 """Name of the status of a running training, which the page polls while it exists."""
 
 
-def viewer_html(*, is_training: bool = False) -> str:
-    """Return the viewer's page for the scene next to it, or for a running training."""
+def viewer_html(*, is_training: bool = False, is_exported: bool = False) -> str:
+    """Return the viewer's page for the scene next to it, or for a running training; exported, with its panel folded."""
     page = resources.files(__package__).joinpath("viewer.html").read_text(encoding="utf-8")
+    if is_exported:
+        page = page.replace('<details id="panel" open>', '<details id="panel">', 1)
     # An attribute, not a script: the page's policy allows no other script than its own.
     return page.replace("<html ", '<html data-training="yes" ', 1) if is_training else page
 
@@ -24,7 +26,7 @@ def viewer_html_with(scene: bytes) -> str:
     """Return the viewer's page with a scene in it; it needs no other file."""
     # text/plain, which browsers do not run, so that the page's policy stays as it is; before the script.
     data = f'<script type="text/plain" id="scene-data">{base64.b64encode(scene).decode("ascii")}</script>\n  '
-    head, script, rest = viewer_html().partition('<script type="module">')
+    head, script, rest = viewer_html(is_exported=True).partition('<script type="module">')
     return f"{head}{data}{script}{rest}"
 
 
