@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import ExifTags, Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 
 from a2tg_jax.core.notebook_display import enlarged
 from a2tg_jax.host.atomic import replacing
@@ -54,13 +54,17 @@ def error_picture(image: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def largest_gain(target: np.ndarray, before: np.ndarray, after: np.ndarray) -> tuple[slice, slice]:
-    """Return the square, a quarter of the shorter side, where the squared error falls most from `before` to `after`.
+    """Return the square, a quarter of the shorter side, where details gain most from `before` to `after`.
 
+    The gain is in the squared error without its low frequencies, for a shift in colour on a wall shows nothing.
     Squares whose error stays above the picture's mean are left out, unless all are.
     """
     height, width = target.shape[:2]
     side = max(8, min(height, width) // 4)
-    errors = [np.sum((image.astype(np.float32) - target) ** 2, axis=-1) for image in (before, after)]
+    errors = []
+    for image in (before, after):
+        residual = image.astype(np.float32) - target
+        errors.append(np.sum((residual - gaussian_filter(residual, (side / 8, side / 8, 0))) ** 2, axis=-1))
 
     def in_squares(error: np.ndarray) -> np.ndarray:
         # The origin shifts each window so that its pixel is the upper left corner, not the centre.

@@ -241,7 +241,7 @@ def photographs_line(result: RunResult) -> str:
     if held_out not in main.splits:
         return ""
     train, test = main.train.psnr, main.splits[held_out].psnr
-    few = "few photographs: stay near where you stood, or take more"
+    few = "few photographs; stay near where you stood, or take more"
     found = few if train - test >= FEW_PHOTOGRAPHS else "views between the photographs are about as good"
     return f"{train:.1f} dB on training views, {test:.1f} held out: {found}"
 

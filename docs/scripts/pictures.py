@@ -138,10 +138,11 @@ def find_chromium() -> str | None:
 
 
 def picture_of_viewer(source: Source, chromium: str, window: tuple[int, int] = WINDOW) -> Image.Image:
-    """Draw the viewer's page as it opens, without a graphics processor."""
+    """Draw the viewer's page with its panel unfolded, without a graphics processor."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         page = pathlib.Path(folder) / "scene.html"
-        page.write_text(viewer_html_with(source.encoded), encoding="utf-8")
+        text = viewer_html_with(source.encoded).replace('<details id="panel">', '<details id="panel" open>', 1)
+        page.write_text(text, encoding="utf-8")
         options = ["--headless", "--no-sandbox", "--no-first-run", "--remote-debugging-pipe",
                    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", f"--user-data-dir={folder}/profile",
                    "about:blank"]  # fmt: skip
