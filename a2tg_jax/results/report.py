@@ -336,7 +336,8 @@ def write_report(
         policy, inlined[name] = f"{policy}; {name}-src 'sha256-{digest}'", Markup(text)
     main, held_out = result.models[result.main], result.record.scene.held_out
     # The main model comes first, where a phone shows it.
-    names = sorted(result.models, key=lambda name: name != result.main)
+    own = [result.main, *reversed(result.record.plan.main)]  # The last stage first, and compared systems last.
+    names = sorted(result.models, key=lambda name: own.index(name) if name in own else len(own))
     titles, rows = summary_table(result, names)
     best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
