@@ -335,9 +335,9 @@ def write_report(
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         policy, inlined[name] = f"{policy}; {name}-src 'sha256-{digest}'", Markup(text)
     main, held_out = result.models[result.main], result.record.scene.held_out
-    # The main model comes first, where a phone shows it.
-    own = [result.main, *reversed(result.record.plan.main)]  # The last stage first, and compared systems last.
-    names = sorted(result.models, key=lambda name: own.index(name) if name in own else len(own))
+    # The main model comes first, where a phone shows it, then its earlier stages, and compared systems last.
+    order = [result.main, *reversed(result.plan.main)]
+    names = sorted(result.models, key=lambda name: order.index(name) if name in order else len(order))
     titles, rows = summary_table(result, names)
     best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
