@@ -215,7 +215,7 @@ def doubts_about(scene: Scene, record: RunRecord) -> list[str]:
     if record.scene.path != SYNTHETIC and budget is not None and budget > pixels * one:
         found.append(
             f"memory_budget has room for {budget / one:,.0f} Gaussians, but the photographs have {pixels:,} pixels: "
-            f"{0.1 * pixels * one / MEGABYTE:.2g} MB is a Gaussian for ten"
+            f"{0.1 * pixels * one / MEGABYTE:.2g} MB holds one for ten of them"
         )
     size = max(((view.camera.width, view.camera.height) for view in scene.train), key=max)
     # The built-in scene is drawn as small as tests need it.
