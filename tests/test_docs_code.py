@@ -82,7 +82,8 @@ def test_library_runs(monkeypatch, tmp_path):
     monkeypatch.setattr(a2tg, "fit", untrained)
     fewer = {"cameras, 200):": "cameras, 2):", "iterations=1000": "iterations=2", "Pool(2)": "Pool(1)"}
     names = run("library", {"__name__": "library"}, fewer)
-    assert {path.name for path in tmp_path.iterdir()} == {"scene.npz", "scene.a2tgz"}
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.npz", "scene.a2tgz", "scene.ply"}
+    np.testing.assert_allclose(names["aligned"].gaussians.means, names["model"].gaussians.means, atol=1e-4)
     assert names["found"].psnr > 3
     assert [output.color.shape for output in names["renders"]] == [(48, 64, 3)] * 2
     with pytest.raises(TypeError):
