@@ -74,13 +74,15 @@ def test_floaters_are_what_floats_not_what_is_faint():
 
 
 def test_scores_of_few_or_equal_gaussians():
-    """Without cameras the one far away floats."""
+    """Without cameras the one far away floats, and its copies as well."""
     nothing = (np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), np.zeros((0, 2)))
     assert floater_scores(np.zeros((1, 3)), np.zeros((1, 2)), *nothing).tolist() == [0]
     assert floater_scores(np.zeros((30, 3)), np.full((30, 2), -9.0), *nothing).max() == 0
     cloud = np.concatenate([np.random.default_rng(0).uniform(size=(200, 3)), [[9.0, 9.0, 9.0]]])
-    scores = floater_scores(cloud, np.full((201, 2), -5.0), *nothing)
-    assert scores[-1] == 255 > 4 * np.median(scores)
+    for copies in (1, 20):
+        means = np.concatenate([cloud, np.repeat(cloud[-1:], copies - 1, axis=0)])
+        scores = floater_scores(means, np.full((len(means), 2), -5.0), *nothing)
+        assert scores[200:].min() == 255 > 4 * np.median(scores[:200])
 
 
 def test_the_viewers_file_has_the_same_scores_and_the_vertical():

@@ -33,13 +33,15 @@ def floater_scores(
       log_scales: [N, 2].
       viewmats, Ks, sizes: [V, 4, 4], [V, 3, 3] and [V, 2] of the cameras; without cameras only gaps count.
     """
-    if len(means) < 2:
-        return np.zeros(len(means), np.uint8)
     means, few = np.asarray(means, np.float64), slice(None, None, -(-len(viewmats) // MOST_CAMERAS) or 1)
-    distances, ids = cKDTree(means).query(means, k=min(NUM_NEIGHBOURS, len(means) - 1) + 1)
+    # A tree does not divide copies at one place, and would compare each with all; nor are they company.
+    places, first, place_of = np.unique(means, axis=0, return_index=True, return_inverse=True)
+    if len(places) < 2:
+        return np.zeros(len(means), np.uint8)
+    distances, ids = cKDTree(places).query(places, k=min(NUM_NEIGHBOURS, len(places) - 1) + 1)
     # A gap ends where the neighbour begins; the own size does not fill it, since floaters are large.
-    reach = np.exp(np.asarray(log_scales, np.float64).mean(axis=1))
-    gaps = np.maximum(distances - reach[ids], 0.1 * distances)[:, 1:].mean(axis=1)
+    reach = np.exp(np.asarray(log_scales, np.float64).mean(axis=1))[first]
+    gaps = np.maximum(distances - reach[ids], 0.1 * distances)[:, 1:].mean(axis=1)[place_of.ravel()]
     if not len(viewmats):
         return _bytes_of(_octaves_over_median(gaps))
     num_views, front = np.zeros(len(means)), np.zeros(len(means))
