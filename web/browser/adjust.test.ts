@@ -154,7 +154,8 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
         return [(viewer?.image.fx ?? NaN) / (viewer?.image.width ?? NaN), viewer?.exposure];
       });
     expectClose((await stateOf(page)).map(Number), [0.5, 1]);
-    expect(await page.textContent("#angle-value")).toBe("90°");
+    // The text follows with the next frame.
+    await page.waitForFunction(() => document.getElementById("angle-value")?.textContent === "90°");
     await page.waitForFunction(() => location.hash.includes("&exposure=1"));
     const other = await opened(DESK, new URL(page.url()).hash);
     expectClose((await stateOf(other)).map(Number), [0.5, 1]);
