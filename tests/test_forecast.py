@@ -360,10 +360,10 @@ def test_what_would_show_little_is_asked_about(monkeypatch, capsys):
     with pytest.raises(ValueError, match=r"has room .*; `downscale` 40 .*; to train all the same, add `yes`"):
         ask([budget, photographs])
     huge = dataclasses.replace(record, options=a2tg.Bytewise(memory_budget="100MB"), scene=SceneSource("fox"))
-    found = (
-        "has room for 1,785,714 Gaussians, but the photographs have 115,200 pixels: 0.65 MB holds one for ten of them"
-    )
-    assert doubts_about(scene, huge) == [f"memory_budget {found}"]
+    assert doubts_about(scene, huge) == [
+        "`memory_budget` has room for more Gaussians (1,785,714) than the photographs have pixels (115,200): 645kB "
+        "holds one for ten pixels"
+    ]
     for stream in (sys.stdin, sys.stderr):
         monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(sys.stdin, "readline", iter(["Y\n", "\n"]).__next__, raising=False)

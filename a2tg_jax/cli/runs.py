@@ -470,6 +470,8 @@ class Info:
         if is_regular(self.folder):
             print(json_text(file_facts(self.folder)) if self.json else describe_file(self.folder))
             return
+        if not self.folder.exists():
+            raise FileNotFoundError(f"{self.folder}: no such file or folder")
         runs = [] if RunFolder(self.folder).record.is_file() else runs_in(self.folder)
         if runs:
             print(json_text([facts_or_damage(run) for run in runs]) if self.json else describe_runs(runs))

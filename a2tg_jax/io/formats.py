@@ -92,9 +92,9 @@ def format_of(path: str | os.PathLike[str], *, is_written: bool = False) -> File
     for suffix, found in FORMATS.items():
         if name.endswith(suffix):
             return found
-    known = ", ".join(suffix for suffix, found in FORMATS.items() if not is_written or found.save is not None)
-    near = did_you_mean(Path(name).suffix, FORMATS)
-    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix{near or ';'} known are {known}")
+    known = [suffix for suffix, found in FORMATS.items() if not is_written or found.save is not None]
+    near = did_you_mean(Path(name).suffix, known)
+    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix{near}; known are {', '.join(known)}")
 
 
 def writer_of(path: str | os.PathLike[str]) -> Writer:

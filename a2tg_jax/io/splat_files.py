@@ -35,7 +35,7 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.operating_system import printing_to_stderr
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io import other_programs as others
-from a2tg_jax.io.columns import morton
+from a2tg_jax.io.columns import morton, room_of
 from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, place_comments, place_marks
 from a2tg_jax.io.validate import check_model, existing_bytes, reading
 from a2tg_jax.model import Model
@@ -95,7 +95,9 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
       ValueError: if gaussforge is not installed or cannot read the file, or a number is not finite.
     """
     kind, path, data = _kind_of(path), Path(path), existing_bytes(path, "file")
-    header = _sog_header(data, path) if kind == "sog" else {}
+    header: dict[str, Any] = {}
+    if kind == "sog":
+        header, data = _checked_sog(data, path)
     converted = _converted(data, kind, "ply", path)
     gaussians = decode_ply(io.BytesIO(converted), path, is_flat=header.get("model") == SOG_FLAT).gaussians
     with reading(path):
@@ -104,20 +106,27 @@ def load_by_gaussforge(path: str | os.PathLike[str]) -> Model:
     return Model(gaussians, origin=origin)
 
 
-def _sog_header(data: bytes, path: Path) -> dict[str, Any]:
-    """Return the header of a SOG file, a ZIP. ValueError: a checksum in it is wrong; gaussforge would not notice, and
-    crash or return other numbers."""
+def _checked_sog(data: bytes, path: Path) -> tuple[dict[str, Any], bytes]:
+    """Return the header of a SOG file, a ZIP, and the file written again.
+
+    gaussforge checks neither checksums nor the ZIP's own tables: damaged ones end the process or change numbers.
+
+    Raises:
+      ValueError: if the file is damaged, or unpacks to more than 64 times its size.
+    """
+    again = io.BytesIO()
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            damaged = archive.testzip()
-            found = json.loads(archive.open(SOG_HEADER).read(MOST_HEADER_BYTES))
+        with zipfile.ZipFile(io.BytesIO(data)) as archive, zipfile.ZipFile(again, "w") as new:
+            if sum(entry.file_size for entry in archive.infolist()) > room_of(len(data)):
+                raise ValueError("it unpacks to more than 64 times its size")
+            found = json.loads(archive.read(SOG_HEADER)[:MOST_HEADER_BYTES])
+            for entry in archive.infolist():
+                new.writestr(zipfile.ZipInfo(entry.filename), archive.read(entry))
     except KeyError:
         raise ValueError(f"{path}: is not SOG: it has no {SOG_HEADER}") from None
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, NotImplementedError, RuntimeError) as error:
         raise ValueError(f"{path}: is damaged or no SOG file: {shortened(str(error))}") from error
-    if damaged is not None:
-        raise ValueError(f"{path}: is damaged: the checksum of {shortened(damaged)} in it is wrong")
-    return found if isinstance(found, dict) else {}
+    return (found if isinstance(found, dict) else {}), again.getvalue()
 
 
 def import_gaussforge(path: Path) -> Any:

@@ -113,8 +113,8 @@ def write_converted(
         lines.append(f"not shown by other programs: {unseen}")
     if not format_of(out).keeps_origin:
         lines.append(world_line(model, world))
-    if out.suffix.lower() == ".spz":
-        lines.append("programs that expect SPZ with +y up show it upside down; they show *.sog and *.ply upright")
+    if out.suffix.lower() == ".spz" and world == "upright":
+        lines.append("programs that expect SPZ with +y up show it upside down: turn it half about x there")
     return "\n".join(lines)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax
 
-from a2tg_jax.core.budget import MEGABYTE, bytes_of, megabytes_of
+from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
@@ -214,8 +214,8 @@ def doubts_about(scene: Scene, record: RunRecord) -> list[str]:
     one = record.options.initial_bytes
     if record.scene.path != SYNTHETIC and budget is not None and budget > pixels * one:
         found.append(
-            f"memory_budget has room for {budget / one:,.0f} Gaussians, but the photographs have {pixels:,} pixels: "
-            f"{0.1 * pixels * one / MEGABYTE:.2g} MB holds one for ten of them"
+            f"`memory_budget` has room for more Gaussians ({budget / one:,.0f}) than the photographs have pixels "
+            f"({pixels:,}): {in_bytes(0.1 * pixels * one).replace(' ', '')} holds one for ten pixels"
         )
     size = max(((view.camera.width, view.camera.height) for view in scene.train), key=max)
     # The built-in scene is drawn as small as tests need it.

@@ -126,6 +126,8 @@ class RunRecord:
         return dataclasses.replace(self, system=name, preset=preset, options=options, compare_options={})
 
 
+PLAIN = ("gaussians-2d", "gaussians-2d-mcmc")
+"""Systems without textures, which are baselines of the others."""
 SCENE_KEYS = {"scene": "path"} | {field.name: field.name for field in dataclasses.fields(SceneSource)[1:]}
 """Names of the fields of a scene's source by their keys in run.toml."""
 KEYS = (*SCENE_KEYS, *(field.name for field in dataclasses.fields(RunRecord)[1:]), "version")
@@ -145,13 +147,12 @@ def chosen_system(name: str, preset: str | None = None) -> System:
 
 def compared_system(name: str, other: System, preset: str | None = None) -> System:
     """Return a system by name, with another's options where names match and its own preset's otherwise, if it has that
-    preset. A system of one degree of spherical harmonics takes the other's first: plain Gaussians are strongest at
-    equal bytes with the degree that `bytewise` starts from. Options set by an instance take precedence. Raises
-    ValueError if there is no such system."""
+    preset. Plain Gaussians take the degree that the other starts from: with degree 0 they are strongest in the bytes of
+    `bytewise`. Options set by an instance take precedence. Raises ValueError if there is no such system."""
     found = find_system(name)
     kind = type(found)
     system = like(kind() if preset is None else kind.presets().get(preset, kind()), other)
-    if system.initial_sh_degree == system.sh_degree:
+    if name in PLAIN:
         system = dataclasses.replace(system, sh_degree=other.initial_sh_degree)
     return changed_config(system, differences(found), name)
 
@@ -199,7 +200,10 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
     preset, scene, compared = chosen_system(record.system, record.preset), config_to_dict(record.scene), {}
     for name in record.compare:  # Options not taken from the main system, and given ones.
         start = compared_system(name, record.options, record.preset)
-        own = own_options(record.systems[label_of(name)], record.options)
+        system = record.systems[label_of(name)]
+        own = own_options(system, record.options)
+        if system.sh_degree != record.options.sh_degree:
+            own |= {"sh_degree": system.sh_degree}
         compared[name] = _without_none(merged(own, record.compare_options.get(name, {})), config_to_dict(start))
     table = {
         **{key: scene[name] for key, name in SCENE_KEYS.items()},

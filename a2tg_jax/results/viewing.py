@@ -283,6 +283,7 @@ def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool =
 
 def _place_of(path: Path) -> str:
     """Return the run and the model of a run's file, or the name of another file."""
+    path = path.absolute()
     return f"{path.parent.parent.name} · {path.stem}" if path.parent.name == "models" else path.name
 
 
