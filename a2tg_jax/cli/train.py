@@ -105,7 +105,7 @@ class Train:
       --resume               continue from the newest checkpoint in the run folder
       --resume --more N      train a finished run on, for N more iterations of the last stage
       --overwrite            replace an earlier run in that folder
-      --yes                  train without a question about tiny photographs or budgets
+      --yes                  train without a question about tiny photographs, or tiny or huge budgets
       --quiet                hide the progress of training
 
     a2tg train --help-all lists every option by group, with its default; add --system NAME for the options of another
@@ -135,8 +135,8 @@ class Train:
     """Replace an earlier run in that folder; it is kept until the new one has its report."""
     lpips_weights: LpipsWeights = None
     yes: bool = False
-    """Train even if the photographs or the memory budget are so small that little can be seen. Without it you are
-    asked."""
+    """Train even if the photographs or the memory budget are so small that little can be seen, or the budget has room
+    for more Gaussians than the photographs have pixels. Without it you are asked."""
     quiet: bool = False
     """Hide the progress of training, but not forecasts, warnings and results."""
     tensorboard: bool = False

@@ -372,6 +372,7 @@ def write_report(
         command=repeating_command(run),
         final=shlex.join(
             ["a2tg", "train", "--config", str(run.record), "--test-every", "0", "--out", f"{run.path}-final"]
+            + ["--no-validation"] * result.record.scene.validation
         ),
         record=read_regular(run.record, MOST_TOML_BYTES).decode() if is_regular(run.record) else "",
     )
