@@ -55,7 +55,7 @@ COMMANDS = {
 }  # fmt: skip
 """Module of `a2tg_jax.cli` and dataclass of each command."""
 CONVERTED = ("sog", "spz", "splat", "ksplat", "glb", "gltf", "usdz", "usda", "usdc", "npz", "a2tgz")
-"""Suffixes that are taken for flags of export."""
+"""Suffixes of files that convert writes, tried as flags of export. `io.formats` has them too, but imports JAX."""
 SMALLER = {
     "train": "close other programs, or give a larger --downscale, or a smaller --memory-budget or --batch-size",
     "render": "lower --size or --supersample",
@@ -136,11 +136,11 @@ def _misspelt_flag(name: str, arguments: Sequence[str]) -> str | None:
         return None
     for flag in given:
         if flag not in known and re.sub(r"(^|\.)no-", r"\1", flag) not in known:
+            if name == "export" and flag in CONVERTED:
+                return f"a2tg export has no option --{flag}: a2tg convert writes such files, by the suffix of OUT"
             # Of a group first, such as densify.cap for cap.
             within = sorted(each for each in known if each.endswith(f".{flag}"))
             near = f"; did you mean {' or '.join(within)}?" if within else did_you_mean(flag, known)
-            if name == "export" and flag in CONVERTED:
-                return f"a2tg export has no option --{flag}: a2tg convert writes such files, by the suffix of OUT"
             hint = re.sub(r"(mean|or) ", r"\1 --", near) if near else f"; a2tg {name} --help lists them"
             return f"a2tg {name} has no option --{flag}{hint}"
     return None

@@ -145,8 +145,8 @@ def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "o
       >>> a2tg.load_splats("scene.splat").num
       200
     """
-    options = {} if format_of(path, is_written=True).keeps_origin else {"world": world}
-    writer_of(path)(Path(path), model, **options)
+    save = writer_of(path)
+    save(Path(path), model, **({} if format_of(path).keeps_origin else {"world": world}))
 
 
 def files_written(path: Path) -> list[Path]:

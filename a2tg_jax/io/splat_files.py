@@ -22,6 +22,7 @@ import os
 import struct
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -114,19 +115,27 @@ def _checked_sog(data: bytes, path: Path) -> tuple[dict[str, Any], bytes]:
     Raises:
       ValueError: if the file is damaged, or unpacks to more than 64 times its size.
     """
-    again = io.BytesIO()
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive, zipfile.ZipFile(again, "w") as new:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > room_of(len(data)):
                 raise ValueError("it unpacks to more than 64 times its size")
-            found = json.loads(archive.read(SOG_HEADER)[:MOST_HEADER_BYTES])
-            for entry in archive.infolist():
-                new.writestr(zipfile.ZipInfo(entry.filename), archive.read(entry))
+            contents = {entry.filename: archive.read(entry) for entry in archive.infolist()}
+        found = json.loads(contents[SOG_HEADER][:MOST_HEADER_BYTES])
     except KeyError:
         raise ValueError(f"{path}: is not SOG: it has no {SOG_HEADER}") from None
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, NotImplementedError, RuntimeError) as error:
         raise ValueError(f"{path}: is damaged or no SOG file: {shortened(str(error))}") from error
-    return (found if isinstance(found, dict) else {}), again.getvalue()
+    return (found if isinstance(found, dict) else {}), _zipped(contents)
+
+
+def _zipped(contents: Mapping[str, bytes]) -> bytes:
+    """Return a ZIP of files by name, always the same."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        for name, content in contents.items():
+            # A fresh ZipInfo has a fixed date.
+            archive.writestr(zipfile.ZipInfo(name), content)
+    return data.getvalue()
 
 
 def import_gaussforge(path: Path) -> Any:
@@ -161,17 +170,11 @@ def _marked(data: bytes, kind: str, offset: np.ndarray, turn: np.ndarray) -> byt
         return data.replace(b" 1.0\n", f" 1.0\ncomment {FLAT_MARK}\n{place_comments(offset, turn)}".encode(), 1)
     if kind != "sog":
         return data
-    marked = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(marked, "w") as new:
-        for entry in old.infolist():
-            content = old.read(entry)
-            if entry.filename == SOG_HEADER:
-                header = {**json.loads(content), "model": SOG_FLAT}
-                header |= {word: numbers.tolist() for word, numbers in place_marks(offset, turn).items()}
-                content = json.dumps(header, separators=(",", ":")).encode()
-            # A fresh ZipInfo has a fixed date, so that files repeat.
-            new.writestr(zipfile.ZipInfo(entry.filename), content)
-    return marked.getvalue()
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    header = {**json.loads(contents[SOG_HEADER]), "model": SOG_FLAT}
+    header |= {word: numbers.tolist() for word, numbers in place_marks(offset, turn).items()}
+    return _zipped(contents | {SOG_HEADER: json.dumps(header, separators=(",", ":")).encode()})
 
 
 # .ksplat

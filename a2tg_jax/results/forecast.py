@@ -210,16 +210,17 @@ def doubts_about(scene: Scene, record: RunRecord) -> list[str]:
     found, downscale = [], record.scene.downscale
     if record.options.small_budget:
         found.append(f"{record.options.small_budget}; it is in bytes of the model in memory")
+    # The built-in scene is drawn as small as tests need it.
+    is_captured = record.scene.path != SYNTHETIC
     pixels, budget = sum(view.camera.width * view.camera.height for view in scene.train), record.options.budget_bytes
     one = record.options.initial_bytes
-    if record.scene.path != SYNTHETIC and budget is not None and budget > pixels * one:
+    if is_captured and budget is not None and budget > pixels * one:
         found.append(
             f"`memory_budget` has room for more Gaussians ({budget / one:,.0f}) than the photographs have pixels "
             f"({pixels:,}): {in_bytes(0.1 * pixels * one).replace(' ', '')} holds one for ten pixels"
         )
     size = max(((view.camera.width, view.camera.height) for view in scene.train), key=max)
-    # The built-in scene is drawn as small as tests need it.
-    if record.scene.path != SYNTHETIC and downscale > 1 and max(size) < SMALL_SIDE:
+    if is_captured and downscale > 1 and max(size) < SMALL_SIDE:
         sensible = math.ceil(max(size) * downscale / QUICK_SIDE)
         advice = f"`downscale` {sensible} makes the longer side {max(size) * downscale // sensible:,}"
         found.append(

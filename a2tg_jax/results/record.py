@@ -200,10 +200,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
     preset, scene, compared = chosen_system(record.system, record.preset), config_to_dict(record.scene), {}
     for name in record.compare:  # Options not taken from the main system, and given ones.
         start = compared_system(name, record.options, record.preset)
-        system = record.systems[label_of(name)]
-        own = own_options(system, record.options)
-        if system.sh_degree != record.options.sh_degree:
-            own |= {"sh_degree": system.sh_degree}
+        own = own_options(record.systems[label_of(name)], record.options)
         compared[name] = _without_none(merged(own, record.compare_options.get(name, {})), config_to_dict(start))
     table = {
         **{key: scene[name] for key, name in SCENE_KEYS.items()},
@@ -265,11 +262,16 @@ def is_finished(run: RunFolder, record: RunRecord) -> bool:
     return all(is_regular(run.model(name)) for name in record.plan.names)
 
 
+def training_command(run: RunFolder, out: str, *flags: str) -> str:
+    """Return the command line that trains with the options of a run, into another folder."""
+    return shlex.join(["a2tg", "train", "--config", str(run.record), *flags, "--out", out])
+
+
 def repeating_command(run: RunFolder) -> str:
     """Return the command line that repeats a run, and its finishing, if any."""
     is_finished, again = is_regular(run.finish), f"{run.path}-again"
     trained = f"{run.path}-trained" if is_finished else again
-    training = shlex.join(["a2tg", "train", "--config", str(run.record), "--out", trained])
+    training = training_command(run, trained)
     if not is_finished:
         return training
     flags = [f"--{name.replace('_', '-')}={value}" for name, value in config_to_dict(read_finish(run)).items()]

@@ -5,7 +5,6 @@ import dataclasses
 import hashlib
 import inspect
 import platform
-import shlex
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -25,7 +24,7 @@ from a2tg_jax.measure.evaluation import Evaluation
 from a2tg_jax.results.figures import ReportFigure
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import file_uri, jpeg_uri
-from a2tg_jax.results.record import RunPlan, RunRecord, repeating_command
+from a2tg_jax.results.record import RunPlan, RunRecord, repeating_command, training_command
 
 QUALITIES = ("PSNR (dB)", "SSIM", "LPIPS")
 WAYS = {
@@ -342,6 +341,7 @@ def write_report(
     best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
     leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.options)
+    all_views = ["--no-validation"] if result.record.scene.validation else []
     page = pages.get_template("report.html").render(
         **inlined,
         policy=Markup(policy),
@@ -370,10 +370,7 @@ def write_report(
         versions=versions(),
         commit=source_commit(),
         command=repeating_command(run),
-        final=shlex.join(
-            ["a2tg", "train", "--config", str(run.record), "--test-every", "0", "--out", f"{run.path}-final"]
-            + ["--no-validation"] * result.record.scene.validation
-        ),
+        final=training_command(run, f"{run.path}-final", "--test-every", "0", *all_views),
         record=read_regular(run.record, MOST_TOML_BYTES).decode() if is_regular(run.record) else "",
     )
     with replacing(run.own(run.report)) as temporary:

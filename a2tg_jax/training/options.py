@@ -439,7 +439,7 @@ def like(kind: Any, other: object) -> Any:
 
 
 def own_options(system: object, other: object) -> dict[str, Any]:
-    """Return the options of a system, or of a group of options, that `like` does not take from another, nested as in a
+    """Return the options of a system, or of a group of options, that another lacks or has otherwise, nested as in a
     configuration file."""
     hints, other_hints = (typing.get_type_hints(type(config)) for config in (system, other))
     found: dict[str, Any] = {}
@@ -448,6 +448,6 @@ def own_options(system: object, other: object) -> dict[str, Any]:
         if dataclasses.is_dataclass(own) and dataclasses.is_dataclass(others):
             inner = own_options(own, others)
             found |= {name: inner} if inner else {}
-        elif hints[name] != other_hints.get(name):
+        elif hints[name] != other_hints.get(name) or own != others:
             found[name] = option
     return found
