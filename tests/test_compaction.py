@@ -12,7 +12,15 @@ from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.data import synthetic_scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import compaction
-from a2tg_jax.finish.compaction import Trial, loss_beside_renders, loss_on_views, measure_choices, smallest_within
+from a2tg_jax.finish.compaction import (
+    Trial,
+    best_within,
+    loss_beside_renders,
+    loss_on_views,
+    measure_choices,
+    smallest_within,
+    try_choices,
+)
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.compact import CompactChoices, encode_model, load_compact
 from a2tg_jax.io.model_file import save_model
@@ -109,3 +117,25 @@ def test_the_command_refuses_what_it_cannot_measure(model, flags, words, tmp_pat
     assert cli.main(["compress", str(tmp_path / "scene.npz"), *flags]) == 2
     assert words in capsys.readouterr().err
     assert not list(tmp_path.glob("*.a2tgz"))
+
+
+def test_the_best_file_within_some_bytes():
+    model = a_model()
+    loss = loss_on_views(model, SCENE.train)
+    trials = measure_choices(model, [loss], SMALL)
+    sizes = sorted({trial.num_bytes for trial in trials})
+    budgets = [sizes[-1], (sizes[0] + sizes[-1]) // 2, sizes[0]]
+    found = [try_choices(model, best_within(model, most, trials), [loss]) for most in budgets]
+    assert all(trial.num_bytes <= most for trial, most in zip(found, budgets, strict=True))
+    losses = [trial.losses[0] for trial in found]
+    assert losses == sorted(losses) and losses[0] < losses[-1]
+    # No combination of these steps that fits loses less than a third of what was chosen.
+    for most, chosen in zip(budgets, found, strict=True):
+        others = [
+            try_choices(model, compaction.finest_choices().keeping({"means": a, "opacities": b, "sh_0": c}), [loss])
+            for a in SMALL["means"] for b in SMALL["opacities"] for c in SMALL["sh_0"]
+        ]  # fmt: skip
+        best = min(trial.losses[0] for trial in others if trial.num_bytes <= most)
+        assert chosen.losses[0] <= 3 * max(best, 0.001)
+    with pytest.raises(ValueError, match=r"file_budget must be at least [\d.]+ kB: the smallest file has that"):
+        best_within(model, 100, trials)

@@ -98,6 +98,26 @@ def test_compress_with_tuning(run, tmp_path, monkeypatch, capsys):
     assert before - after <= 0.02 and tuned.stat().st_size <= plain.stat().st_size
 
 
+@pytest.mark.long
+def test_compress_within_a_file_budget(run, tmp_path, monkeypatch, capsys):
+    """The file stays within its bytes, and tuning makes it better; too few bytes are refused with the fewest."""
+    ladder = {"means": (5, 8, 14), "log_scales": (2, 4, 10), "sh_0": (2, 4, 10), "opacities": (2, 4, 10)}
+    monkeypatch.setattr(compression, "LADDER", ladder)
+    monkeypatch.setattr(compression, "TUNED_LADDER", ladder)
+    scene, path, losses = read_record(run).scene.load(), run.model("a2tg-textures"), []
+    for name, flags in {"plain": (), "tuned": ("--tune-iterations", "30")}.items():
+        out = tmp_path / f"{name}.a2tgz"
+        assert cli.main(["compress", str(run.path), "--out", str(out), "--file-budget", "2.3kB", *flags]) == 0
+        assert 2000 < out.stat().st_size <= 2300
+        losses.append(evaluate(scene.train, load_model(path)).psnr - evaluate(scene.train, load_compact(out)).psnr)
+    assert losses[1] < losses[0]
+    capsys.readouterr()
+    refused = ["compress", run.path, "--out", tmp_path / "no.a2tgz"]
+    assert "--file-budget must be at least " in fails(capsys, *refused, "--file-budget", "0.1kB")
+    assert "give one of them" in fails(capsys, *refused, "--file-budget", "6kB", "--max-loss", "0.1")
+    assert "--file-budget must be a number of MB" in fails(capsys, *refused, "--file-budget", "six")
+
+
 def tuned_so(path, choices, *, adds=0, losses=2):
     """A search of tuned files that has found the model of a file in some bits, said to be larger than it is."""
     model = half_turned(load_model(path))

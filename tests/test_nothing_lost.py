@@ -556,6 +556,33 @@ def test_an_internal_error_is_not_reported_as_a_mistake_of_the_user(monkeypatch)
         cli.main(["info", "run"])
 
 
+def test_a_run_with_a_file_budget_ends_with_its_file(tmp_path, monkeypatch, capsys):
+    """If the program is killed before, the resumed run writes it; the model has 7 times as many bytes."""
+    asked = []
+
+    def compress(path, **options):
+        asked.append((path, options))
+        if len(asked) == 1:
+            raise KeyboardInterrupt
+        return "the file"
+
+    monkeypatch.setattr(run_training, "evaluate_run", lambda *_, **__: some_result())
+    monkeypatch.setattr(run_training, "compress", compress)
+    run = RunFolder(tmp_path / "run")
+    assert cli.main([*TRAIN, "--out", str(run.path), "--quiet", "--file-budget", "60kB"]) == 130
+    assert f"continue with: a2tg train --out {run.path} --resume" in capsys.readouterr().err
+    resuming = ["train", "--out", str(run.path), "--resume", "--quiet"]
+    assert cli.main(resuming) == 0 and "the file\n" in capsys.readouterr().out
+    assert asked == [(run.path, {"file_budget": "60kB", "tune_iterations": 1000})] * 2
+    assert read_record(run).options.budget_bytes == 420_000 >= load_model(run.model(NAME)).num_bytes > 417_000
+    assert cli.main([*resuming, "--file-budget", "3kB"]) == 2
+    assert "--resume takes every option from" in capsys.readouterr().err
+    record = dataclasses.replace(read_record(run), file_budget="9kB")
+    assert record.budgeted() == record  # It has a memory budget.
+    with pytest.raises(ValueError, match="file_budget must be a number of MB"):
+        dataclasses.replace(record, file_budget="nine").check()
+
+
 def test_a_finished_run_is_trained_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_training, "evaluate_run", lambda *_, **__: some_result())
     run = RunFolder(tmp_path / "run")

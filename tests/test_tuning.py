@@ -17,7 +17,7 @@ from a2tg_jax.core.cameras import moved_viewmat
 from a2tg_jax.data import Scene
 from a2tg_jax.data.scene import origin_of_scene
 from a2tg_jax.finish import tuning
-from a2tg_jax.finish.compaction import Trial, loss_on_views
+from a2tg_jax.finish.compaction import TooLargeError, Trial, loss_on_views
 from a2tg_jax.finish.tuning import (
     MOST_TUNINGS,
     TUNED_LADDER,
@@ -25,6 +25,7 @@ from a2tg_jax.finish.tuning import (
     GridRounding,
     Tuned,
     TunedFiles,
+    best_tuned,
     partly_rounded,
     smallest_tuned,
     tune_compact,
@@ -286,6 +287,46 @@ def test_the_search_ends_without_choices_and_at_the_coarsest(monkeypatch):
     monkeypatch.setattr(tuning, "_measured", lambda *a: Trial(choices, 7, (0.0,)))
     found = smallest_tuned("model", [], 0.05, [], tune)
     assert len(found.tried) == 1 and found.tuned.model == "tuned"
+
+
+@pytest.mark.parametrize(
+    ("growth", "targets", "kept"),
+    [
+        pytest.param((1.0,), (990,), 0, id="mostly fits at once"),
+        pytest.param((1.05, 1.05), (990, 943), 1, id="is tuned again for fewer bytes"),
+        pytest.param((1.5, 1.5), (990, 660), 1, id="grows by half"),
+        pytest.param((2.0, "diverges"), (990, 495), None, id="ends where a tuning diverges"),
+        pytest.param((9.0, "too coarse"), (990, 110), None, id="ends at the coarsest bits"),
+    ],
+)
+def test_the_search_for_a_file_of_given_bytes(monkeypatch, growth, targets, kept):
+    """Bytes before tuning, and the file it keeps, given by how much files grow in tuning."""
+    asked, started = [], []
+
+    def within(model, max_bytes, trials):
+        assert model == "model"
+        asked.append(max_bytes)
+        if growth[len(asked) - 1] == "too coarse":
+            raise TooLargeError(2000)
+        return CompactChoices()
+
+    def tune(model, choices, number):
+        started.append(model)
+        if growth[number - 1] == "diverges":
+            raise DivergedError("the loss has exploded", None)
+        return Tuned(number, choices, {})
+
+    monkeypatch.setattr(tuning, "best_within", within)
+    sized = lambda found, measures: Trial(found.choices, round(asked[-1] * growth[len(asked) - 1]), (0.0,))  # noqa: E731
+    monkeypatch.setattr(tuning, "_measured", sized)
+    found = best_tuned("model", [], 1000, [], tune)
+    np.testing.assert_allclose(asked, targets[: len(asked)], atol=1)
+    assert started == ["model", 1, 2, 3][: len(started)]
+    assert found.diverged == ("the loss has exploded" if "diverges" in growth else None)
+    if kept is None:
+        assert found.chosen is None and found.tuned is None
+    else:
+        assert found.chosen.num_bytes <= 1000 and found.tuned.model == kept + 1 == len(found.tried)
 
 
 def test_coarser_choices_come_first():

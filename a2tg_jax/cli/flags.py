@@ -12,9 +12,9 @@ FLAGS = {
         "corrections.pose.final-factor corrections.pose.rate densify.cap densify.dense-share densify.largest-share "
         "densify.least-opacity densify.threshold details.anisotropic details.at details.axes details.budget-mb "
         "details.cap details.fraction details.gradient details.k-a details.k-s details.moments details.select "
-        "details.threshold devices downscale exponents.least exposure floaters.at floaters.least floaters.min-views "
-        "floaters.near heartbeat-timeout-seconds init initial-gaussians initial-opacity kernel-rate kernels.centers "
-        "kernels.colors kernels.logit-opacities kernels.sharpness lens lookup.alpha lookup.initial-rgb "
+        "details.threshold devices downscale exponents.least exposure file-budget floaters.at floaters.least "
+        "floaters.min-views floaters.near heartbeat-timeout-seconds init initial-gaussians initial-opacity kernel-rate "
+        "kernels.centers kernels.colors kernels.logit-opacities kernels.sharpness lens lookup.alpha lookup.initial-rgb "
         "lookup.max-alpha lookup.outside lookup.rgb lookup.uv lookup.uv-gradient loss.depth-kind loss.depth-weight "
         "loss.distortion-weight loss.normal-weight loss.opacity-weight loss.points-weight loss.robust-factor "
         "loss.robust-share loss.scale-weight loss.ssim-weight lpips-weights mask-as max-memory memory-budget more "
@@ -36,7 +36,7 @@ FLAGS = {
     "convert": "bake bake-growth bake-iterations edit float64 model overwrite world",
     "edit": "background crop floaters model out overwrite upright",
     "compare": "out overwrite",
-    "compress": "max-loss out overwrite tune-iterations verbose",
+    "compress": "file-budget max-loss out overwrite tune-iterations verbose",
     "info": "json",
     "sfm": "camera-model frames masks matching out panorama",
     "download": "list out",

@@ -12,7 +12,7 @@ from a2tg_jax.cli.train import open_browser, print_result
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import counted
 from a2tg_jax.mesh.files import mesh_files
-from a2tg_jax.results.compression import compress
+from a2tg_jax.results.compression import MAX_LOSS, compress
 from a2tg_jax.results.conversion import BakeOptions, check_ply, convert, export_ply
 from a2tg_jax.results.editing import EditOptions, write_edit
 from a2tg_jax.results.finishing import finish_run
@@ -411,7 +411,7 @@ class EditCommand:
 
 @dataclasses.dataclass(frozen=True)
 class Compress:
-    """Write the smallest file of a model within a given loss of PSNR.
+    """Write the smallest file of a model within a given loss of PSNR, or the best one within given bytes.
 
     The loss is measured on at most 16 training views. If the photographs are missing, it is estimated from renders, for
     a model of 30 dB. This takes minutes on a CPU. With --tune-iterations the model is trained further while its numbers
@@ -420,6 +420,7 @@ class Compress:
     Examples:
       a2tg compress runs/fox
       a2tg compress runs/fox --tune-iterations 1000
+      a2tg compress runs/fox --file-budget 60kB --tune-iterations 1000
       a2tg compress scene.npz --out scene.a2tgz --max-loss 0.02
     """
 
@@ -427,12 +428,14 @@ class Compress:
     """Model file (*.npz), or run folder, whose last model is taken."""
     out: Annotated[Path | None, defaulting_to("NAME.a2tgz next to the model", "FILE")] = None
     """Output file, *.a2tgz."""
-    max_loss: float = 0.05
+    max_loss: Annotated[float | None, defaulting_to(f"{MAX_LOSS:g}", "DB")] = None
     """Largest loss of PSNR in dB."""
+    file_budget: Annotated[str | None, defaulting_to("--max-loss decides", "SIZE")] = None
+    """Largest size of the file, such as 60kB, instead of --max-loss."""
     tune_iterations: int = 0
     """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. The model is
-    tuned up to 4 times, each time for other bits: first for bits that lose 0.5 dB, or twice --max-loss if that is more.
-    0: numbers are only rounded."""
+    tuned up to 4 times: each time for other bits, first for those that lose 0.5 dB, or twice --max-loss if that is
+    more; with --file-budget until the file fits, mostly once. 0: numbers are only rounded."""
     overwrite: bool = False
     """Replace the output file. A file that a2tg compress wrote into a run folder is always replaced."""
     verbose: bool = False
@@ -444,6 +447,7 @@ class Compress:
                 self.source,
                 self.out,
                 max_loss=self.max_loss,
+                file_budget=self.file_budget,
                 tune_iterations=self.tune_iterations,
                 overwrite=self.overwrite,
                 verbose=self.verbose,

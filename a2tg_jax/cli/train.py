@@ -97,6 +97,7 @@ class Train:
       --preset NAME          paper (default), quick (minutes on two cores) or smoke (half a minute)
       --downscale K          divide the width and height of the photographs by K
       --memory-budget SIZE   cap the model's size in memory during training, such as 20MB
+      --file-budget SIZE     write a compact file of at most this size, such as 60kB, when training is over
       --baseline             train plain Gaussians as well, and compare
       --compare NAME         train another system as well, and compare; may be repeated
       --view                 show the training in a browser, where you can pause it
@@ -223,7 +224,7 @@ class Train:
         """Record with full paths, and with the baseline."""
         compare = (*self.record.compare, BASELINE) if self.baseline else self.record.compare
         # A dict keeps the order and drops repetitions, such as of --baseline by --compare.
-        return dataclasses.replace(self.record.placed(), compare=tuple(dict.fromkeys(compare)))
+        return dataclasses.replace(self.record.placed().budgeted(), compare=tuple(dict.fromkeys(compare)))
 
     def resumed(self, run: RunFolder, *, is_first: bool = True) -> RunRecord:
         """Return the record of a run to resume, with further comparisons, which the first of several processes writes.

@@ -1,10 +1,12 @@
-"""Smallest file of a model within a loss, from the cost in dB of each choice of bits.
+"""Smallest file of a model within a loss, or the best one within some bytes, from what each choice of bits costs.
 
 A loss is a function of a model: how many dB it is below the original model. It is measured on photographs or, without
 them, estimated from differences between renders.
 """
 
+import bisect
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
@@ -219,11 +221,7 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
     Raises:
       ValueError: if the finest choices lose more.
     """
-    by_group: dict[str, list[Trial]] = {}
-    for trial in trials:
-        by_group.setdefault(trial.group, []).append(trial)
-    # A finer step may take fewer bytes: coders decide.
-    by_size = {group: sorted(own, key=lambda trial: trial.num_bytes) for group, own in by_group.items()}
+    by_size = _by_size(trials)
     finest = {group: own[-1].precision for group, own in by_size.items()}
     # The sum of separate losses is only an estimate: coarser groups may interact.
     for chosen in [*reversed(_descent(by_size, max_loss)), finest]:
@@ -246,6 +244,66 @@ def smallest_within(model: Model, losses: Sequence[Loss], max_loss: float, trial
             tried = try_choices(model, found.choices.keeping({group: precision}), losses)
             found = tried if tried.losses[0] <= max_loss and tried.num_bytes < found.num_bytes else found
     return found
+
+
+class TooLargeError(ValueError):
+    """No file is within the allowed bytes."""
+
+    def __init__(self, least: int):
+        """`least` is the size of the smallest file."""
+        kilobytes = math.ceil(least / 10) / 100
+        super().__init__(f"file_budget must be at least {kilobytes} kB: the smallest file has that")
+
+
+def check_fits(model: Model, max_bytes: int, ladder: Ladder = LADDER) -> None:
+    """Raise TooLargeError if the file with the coarsest steps of all groups takes more bytes (host)."""
+    coarsest = CompactChoices().keeping({group: steps[0] for group, steps in ladder.items()})
+    if (least := len(encode_model(model, coarsest))) > max_bytes:
+        raise TooLargeError(least)
+
+
+def best_within(model: Model, max_bytes: int, trials: Sequence[Trial]) -> CompactChoices:
+    """Return the choices of a file of at most so many bytes that loses least, by greedy search (host).
+
+    Start from the finest choices. Take the step with the most bytes saved per loss, until the file is small enough.
+    Then take finer steps back, those that gain most first, while it stays so.
+
+    Args:
+      model: the model.
+      max_bytes: largest size of the file.
+      trials: results of `measure_choices`, of this model or of a similar one.
+
+    Raises:
+      ValueError: if the coarsest choices take more bytes.
+    """
+    by_size = _by_size(trials)
+    size_of = lambda kept: len(encode_model(model, finest_choices().keeping(kept)))  # noqa: E731
+    path = [{group: own[-1].precision for group, own in by_size.items()}, *_descent(by_size, math.inf)]
+    at = bisect.bisect_left(range(len(path)), True, key=lambda index: size_of(path[index]) <= max_bytes)
+    if at == len(path):
+        raise TooLargeError(size_of(path[-1]))
+    chosen = path[at]
+    while True:
+        steps = [
+            (finer.losses[0] - coarser.losses[0], finer)
+            for own in by_size.values()
+            for coarser, finer in itertools.pairwise(own)
+            if coarser.precision == chosen[coarser.group]
+        ]
+        gaining = [finer for change, finer in sorted(steps, key=lambda step: step[0]) if change < 0]
+        tried = (chosen | {finer.group: finer.precision} for finer in gaining)
+        better = next((kept for kept in tried if size_of(kept) <= max_bytes), None)
+        if better is None:
+            return finest_choices().keeping(chosen)
+        chosen = better
+
+
+def _by_size(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
+    """Return the trials of each group from small to large: coders decide, and a finer step may take fewer bytes."""
+    by_group: dict[str, list[Trial]] = {}
+    for trial in trials:
+        by_group.setdefault(trial.group, []).append(trial)
+    return {group: sorted(own, key=lambda trial: trial.num_bytes) for group, own in by_group.items()}
 
 
 def _descent(by_group: Mapping[str, Sequence[Trial]], max_loss: float) -> list[dict[str, Precision]]:

@@ -24,7 +24,16 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Change, Now, StepEvent
-from a2tg_jax.finish.compaction import LADDER, Ladder, Loss, TooMuchLostError, Trial, smallest_within
+from a2tg_jax.finish.compaction import (
+    LADDER,
+    Ladder,
+    Loss,
+    TooLargeError,
+    TooMuchLostError,
+    Trial,
+    best_within,
+    smallest_within,
+)
 from a2tg_jax.io.columns import LEAST_OPACITY
 from a2tg_jax.io.compact import CompactChoices, Grids, decode_model, encode_model, grids_of, half_turned
 from a2tg_jax.io.model_rows import check_encodable
@@ -42,6 +51,8 @@ FIRST_TOLERANCE = 0.5
 """Loss in dB before tuning for the first try."""
 MOST_TUNINGS = 4
 """Largest number of tunings."""
+TIGHTER = 0.99
+"""Factor of the bytes for which a file is tuned, in each try."""
 COARSER: Mapping[str, tuple[int, ...]] = {
     "means": (8, 9), "log_scales": (3,), "quats": (3, 4), "opacities": (2,), "sh_0": (3,), "texels": (2,),
     "shapes": (1, 2),
@@ -363,6 +374,28 @@ def smallest_tuned(
         if found.chosen is None or trial.num_bytes < found.chosen.num_bytes:
             found = found._replace(chosen=trial, tuned=tuned)
         tolerance *= factor
+    return found
+
+
+def best_tuned(model: Model, losses: Sequence[Loss], max_bytes: int, trials: Sequence[Trial], tune: Tune) -> TunedFiles:
+    """Tune a model for a file of at most so many bytes (host); arguments as of `smallest_tuned`.
+
+    Training spreads numbers, so that a file becomes some percent longer. While it is too long, the tuned model is tuned
+    again, for bits with which `model` takes fewer bytes, up to `MOST_TUNINGS` times in all.
+    """
+    found, latest, target = TunedFiles([]), model, TIGHTER * max_bytes
+    for number in range(1, MOST_TUNINGS + 1):
+        try:
+            tuned = tune(latest, best_within(model, int(target), trials), number)
+        except TooLargeError:
+            break
+        except DivergedError as error:
+            return found._replace(diverged=str(error))
+        trial, latest = _measured(tuned, losses), tuned.model
+        found.tried.append(trial)
+        if trial.num_bytes <= max_bytes:
+            return found._replace(chosen=trial, tuned=tuned)
+        target *= TIGHTER * max_bytes / trial.num_bytes
     return found
 
 

@@ -1,10 +1,12 @@
-"""Compression of a model to the smallest compact file within a loss, with a table of the choices tried."""
+"""Compression of a model to the smallest compact file within a loss, or the best one within some bytes, with a table of
+the choices tried."""
 
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.data import Scene
 from a2tg_jax.finish.compaction import (
     ASSUMED_PSNR,
@@ -12,12 +14,23 @@ from a2tg_jax.finish.compaction import (
     Loss,
     TooMuchLostError,
     Trial,
+    best_within,
+    check_fits,
     loss_beside_renders,
     loss_on_views,
     measure_choices,
     smallest_within,
+    try_choices,
 )
-from a2tg_jax.finish.tuning import MOST_TUNINGS, TUNED_LADDER, Tuned, TunedFiles, smallest_tuned, tune_compact
+from a2tg_jax.finish.tuning import (
+    MOST_TUNINGS,
+    TUNED_LADDER,
+    Tuned,
+    TunedFiles,
+    best_tuned,
+    smallest_tuned,
+    tune_compact,
+)
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import in_bytes, shortened
 from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
@@ -32,6 +45,8 @@ from a2tg_jax.results.run_evaluation import refined_views
 from a2tg_jax.training import System
 
 SUFFIX = ".a2tgz"
+MAX_LOSS = 0.05
+"""Default of `max_loss`."""
 MOST_VIEWS = 16
 """Largest number of training views measured, evenly chosen."""
 
@@ -40,12 +55,14 @@ def compress(
     source: Path,
     out: Path | None = None,
     *,
-    max_loss: float = 0.05,
+    max_loss: float | None = None,
+    file_budget: float | str | None = None,
     tune_iterations: int = 0,
     overwrite: bool = False,
     verbose: bool = False,
 ) -> str:
-    """Write the smallest compact file of a model within a given loss, and return a line about it.
+    """Write the smallest compact file of a model within a given loss, or the best one within given bytes, and return a
+    line about it.
 
     Losses are in PSNR on a run's training views. Without photographs they are estimated from renders, for a model of
     `ASSUMED_PSNR`.
@@ -54,19 +71,24 @@ def compress(
       source: a run folder, for its last model; or a model, *.npz.
       out: the file, *.a2tgz; None: next to the model. Files that this function did not write into the run's folder
         need `overwrite`.
-      max_loss: largest loss in dB.
+      max_loss: largest loss in dB; None: `MAX_LOSS`, unless there is a file_budget.
+      file_budget: largest size of the file, a number of MB or a text such as "60kB".
       tune_iterations: iterations of training with rounding for each choice of bits that is tuned
-        (`finish.tuning.smallest_tuned`); 0: the model's numbers are only rounded.
+        (`finish.tuning.smallest_tuned`, `best_tuned`); 0: the model's numbers are only rounded.
       verbose: return a table of the choices tried before that line.
 
     Raises:
       ValueError, OSError: if the model or the photographs for tuning are missing, the file exists, a compact file
-        cannot hold the model, or no file is within the loss.
+        cannot hold the model, no file is within the loss or the bytes, or both are given.
     """
     name = source.name.lower()
     if not source.is_dir() and name.endswith(tuple(FORMATS)) and not name.endswith(".npz"):
         done = ", which is compressed already" if name.endswith(SUFFIX) else ""
         raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(source))}{done}")
+    megabytes = megabytes_of(file_budget, "file_budget")
+    if megabytes is not None and max_loss is not None:
+        raise ValueError("max_loss asks for the smallest file and file_budget for the best one: give one of them")
+    max_loss = MAX_LOSS if max_loss is None else max_loss
     if not 0 <= max_loss < math.inf:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
     if tune_iterations < 0:
@@ -87,22 +109,30 @@ def compress(
         if scene is None:
             raise FileNotFoundError(f"tune_iterations needs the photographs of {source}, which are missing")
         tune = functools.partial(_tuned, scene, opened.system, tune_iterations)
+    ladder = LADDER if tune is None else TUNED_LADDER
+    if megabytes is not None:
+        check_fits(model, bytes_of(megabytes), ladder)
     losses = _losses(model, scene, opened.settings)
-    ladder, measures = LADDER if tune is None else TUNED_LADDER, list(losses.values())
+    measures = list(losses.values())
     tunings = f", then training up to {MOST_TUNINGS} times" if tune else ""
     ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
     print(f"trying {ways}{tunings}; on a CPU this takes minutes", flush=True)
     trials = measure_choices(model, measures, ladder, progress=True)
     untuned, found = None, TunedFiles([])
-    # Rounding alone may lose too much. With tuning, that is no error yet.
-    try:
-        untuned = smallest_within(model, measures, max_loss, trials)
-    except TooMuchLostError:
-        if tune is None:
-            raise
-    if tune is not None:
-        found = smallest_tuned(model, measures, max_loss, trials, tune)
-    chosen, data = _smaller(model, untuned, found, max_loss)
+    if megabytes is not None:
+        max_bytes = bytes_of(megabytes)
+        untuned = try_choices(model, best_within(model, max_bytes, trials), measures)
+        found = found if tune is None else best_tuned(model, measures, max_bytes, trials, tune)
+    else:
+        # Rounding alone may lose too much. With tuning, that is no error yet.
+        try:
+            untuned = smallest_within(model, measures, max_loss, trials)
+        except TooMuchLostError:
+            if tune is None:
+                raise
+        found = found if tune is None else smallest_tuned(model, measures, max_loss, trials, tune)
+    rank = _bytes_first if megabytes is None else _loss_first
+    chosen, data = _better(model, untuned, found, rank, max_loss)
     # Only the default path is listed in the marker: any other file is the user's.
     if source.is_dir() and out == default:
         RunFolder(source).own(out)
@@ -134,10 +164,20 @@ def _ended(found: TunedFiles) -> list[str]:
     return [f"tuning ended early, what was found before is kept: {found.diverged}"] if found.diverged else []
 
 
-def _smaller(model: Model, untuned: Trial | None, found: TunedFiles, max_loss: float) -> tuple[Trial, bytes]:
-    """Return the smaller of the untuned and the tuned file. Raises TooMuchLostError if there is neither."""
+def _bytes_first(trial: Trial) -> float:
+    return trial.num_bytes
+
+
+def _loss_first(trial: Trial) -> float:
+    return trial.losses[0]
+
+
+def _better(
+    model: Model, untuned: Trial | None, found: TunedFiles, rank: Callable[[Trial], float], max_loss: float
+) -> tuple[Trial, bytes]:
+    """Return the untuned or the tuned file, whichever ranks lower. Raises TooMuchLostError if there is neither."""
     tuned = found.chosen
-    if found.tuned is not None and tuned is not None and (untuned is None or tuned.num_bytes < untuned.num_bytes):
+    if found.tuned is not None and tuned is not None and (untuned is None or rank(tuned) < rank(untuned)):
         return tuned, found.tuned.data
     if untuned is not None:
         return untuned, encode_model(model, untuned.choices)

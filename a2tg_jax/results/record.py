@@ -29,6 +29,7 @@ import numpy as np
 import tomli_w
 from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 
+from a2tg_jax.core.budget import megabytes_of
 from a2tg_jax.data.load import SYNTHETIC, SceneSource
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
@@ -44,6 +45,8 @@ from a2tg_jax.training.registry import differences
 
 DEFAULT_SYSTEM = "bytewise"
 LONGEST_REASON = 500
+MEMORY_OF_FILE = 7.0
+"""Bytes of a model for each byte of a compact file with tuned numbers."""
 OnNan = Literal["stop", "restore"]
 """Action on divergence: end with an error, or restore the newest checkpoint and reorder the views."""
 LONGEST_WITHOUT_CHECKPOINT = 500
@@ -71,6 +74,9 @@ class RunRecord:
     init: Annotated[str | None, arg(metavar="FILE")] = None
     """File of splats (PLY, SPZ, SOG, a checkpoint of gsplat, ...) instead of the first stage, in the world of the
     scene folder."""
+    file_budget: Annotated[str | None, arg(metavar="SIZE")] = None
+    """Largest size of a compact file (*.a2tgz), such as 60kB, that is written when training is over, as by a2tg
+    compress with 1000 --tune-iterations. Unless memory_budget is given, it is 7 times as much."""
     compare_options: Annotated[Mapping[str, Mapping[str, Any]], Fixed, Suppress] = dataclasses.field(
         default_factory=dict, compare=False
     )
@@ -108,10 +114,19 @@ class RunRecord:
                 if system is self.options:
                     raise
                 raise ValueError(f"compare {label}, with the options of {self.system}: {error}") from error
+        megabytes_of(self.file_budget, "file_budget")
         if self.init is not None and len(self.plan.main) < 2:
             raise ValueError(f"init replaces a first stage, and {self.system} has no second one")
         if self.init is not None and self.options.sky_gaussians:
             raise ValueError("init replaces a first stage, and sky_gaussians start in one: leave one out")
+
+    def budgeted(self) -> "RunRecord":
+        """Return the record with the memory budget that goes with its file budget, unless it has one."""
+        megabytes = megabytes_of(self.file_budget, "file_budget")
+        if megabytes is None or self.options.memory_budget is not None:
+            return self
+        budget = MEMORY_OF_FILE * megabytes
+        return dataclasses.replace(self, options=dataclasses.replace(self.options, memory_budget=budget))
 
     def placed(self, folder: Path = Path()) -> "RunRecord":
         """Return the record with full paths; relative ones start from a folder. Raises as `scene_place`."""
@@ -209,6 +224,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         "compare": list(record.compare),
         "on_nan": record.on_nan,
         **({} if record.init is None else {"init": record.init}),
+        **({} if record.file_budget is None else {"file_budget": record.file_budget}),
         "version": version("a2tg-jax"),
         "options": _without_none(config_to_dict(record.options), config_to_dict(preset)),
         **({"compare_options": compared} if compared else {}),
@@ -250,7 +266,13 @@ def contradictions(asked: RunRecord, kept: RunRecord) -> list[str]:
     """Return the options, named as in run.toml, in which a record differs from the run to resume. The scene's path, the
     systems to compare and `on_nan` may differ."""
     before, now = (
-        {"system": one.system, "preset": one.preset, "init": one.init, **flatten_config(one.scene)}
+        {
+            "system": one.system,
+            "preset": one.preset,
+            "init": one.init,
+            "file_budget": one.file_budget,
+            **flatten_config(one.scene),
+        }
         | flatten_config(one.options)
         for one in (kept, asked)
     )

@@ -22,6 +22,7 @@ import numpy as np
 from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.scene import views_by_kind
+from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import Devices, this_machine
@@ -31,6 +32,7 @@ from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.io.model_file import FORMAT, load_model, number_in_file, save_model
 from a2tg_jax.parallel.processes import broadcast, team
+from a2tg_jax.results.compression import compress
 from a2tg_jax.results.folder import (
     DAMAGED,
     RunFolder,
@@ -161,8 +163,8 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
 
 
 def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options: RunOptions) -> RunResult:
-    """Train and measure. Errors and signals come with advice on how to continue; a replaced run is restored if there is
-    no checkpoint yet."""
+    """Train, measure, and write the file of a file budget. Errors and signals come with advice on how to continue; a
+    replaced run is restored if there is no checkpoint yet."""
 
     def advice() -> str:
         if put_back_old(run):
@@ -178,7 +180,10 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
             train_run(run, scene, options, is_stopped=is_stopped, watch=watch)
         if others is not None:
             others.leave()
-        return evaluate_run(run, scene, lpips_weights=options.lpips_weights)
+        result = evaluate_run(run, scene, lpips_weights=options.lpips_weights)
+        if record.file_budget is not None:
+            print(compress(run.path, file_budget=record.file_budget, tune_iterations=ITERATIONS), flush=True)
+        return result
     except KeyboardInterrupt as stop:
         number = getattr(stop, "number", signals.CTRL_C)
         raise signals.Stopped(number, advice()) from None
