@@ -135,6 +135,9 @@ describe.skipIf(CHROMIUM === undefined)("the page", () => {
     const [here, there] = [await poseOn(page), await poseOn(other.page)];
     expectClose(there.position, here.position, 4);
     expect(await other.page.inputValue("#mode")).toBe("normals");
+    await other.page.keyboard.press("ArrowRight");
+    await other.page.waitForFunction((old) => location.hash !== old, `${hash}&panel=no`);
+    expect(new URL(other.page.url()).hash).toContain("panel=no");
     await page.close();
     await other.page.close();
   });

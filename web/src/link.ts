@@ -22,6 +22,8 @@ export interface View {
   readonly exposure: number;
   /** Whether the page flies past the cameras. */
   readonly isFlying: boolean;
+  /** Whether the page has a panel, which one that embeds it may not want. */
+  readonly hasPanel: boolean;
 }
 
 /** Position, right, forward; focus; fx, fy, cx, cy, skew, width, height. */
@@ -51,6 +53,7 @@ export function linkOf({ pose, lens, mode, fit, up, crop, floaters, ...rest }: V
   if (rest.background !== null) fields.push(`background=${textOf(rest.background)}`);
   if (rest.exposure !== 0) fields.push(`exposure=${textOf([rest.exposure])}`);
   if (rest.isFlying) fields.push("fly=yes");
+  if (!rest.hasPanel) fields.push("panel=no");
   return `#${fields.join("&")}`;
 }
 
@@ -80,8 +83,12 @@ export function viewOf(hash: string): View | null {
     background: sharesOf<Vec3>(fields.get("background"), 3),
     exposure: Math.min(Math.max(Number(fields.get("exposure")) || 0, -3), 3),
     isFlying: fields.get("fly") === "yes",
+    hasPanel: hasPanel(hash),
   };
 }
+
+/** Return whether a fragment, with or without a view, leaves the panel. */
+export const hasPanel = (hash: string): boolean => new URLSearchParams(hash.replace(/^#/, "")).get("panel") !== "no";
 
 const isCropped = ({ from, to }: Crop): boolean => from.some((x) => x > 0) || to.some((x) => x < 1);
 

@@ -7,6 +7,7 @@ import type { Intrinsics, Viewmat } from "./camera";
 import { SceneError } from "./format";
 import type { Vec2 } from "./math";
 import { bytesText, countText, element, setFigures, showMessage } from "./page";
+import { hasPanel } from "./link";
 import { Panel } from "./panel";
 import { MODES } from "./shaders";
 import { openScene, readScene } from "./source";
@@ -101,8 +102,7 @@ async function findPhotographs(panel: Panel): Promise<void> {
 }
 
 function begin(): void {
-  // For pages that embed this one.
-  if (new URLSearchParams(location.hash.slice(1)).get("panel") === "no") {
+  if (!hasPanel(location.hash)) {
     for (const id of ["panel", "hint"]) element(id, HTMLElement).hidden = true;
   }
   const viewer = new Viewer(element("view", HTMLCanvasElement));

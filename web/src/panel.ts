@@ -6,7 +6,7 @@ import type { Intrinsics, Viewmat } from "./camera";
 import { textOfEdit } from "./edit";
 import { Flight } from "./flight";
 import type { Header } from "./format";
-import { linkOf, viewOf } from "./link";
+import { hasPanel, linkOf, viewOf } from "./link";
 import type { Vec2 } from "./math";
 import { element, setText } from "./page";
 import { MODES } from "./shaders";
@@ -41,6 +41,7 @@ export class Panel {
   private current: number | null = null;
   private kept: KeptView[] = [];
   private linkTimer = 0;
+  private readonly isShown = hasPanel(location.hash);
   private readonly leveling: LevelControls;
   private readonly cropping: CropControls;
   private readonly flight: Flight;
@@ -207,8 +208,8 @@ export class Panel {
     const { pose, image, mode, fit, up, isUpChosen, crop, floaters } = this.viewer;
     const { background, exposure } = this.viewer;
     const { isOn: isFlying } = this.flight;
-    const chosen = isUpChosen ? up : null;
-    return linkOf({ pose, lens: image, mode, fit, up: chosen, crop, floaters, background, exposure, isFlying });
+    const edits = { up: isUpChosen ? up : null, crop, floaters, background, exposure };
+    return linkOf({ pose, lens: image, mode, fit, ...edits, isFlying, hasPanel: this.isShown });
   }
 
   private async copyLink(): Promise<void> {

@@ -118,16 +118,23 @@ test.each([
 
 test("links preserve a view", () => {
   const crop: Crop = { from: [0, 0.25, 0], to: [1, 1, 0.5] };
-  const edit = { crop, floaters: 0.3, background: [1, 0.5, 0] as const, exposure: -1.5, isFlying: true };
+  const edit = {
+    crop,
+    floaters: 0.3,
+    background: [1, 0.5, 0] as const,
+    exposure: -1.5,
+    isFlying: true,
+    hasPanel: false,
+  };
   const view = viewOf(linkOf({ pose: POSE, lens: LENS, mode: "depth", fit: "close", up: [0, 0.6, 0.8], ...edit }));
   expect([view?.crop, view?.floaters, view?.background]).toEqual([crop, 0.3, [1, 0.5, 0]]);
-  expect([view?.exposure, view?.isFlying]).toEqual([-1.5, true]);
+  expect([view?.exposure, view?.isFlying, view?.hasPanel]).toEqual([-1.5, true, false]);
   expect(view?.mode).toBe("depth");
   expectClose(view?.pose.position ?? [], POSE.position, 5);
   expectClose(view?.pose.rotation.flat() ?? [], POSE.rotation.flat(), 5);
   expect(view?.lens).toEqual(LENS);
   expect([view?.fit, view?.up]).toEqual(["close", [0, 0.6, 0.8]]);
-  const none = { crop: WHOLE, floaters: 0, background: null, exposure: 0, isFlying: false };
+  const none = { crop: WHOLE, floaters: 0, background: null, exposure: 0, isFlying: false, hasPanel: true };
   const link = linkOf({ pose: POSE, lens: LENS, mode: "full", fit: "whole", up: null, ...none });
   const plain = viewOf(link);
   expect([plain?.fit, plain?.up, plain?.crop]).toEqual(["whole", null, WHOLE]);
