@@ -20,6 +20,7 @@ from a2tg_jax.appearance import Appearance, Bands, Texture
 from a2tg_jax.appearance.parts import empty_bands
 from a2tg_jax.core.gaussians import init_from_points
 from a2tg_jax.core.origin import Origin
+from a2tg_jax.data.load import SceneSource
 from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import Geometry
@@ -126,6 +127,24 @@ def test_the_report_says_what_is_special_about_a_run(tmp_path):
     for printed in ("2 views, none held out", "Training PSNR", "Colours fitted: ", "Poses aligned: ", "did not learn"):
         assert printed in report and printed not in usual
     assert "4 views, 2 held out" in usual and "test views: " in usual and "test views: " not in report
+
+
+@pytest.mark.parametrize(
+    ("source", "flags"),
+    [
+        (SceneSource("s", test_every=2), "--test-every 0 --out"),
+        (SceneSource("s", validation=True), "--test-every 0 --no-validation --out"),
+        (SceneSource("s", test_every=8), None),  # Two of four views are held out: by a list of the scene.
+    ],
+)
+def test_a_run_that_held_views_out_by_number_shows_how_to_train_on_all(source, flags, tmp_path):
+    result, kind = some_result(), "validation" if source.validation else "test"
+    named = lambda splits: {kind if name == "test" else name: own for name, own in splits.items()}  # noqa: E731
+    models = {name: dataclasses.replace(own, splits=named(own.splits)) for name, own in result.models.items()}
+    record = dataclasses.replace(result.record, scene=source)
+    report = written_report(tmp_path, dataclasses.replace(result, record=record, models=models))
+    assert "dB on training views" in report and ("For the final picture" in report) is (flags is not None)
+    assert flags is None or flags in report
 
 
 def test_the_report_names_the_commit(tmp_path, monkeypatch):
