@@ -25,6 +25,7 @@ from a2tg_jax.finish.compaction import (
 from a2tg_jax.finish.tuning import (
     MOST_TUNINGS,
     TUNED_LADDER,
+    Tune,
     Tuned,
     TunedFiles,
     best_tuned,
@@ -110,28 +111,17 @@ def compress(
             raise FileNotFoundError(f"tune_iterations needs the photographs of {source}, which are missing")
         tune = functools.partial(_tuned, scene, opened.system, tune_iterations)
     ladder = LADDER if tune is None else TUNED_LADDER
-    if megabytes is not None:
-        check_fits(model, bytes_of(megabytes), ladder)
+    max_bytes = None if megabytes is None else bytes_of(megabytes)
+    if max_bytes is not None:
+        check_fits(model, max_bytes, ladder)
     losses = _losses(model, scene, opened.settings)
     measures = list(losses.values())
     tunings = f", then training up to {MOST_TUNINGS} times" if tune else ""
     ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
     print(f"trying {ways}{tunings}; on a CPU this takes minutes", flush=True)
     trials = measure_choices(model, measures, ladder, progress=True)
-    untuned, found = None, TunedFiles([])
-    if megabytes is not None:
-        max_bytes = bytes_of(megabytes)
-        untuned = try_choices(model, best_within(model, max_bytes, trials), measures)
-        found = found if tune is None else best_tuned(model, measures, max_bytes, trials, tune)
-    else:
-        # Rounding alone may lose too much. With tuning, that is no error yet.
-        try:
-            untuned = smallest_within(model, measures, max_loss, trials)
-        except TooMuchLostError:
-            if tune is None:
-                raise
-        found = found if tune is None else smallest_tuned(model, measures, max_loss, trials, tune)
-    rank = _bytes_first if megabytes is None else _loss_first
+    untuned, found = _search(model, measures, max_loss, max_bytes, trials, tune)
+    rank = _bytes_first if max_bytes is None else _loss_first
     chosen, data = _better(model, untuned, found, rank, max_loss)
     # Only the default path is listed in the marker: any other file is the user's.
     if source.is_dir() and out == default:
@@ -142,6 +132,24 @@ def compress(
     size = f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
     lines = _table(trials, found, chosen, losses) if verbose else []
     return "\n".join([*lines, *_ended(found), size])
+
+
+def _search(
+    model: Model, measures: Sequence[Loss], max_loss: float, max_bytes: int | None, trials: Sequence[Trial],
+    tune: Tune | None,
+) -> tuple[Trial | None, TunedFiles]:  # fmt: skip
+    """Return the best file without tuning, and tuned ones; within bytes if they are given, or else within a loss."""
+    if max_bytes is not None:
+        untuned = try_choices(model, best_within(model, max_bytes, trials), measures)
+        return untuned, TunedFiles([]) if tune is None else best_tuned(model, measures, max_bytes, trials, tune)
+    try:
+        within = smallest_within(model, measures, max_loss, trials)
+    except TooMuchLostError:
+        # Rounding alone may lose too much. With tuning, that is no error yet.
+        if tune is None:
+            raise
+        within = None
+    return within, TunedFiles([]) if tune is None else smallest_tuned(model, measures, max_loss, trials, tune)
 
 
 def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: Iterable[str]) -> list[str]:
