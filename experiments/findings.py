@@ -1,6 +1,7 @@
 """The table and the chart of docs/results.md: every comparison of PROTOCOL.md, from the committed records."""
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -14,11 +15,14 @@ from lab.tables import EQUAL_BYTES, Result
 from a2tg_jax.results.figures import save_figure
 
 DENSE, FEW = "dense", "few views"
-BEST, MCMC, BYTEWISE = "Best plain method", "2DGS*-MCMC", "Bytewise"
+BEST, MCMC = "Best plain method", "2DGS*-MCMC"
+BYTEWISE, FIRST = "Bytewise", "Bytewise, first version"
+VERSIONS = {BYTEWISE: "bytewise", FIRST: "bytewise 1"}
+"""`bytewise` as it is, and its first version, with textures and without a weight on opacities, in the table's words."""
 EQUAL_TIME = ", equal time"
 PRIMARY = "bytewise − best plain method, 0.3 MB"
 SECONDARY = {
-    "equal time": (f"{PRIMARY}, equal time", "psnr"),
+    "equal time": (f"bytewise 1 − best plain method, 0.3 MB{EQUAL_TIME}", "psnr"),
     "SSIM": (PRIMARY, "ssim"),
     "LPIPS": (PRIMARY, "lpips"),
     "1.2 MB": ("bytewise − best plain method, 1.2 MB", "psnr"),
@@ -66,13 +70,13 @@ def rows_of_bytewise(results: Sequence[Result]) -> list[Row]:
     for stratum in (DENSE, FEW):
         for budget in (0.3, 1.2):
             own = [result for result in results if stratum_of(result) == stratum and result.run.cell.budget == budget]
-            for label, wording in OTHERS.items():
+            for (version, prefix), (label, wording) in itertools.product(VERSIONS.items(), OTHERS.items()):
                 place = f"{budget:g} MB" + ("" if stratum == DENSE else f", {FEW}")
                 place += EQUAL_TIME if label.endswith(EQUAL_TIME) else ""
-                rows.append(Row(f"bytewise − {wording}, {place}", own, BYTEWISE, label))
+                rows.append(Row(f"{prefix} − {wording}, {place}", own, version, label))
                 if label == BEST and stratum == DENSE:
                     others = [result for result in own if result.run.cell.scene.label not in CHOSEN_ON]
-                    rows.append(Row(rows[-1].name + UNSEEN, others, BYTEWISE, label))
+                    rows.append(Row(rows[-1].name + UNSEEN, others, version, label))
     return rows
 
 
@@ -81,8 +85,8 @@ def stratum_of(result: Result) -> str:
 
 
 def rows_of_parts(results: Sequence[Result]) -> list[Row]:
-    """Return what each part of `bytewise` brings."""
-    return [Row(f"bytewise: {part}, 0.3 MB", results, BYTEWISE, label) for label, part in PARTS.items()]
+    """Return what each part of the first version of `bytewise` brings."""
+    return [Row(f"{VERSIONS[FIRST]}: {part}, 0.3 MB", results, FIRST, label) for label, part in PARTS.items()]
 
 
 def rows_of_degrees(results: Mapping[int, Sequence[Result]]) -> list[Row]:

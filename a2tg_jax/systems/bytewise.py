@@ -51,12 +51,12 @@ QUICK_CAP, SMOKE_CAP = 40_000, 2_000
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bytewise(TwoStages):
-    """Gaussians of degree 0 first, then degrees and textures for those with the largest gradients.
+    """Gaussians of degree 0 first, then higher degrees, and textures if wanted, for those with the largest gradients.
 
     This library's own method, without a paper; its `Exponents` are after GES (Hamdi et al., 2024).
 
     Examples:
-      >>> system = a2tg.Bytewise.preset("quick", memory_budget="300kB", texture_share=0.0)
+      >>> system = a2tg.Bytewise.preset("quick", memory_budget="300kB")
       >>> system.memory_budget, len(system.stages())
       (0.3, 2)
     """
@@ -69,6 +69,9 @@ class Bytewise(TwoStages):
     prune: Prune = PRUNING
     """Pruning of the Gaussians that show least, up to 0.8 of the first stage; others grow in their place. The end of
     the stage prunes in any case."""
+    fading_weight: float = 0.01  # measured in experiments/NOTEBOOK.md, "A weight on opacities"
+    """Weight of the mean opacity in the loss of the first stage, so that Gaussians that show little fade and move; 0:
+    none. It adds to loss.opacity_weight."""
     kernel_rate: float = 0.01  # 0.02 and 0.005 are worse (experiments/NOTEBOOK.md, "Shapes of kernels")
     """Adam's learning rate of the kernels' shapes; 0: all kernels are Gaussians, as other programs draw them, for which
     a view_dependence_share of 0.23 is better."""
@@ -80,8 +83,8 @@ class Bytewise(TwoStages):
     """Adam's learning rate of the coefficients above base_degree."""
     view_dependence: AdaptDegrees = AdaptDegrees()
     """Spherical harmonics above base_degree, in the second stage."""
-    texture_share: float = 0.02  # 0 to 0.05 differ by hundredths of a dB (experiments/NOTEBOOK.md)
-    """Share of the bytes for textures; 0: none."""
+    texture_share: float = 0.0  # 0.02 gains nothing at 0.3 MB (docs/results.md)
+    """Share of the bytes for textures, such as 0.02; 0: none."""
     texel_rate: float = 2.5e-3
     """Adam's learning rate of the texels; textures of one texel are not trained."""
     details: Upscale = Upscale(at=(0.1, 0.2, 0.3))
@@ -106,6 +109,8 @@ class Bytewise(TwoStages):
         pruning = pruned(self.prune, self.stage1_iterations, densify_times)
         last = (Prune(keep=self._num_kept()),) if self._share else ()
         first = self.growing_stage((Noise(), grow, *pruning, *last, *limits), plain, kernels or None)
+        fading = dataclasses.replace(self.loss, opacity_weight=self.loss.opacity_weight + self.fading_weight)
+        first = dataclasses.replace(first, losses=fading.terms())
         # Degrees rise up to their share of the bytes; textures, empty at first, take the rest.
         events: list[Event] = []
         rates = kernels | {"bands": self.view_dependence_rate}
@@ -163,7 +168,7 @@ class Bytewise(TwoStages):
         check_number("base_degree", self.base_degree, least=0, most=self.sh_degree)
         for name in ("view_dependence_share", "texture_share"):
             check_number(name, getattr(self, name), least=0, most=1)
-        for name in ("kernel_rate", "view_dependence_rate", "texel_rate"):
+        for name in ("fading_weight", "kernel_rate", "view_dependence_rate", "texel_rate"):
             check_number(name, getattr(self, name), least=0)
         view, details = self.view_dependence, self.details
         by_shares: tuple[tuple[str, Any, str], ...] = (
