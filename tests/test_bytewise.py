@@ -1,7 +1,5 @@
 """The system that spends bytes where they pay: what its options lead to, and which it refuses before training."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +19,7 @@ from a2tg_jax.events import HostEvent
 from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.results.record import compared_system
 from a2tg_jax.systems.bytewise import Bytewise, LimitExponents
+from a2tg_jax.training import LossConfig
 from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import jitted_step
@@ -142,11 +141,19 @@ def test_shapes_of_kernels_are_trained_in_both_stages_and_counted(scene, tmp_pat
 
 
 def test_without_a_budget_the_cap_says_how_many_bytes():
-    system = dataclasses.replace(Bytewise.preset("quick"), memory_budget=None)
+    system = Bytewise.preset("quick", texture_share=0.02)
     degrees, textures, _ = system.stages()[1].events
     assert isinstance(degrees, AdaptDegrees) and isinstance(textures, Upscale)
     assert textures.budget_mb == pytest.approx(56e-6 * system.densify.cap)
     assert degrees.budget_mb == pytest.approx((1 - system.texture_share) * textures.budget_mb)
+
+
+def test_gaussians_fade_in_the_first_stage_only():
+    system = Bytewise(loss=LossConfig(opacity_weight=0.02))
+    weights = [[term.weight for term in stage.losses[1:]] for stage in system.stages()]
+    assert system.fading_weight == 0.01 and np.allclose(weights, [[0.03], [0.02]])
+    assert [len(stage.losses) for stage in Bytewise().stages()] == [2, 1]
+    assert [len(stage.losses) for stage in Bytewise(fading_weight=0.0).stages()] == [1, 1]
 
 
 @pytest.mark.parametrize("limit", [{"densify": {"cap": 1_000}}, {"memory_budget": "56kB"}])
@@ -217,10 +224,11 @@ def test_a_limit_below_all_exponents_changes_none_and_needs_exponents():
         ({"texture_share": 0.5, "view_dependence_share": 0.5}, "must leave bytes for Gaussians"),
         ({"texture_share": 1.5}, "texture_share must be at least 0 and at most 1; got 1.5"),
         ({"view_dependence_share": -0.1}, "view_dependence_share must be .*; got -0.1"),
+        ({"fading_weight": -1.0}, "fading_weight must be at least 0"),
         ({"texel_rate": -1.0}, "texel_rate must be at least 0"),
         ({"kernel_rate": -1.0}, "kernel_rate must be at least 0"),
         ({"details": {"cap": 32}}, "details.cap must be at least 1 and at most 16; got 32"),
-        ({"details": {"cap": 1}}, r"^details\.cap must be at least 2; got 1$"),
+        ({"texture_share": 0.1, "details": {"cap": 1}}, r"^details\.cap must be at least 2; got 1$"),
         ({"details": {"select": "fraction", "fraction": 0.5}}, r"^details\.fraction must stay 0\.25, .*; got 0\.5"),
         ({"view_dependence": {"budget_mb": 2.0}}, r"^view_dependence\.budget_mb must stay 0\.0, .*; got 2\.0"),
         ({"view_dependence": {"idle": -1.0}}, "view_dependence.idle must be at least 0"),
@@ -228,11 +236,14 @@ def test_a_limit_below_all_exponents_changes_none_and_needs_exponents():
         ({"base_degree": 2, "sh_degree": 1}, "base_degree must be at least 0 and at most 1; got 2"),
         ({"base_degree": 3}, "view_dependence_share must be 0 where all Gaussians have the highest degree, 3"),
         ({"details": {"at": [0.5, 0.2]}}, "details.at must be ascending"),
-        ({"details": {"at": []}}, "details.at must hold fractions"),
+        ({"texture_share": 0.1, "details": {"at": []}}, "details.at must hold fractions"),
         ({"prune": {"share": 1.0}}, "prune.share must be at least 0 and below 1; got 1.0"),
         ({"prune": {"at": [0.5, 0.83]}}, "prune.at must hold fractions up to 0.8, .* lower the last"),
         ({"prune": {"at": []}}, "prune.at must hold fractions"),
-        ({"view_dependence": {"at": [0.5]}}, "view_dependence.at must be over when textures begin"),
+        (
+            {"texture_share": 0.1, "view_dependence": {"at": [0.5]}},
+            "view_dependence.at must be over when textures begin",
+        ),
         ({"memory_budget": None, "densify": {"cap": 2}}, "densify.cap must leave room for 2 Gaussians"),
         ({"memory_budget": "0.05kB"}, "has room for 0 Gaussians"),
         ({"memory_budget": "0.115kB"}, "memory_budget must leave room for 2 Gaussians"),

@@ -263,7 +263,7 @@ def check_fits(model: Model, max_bytes: int, ladder: Ladder = LADDER) -> None:
 
 
 def best_within(model: Model, max_bytes: int, trials: Sequence[Trial]) -> CompactChoices:
-    """Return the choices of a file of at most so many bytes that loses least, by greedy search (host).
+    """Return the choices of a file of at most this many bytes that loses least, by greedy search (host).
 
     Start from the finest choices. Take the step with the most bytes saved per loss, until the file is small enough.
     Then take finer steps back, those that gain most first, while it stays so.

@@ -378,7 +378,7 @@ def smallest_tuned(
 
 
 def best_tuned(model: Model, losses: Sequence[Loss], max_bytes: int, trials: Sequence[Trial], tune: Tune) -> TunedFiles:
-    """Tune a model for a file of at most so many bytes (host); arguments as of `smallest_tuned`.
+    """Tune a model for a file of at most this many bytes (host); arguments as of `smallest_tuned`.
 
     Training spreads numbers, so that a file becomes some percent longer. While it is too long, the tuned model is tuned
     again, for bits with which `model` takes fewer bytes, up to `MOST_TUNINGS` times in all.
