@@ -29,9 +29,9 @@ from a2tg_jax.host.machine import this_machine
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.results import forecast, run_evaluation, run_training
+from a2tg_jax.results import compression, forecast, run_evaluation, run_training
 from a2tg_jax.results.folder import OLD, RunFolder, check_apart, old_run, opened, put_back_old, set_aside
-from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
+from a2tg_jax.results.record import RunRecord, SceneSource, read_record, read_run_file, write_record
 from a2tg_jax.results.run_training import MOST_RESTORED, RunOptions, train_run
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import DivergedError, load_checkpoint, save_checkpoint
@@ -557,13 +557,16 @@ def test_an_internal_error_is_not_reported_as_a_mistake_of_the_user(monkeypatch)
 
 
 def test_a_run_with_a_file_budget_ends_with_its_file(tmp_path, monkeypatch, capsys):
-    """If the program is killed before, the resumed run writes it; the model has 7 times as many bytes."""
+    """If the program is killed before, the resumed run writes it, once. Without a file the run is finished, too."""
     asked = []
 
-    def compress(path, **options):
-        asked.append((path, options))
+    def compress(path, *, file_budget, tune_iterations, scene, progress):
+        asked.append((path, file_budget, tune_iterations, progress))
         if len(asked) == 1:
             raise KeyboardInterrupt
+        if len(asked) == 2:
+            raise ValueError("file_budget must be larger")
+        run.model(NAME).with_suffix(".a2tgz").touch()
         return "the file"
 
     monkeypatch.setattr(run_training, "evaluate_run", lambda *_, **__: some_result())
@@ -572,15 +575,51 @@ def test_a_run_with_a_file_budget_ends_with_its_file(tmp_path, monkeypatch, caps
     assert cli.main([*TRAIN, "--out", str(run.path), "--quiet", "--file-budget", "60kB"]) == 130
     assert f"continue with: a2tg train --out {run.path} --resume" in capsys.readouterr().err
     resuming = ["train", "--out", str(run.path), "--resume", "--quiet"]
-    assert cli.main(resuming) == 0 and "the file\n" in capsys.readouterr().out
-    assert asked == [(run.path, {"file_budget": "60kB", "tune_iterations": 1000})] * 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert cli.main(resuming) == 0
+    printed = capsys.readouterr()
+    assert "the file\n" not in printed.out
+    assert (
+        f"no file was written: file_budget must be larger; to try another size: a2tg compress {run.path}" in printed.err
+    )
+    assert cli.main([*resuming, "--file-budget", "0.06MB"]) == 0 and "the file\n" in capsys.readouterr().out
+    assert cli.main(resuming) == 0 and "the file\n" not in capsys.readouterr().out
+    assert asked == [(run.path, 0.06, 1000, False)] * 3
     assert read_record(run).options.budget_bytes == 420_000 >= load_model(run.model(NAME)).num_bytes > 417_000
     assert cli.main([*resuming, "--file-budget", "3kB"]) == 2
-    assert "--resume takes every option from" in capsys.readouterr().err
-    record = dataclasses.replace(read_record(run), file_budget="9kB")
-    assert record.budgeted() == record  # It has a memory budget.
+    assert f"a2tg compress {run.path} --file-budget 0.003MB --tune-iterations 1000" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_the_file_of_a_file_budget(tmp_path, monkeypatch, capsys):
+    ladder = {"means": (8, 12), "log_scales": (4, 8), "sh_0": (4, 8), "sh_rest": (2, 4)}
+    monkeypatch.setattr(compression, "TUNED_LADDER", ladder)
+    monkeypatch.setattr(run_training, "ITERATIONS", 10)
+    run = RunFolder(tmp_path / "run")
+    assert cli.main([*TRAIN, "--out", str(run.path), "--quiet", "--file-budget", "40kB"]) == 0
+    size, printed = run.model(NAME).with_suffix(".a2tgz").stat().st_size, capsys.readouterr()
+    assert 10_000 < size <= 40_000 and "tuning" not in printed.err and " on disk" in printed.out
+    assert "compressed (gaussians-2d-mcmc-gaussians.a2tgz)" in printed.out
+    other = ["train", "synthetic", "--system", "supergaussians", "--out", str(tmp_path / "other")]
+    assert cli.main([*other, "--file-budget", "6kB"]) == 2
+    assert "the file of file_budget holds Gaussians" in capsys.readouterr().err
+
+
+def test_a_file_budget_goes_with_a_memory_budget(tmp_path):
+    run = create_run(tmp_path / "run")
+    record = dataclasses.replace(RECORD, file_budget="70 kB").budgeted()
+    assert (record.file_bytes, record.options.memory_budget) == (70_000, 0.49)
+    write_record(run, record)
+    assert "\nmemory_budget" not in run.record.read_text() and read_record(run) == record
+    # Another one in its place: the memory follows, unless it was given.
+    for budget, expected in ((None, 210_000), (0.1, 100_000)):
+        given = dataclasses.replace(RECORD, options=dataclasses.replace(RECORD.options, memory_budget=budget))
+        write_record(run, dataclasses.replace(given, file_budget="70kB").budgeted())
+        again = dataclasses.replace(read_run_file(run.record), file_budget=0.03).budgeted()
+        assert again.options.budget_bytes == expected
     with pytest.raises(ValueError, match="file_budget must be a number of MB"):
-        dataclasses.replace(record, file_budget="nine").check()
+        dataclasses.replace(record, file_budget="nine")
 
 
 def test_a_finished_run_is_trained_on(tmp_path, monkeypatch, capsys):

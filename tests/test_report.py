@@ -129,22 +129,26 @@ def test_the_report_says_what_is_special_about_a_run(tmp_path):
     assert "4 views, 2 held out" in usual and "test views: " in usual and "test views: " not in report
 
 
-@pytest.mark.parametrize(
-    ("source", "flags"),
-    [
-        (SceneSource("s", test_every=2), "--test-every 0 --out"),
-        (SceneSource("s", validation=True), "--test-every 0 --no-validation --out"),
-        (SceneSource("s", test_every=8), None),  # Two of four views are held out: by a list of the scene.
-    ],
-)
-def test_a_run_that_held_views_out_by_number_shows_how_to_train_on_all(source, flags, tmp_path):
-    result, kind = some_result(), "validation" if source.validation else "test"
-    named = lambda splits: {kind if name == "test" else name: own for name, own in splits.items()}  # noqa: E731
-    models = {name: dataclasses.replace(own, splits=named(own.splits)) for name, own in result.models.items()}
-    record = dataclasses.replace(result.record, scene=source)
+@pytest.mark.parametrize(("tested", "is_shown"), [("13", True), ("12", False), ("24", False)])
+def test_a_run_that_held_every_second_view_out_shows_how_to_train_on_all(tested, is_shown, tmp_path):
+    """Other test views are those of a list of the scene, which no option changes."""
+    result = some_result()
+
+    def named(evaluation, names):
+        pairs = zip(evaluation.per_view, names, strict=True)
+        return dataclasses.replace(evaluation, per_view=tuple(dataclasses.replace(v, name=n) for v, n in pairs))
+
+    def changed(model):
+        train = "".join(name for name in "1234" if name not in tested)
+        return dataclasses.replace(
+            model, splits={"test": named(model.shown, tested), "train": named(model.train, train)}
+        )
+
+    models = {name: changed(model) for name, model in result.models.items()}
+    record = dataclasses.replace(result.record, scene=SceneSource("s", test_every=2))
     report = written_report(tmp_path, dataclasses.replace(result, record=record, models=models))
-    assert "dB on training views" in report and ("For the final picture" in report) is (flags is not None)
-    assert flags is None or flags in report
+    assert "dB on training views" in report
+    assert ("For the final picture" in report) is is_shown is ("--test-every 0 --out" in report)
 
 
 def test_the_report_names_the_commit(tmp_path, monkeypatch):

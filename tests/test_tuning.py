@@ -297,6 +297,7 @@ def test_the_search_ends_without_choices_and_at_the_coarsest(monkeypatch):
         pytest.param((1.5, 1.5), (990, 660), 1, id="grows by half"),
         pytest.param((2.0, "diverges"), (990, 495), None, id="ends where a tuning diverges"),
         pytest.param((9.0, "too coarse"), (990, 110), None, id="ends at the coarsest bits"),
+        pytest.param((1.5, 1.6, 1.8, 2.0), (990, 660, 618, 549), None, id="gives up after four"),
     ],
 )
 def test_the_search_for_a_file_of_given_bytes(monkeypatch, growth, targets, kept):
@@ -320,8 +321,9 @@ def test_the_search_for_a_file_of_given_bytes(monkeypatch, growth, targets, kept
     sized = lambda found, measures: Trial(found.choices, round(asked[-1] * growth[len(asked) - 1]), (0.0,))  # noqa: E731
     monkeypatch.setattr(tuning, "_measured", sized)
     found = best_tuned("model", [], 1000, [], tune)
-    np.testing.assert_allclose(asked, targets[: len(asked)], atol=1)
-    assert started == ["model", 1, 2, 3][: len(started)]
+    np.testing.assert_allclose(asked, targets, atol=1)
+    num_tuned = len(growth) - ("too coarse" in growth)
+    assert started == ["model", 1, 2, 3][:num_tuned]
     assert found.diverged == ("the loss has exploded" if "diverges" in growth else None)
     if kept is None:
         assert found.chosen is None and found.tuned is None

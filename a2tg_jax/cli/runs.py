@@ -434,8 +434,8 @@ class Compress:
     """Largest size of the file, such as 60kB, instead of --max-loss."""
     tune_iterations: int = 0
     """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. The model is
-    tuned up to 4 times: each time for other bits, first for those that lose 0.5 dB, or twice --max-loss if that is
-    more; with --file-budget until the file fits, mostly once. 0: numbers are only rounded."""
+    tuned up to 4 times, each time for other bits: first for bits that lose 0.5 dB, or twice --max-loss if that is more.
+    With --file-budget it is tuned until the file fits, mostly once. 0: numbers are only rounded."""
     overwrite: bool = False
     """Replace the output file. A file that a2tg compress wrote into a run folder is always replaced."""
     verbose: bool = False

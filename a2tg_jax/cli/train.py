@@ -221,7 +221,7 @@ class Train:
 
     @property
     def whole_record(self) -> RunRecord:
-        """Record with full paths, and with the baseline."""
+        """Record with full paths, the memory budget, and the baseline."""
         compare = (*self.record.compare, BASELINE) if self.baseline else self.record.compare
         # A dict keeps the order and drops repetitions, such as of --baseline by --compare.
         return dataclasses.replace(self.record.placed().budgeted(), compare=tuple(dict.fromkeys(compare)))
@@ -234,7 +234,11 @@ class Train:
         Raises:
           ValueError: if a flag contradicts the record.
         """
-        kept, record = read_record(run), self.whole_record
+        kept = read_record(run)
+        if (size := self.record.file_budget) != kept.file_budget:
+            compressing = f"a2tg compress {run.path} --file-budget {size or 0.06:g}MB --tune-iterations 1000"
+            raise ValueError(f"--file-budget is for new runs; for another file of a finished one: {compressing}")
+        record = self.whole_record
         more, options = record.options.more, dataclasses.replace(record.options, more=kept.options.more)
         record = dataclasses.replace(record, options=options)
         changed = [f"--{name.replace('_', '-')}" for name in contradictions(record, kept)]

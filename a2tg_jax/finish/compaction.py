@@ -252,7 +252,7 @@ class TooLargeError(ValueError):
     def __init__(self, least: int):
         """`least` is the size of the smallest file."""
         kilobytes = math.ceil(least / 10) / 100
-        super().__init__(f"file_budget must be at least {kilobytes} kB: the smallest file has that")
+        super().__init__(f"file_budget must be at least {kilobytes} kB, the size of the smallest file")
 
 
 def check_fits(model: Model, max_bytes: int, ladder: Ladder = LADDER) -> None:

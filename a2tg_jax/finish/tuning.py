@@ -325,10 +325,10 @@ def _held(kind: type[Correction]) -> type[Correction]:
 
 
 class TunedFiles(NamedTuple):
-    """Result of `smallest_tuned`."""
+    """Result of `smallest_tuned` and `best_tuned`."""
 
     tried: list[Trial]  # All files of tuned models.
-    chosen: Trial | None = None  # The smallest one within the loss; None if there is none.
+    chosen: Trial | None = None  # The smallest within the loss, or the one within the bytes; None if there is none.
     tuned: Tuned | None = None  # The model of that file.
     diverged: str | None = None  # Error that ended the search; None: the search was completed.
 

@@ -61,6 +61,8 @@ def compress(
     tune_iterations: int = 0,
     overwrite: bool = False,
     verbose: bool = False,
+    scene: Scene | None = None,
+    progress: bool = True,
 ) -> str:
     """Write the smallest compact file of a model within a given loss, or the best one within given bytes, and return a
     line about it.
@@ -77,6 +79,8 @@ def compress(
       tune_iterations: iterations of training with rounding for each choice of bits that is tuned
         (`finish.tuning.smallest_tuned`, `best_tuned`); 0: the model's numbers are only rounded.
       verbose: return a table of the choices tried before that line.
+      scene: the run's photographs, if they are loaded already.
+      progress: show progress bars.
 
     Raises:
       ValueError, OSError: if the model or the photographs for tuning are missing, the file exists, a compact file
@@ -88,7 +92,7 @@ def compress(
         raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(source))}{done}")
     megabytes = megabytes_of(file_budget, "file_budget")
     if megabytes is not None and max_loss is not None:
-        raise ValueError("max_loss asks for the smallest file and file_budget for the best one: give one of them")
+        raise ValueError("max_loss and file_budget exclude each other: give one of them")
     max_loss = MAX_LOSS if max_loss is None else max_loss
     if not 0 <= max_loss < math.inf:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
@@ -103,23 +107,23 @@ def compress(
     check_export(out, default, "--out", overwrite=overwrite)
     # Before the photographs are loaded, and minutes of trials.
     check_encodable(model.appearance)
-    scene, tune = opened.load_scene(), None
+    ladder, max_bytes = TUNED_LADDER if tune_iterations else LADDER, None
+    if megabytes is not None:
+        max_bytes = bytes_of(megabytes)
+        check_fits(model, max_bytes, ladder)
+    scene, tune = scene or opened.load_scene(), None
     if tune_iterations:
         if opened.system is None:
             raise ValueError(f"tune_iterations needs the photographs of a run folder; {source} is a file")
         if scene is None:
             raise FileNotFoundError(f"tune_iterations needs the photographs of {source}, which are missing")
-        tune = functools.partial(_tuned, scene, opened.system, tune_iterations)
-    ladder = LADDER if tune is None else TUNED_LADDER
-    max_bytes = None if megabytes is None else bytes_of(megabytes)
-    if max_bytes is not None:
-        check_fits(model, max_bytes, ladder)
+        tune = functools.partial(_tuned, scene, opened.system, tune_iterations, progress)
     losses = _losses(model, scene, opened.settings)
     measures = list(losses.values())
     tunings = f", then training up to {MOST_TUNINGS} times" if tune else ""
     ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
     print(f"trying {ways}{tunings}; on a CPU this takes minutes", flush=True)
-    trials = measure_choices(model, measures, ladder, progress=True)
+    trials = measure_choices(model, measures, ladder, progress=progress)
     untuned, found = _search(model, measures, max_loss, max_bytes, trials, tune)
     rank = _bytes_first if max_bytes is None else _loss_first
     chosen, data = _better(model, untuned, found, rank, max_loss)
@@ -131,7 +135,7 @@ def compress(
     share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
     size = f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
     lines = _table(trials, found, chosen, losses) if verbose else []
-    return "\n".join([*lines, *_ended(found), size])
+    return "\n".join([*lines, *_ended(found), *_unfit(found, max_bytes), size])
 
 
 def _search(
@@ -172,6 +176,14 @@ def _ended(found: TunedFiles) -> list[str]:
     return [f"tuning ended early, what was found before is kept: {found.diverged}"] if found.diverged else []
 
 
+def _unfit(found: TunedFiles, max_bytes: int | None) -> list[str]:
+    """Return a line about tuned files that are all too large."""
+    if max_bytes is None or not found.tried or found.chosen is not None:
+        return []
+    least = in_bytes(min(trial.num_bytes for trial in found.tried))
+    return [f"no tuned file is small enough, the best of {len(found.tried)} has {least}: the untuned one is kept"]
+
+
 def _bytes_first(trial: Trial) -> float:
     return trial.num_bytes
 
@@ -195,9 +207,11 @@ def _better(
     raise TooMuchLostError(f"max_loss must be larger: no file, tuned or not, is within it; got {max_loss}{best}{ended}")
 
 
-def _tuned(scene: Scene, system: System, iterations: int, model: Model, choices: CompactChoices, number: int) -> Tuned:
+def _tuned(
+    scene: Scene, system: System, iterations: int, progress: bool, model: Model, choices: CompactChoices, number: int
+) -> Tuned:
     title = f"tuning {number} of up to {MOST_TUNINGS}"
-    return tune_compact(model, scene, system, choices, iterations=iterations, progress=True, title=title)
+    return tune_compact(model, scene, system, choices, iterations=iterations, progress=progress, title=title)
 
 
 def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict[str, Loss]:

@@ -29,7 +29,7 @@ import numpy as np
 import tomli_w
 from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 
-from a2tg_jax.core.budget import megabytes_of
+from a2tg_jax.core.budget import MEGABYTE, bytes_of, megabytes_of
 from a2tg_jax.data.load import SYNTHETIC, SceneSource
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
@@ -37,6 +37,7 @@ from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.remote_files import checked_url, path_here
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
+from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.results.folder import RunFolder, read_json
 from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.training import Stage, System, find_system, like
@@ -74,14 +75,18 @@ class RunRecord:
     init: Annotated[str | None, arg(metavar="FILE")] = None
     """File of splats (PLY, SPZ, SOG, a checkpoint of gsplat, ...) instead of the first stage, in the world of the
     scene folder."""
-    file_budget: Annotated[str | None, arg(metavar="SIZE")] = None
-    """Largest size of a compact file (*.a2tgz), such as 60kB, that is written when training is over, as by a2tg
-    compress with 1000 --tune-iterations. Unless memory_budget is given, it is 7 times as much."""
+    file_budget: Annotated[float | str | None, arg(metavar="SIZE")] = None
+    """Largest size of a compact file (*.a2tgz), such as 60kB. It is written when training is over, as by a2tg compress
+    --tune-iterations 1000. Without a memory_budget the model gets 7 times as many bytes in memory."""
     compare_options: Annotated[Mapping[str, Mapping[str, Any]], Fixed, Suppress] = dataclasses.field(
         default_factory=dict, compare=False
     )
     """Options of the compared systems, nested, by name. Missing ones take the main system's values, or the preset's if
     it lacks them. run.toml keeps all those that the main system lacks."""
+
+    def __post_init__(self) -> None:
+        """Convert the file budget to a number of MB."""
+        object.__setattr__(self, "file_budget", megabytes_of(self.file_budget, "file_budget"))
 
     @property
     def systems(self) -> dict[str, System]:
@@ -114,19 +119,30 @@ class RunRecord:
                 if system is self.options:
                     raise
                 raise ValueError(f"compare {label}, with the options of {self.system}: {error}") from error
-        megabytes_of(self.file_budget, "file_budget")
+        if self.file_budget is not None:
+            check_encodable(self.options.stages()[-1].appearance, "the file of file_budget", "leave it out")
         if self.init is not None and len(self.plan.main) < 2:
             raise ValueError(f"init replaces a first stage, and {self.system} has no second one")
         if self.init is not None and self.options.sky_gaussians:
             raise ValueError("init replaces a first stage, and sky_gaussians start in one: leave one out")
 
-    def budgeted(self) -> "RunRecord":
-        """Return the record with the memory budget that goes with its file budget, unless it has one."""
+    @property
+    def file_bytes(self) -> int | None:
+        """File budget in bytes; None without one."""
         megabytes = megabytes_of(self.file_budget, "file_budget")
-        if megabytes is None or self.options.memory_budget is not None:
+        return None if megabytes is None else bytes_of(megabytes)
+
+    def budgeted(self) -> "RunRecord":
+        """Return the record with the memory budget that goes with its file budget, unless it has another."""
+        if self.file_bytes is None or self.options.memory_budget is not None:
             return self
-        budget = MEMORY_OF_FILE * megabytes
+        budget = round(MEMORY_OF_FILE * self.file_bytes) / MEGABYTE
         return dataclasses.replace(self, options=dataclasses.replace(self.options, memory_budget=budget))
+
+    def unbudgeted(self) -> "RunRecord":
+        """Return the record without the memory budget that `budgeted` adds."""
+        plain = dataclasses.replace(self, options=dataclasses.replace(self.options, memory_budget=None))
+        return plain if plain.budgeted() == self else self
 
     def placed(self, folder: Path = Path()) -> "RunRecord":
         """Return the record with full paths; relative ones start from a folder. Raises as `scene_place`."""
@@ -226,7 +242,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         **({} if record.init is None else {"init": record.init}),
         **({} if record.file_budget is None else {"file_budget": record.file_budget}),
         "version": version("a2tg-jax"),
-        "options": _without_none(config_to_dict(record.options), config_to_dict(preset)),
+        "options": _without_none(config_to_dict(record.unbudgeted().options), config_to_dict(preset)),
         **({"compare_options": compared} if compared else {}),
     }
     text = f"# Repeats the run: {repeating_command(run)}\n"
@@ -251,7 +267,7 @@ def read_record(run: RunFolder) -> RunRecord:
     """Read run.toml. The module of a custom system is imported. Raises ValueError if it is damaged or of another
     version, its system is not found, or an option is invalid."""
     try:
-        record = read_run_file(run.record)
+        record = read_run_file(run.record).budgeted()
         if not record.scene.path:
             raise ValueError(f"{run.record}: scene is missing")
         record.check()
@@ -266,13 +282,7 @@ def contradictions(asked: RunRecord, kept: RunRecord) -> list[str]:
     """Return the options, named as in run.toml, in which a record differs from the run to resume. The scene's path, the
     systems to compare and `on_nan` may differ."""
     before, now = (
-        {
-            "system": one.system,
-            "preset": one.preset,
-            "init": one.init,
-            "file_budget": one.file_budget,
-            **flatten_config(one.scene),
-        }
+        {"system": one.system, "preset": one.preset, "init": one.init, **flatten_config(one.scene)}
         | flatten_config(one.options)
         for one in (kept, asked)
     )

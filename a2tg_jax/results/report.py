@@ -341,13 +341,11 @@ def write_report(
     best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
     leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.options)
-    final, scene = None, result.record.scene
-    num_held_out = len(main.splits[held_out].per_view) if held_out in main.splits else 0
-    num_views = len(main.train.per_view) + num_held_out
-    # The lists of a scene that names its own test views cannot be changed by an option.
-    if scene.validation or (scene.test_every and num_held_out == len(range(0, num_views, scene.test_every))):
-        all_views = ["--no-validation"] if scene.validation else []
-        final = training_command(run, f"{run.path}-final", "--test-every", "0", *all_views)
+    final, every = None, result.record.scene.test_every
+    tested = [view.name for view in main.splits["test"].per_view] if "test" in main.splits else []
+    # A scene may also list its test views, which no option changes.
+    if tested and every and tested == sorted([*tested, *(view.name for view in main.train.per_view)])[::every]:
+        final = training_command(run, f"{run.path}-final", "--test-every", "0")
     page = pages.get_template("report.html").render(
         **inlined,
         policy=Markup(policy),

@@ -93,7 +93,7 @@ class Bytewise(TwoStages):
     """Options of the texture lookup."""
 
     name: ClassVar[str] = "bytewise"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     @property
     def initial_sh_degree(self) -> int:
@@ -183,6 +183,8 @@ class Bytewise(TwoStages):
                 )
         if self.texture_share:
             check_number("details.cap", details.cap, least=2)
+        elif details != type(self).details:
+            raise ValueError("details has no effect while texture_share is 0: set that too, to 0.02 for example")
         if self._share >= 1:
             raise ValueError(
                 "view_dependence_share and texture_share must leave bytes for Gaussians, adding up to less than 1; "
