@@ -228,6 +228,7 @@ def test_a_limit_below_all_exponents_changes_none_and_needs_exponents():
         ({"texel_rate": -1.0}, "texel_rate must be at least 0"),
         ({"kernel_rate": -1.0}, "kernel_rate must be at least 0"),
         ({"details": {"cap": 32}}, "details.cap must be at least 1 and at most 16; got 32"),
+        ({"details": {"cap": 8}}, "details has no effect while texture_share is 0"),
         ({"texture_share": 0.1, "details": {"cap": 1}}, r"^details\.cap must be at least 2; got 1$"),
         ({"details": {"select": "fraction", "fraction": 0.5}}, r"^details\.fraction must stay 0\.25, .*; got 0\.5"),
         ({"view_dependence": {"budget_mb": 2.0}}, r"^view_dependence\.budget_mb must stay 0\.0, .*; got 2\.0"),
