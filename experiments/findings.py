@@ -32,11 +32,11 @@ CHOSEN_ON = {"fox", "lego", "snowmiku"}
 """Scenes on which defaults of `bytewise` were chosen."""
 UNSEEN = ", without fox, lego and snowmiku"
 OTHERS = {
-    FIRST: "bytewise 1",
     BEST: "best plain method",
     BEST + EQUAL_TIME: "best plain method",
     "3DGS-MCMC, degree 0": "3DGS, degree 0",
     "3DGS-MCMC, degree 3": "3DGS, degree 3",
+    FIRST: VERSIONS[FIRST],
 }
 """Methods that `bytewise` is compared with, in the words of the table."""
 PARTS = {
