@@ -277,7 +277,10 @@ def best_within(model: Model, max_bytes: int, trials: Sequence[Trial]) -> Compac
       ValueError: if the coarsest choices take more bytes.
     """
     by_size = _by_size(trials)
-    size_of = lambda kept: len(encode_model(model, finest_choices().keeping(kept)))  # noqa: E731
+
+    def size_of(kept: Mapping[str, Precision]) -> int:
+        return len(encode_model(model, finest_choices().keeping(kept)))
+
     path = [{group: own[-1].precision for group, own in by_size.items()}, *_descent(by_size, math.inf)]
     at = bisect.bisect_left(range(len(path)), True, key=lambda index: size_of(path[index]) <= max_bytes)
     if at == len(path):

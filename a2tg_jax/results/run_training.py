@@ -203,9 +203,10 @@ def _write_file(run: RunFolder, record: RunRecord, scene: Scene, max_bytes: int,
     path = model.with_suffix(SUFFIX)
     if path.is_file() and path.stat().st_size <= max_bytes and path.stat().st_mtime >= model.stat().st_mtime:
         return
-    budget = {"file_budget": max_bytes / MEGABYTE, "tune_iterations": ITERATIONS}
+    budget = max_bytes / MEGABYTE
     try:
-        print(compress(run.path, **budget, scene=scene, progress=progress), flush=True)
+        line = compress(run.path, file_budget=budget, tune_iterations=ITERATIONS, scene=scene, progress=progress)
+        print(line, flush=True)
     except ValueError as error:
         again = f"a2tg compress {run.path} --file-budget SIZE --tune-iterations {ITERATIONS}"
         warnings.warn(f"no file was written: {error}; to try another size: {again}", stacklevel=2)
