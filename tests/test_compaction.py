@@ -137,5 +137,5 @@ def test_the_best_file_within_some_bytes():
         ]  # fmt: skip
         best = min(trial.losses[0] for trial in others if trial.num_bytes <= most)
         assert chosen.losses[0] <= 3 * max(best, 0.001)
-    with pytest.raises(ValueError, match=r"file_budget must be at least [\d.]+ kB: the smallest file has that"):
+    with pytest.raises(ValueError, match=r"file_budget must be at least [\d.]+ kB, the size of the smallest file"):
         best_within(model, 100, trials)
