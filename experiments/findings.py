@@ -18,14 +18,14 @@ DENSE, FEW = "dense", "few views"
 BEST, MCMC = "Best plain method", "2DGS*-MCMC"
 BYTEWISE, FIRST = "Bytewise", "Bytewise, first version"
 VERSIONS = {BYTEWISE: "bytewise", FIRST: "bytewise 1"}
-"""`bytewise` as it is, and its first version, with textures and without a weight on opacities, in the table's words."""
+"""Names in the table of `bytewise` and of its first version, which had textures and no weight on opacities."""
 EQUAL_TIME = ", equal time"
-PRIMARY = "bytewise 1 − best plain method, 0.3 MB"
+PRIMARY = f"{VERSIONS[FIRST]} − best plain method, 0.3 MB"
 SECONDARY = {
     "equal time": (PRIMARY + EQUAL_TIME, "psnr"),
     "SSIM": (PRIMARY, "ssim"),
     "LPIPS": (PRIMARY, "lpips"),
-    "1.2 MB": ("bytewise 1 − best plain method, 1.2 MB", "psnr"),
+    "1.2 MB": (f"{VERSIONS[FIRST]} − best plain method, 1.2 MB", "psnr"),
 }
 """Secondary endpoints: row of the table and figure."""
 CHOSEN_ON = {"fox", "lego", "snowmiku"}

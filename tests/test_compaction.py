@@ -130,11 +130,11 @@ def test_the_best_file_within_some_bytes():
     losses = [trial.losses[0] for trial in found]
     assert losses == sorted(losses) and losses[0] < losses[-1]
     # No combination of these steps that fits loses less than a third of what was chosen.
+    others = [
+        try_choices(model, compaction.finest_choices().keeping({"means": a, "opacities": b, "sh_0": c}), [loss])
+        for a in SMALL["means"] for b in SMALL["opacities"] for c in SMALL["sh_0"]
+    ]  # fmt: skip
     for most, chosen in zip(budgets, found, strict=True):
-        others = [
-            try_choices(model, compaction.finest_choices().keeping({"means": a, "opacities": b, "sh_0": c}), [loss])
-            for a in SMALL["means"] for b in SMALL["opacities"] for c in SMALL["sh_0"]
-        ]  # fmt: skip
         best = min(trial.losses[0] for trial in others if trial.num_bytes <= most)
         assert chosen.losses[0] <= 3 * max(best, 0.001)
     with pytest.raises(ValueError, match=r"file_budget must be at least [\d.]+ kB, the size of the smallest file"):

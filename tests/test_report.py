@@ -41,16 +41,17 @@ from a2tg_jax.results.figures import (
 )
 from a2tg_jax.results.images import error_picture, largest_gain, save_animation, side_by_side, to_uint8
 from a2tg_jax.results.report import Comparison, ModelResult, write_report
+from a2tg_jax.results.run_evaluation import is_split_by_number
 from a2tg_jax.texture import textures_from_arrays
 
 
-def written_report(folder, result, *, view="a", captions=("b",), figures=()) -> str:
+def written_report(folder, result, *, view="a", captions=("b",), figures=(), **options) -> str:
     run = create_run(folder)
     run.own(run.point_cloud).touch()
     image = np.zeros((30, 40, 3), np.uint8)
     comparison = Comparison.of(view, [image] * len(captions), captions, largest_gain(image, image, image))
     places = dict.fromkeys(("curves", "textures", "maps", "geometry", "flight"), ()) | dict(figures)
-    write_report(run, result, [comparison], places)
+    write_report(run, result, [comparison], places, **options)
     return run.report.read_text(encoding="utf-8")
 
 
@@ -132,23 +133,21 @@ def test_the_report_says_what_is_special_about_a_run(tmp_path):
 @pytest.mark.parametrize(("tested", "is_shown"), [("13", True), ("12", False), ("24", False)])
 def test_a_run_that_held_every_second_view_out_shows_how_to_train_on_all(tested, is_shown, tmp_path):
     """Other test views are those of a list of the scene, which no option changes."""
-    result = some_result()
-
-    def named(evaluation, names):
-        pairs = zip(evaluation.per_view, names, strict=True)
-        return dataclasses.replace(evaluation, per_view=tuple(dataclasses.replace(v, name=n) for v, n in pairs))
-
-    def changed(model):
-        train = "".join(name for name in "1234" if name not in tested)
-        return dataclasses.replace(
-            model, splits={"test": named(model.shown, tested), "train": named(model.train, train)}
-        )
-
-    models = {name: changed(model) for name, model in result.models.items()}
-    record = dataclasses.replace(result.record, scene=SceneSource("s", test_every=2))
-    report = written_report(tmp_path, dataclasses.replace(result, record=record, models=models))
+    views = [SimpleNamespace(name=name, panorama=None) for name in "1234"]
+    test, train = ([view for view in views if (view.name in tested) is is_test] for is_test in (True, False))
+    source, scene = SceneSource("s", test_every=2), SimpleNamespace(test=test, train=train)
+    by_number = is_split_by_number(source, scene)
+    assert not is_split_by_number(dataclasses.replace(source, validation=True), scene)
+    report = written_report(tmp_path, some_result(), is_split_by_number=by_number)
     assert "dB on training views" in report
     assert ("For the final picture" in report) is is_shown is ("--test-every 0 --out" in report)
+
+
+def test_the_views_of_a_panorama_count_as_one():
+    views = [SimpleNamespace(name=str(number), panorama=number // 2) for number in range(6)]
+    scene = SimpleNamespace(test=[*views[:2], *views[4:]], train=views[2:4])
+    assert is_split_by_number(SceneSource("s", test_every=2), scene)
+    assert not is_split_by_number(SceneSource("s", test_every=3), scene)
 
 
 def test_the_report_names_the_commit(tmp_path, monkeypatch):

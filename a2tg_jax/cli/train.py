@@ -25,6 +25,7 @@ from a2tg_jax.host.text import counted
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.parallel.processes import AUTO, ProcessPlace, joined
+from a2tg_jax.results.compression import command_for_file
 from a2tg_jax.results.folder import RunFolder, open_run, opened, resuming_command
 from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs
 from a2tg_jax.results.history import check_tensorboard
@@ -236,8 +237,8 @@ class Train:
         """
         kept = read_record(run)
         if (size := self.record.file_budget) != kept.file_budget:
-            compressing = f"a2tg compress {run.path} --file-budget {size or 0.06:g}MB --tune-iterations 1000"
-            raise ValueError(f"--file-budget is for new runs; for another file of a finished one: {compressing}")
+            other = command_for_file(run, f"{size}MB" if size else "SIZE")
+            raise ValueError(f"--file-budget is for new runs; for another file of a finished one: {other}")
         record = self.whole_record
         more, options = record.options.more, dataclasses.replace(record.options, more=kept.options.more)
         record = dataclasses.replace(record, options=options)

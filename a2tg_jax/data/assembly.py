@@ -336,8 +336,8 @@ def check_test_every(test_every: int) -> None:
         raise ValueError(f"test_every must be 0 (no test views) or at least 2; got {test_every}")
 
 
-def every_kth(shots: Sequence[Shot], test_every: int) -> tuple[list[Shot], list[Shot]]:
-    """Return (train, test) as `split_views` does, of shots in order of names."""
+def every_kth(shots: Sequence[Held], test_every: int) -> tuple[list[Held], list[Held]]:
+    """Return (train, test) as `split_views` does, of shots or views in order of names."""
     return split_views(sorted(shots, key=lambda shot: shot.name), test_every)
 
 

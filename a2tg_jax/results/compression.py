@@ -3,7 +3,8 @@ the choices tried."""
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
+import shlex
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
@@ -23,6 +24,7 @@ from a2tg_jax.finish.compaction import (
     try_choices,
 )
 from a2tg_jax.finish.tuning import (
+    ITERATIONS,
     MOST_TUNINGS,
     TUNED_LADDER,
     Tune,
@@ -107,9 +109,9 @@ def compress(
     check_export(out, default, "--out", overwrite=overwrite)
     # Before the photographs are loaded, and minutes of trials.
     check_encodable(model.appearance)
-    ladder, max_bytes = TUNED_LADDER if tune_iterations else LADDER, None
-    if megabytes is not None:
-        max_bytes = bytes_of(megabytes)
+    ladder = TUNED_LADDER if tune_iterations else LADDER
+    max_bytes = None if megabytes is None else bytes_of(megabytes)
+    if max_bytes is not None:
         check_fits(model, max_bytes, ladder)
     scene, tune = scene or opened.load_scene(), None
     if tune_iterations:
@@ -125,8 +127,7 @@ def compress(
     print(f"trying {ways}{tunings}; on a CPU this takes minutes", flush=True)
     trials = measure_choices(model, measures, ladder, progress=progress)
     untuned, found = _search(model, measures, max_loss, max_bytes, trials, tune)
-    rank = _bytes_first if max_bytes is None else _loss_first
-    chosen, data = _better(model, untuned, found, rank, max_loss)
+    chosen, data = _better(model, untuned, found, max_loss, max_bytes)
     # Only the default path is listed in the marker: any other file is the user's.
     if source.is_dir() and out == default:
         RunFolder(source).own(out)
@@ -135,7 +136,13 @@ def compress(
     share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
     size = f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
     lines = _table(trials, found, chosen, losses) if verbose else []
-    return "\n".join([*lines, *_ended(found), *_unfit(found, max_bytes), size])
+    return "\n".join([*lines, *_notes(found, max_bytes), size])
+
+
+def command_for_file(run: RunFolder, size: str) -> str:
+    """Return the command line that writes the tuned file of a size of a finished run."""
+    flags = ["--file-budget", size, "--tune-iterations", str(ITERATIONS)]
+    return shlex.join(["a2tg", "compress", str(run.path), *flags])
 
 
 def _search(
@@ -171,31 +178,25 @@ def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: 
     return [*aligned(list(zip(*rows, strict=True))), *bits]
 
 
-def _ended(found: TunedFiles) -> list[str]:
-    """Return a line about a tuning that ended early."""
-    return [f"tuning ended early, what was found before is kept: {found.diverged}"] if found.diverged else []
-
-
-def _unfit(found: TunedFiles, max_bytes: int | None) -> list[str]:
-    """Return a line about tuned files that are all too large."""
-    if max_bytes is None or not found.tried or found.chosen is not None:
-        return []
-    least = in_bytes(min(trial.num_bytes for trial in found.tried))
-    return [f"no tuned file is small enough, the best of {len(found.tried)} has {least}: the untuned one is kept"]
-
-
-def _bytes_first(trial: Trial) -> float:
-    return trial.num_bytes
-
-
-def _loss_first(trial: Trial) -> float:
-    return trial.losses[0]
+def _notes(found: TunedFiles, max_bytes: int | None) -> list[str]:
+    """Return lines about a tuning that ended early, and about tuned files that are all too large."""
+    notes = [f"tuning ended early, what was found before is kept: {found.diverged}"] if found.diverged else []
+    if max_bytes is not None and found.tried and found.chosen is None:
+        least = in_bytes(min(trial.num_bytes for trial in found.tried))
+        best = f"the best of {len(found.tried)} has {least}"
+        notes.append(f"no tuned file is small enough, {best}: the untuned one is kept")
+    return notes
 
 
 def _better(
-    model: Model, untuned: Trial | None, found: TunedFiles, rank: Callable[[Trial], float], max_loss: float
+    model: Model, untuned: Trial | None, found: TunedFiles, max_loss: float, max_bytes: int | None
 ) -> tuple[Trial, bytes]:
-    """Return the untuned or the tuned file, whichever ranks lower. Raises TooMuchLostError if there is neither."""
+    """Return the untuned or the tuned file: the one that loses less if bytes are given, or else the smaller one. Raises
+    TooMuchLostError if there is neither."""
+
+    def rank(trial: Trial) -> float:
+        return trial.num_bytes if max_bytes is None else trial.losses[0]
+
     tuned = found.chosen
     if found.tuned is not None and tuned is not None and (untuned is None or rank(tuned) < rank(untuned)):
         return tuned, found.tuned.data

@@ -317,9 +317,15 @@ class Comparison(NamedTuple):
 
 
 def write_report(
-    run: RunFolder, result: RunResult, views: Sequence[Comparison], figures: Mapping[str, Sequence[ReportFigure]]
+    run: RunFolder,
+    result: RunResult,
+    views: Sequence[Comparison],
+    figures: Mapping[str, Sequence[ReportFigure]],
+    *,
+    is_split_by_number: bool = False,
 ) -> None:
-    """Write report.html from the results, some views, and the figures in the run folder."""
+    """Write report.html from the results, some views, and the figures in the run folder. If `test_every` chose the test
+    views, which a scene may also list, the page says how to train on all."""
     from jinja2 import Environment, PackageLoader, StrictUndefined  # Its import is slow, and few commands need it.
     from markupsafe import Markup
 
@@ -341,11 +347,6 @@ def write_report(
     best = {(at, column) for at, row in enumerate(rows) for column in _best(row)}
     own = sum(measured.seconds for name, measured in result.models.items() if name in result.plan.main)
     leaves = flatten_config(result.record.scene, "scene.") | flatten_config(result.record.options)
-    final, every = None, result.record.scene.test_every
-    tested = [view.name for view in main.splits["test"].per_view] if "test" in main.splits else []
-    # A scene may also list its test views, which no option changes.
-    if tested and every and tested == sorted([*tested, *(view.name for view in main.train.per_view)])[::every]:
-        final = training_command(run, f"{run.path}-final", "--test-every", "0")
     page = pages.get_template("report.html").render(
         **inlined,
         policy=Markup(policy),
@@ -374,7 +375,7 @@ def write_report(
         versions=versions(),
         commit=source_commit(),
         command=repeating_command(run),
-        final=final,
+        final=training_command(run, f"{run.path}-final", "--test-every", "0") if is_split_by_number else None,
         record=read_regular(run.record, MOST_TOML_BYTES).decode() if is_regular(run.record) else "",
     )
     with replacing(run.own(run.report)) as temporary:

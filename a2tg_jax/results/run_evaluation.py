@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.data import Scene, View, view_image
-from a2tg_jax.data.load import HeldOut
+from a2tg_jax.data.assembly import every_kth
+from a2tg_jax.data.load import HeldOut, SceneSource
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.host.text import counted
@@ -94,11 +95,20 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
             temporary.write_text(viewer_html_with(data), encoding="utf-8")
     starts = {name: plan.first_iteration(name) for name in models}
     figures = write_figures(run, main, (*scene.test, *scene.train)[0].camera, settings, histories, starts)
-    write_report(run, result, _write_sheets(run, result, models, scene), figures)
+    comparisons = _write_sheets(run, result, models, scene)
+    write_report(run, result, comparisons, figures, is_split_by_number=is_split_by_number(record.scene, scene))
     # Until then, the replaced run is the only one with all its models.
     if len(models) == len(plan.names):
         drop_old(run)
     return result
+
+
+def is_split_by_number(source: SceneSource, scene: Scene) -> bool:
+    """Return whether every k-th view is held out for testing, and not views that the scene lists."""
+    if source.validation or not scene.test:
+        return False
+    _, held_out = every_kth([*scene.test, *scene.train], source.test_every)
+    return {view.name for view in held_out} == {view.name for view in scene.test}
 
 
 def check_weights(lpips_weights: Path | None) -> None:

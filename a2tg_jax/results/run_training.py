@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax.core.budget import MEGABYTE
 from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.scene import views_by_kind
@@ -33,7 +32,7 @@ from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.io.model_file import FORMAT, load_model, number_in_file, save_model
 from a2tg_jax.parallel.processes import broadcast, team
-from a2tg_jax.results.compression import SUFFIX, compress
+from a2tg_jax.results.compression import SUFFIX, command_for_file, compress
 from a2tg_jax.results.folder import (
     DAMAGED,
     RunFolder,
@@ -183,7 +182,7 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
             others.leave()
         result = evaluate_run(run, scene, lpips_weights=options.lpips_weights)
         if record.file_bytes is not None:
-            _write_file(run, record, scene, record.file_bytes, progress=options.progress)
+            _write_file(run, record, record.file_bytes, scene, progress=options.progress)
         return result
     except KeyboardInterrupt as stop:
         number = getattr(stop, "number", signals.CTRL_C)
@@ -197,18 +196,18 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
         raise ValueError(f"{text}; {advice()}") from error
 
 
-def _write_file(run: RunFolder, record: RunRecord, scene: Scene, max_bytes: int, *, progress: bool) -> None:
+def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene, *, progress: bool) -> None:
     """Write the file of a file budget, unless it is there, and print a line about it; warn if none is small enough."""
     model = run.model(record.plan.main[-1])
     path = model.with_suffix(SUFFIX)
     if path.is_file() and path.stat().st_size <= max_bytes and path.stat().st_mtime >= model.stat().st_mtime:
         return
-    budget = max_bytes / MEGABYTE
+    budget = record.file_budget
     try:
         line = compress(run.path, file_budget=budget, tune_iterations=ITERATIONS, scene=scene, progress=progress)
         print(line, flush=True)
     except ValueError as error:
-        again = f"a2tg compress {run.path} --file-budget SIZE --tune-iterations {ITERATIONS}"
+        again = command_for_file(run, "SIZE")
         warnings.warn(f"no file was written: {error}; to try another size: {again}", stacklevel=2)
 
 

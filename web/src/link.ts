@@ -22,7 +22,7 @@ export interface View {
   readonly exposure: number;
   /** Whether the page flies past the cameras. */
   readonly isFlying: boolean;
-  /** Whether the page has a panel, which one that embeds it may not want. */
+  /** Whether the page has its panel, which a page around it may hide. */
   readonly hasPanel: boolean;
 }
 
