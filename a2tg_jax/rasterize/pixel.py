@@ -65,6 +65,7 @@ class Hit(NamedTuple):
     infinity without a hit."""
     depth: Array  # depth of the hit, or of the mean if the low-pass filter decides
     is_ray: Array  # whether the hit decides ρ, not the low-pass filter
+    inverse: Array  # 1/p₂, finite also where there is no hit
 
 
 class Shown(NamedTuple):
@@ -78,26 +79,34 @@ def _cross(a: Triple, b: Triple) -> Triple:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
+def _from_center(column: Triple, tile: TileNumbers) -> Triple:
+    """Return a column of the homography to pixels counted from the tile's centre, in its frame if it has one."""
+    x, y, *frame = tile
+    # Before any product: this keeps float32 exact to 1e-4.
+    first, second, last = column[0] - x * column[2], column[1] - y * column[2], column[2]
+    if frame:
+        xx, xy, yx, yy = frame
+        first, second = xx * first + xy * second, yx * first + yy * second
+    return first, second, last
+
+
 def planes_of(M: Rows, tile: TileNumbers) -> Planes:
     """Return the planes of a splat for a tile centred at (x, y): p = [M₁×M₂ | M₂×M₀ | M₀×M₁]·(x, y, 1).
 
     With a frame, pixels are counted in it (`tile_pixels`).
     """
-    x, y, *frame = tile
-    last = M[2]
-    # Counting pixels from the tile's centre before the cross products keeps float32 exact to 1e-4.
-    first: Any = tuple(M[0][k] - x * last[k] for k in range(3))
-    second: Any = tuple(M[1][k] - y * last[k] for k in range(3))
-    if frame:
-        xx, xy, yx, yy = frame
-        rows = list(zip(first, second, strict=True))
-        first, second = tuple(xx * p + xy * q for p, q in rows), tuple(yx * p + yy * q for p, q in rows)
+    first, second, last = zip(*(_from_center(column, tile) for column in zip(*M, strict=True)), strict=True)
     # 2DGS: the pixel's ray is the intersection of the planes k = x·M₂ − M₀ and l = y·M₂ − M₁, and p = k × l. It is
     # bilinear: x and y multiply the cross products with the last row, and x·y the one of the last row with itself, 0.
     a, b, c = _cross(second, last), _cross(last, first), _cross(first, second)
     p0, p1, p2 = ((a[k], b[k], c[k]) for k in range(3))
     determinant = last[0] * c[0] + last[1] * c[1] + last[2] * c[2]
     return Planes(p0, p1, p2, determinant, center_x=first[2] / last[2], center_y=second[2] / last[2], depth=last[2])
+
+
+def _larger(x: Array, y: Array) -> Array:
+    """Return the larger number, in one instruction; jnp.maximum, which keeps NaN, takes six."""
+    return jnp.where(x > y, x, y)
 
 
 def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pass: bool = True) -> Hit:
@@ -110,7 +119,7 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pas
     # clamped there, with a finite gradient. With |u| <= ∛max, u² and its product with u stay finite.
     far, tiny = float(np.cbrt(np.finfo(p2.dtype).max)), float(np.sqrt(np.finfo(p2.dtype).tiny))
     q0, q1, q2, determinant = jax.lax.stop_gradient((p0, p1, p2, planes.determinant))
-    least = jnp.maximum(jnp.maximum(jnp.abs(q0), jnp.abs(q1)), jnp.abs(determinant)) * (1 / far)
+    least = _larger(_larger(jnp.abs(q0), jnp.abs(q1)), jnp.abs(determinant)) * (1 / far)
     least = jnp.maximum(least, tiny)
     is_far = jnp.abs(q2) <= least
     is_parallel = q2 == 0
@@ -121,11 +130,12 @@ def intersect(planes: Planes, x: Array, y: Array, near_plane: float, has_low_pas
 
     rho_ray = u * u + v * v
     if not has_low_pass:
-        return Hit(u, v, jnp.where(is_hit, rho_ray, jnp.inf), jnp.where(is_hit, depth, planes.depth), is_hit)
+        return Hit(u, v, jnp.where(is_hit, rho_ray, jnp.inf), jnp.where(is_hit, depth, planes.depth), is_hit, inverse)
     dx, dy = x - planes.center_x, y - planes.center_y
     rho_screen = 2 * (dx * dx + dy * dy)
     is_ray = is_hit & (rho_ray <= rho_screen)
-    return Hit(u, v, jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, planes.depth), is_ray)
+    rho, depth = jnp.where(is_ray, rho_ray, rho_screen), jnp.where(is_ray, depth, planes.depth)
+    return Hit(u, v, rho, depth, is_ray, inverse)
 
 
 def values_at(functions: Elementwise, lookup: Lookup | None, hit: Hit, values: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -241,8 +251,8 @@ def blend_vjp(
 
 
 def positional_gradient(
-    statistic: Statistic, M: Rows, x: Array, y: Array, tile: TileNumbers, d_rho: Array,
-    jacobian: Sequence[Sequence[Array]] | Array, near_plane: float, has_low_pass: bool,
+    statistic: Statistic, M: Rows, hit: Hit, x: Array, y: Array, tile: TileNumbers, d_rho: Array,
+    jacobian: Sequence[Sequence[Array]] | Array,
 ) -> Triple:  # fmt: skip
     """Return a pixel's contribution to a statistic of densification, through the falloff only; zero where `d_rho` is.
 
@@ -253,17 +263,23 @@ def positional_gradient(
 
     `d_rho` is ∂L/∂ρ through the falloff, `jacobian` has the rows of ∂M[:, 2]/∂μ = K·Rc.
     """
-    axes = tuple((row[0], row[1]) for row in M)
+    # Only the third column of M moves with the mean, by the jacobian. The other two give k, l and p₂ = k₀·l₁ − k₁·l₀,
+    # which stay.
+    (k0, l0), (k1, l1) = (
+        (x * last - first, y * last - second)
+        for first, second, last in (_from_center((M[0][k], M[1][k], M[2][k]), tile) for k in range(2))
+    )
+
+    def rho(mean: Triple) -> Array:
+        first, second, last = _from_center(mean, tile)
+        k2, l2 = x * last - first, y * last - second
+        u, v = (k1 * l2 - k2 * l1) * hit.inverse, (k2 * l0 - k0 * l2) * hit.inverse
+        dx, dy = x - first / last, y - second / last
+        # As u² + v², the first has the slope 2·(u, v); its value is not needed.
+        return jnp.where(hit.is_ray, 2 * (hit.u * u + hit.v * v), 2 * (dx * dx + dy * dy))
+
     mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_rho)) for row in M)
-
-    def rho(mean: Triple) -> tuple[Array, Array]:
-        rows: Any = tuple((*axes[i], mean[i]) for i in range(3))
-        hit = intersect(planes_of(rows, tile), x, y, near_plane, has_low_pass)
-        return hit.rho, hit.is_ray
-
-    # Only the third column of M moves with the mean, by the jacobian.
-    _, pull_back, is_ray = jax.vjp(rho, mean, has_aux=True)
-    (d_mean,) = pull_back(d_rho)
+    (d_mean,) = jax.vjp(rho, mean)[1](d_rho)
     if statistic == "position":
         components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
         return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]
@@ -275,7 +291,7 @@ def positional_gradient(
         inverse = 1 / (xx * yy - xy * yx)
         dx, dy = (yy * dx - yx * dy) * inverse, (xx * dy - xy * dx) * inverse
     if statistic == "center":
-        dx, dy = jnp.where(is_ray, dx, 0.0), jnp.where(is_ray, dy, 0.0)
+        dx, dy = jnp.where(hit.is_ray, dx, 0.0), jnp.where(hit.is_ray, dy, 0.0)
     else:
-        dx, dy = jnp.where(is_ray, 0.0, jnp.abs(dx)), jnp.where(is_ray, 0.0, jnp.abs(dy))
+        dx, dy = jnp.where(hit.is_ray, 0.0, jnp.abs(dx)), jnp.where(hit.is_ray, 0.0, jnp.abs(dy))
     return dx, dy, jnp.zeros_like(dx)

@@ -205,9 +205,8 @@ class PixelFunctions:
         state, weight, d = pixel.blend_vjp(functions, near_plane, *at_pixel, statistic is not None)
         added: tuple[Array, ...] = ()
         if statistic and d.rho is not None:
-            added = pixel.positional_gradient(
-                statistic, splat.M, x, y, tile, d.rho, jacobian, near_plane, functions.has_low_pass
-            )
+            hit = pixel.intersect(planes, x, y, near_plane, functions.has_low_pass)
+            added = pixel.positional_gradient(statistic, splat.M, hit, x, y, tile, d.rho, jacobian)
         # Without weight the cotangents may be anything, NaN included; kernels leave them out.
         return state, weight != 0, d.values, (d.planes, d.opacity, d.color, d.normal, d.numbers, added)
 

@@ -275,7 +275,8 @@ class _TracedPass:
         """
         splats, regions = rows
         # Texels are read once, outside of what is differentiated; `backward` adds to their gradient.
-        lookup = self.look_up(regions, self.hit(self.spread(splats, tile)[1], tile))
+        found = self.hit(self.spread(splats, tile)[1], tile)
+        lookup = self.look_up(regions, found)
 
         def of_floats(splats: Splats, values: tuple[Array, ...], rho_probe: Array | None) -> pixel.Shown:
             splat, planes = self.spread(splats, tile)
@@ -300,8 +301,7 @@ class _TracedPass:
         d_probe = d_texels = None
         if statistic:
             M = jax.tree.map(lambda entry: entry[:, None], _split(splats, False).M)
-            near_plane, has_low_pass = self.settings.near_plane, self.functions.has_low_pass
-            of_pixels = *self.pixel_offsets(tile), _numbers_of(tile), d_rho, jacobian, near_plane, has_low_pass
+            of_pixels = found, *self.pixel_offsets(tile), _numbers_of(tile), d_rho, jacobian
             components = pixel.positional_gradient(statistic, M, *of_pixels)
             num_pixels = (weights > 0).astype(d_rho.dtype)
             d_probe = jnp.stack([pixel_sum(numbers) for numbers in (*components, num_pixels)], axis=1)

@@ -22,6 +22,8 @@ from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
 
 FLAGS = ("contract",)
 """Flags that let products and sums fuse; within a lane all other IEEE rules hold."""
+ALIGNMENT = 128
+"""Bytes to which rooms on the stack and tables are aligned: the largest vector that a pass loads at once."""
 BOOL, INT, LONG = (ir.IntType(bits) for bits in (1, 32, 64))
 POINTER = ir.PointerType()
 CompiledFunction = Callable[..., None]
@@ -56,7 +58,7 @@ class Writer:
         # In the entry block: within a loop, the stack would grow at every turn.
         with self.b.goto_entry_block():
             room = self.b.alloca(type_, count)
-            room.align, room.type = vector_bytes(), POINTER
+            room.align, room.type = ALIGNMENT, POINTER
         return room
 
     def at(self, base: ir.Value, index: ir.Value, type_: ir.Type) -> ir.Value:

@@ -17,7 +17,7 @@ more_probe, and to more_texels from texel more_first[k] on.
 import contextlib
 import functools
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,6 +38,21 @@ BACKWARD = (
     *(*FORWARD[:-1], "g", "suffix_sum", "jacobian", "d_splats", "d_texels", "d_probe"),
     *("places", "more_splats", "more_texels", "more_probe", "more_first"),
 )
+FORWARD_BYTES, BACKWARD_BYTES = 128, 64
+"""Size of the vectors of numbers in each pass, several registers of most processors: these work on while results of
+others are awaited, and a branch for many pixels is rarely a surprise. With textures, one register is faster."""
+
+
+def num_lanes(settings: PassSettings, vector_bytes: int) -> int:
+    """Return the number L of pixels of a pass's vectors."""
+    in_register = llvm_code.num_lanes(settings.dtype)
+    if settings.num_columns:
+        return in_register
+    lanes = vector_bytes // np.dtype(settings.dtype).itemsize
+    # Vectors larger than a tile would compute pixels that do not exist.
+    while lanes > settings.num_pixels:
+        lanes //= 2
+    return max(in_register, lanes)
 
 
 def pixel_order(tile_size: int, lanes: int) -> np.ndarray:
@@ -55,14 +70,14 @@ def pixel_order(tile_size: int, lanes: int) -> np.ndarray:
     return np.moveaxis(blocks, 2, 1).reshape(-1)
 
 
-def packed_pixels(settings: PassSettings, pixels: TilePixels | None) -> Array:
+def packed_pixels(settings: PassSettings, pixels: TilePixels | None, vector_bytes: int) -> Array:
     """Pack the pixels of each tile as a row: its numbers, then x, y and whether they are seen, in the order of vectors.
 
     All four parts fill whole vectors. Without rays, the result is empty.
     """
     if pixels is None:
         return jnp.zeros((1, 0), settings.dtype)
-    lanes = llvm_code.num_lanes(settings.dtype)
+    lanes = num_lanes(settings, vector_bytes)
     order = pixel_order(settings.grid.tile_size, lanes)
     numbers = jnp.concatenate([pixels.centers, pixels.frames.reshape(-1, 4)], axis=1)
     x, y = (pixels.offsets[:, k, order] for k in range(2))
@@ -90,12 +105,14 @@ class _Vector(NamedTuple):
 class _Pass(TexelWriter):
     """Base of both passes. Generators write a loop, or a branch, which the body of the caller's `for` fills."""
 
+    vector_bytes: ClassVar[int]
+
     def __init__(self, functions: PixelFunctions, module: ir.Module, name: str, buffers: Sequence[str]):
         settings = functions.settings
         super().__init__(module, name, buffers, INTEGERS, settings.dtype)
         self.settings, self.functions, self.num_columns = settings, functions, settings.num_columns
         self.empty, self.tile_size = settings.static.functions.empty, settings.grid.tile_size
-        self.lanes, self.scalars = Lanes(self.b, llvm_code.num_lanes(settings.dtype)), Lanes(self.b, 1)
+        self.lanes, self.scalars = Lanes(self.b, num_lanes(settings, self.vector_bytes)), Lanes(self.b, 1)
         self.num_vectors = -(-settings.num_pixels // self.lanes.width)
         self.reals, self.integers = self.lanes.vector(self.real), self.lanes.vector(INT)
         order = pixel_order(self.tile_size, self.lanes.width)
@@ -114,8 +131,7 @@ class _Pass(TexelWriter):
         """Add a table of constants to the module; return its address."""
         array = ir.Constant(ir.ArrayType(type_, len(numbers)), np.asarray(numbers).tolist())
         table = ir.GlobalVariable(self.b.module, array.type, name)
-        # Aligned to vectors, so that each load is one instruction.
-        table.initializer, table.global_constant, table.align = array, True, llvm_code.vector_bytes()
+        table.initializer, table.global_constant, table.align = array, True, llvm_code.ALIGNMENT
         table.type = ir.PointerType()
         return table
 
@@ -218,6 +234,8 @@ class _Pass(TexelWriter):
 class _Forward(_Pass):
     """Pass that computes channels and transmittance of the tiles."""
 
+    vector_bytes = FORWARD_BYTES
+
     def write(self) -> None:
         channels = [self.variable(self.reals, self.num_vectors) for _ in range(self.settings.num_channels)]
         for tile, tile_numbers in self.tiles():
@@ -249,6 +267,8 @@ class _Forward(_Pass):
 
 class _Backward(_Pass):
     """Pass that computes cotangents of the splats and of the texels, and the statistic."""
+
+    vector_bytes = BACKWARD_BYTES
 
     def write(self) -> None:
         b, settings = self.b, self.settings
