@@ -72,7 +72,7 @@ def rows_of_bytewise(results: Sequence[Result]) -> list[Row]:
         for budget in (0.3, 1.2):
             own = [result for result in results if stratum_of(result) == stratum and result.run.cell.budget == budget]
             for (version, prefix), (label, wording) in itertools.product(VERSIONS.items(), OTHERS.items()):
-                # Best plain methods were trained for the time of the first version.
+                # These plain methods were trained for the time of the first version.
                 if version == label or (version != FIRST and label.endswith(EQUAL_TIME)):
                     continue
                 place = f"{budget:g} MB" + ("" if stratum == DENSE else f", {FEW}")
@@ -82,6 +82,12 @@ def rows_of_bytewise(results: Sequence[Result]) -> list[Row]:
                     others = [result for result in own if result.run.cell.scene.label not in CHOSEN_ON]
                     rows.append(Row(rows[-1].name + UNSEEN, others, version, label))
     return rows
+
+
+def rows_of_equal_time(results: Sequence[Result]) -> list[Row]:
+    """Return the comparison of `bytewise` with plain methods that were trained for its own time."""
+    name = f"{VERSIONS[BYTEWISE]} − {OTHERS[BEST]}, 0.3 MB{EQUAL_TIME}"
+    return [Row(name, results, BYTEWISE, BEST + EQUAL_TIME)]
 
 
 def stratum_of(result: Result) -> str:
@@ -167,11 +173,13 @@ def endpoints(rows: Sequence[Row]) -> str:
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """Write the table and the chart, from the records of this scale and of the other one beside it."""
-    bytewise, parts = (tables.results_of(grid, lab.records) for grid in grids)
+    bytewise, equal_time, parts = (tables.results_of(grid, lab.records) for grid in grids)
     scale = "smoke" if lab.is_smoke else "protocol160"
     records = read_kept(lab.out.parent / scale / "records.json")
     degrees = {degree: tables.results_of(read_grid(f"degree_{degree}", scale), records) for degree in (3, 1, 0)}
-    first = rows_of_bytewise(bytewise)
+    # In equal time, right after equal iterations.
+    first, *others = rows_of_bytewise(bytewise)
+    first = [first, *rows_of_equal_time(equal_time), *others]
     at_size = [row for row in first if "0.3 MB" in row.name and not row.other.endswith("degree 3")]
     dense = [row for row in at_size if FEW not in row.name and UNSEEN not in row.name]
     rows = [*first, *rows_of_parts(parts), *rows_of_degrees(degrees)]
@@ -186,4 +194,4 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         save_figure(lab.pages / f"{EXPERIMENT.name}.png", plots.forest(charted, "difference of PSNR, dB"))
 
 
-EXPERIMENT = Experiment("findings", ("bytewise", "parts"), present, __doc__)
+EXPERIMENT = Experiment("findings", ("bytewise", "equal_time", "parts"), present, __doc__)
