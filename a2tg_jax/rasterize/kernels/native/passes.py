@@ -43,7 +43,7 @@ FORWARD_BYTES, BACKWARD_BYTES = 128, 64
 others are awaited, and a branch for many pixels is rarely a surprise. With textures, one register is faster."""
 
 
-def num_lanes(settings: PassSettings, vector_bytes: int) -> int:
+def lanes_of(settings: PassSettings, vector_bytes: int) -> int:
     """Return the number L of pixels of a pass's vectors."""
     in_register = llvm_code.num_lanes(settings.dtype)
     if settings.num_columns:
@@ -77,7 +77,7 @@ def packed_pixels(settings: PassSettings, pixels: TilePixels | None, vector_byte
     """
     if pixels is None:
         return jnp.zeros((1, 0), settings.dtype)
-    lanes = num_lanes(settings, vector_bytes)
+    lanes = lanes_of(settings, vector_bytes)
     order = pixel_order(settings.grid.tile_size, lanes)
     numbers = jnp.concatenate([pixels.centers, pixels.frames.reshape(-1, 4)], axis=1)
     x, y = (pixels.offsets[:, k, order] for k in range(2))
@@ -112,7 +112,7 @@ class _Pass(TexelWriter):
         super().__init__(module, name, buffers, INTEGERS, settings.dtype)
         self.settings, self.functions, self.num_columns = settings, functions, settings.num_columns
         self.empty, self.tile_size = settings.static.functions.empty, settings.grid.tile_size
-        self.lanes, self.scalars = Lanes(self.b, num_lanes(settings, self.vector_bytes)), Lanes(self.b, 1)
+        self.lanes, self.scalars = Lanes(self.b, lanes_of(settings, self.vector_bytes)), Lanes(self.b, 1)
         self.num_vectors = -(-settings.num_pixels // self.lanes.width)
         self.reals, self.integers = self.lanes.vector(self.real), self.lanes.vector(INT)
         order = pixel_order(self.tile_size, self.lanes.width)
