@@ -4,6 +4,7 @@ import itertools
 import os
 import re
 import shutil
+import sqlite3
 import sys
 import tempfile
 import threading
@@ -242,9 +243,28 @@ def _match_features(database: Path, num_photos: int, seed: int, matching: Matchi
     verification.ransac.random_seed = seed
     is_exhaustive = matching == "exhaustive"
     match = colmap.match_exhaustive if is_exhaustive else colmap.match_sequential
-    pairs = f"{num_photos * (num_photos - 1) // 2:,} pairs" if is_exhaustive else "neighbours by name"
-    with _clock(f"matching {pairs}", progress):
-        match(database, verification_options=verification, device=colmap.Device.cpu)
+    total = num_photos * (num_photos - 1) // 2 if is_exhaustive else None
+    done = 0
+    with counting("matching", total, "pair", is_shown=progress) as bar:
+
+        def count() -> None:
+            nonlocal done
+            # While COLMAP locks the database, nothing is counted.
+            with suppress(sqlite3.OperationalError):
+                if (found := _num_matched(database)) > done:
+                    bar.update(found - done)
+                    done = found
+
+        with _ticking(count):
+            match(database, verification_options=verification, device=colmap.Device.cpu)
+        count()
+
+
+def _num_matched(database: Path) -> int:
+    """Return the number of pairs that COLMAP has matched, which it writes one by one."""
+    with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as opened:
+        (num,) = opened.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()
+    return int(num)
 
 
 def _map(database: Path, staged: Staged, work: Path, seed: int, progress: bool) -> list[Any]:
@@ -403,17 +423,23 @@ def _clock(phase: str, progress: bool) -> Iterator[None]:
     if progress and not has_terminal():
         print(f"{phase} …", file=sys.stderr, flush=True)
         progress = False
+    with tqdm(desc=phase, bar_format="{desc}: {elapsed}", disable=not progress) as bar, _ticking(bar.refresh):
+        yield
+
+
+@contextmanager
+def _ticking(act: Callable[[], object]) -> Iterator[None]:
+    """Call a function twice a second while COLMAP works."""
     ended = threading.Event()
-    with tqdm(desc=phase, bar_format="{desc}: {elapsed}", disable=not progress) as bar:
 
-        def tick() -> None:
-            while not ended.wait(TICK):
-                bar.refresh()
+    def tick() -> None:
+        while not ended.wait(TICK):
+            act()
 
-        ticking = threading.Thread(target=tick, daemon=True)
-        ticking.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            ticking.join()
+    ticking = threading.Thread(target=tick, daemon=True)
+    ticking.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        ticking.join()
