@@ -331,15 +331,6 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
         return model_of(joined_rows(parts), header["base_degree"], appearance, origin, background_of(header))
 
 
-def bytes_by_part(data: bytes) -> dict[str, int]:
-    """Return the bytes of each part of a file, header included."""
-    header, body = unframed(data)
-    found = {"header": len(data) - len(body)}
-    for name, _, length in header["parts"]:
-        found[name] = found.get(name, 0) + length
-    return found
-
-
 def framed(header: Mapping[str, object], body: bytes) -> bytes:
     # Browsers read the header with JSON.parse, which rejects NaN.
     text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
