@@ -84,12 +84,6 @@ def rows_of_bytewise(results: Sequence[Result]) -> list[Row]:
     return rows
 
 
-def rows_of_equal_time(results: Sequence[Result]) -> list[Row]:
-    """Return the comparison of `bytewise` with plain methods that were trained for its own time."""
-    name = f"{VERSIONS[BYTEWISE]} − {OTHERS[BEST]}, 0.3 MB{EQUAL_TIME}"
-    return [Row(name, results, BYTEWISE, BEST + EQUAL_TIME)]
-
-
 def stratum_of(result: Result) -> str:
     return DENSE if result.run.cell.scene.fold is None else FEW
 
@@ -177,12 +171,12 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     scale = "smoke" if lab.is_smoke else "protocol160"
     records = read_kept(lab.out.parent / scale / "records.json")
     degrees = {degree: tables.results_of(read_grid(f"degree_{degree}", scale), records) for degree in (3, 1, 0)}
-    # In equal time, right after equal iterations.
-    first, *others = rows_of_bytewise(bytewise)
-    first = [first, *rows_of_equal_time(equal_time), *others]
-    at_size = [row for row in first if "0.3 MB" in row.name and not row.other.endswith("degree 3")]
+    equal, *others = rows_of_bytewise(bytewise)
+    timed = Row(equal.name + EQUAL_TIME, equal_time, BYTEWISE, BEST + EQUAL_TIME)
+    of_bytewise = [equal, timed, *others]
+    at_size = [row for row in of_bytewise if "0.3 MB" in row.name and not row.other.endswith("degree 3")]
     dense = [row for row in at_size if FEW not in row.name and UNSEEN not in row.name]
-    rows = [*first, *rows_of_parts(parts), *rows_of_degrees(degrees)]
+    rows = [*of_bytewise, *rows_of_parts(parts), *rows_of_degrees(degrees)]
     lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(rows)}\n{endpoints(rows)}\n{scenes_table(dense)}")
     found = {row.name: row.compared("psnr") for row in rows}
     charted = {

@@ -4,13 +4,12 @@ import itertools
 import os
 import re
 import shutil
-import sqlite3
 import sys
 import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NamedTuple
 
@@ -245,26 +244,21 @@ def _match_features(database: Path, num_photos: int, seed: int, matching: Matchi
     match = colmap.match_exhaustive if is_exhaustive else colmap.match_sequential
     total = num_photos * (num_photos - 1) // 2 if is_exhaustive else None
     done = 0
-    with counting("matching", total, "pair", is_shown=progress) as bar:
+    with (
+        counting("matching", total, "pair", is_shown=progress) as bar,
+        # Read by COLMAP's own SQLite: another copy of it in the same process would disturb its locks.
+        closing(colmap.Database.open(database)) as opened,
+    ):
 
         def count() -> None:
             nonlocal done
-            # While COLMAP locks the database, nothing is counted.
-            with suppress(sqlite3.OperationalError):
-                if (found := _num_matched(database)) > done:
-                    bar.update(found - done)
-                    done = found
+            if (found := opened.num_verified_image_pairs()) > done:
+                bar.update(found - done)
+                done = found
 
-        with _ticking(count):
+        with _ticking(count) if progress else nullcontext():
             match(database, verification_options=verification, device=colmap.Device.cpu)
         count()
-
-
-def _num_matched(database: Path) -> int:
-    """Return the number of pairs that COLMAP has matched, which it writes one by one."""
-    with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as opened:
-        (num,) = opened.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()
-    return int(num)
 
 
 def _map(database: Path, staged: Staged, work: Path, seed: int, progress: bool) -> list[Any]:

@@ -105,7 +105,7 @@ def planes_of(M: Rows, tile: TileNumbers) -> Planes:
 
 
 def _larger(x: Array, y: Array) -> Array:
-    """Return the larger number, in one instruction; jnp.maximum, which keeps NaN, takes six."""
+    """Return the larger number: one instruction in native loops, where jnp.maximum, which keeps NaN, takes six."""
     return jnp.where(x > y, x, y)
 
 
@@ -263,23 +263,23 @@ def positional_gradient(
 
     `d_rho` is ∂L/∂ρ through the falloff, `jacobian` has the rows of ∂M[:, 2]/∂μ = K·Rc.
     """
-    # Only the third column of M moves with the mean, by the jacobian. The other two give k, l and p₂ = k₀·l₁ − k₁·l₀,
-    # which stay.
+    # Only the third column of M moves with the mean, by the jacobian. k₀, k₁, l₀, l₁ and p₂ = k₀·l₁ − k₁·l₀ do not.
     (k0, l0), (k1, l1) = (
         (x * last - first, y * last - second)
         for first, second, last in (_from_center((M[0][k], M[1][k], M[2][k]), tile) for k in range(2))
     )
 
-    def rho(mean: Triple) -> Array:
+    def like_rho(mean: Triple) -> Array:
+        """Return a number with the gradient of ρ."""
         first, second, last = _from_center(mean, tile)
         k2, l2 = x * last - first, y * last - second
         u, v = (k1 * l2 - k2 * l1) * hit.inverse, (k2 * l0 - k0 * l2) * hit.inverse
         dx, dy = x - first / last, y - second / last
-        # As u² + v², the first has the slope 2·(u, v); its value is not needed.
+        # 2·(hit.u·u + hit.v·v), with constants hit.u and hit.v, has the gradient of u² + v² at the hit.
         return jnp.where(hit.is_ray, 2 * (hit.u * u + hit.v * v), 2 * (dx * dx + dy * dy))
 
     mean = tuple(jnp.broadcast_to(row[2], jnp.shape(d_rho)) for row in M)
-    (d_mean,) = jax.vjp(rho, mean)[1](d_rho)
+    (d_mean,) = jax.vjp(like_rho, mean)[1](d_rho)
     if statistic == "position":
         components = [sum(d_mean[i] * jacobian[i][axis] for i in range(3)) for axis in range(3)]
         return tuple(jnp.abs(component) for component in components)  # type: ignore[return-value]

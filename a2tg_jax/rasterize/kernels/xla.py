@@ -301,6 +301,8 @@ class _TracedPass:
         d_probe = d_texels = None
         if statistic:
             M = jax.tree.map(lambda entry: entry[:, None], _split(splats, False).M)
+            # Of a splat that does not show, the slope of the falloff may be NaN.
+            d_rho = jnp.where(weights > 0, d_rho, 0.0)
             of_pixels = found, *self.pixel_offsets(tile), _numbers_of(tile), d_rho, jacobian
             components = pixel.positional_gradient(statistic, M, *of_pixels)
             num_pixels = (weights > 0).astype(d_rho.dtype)

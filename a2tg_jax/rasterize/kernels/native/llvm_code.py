@@ -23,7 +23,7 @@ from a2tg_jax.rasterize.kernels.jaxprs import Untranslatable
 FLAGS = ("contract",)
 """Flags that let products and sums fuse; within a lane all other IEEE rules hold."""
 ALIGNMENT = 128
-"""Bytes to which rooms on the stack and tables are aligned: the largest vector that a pass loads at once."""
+"""Bytes to which rooms on the stack and tables are aligned, the size of the largest vectors: loads of these need it."""
 BOOL, INT, LONG = (ir.IntType(bits) for bits in (1, 32, 64))
 POINTER = ir.PointerType()
 CompiledFunction = Callable[..., None]
@@ -130,8 +130,8 @@ def add_libm_symbol(name: str) -> None:
 
 
 @functools.cache
-def vector_bytes() -> int:
-    """Return the width of the processor's vectors in bytes: 64 with AVX-512, 32 with AVX, else 16."""
+def register_bytes() -> int:
+    """Return the width of the processor's vector registers in bytes: 64 with AVX-512, 32 with AVX, else 16."""
     features = llvm.get_host_cpu_features()
     if features.get("avx512f"):
         return 64
@@ -139,7 +139,7 @@ def vector_bytes() -> int:
 
 
 def num_lanes(dtype: DTypeLike) -> int:
-    return vector_bytes() // np.dtype(dtype).itemsize
+    return register_bytes() // np.dtype(dtype).itemsize
 
 
 _numbers = itertools.count()
@@ -157,7 +157,7 @@ def compile_text(code: str, names: Sequence[str]) -> dict[str, int]:
         parsed.triple, parsed.data_layout = llvm.get_default_triple(), str(_machine().target_data)
         parsed.verify()
         dump(names[0], "ll", lambda: str(parsed))
-        # Code is in vectors already: a higher level takes half as long again and makes no loop faster.
+        # Higher levels take half as long again and make no loop faster: pixels are in vectors already.
         options = llvm.create_pipeline_tuning_options(speed_level=1)
         options.slp_vectorization = options.loop_unrolling = False
         builder = llvm.create_pass_builder(_machine(), options)

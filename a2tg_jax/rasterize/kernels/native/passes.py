@@ -38,19 +38,21 @@ BACKWARD = (
     *(*FORWARD[:-1], "g", "suffix_sum", "jacobian", "d_splats", "d_texels", "d_probe"),
     *("places", "more_splats", "more_texels", "more_probe", "more_first"),
 )
-FORWARD_BYTES, BACKWARD_BYTES = 128, 64
-"""Size of the vectors of numbers in each pass, several registers of most processors: these work on while results of
-others are awaited, and a branch for many pixels is rarely a surprise. With textures, one register is faster."""
+FORWARD_BYTES, BACKWARD_BYTES = llvm_code.ALIGNMENT, 64
+"""Size of the vectors of float32 in each pass, several registers of most processors: these work on while results of
+others are awaited, and a branch for many pixels is rarely a surprise. With textures, one register is faster
+(experiments/NOTEBOOK.md, "Speed on CPUs")."""
 
 
 def lanes_of(settings: PassSettings, vector_bytes: int) -> int:
     """Return the number L of pixels of a pass's vectors."""
-    in_register = llvm_code.num_lanes(settings.dtype)
-    if settings.num_columns:
+    in_register, itemsize = llvm_code.num_lanes(settings.dtype), np.dtype(settings.dtype).itemsize
+    # In float64, exp is called lane by lane, also for lanes that are not reached.
+    if settings.num_columns or itemsize > 4:
         return in_register
-    lanes = vector_bytes // np.dtype(settings.dtype).itemsize
-    # Vectors larger than a tile would compute pixels that do not exist.
-    while lanes > settings.num_pixels:
+    lanes = vector_bytes // itemsize
+    # Vectors that do not divide the tile would compute pixels that do not exist.
+    while settings.num_pixels % lanes:
         lanes //= 2
     return max(in_register, lanes)
 
