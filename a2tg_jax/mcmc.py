@@ -65,8 +65,8 @@ def relocate(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Arr
       num_live: rows in use, 0 to N; may be traced.
 
     Returns:
-      The named tuple (gaussians, moments, num_live, info): rows and moments after the moves, `num_live` as given, and the
-      scalars `num_dead`, `num_added` and `has_hosts`.
+      The named tuple (gaussians, moments, num_live, info): rows and moments after the moves, `num_live` as given, and
+      the scalars `num_dead`, `num_added` and `has_hosts`.
 
     Raises:
       ValueError: if a leaf of `moments` has another leading axis.
@@ -97,8 +97,8 @@ def grow(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Array |
       cap: largest count, at most N; may be traced.
 
     Returns:
-      The named tuple (gaussians, moments, num_live, info): rows and moments with the copies, the new count, and the scalars
-      `num_dead`, `num_added` and `has_hosts`.
+      The named tuple (gaussians, moments, num_live, info): rows and moments with the copies, the new count, and the
+      scalars `num_dead`, `num_added` and `has_hosts`.
 
     Raises:
       ValueError: if a cap that is not traced exceeds N, or a leaf of `moments` has another leading axis.
