@@ -65,19 +65,23 @@ class Row:
         return compare(self.differences(figure))
 
 
-def rows_of_bytewise(results: Sequence[Result]) -> list[Row]:
-    """Return the comparisons of `bytewise`, by stratum and budget."""
+def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result]) -> list[Row]:
+    """Return the comparisons of `bytewise`, by stratum and budget; the plain methods of `results` were trained for the
+    time of the first version, those of `in_equal_time` for that of the second."""
     rows = []
     for stratum in (DENSE, FEW):
         for budget in (0.3, 1.2):
-            own = [result for result in results if stratum_of(result) == stratum and result.run.cell.budget == budget]
+            own, timed = (
+                [result for result in each if stratum_of(result) == stratum and result.run.cell.budget == budget]
+                for each in (results, in_equal_time)
+            )
             for (version, prefix), (label, wording) in itertools.product(VERSIONS.items(), OTHERS.items()):
-                # These plain methods were trained for the time of the first version.
-                if version == label or (version != FIRST and label.endswith(EQUAL_TIME)):
+                if version == label:
                     continue
-                place = f"{budget:g} MB" + ("" if stratum == DENSE else f", {FEW}")
-                place += EQUAL_TIME if label.endswith(EQUAL_TIME) else ""
-                rows.append(Row(f"{prefix} − {wording}, {place}", own, version, label))
+                is_timed = label.endswith(EQUAL_TIME)
+                place = f"{budget:g} MB" + ("" if stratum == DENSE else f", {FEW}") + (EQUAL_TIME if is_timed else "")
+                found = timed if is_timed and version == BYTEWISE else own
+                rows.append(Row(f"{prefix} − {wording}, {place}", found, version, label))
                 if version == FIRST and label == BEST and stratum == DENSE:
                     others = [result for result in own if result.run.cell.scene.label not in CHOSEN_ON]
                     rows.append(Row(rows[-1].name + UNSEEN, others, version, label))
@@ -171,9 +175,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     scale = "smoke" if lab.is_smoke else "protocol160"
     records = read_kept(lab.out.parent / scale / "records.json")
     degrees = {degree: tables.results_of(read_grid(f"degree_{degree}", scale), records) for degree in (3, 1, 0)}
-    equal, *others = rows_of_bytewise(bytewise)
-    timed = Row(equal.name + EQUAL_TIME, equal_time, BYTEWISE, BEST + EQUAL_TIME)
-    of_bytewise = [equal, timed, *others]
+    of_bytewise = rows_of_bytewise(bytewise, equal_time)
     at_size = [row for row in of_bytewise if "0.3 MB" in row.name and not row.other.endswith("degree 3")]
     dense = [row for row in at_size if FEW not in row.name and UNSEEN not in row.name]
     rows = [*of_bytewise, *rows_of_parts(parts), *rows_of_degrees(degrees)]

@@ -45,7 +45,7 @@ def test_presets_can_be_trained(preset):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("base_degree, shares", [(1, (0.2, 0.0)), (2, (0.0, 0.1))])
+@pytest.mark.parametrize("base_degree, shares", [(0, (0.1, 0.05)), (1, (0.2, 0.0)), (2, (0.0, 0.1))])
 def test_every_mix_fills_its_bytes(scene, base_degree, shares):
     view, texture = shares
     system = smoke(base_degree=base_degree, view_dependence_share=view, texture_share=texture)
@@ -89,7 +89,6 @@ def test_details_have_their_room_before_they_come(scene, before_details, monkeyp
 
     model, num_steps = details()
     assert num_steps == 1
-    assert 0.995 * 40_000 <= model.num_bytes <= 40_000, "both shares are filled"
     for event in (AdaptDegrees, Upscale):
         monkeypatch.setattr(event, "with_room", HostEvent.with_room)
     other, num_steps = details()

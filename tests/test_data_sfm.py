@@ -363,7 +363,8 @@ def test_every_phase_moves_and_colmap_is_silent(tmp_path, capfd, monkeypatch, is
     lines = printed.replace("\r", "\n").splitlines()
     assert all(re.match(r"(features|matching|mapping|undistorting)\b|$", line) for line in lines)
     for phase, num in (("features", 4), ("matching", 6)):
-        assert any((f"{num}/{num}" if is_terminal else f"{num} of {num}") in line for line in lines if phase in line)
+        wanted = f"{num}/{num}" if is_terminal else f"{num} of {num}"
+        assert any(wanted in line for line in lines if line.startswith(phase))
 
 
 def test_too_little_in_common(tmp_path, capfd):

@@ -243,7 +243,6 @@ def _match_features(database: Path, num_photos: int, seed: int, matching: Matchi
     is_exhaustive = matching == "exhaustive"
     match = colmap.match_exhaustive if is_exhaustive else colmap.match_sequential
     total = num_photos * (num_photos - 1) // 2 if is_exhaustive else None
-    done = 0
     with (
         counting("matching", total, "pair", is_shown=progress) as bar,
         # Read by COLMAP's own SQLite: another copy of it in the same process would disturb its locks.
@@ -251,10 +250,8 @@ def _match_features(database: Path, num_photos: int, seed: int, matching: Matchi
     ):
 
         def count() -> None:
-            nonlocal done
-            if (found := opened.num_verified_image_pairs()) > done:
-                bar.update(found - done)
-                done = found
+            if more := opened.num_verified_image_pairs() - bar.n:
+                bar.update(more)
 
         with _ticking(count) if progress else nullcontext():
             match(database, verification_options=verification, device=colmap.Device.cpu)

@@ -46,27 +46,27 @@ def counting(title: str, total: int | None, unit: str, *, is_shown: bool = True)
 
 
 class PlainCounter:
-    """Number of finished items in plain lines on stderr."""
+    """Number `n` of finished items, as tqdm has it, in plain lines on stderr."""
 
     def __init__(self, title: str, total: int | None):
-        self._title, self._total, self._done = title, total, 0
+        self._title, self._total, self.n = title, total, 0
         self._began = time.perf_counter()
         self._last_line = 0, self._began
 
     def update(self, num: int = 1) -> None:
         """Count items."""
-        self._done += num
-        if is_line_due(self._done, self._total or 0, *self._last_line):
+        self.n += num
+        if is_line_due(self.n, self._total or 0, *self._last_line):
             of_total = f" of {self._total:,}" if self._total else ""
-            print(f"{self._title}: {self._done:,}{of_total}{self._left}", file=sys.stderr, flush=True)
-            self._last_line = self._done, time.perf_counter()
+            print(f"{self._title}: {self.n:,}{of_total}{self._left}", file=sys.stderr, flush=True)
+            self._last_line = self.n, time.perf_counter()
 
     @property
     def _left(self) -> str:
         """Remaining time in words; empty at the end, or if the total is not known."""
-        if self._total is None or self._done >= self._total:
+        if self._total is None or self.n >= self._total:
             return ""
-        seconds = (time.perf_counter() - self._began) / self._done * (self._total - self._done)
+        seconds = (time.perf_counter() - self._began) / self.n * (self._total - self.n)
         return f", about {datetime.timedelta(seconds=round(seconds))} left"
 
 

@@ -263,18 +263,19 @@ def positional_gradient(
 
     `d_rho` is ∂L/∂ρ through the falloff, `jacobian` has the rows of ∂M[:, 2]/∂μ = K·Rc.
     """
+
     # Only the third column of M moves with the mean, by the jacobian. k₀, k₁, l₀, l₁ and p₂ = k₀·l₁ − k₁·l₀ do not.
-    (k0, l0), (k1, l1) = (
-        (x * last - first, y * last - second)
-        for first, second, last in (_from_center((M[0][k], M[1][k], M[2][k]), tile) for k in range(2))
-    )
+    def ray(column: Triple) -> tuple[Array, Array]:
+        first, second, last = _from_center(column, tile)
+        return x * last - first, y * last - second
+
+    (k0, l0), (k1, l1) = (ray((M[0][k], M[1][k], M[2][k])) for k in range(2))
 
     def like_rho(mean: Triple) -> Array:
         """Return a number with the gradient of ρ."""
-        first, second, last = _from_center(mean, tile)
-        k2, l2 = x * last - first, y * last - second
+        k2, l2 = ray(mean)
         u, v = (k1 * l2 - k2 * l1) * hit.inverse, (k2 * l0 - k0 * l2) * hit.inverse
-        dx, dy = x - first / last, y - second / last
+        dx, dy = k2 / mean[2], l2 / mean[2]
         # 2·(hit.u·u + hit.v·v), with constants hit.u and hit.v, has the gradient of u² + v² at the hit.
         return jnp.where(hit.is_ray, 2 * (hit.u * u + hit.v * v), 2 * (dx * dx + dy * dy))
 
