@@ -12,7 +12,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, count_floats, in_words, template_of
-from a2tg_jax.appearance.base import check_arrays_given, join_rows, take_rows
+from a2tg_jax.appearance.base import check_arrays_given, join_rows, num_colors_of, take_rows
 from a2tg_jax.appearance.parts import MAX_DEGREE, bands_of_dense, degrees_of_sizes, dense_bands
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
@@ -122,7 +122,14 @@ class Model:
         """Bytes of padding in the buffers (host)."""
         floats, _ = partition(self.appearance)
         allocated = sum(np.asarray(leaf.shape).prod() * leaf.dtype.itemsize for leaf in jax.tree.leaves(floats))
-        return int(allocated) + BYTES_PER_FLOAT * self.gaussians.floats_per_row * self.num - self.num_bytes
+        filled = count_floats(self.appearance, self.num) + self.appearance.replaced_floats * self.num
+        return int(allocated) - BYTES_PER_FLOAT * filled
+
+    @property
+    def background_shown(self) -> tuple[float, ...]:
+        """Background of renders that name none: the model's own, or 0 if its splats have other than three numbers."""
+        num_colors = num_colors_of(self.appearance)
+        return self.background if num_colors == len(self.background) else (0.0,) * num_colors
 
     @property
     def textures(self) -> Textures | None:
@@ -185,7 +192,8 @@ class Model:
         Args:
           camera: the view.
           features: [N, D] numbers to show instead of colours (`render_image`), one row for each allocated Gaussian.
-          background: [3] colour, or [D] features; None is the model's own, or 0 behind features.
+          background: [3] colour, or [D] features; None is the model's own, or 0 behind features and other than three
+            colours.
           settings: static options; `texture` is ignored, since the appearance has its own options. Under jit they
             need a capacity: `plan_render(model, cameras)`.
 
@@ -195,8 +203,9 @@ class Model:
         Raises:
           ValueError: under jit or vmap without a capacity, or if an argument has a wrong shape.
         """
-        background = self.background if background is None and features is None else background
         appearance = with_features(self.appearance, features, self.gaussians)
+        if background is None and features is None:
+            background = self.background_shown
         return render_appearance(
             self.gaussians, camera, appearance, background=background, settings=settings, num_live=self.num_live
         )

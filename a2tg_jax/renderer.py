@@ -8,6 +8,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, check_is_appearance
+from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.core.cameras import Camera, check_camera, checked_cameras, resize_camera
 from a2tg_jax.core.checks import check_kind, check_number
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
@@ -115,7 +116,7 @@ class Renderer:
           appearance: appearance of Gaussians; None is plain 2DGS. A model has its own.
           cameras: one or more for which the first capacities are planned; others may follow.
           capacities: initial capacities, such as `capacities` of the renderer of a similar model.
-          background: [3] colour; None is the model's own, or black.
+          background: [3] colour, or as many numbers as a splat has; None is the model's own, or black.
           settings: static options; the renderer finds the capacity.
           has_geometry: if False, depth, normal and distortion cost nothing, and reading them raises ValueError.
 
@@ -130,10 +131,10 @@ class Renderer:
             raise ValueError("appearance: a model has its own; give Gaussians with an appearance")
         if not isinstance(model, Model):
             model = Model(model, appearance or appearance_of(model, None, settings))
-        background = model.background if background is None else background
-        check_background(background)
         check_gaussians(model.gaussians)
         check_is_appearance(model.appearance, model.gaussians)
+        background = model.background_shown if background is None else background
+        check_background(background, num_colors_of(model.appearance))
         self._gaussians, self._num_live = model.gaussians, model.num_live
         self._appearance = model.appearance
         self._background = jnp.asarray(background, model.gaussians.means.dtype)
