@@ -142,7 +142,7 @@ def test_compress_writes_the_smaller_file(adds, is_kept, run, tmp_path, monkeypa
 def test_a_tuned_file_may_be_the_only_one_within_the_loss(run, tmp_path, monkeypatch, capsys):
     found = tuned_so(run.model("a2tg-textures"), COARSE, losses=1)
     monkeypatch.setattr(compression, "TUNED_LADDER", {"means": (3, 4)})
-    monkeypatch.setattr(compression, "_losses", lambda *a: {"training views": lambda model: 1.0})
+    monkeypatch.setattr(compression, "loss_measures", lambda *a: {"training views": lambda model: 1.0})
     out = tmp_path / "tuned.a2tgz"
     command = [*TUNE, str(run.path), "--out", str(out), "--max-loss", "0.2"]
     with monkeypatch.context() as patch:
@@ -195,7 +195,7 @@ def test_only_a_file_that_the_run_wrote_is_replaced(run, tmp_path, monkeypatch, 
             return True
         return False
 
-    monkeypatch.setattr(compression, "_losses", reached)
+    monkeypatch.setattr(compression, "loss_measures", reached)
     model = tmp_path / "scene.npz"
     model.write_bytes(run.model("a2tg-textures").read_bytes())
     copy = RunFolder(tmp_path / "run")

@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 from test_data_colmap import dot_place, write_scene as write_colmap
 
 from a2tg_jax.core.camera_paths import vertical_of
-from a2tg_jax.core.cameras import intrinsics
+from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import load_scene, run_sfm, sfm, synthetic
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.decoding import picture_facts, picture_size, read_pixels, software_of
@@ -32,7 +32,8 @@ def save_photos(folder, num_photos, width, height):
     centers = synthetic.camera_path(40)[:num_photos]
     folder.mkdir()
     for index, center in enumerate(centers):
-        pixels = synthetic.render(surfaces, synthetic.viewmat_to_target(center), K, width, height)
+        viewmat = looking(center, synthetic.TARGET - center, synthetic.DOWN)
+        pixels = synthetic.render(surfaces, viewmat, K, width, height)
         Image.fromarray(pixels).save(folder / f"view_{index:03d}.png")
     return centers
 

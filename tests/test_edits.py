@@ -124,8 +124,8 @@ def test_commands_take_an_edit(tmp_path, capsys):
     assert main(words) == 0
     edited = a2tg.load_model(tmp_path / "n.npz")
     np.testing.assert_array_equal(edited.gaussians.means, means[means[:, 0] >= 0])
-    outputs = ["--web", str(tmp_path / "site"), "--ply", str(tmp_path / "n.ply")]
-    assert main(["export", str(tmp_path / "m.npz"), *outputs, "--edit", str(path)]) == 0
+    assert main(["convert", str(tmp_path / "m.npz"), str(tmp_path / "n.ply"), "--edit", str(path)]) == 0
+    assert main(["export", str(tmp_path / "m.npz"), "--web", str(tmp_path / "site"), "--edit", str(path)]) == 0
     assert "the original one turned by" in capsys.readouterr().out
     page = decode_model((tmp_path / "site" / "scene.a2tgz").read_bytes())
     assert a2tg.load_ply(tmp_path / "n.ply").num == page.num == edited.num

@@ -8,6 +8,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 from test_data_sfm import cameras_of, staged
 
+from a2tg_jax.core.cameras import looking
 from a2tg_jax.data import load_scene, synthetic
 from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.colmap_library import pycolmap
@@ -20,7 +21,7 @@ WIDTH, FACE = 640, 224
 def camera(rotation):
     """World to camera of a view with a rotation from the panorama's frame."""
     viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation @ synthetic.viewmat_to_target(CENTER)[:3, :3]
+    viewmat[:3, :3] = rotation @ looking(CENTER, synthetic.TARGET - CENTER, synthetic.DOWN)[:3, :3]
     viewmat[:3, 3] = -viewmat[:3, :3] @ CENTER
     return viewmat
 

@@ -275,16 +275,14 @@ def a_model():
     ("words", "mine", "message"),
     [
         (
-            "export model.npz --ply x.ply",
-            "x.ply",
-            "x.ply exists; add --overwrite to replace it, or choose another --ply",
+            "export model.npz --web x.html",
+            "x.html",
+            "x.html exists; add --overwrite to replace it, or choose another --web",
         ),
-        ("export model.npz --web x.html", "x.html", "x.html exists; add --overwrite"),
-        ("export model.npz --ply site/x.ply --web site", "site/scene.a2tgz", "scene.a2tgz exists; add --overwrite"),
-        ("export model.npz --ply site/x.ply --web site", "site/photographs.json", "photographs.json exists"),
+        ("export model.npz --web site", "site/scene.a2tgz", "scene.a2tgz exists; add --overwrite"),
+        ("export model.npz --web site", "site/photographs.json", "photographs.json exists"),
         ("compress model.npz --out x.a2tgz", "x.a2tgz", "x.a2tgz exists; add --overwrite"),
         ("mesh run", "run/mesh.glb", "mesh.glb exists; add --overwrite"),
-        ("export scene.ply --overwrite --ply scene.ply", "", "scene.ply is the model itself; choose another --ply"),
         ("export scene.ply --overwrite --single-file --web scene.ply", "", "the model itself; choose another --web"),
     ],
 )
@@ -304,15 +302,14 @@ def test_files_are_not_replaced_without_a_flag(tmp_path, monkeypatch, capsys, wo
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_export_reports_what_ply_does_not_keep(tmp_path, capsys):
+def test_conversion_reports_what_ply_does_not_keep(tmp_path, capsys):
     appearance = allocate_appearance(MovableKernels(), jax.random.key(0), a_model().gaussians)
     model, lost = a2tg.Model(a_model().gaussians, appearance), "what MovableKernels shows besides Gaussians"
     for given, line in ((model, f"not kept by this format: {lost}\n"), (a_model(), "")):
         a2tg.save_model(tmp_path / "a.npz", given)
-        words = ["export", str(tmp_path / "a.npz"), "--overwrite", "--ply", str(out := tmp_path / "a.compressed.ply")]
-        assert cli.main(words) == 0
+        assert cli.main(["convert", str(tmp_path / "a.npz"), "--overwrite", str(tmp_path / "a.ply")]) == 0
         world = "world: as in the source, which has no cameras to find the vertical by\n"
-        assert capsys.readouterr().out == f"file: {out}: 3 Gaussians\n{line}{world}"
+        assert capsys.readouterr().out.partition("\n")[2] == f"{line}{world}"
 
 
 @pytest.mark.parametrize(("name", "is_export"), [("models/x.a2tgz", True), ("mesh.glb", True), ("models/x.npz", False)])

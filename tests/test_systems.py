@@ -19,7 +19,8 @@ from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
 from a2tg_jax.training.loop import StageRun
-from a2tg_jax.training.registry import SYSTEMS, differences, system_from_dict, system_to_dict
+from a2tg_jax.training.options import own_options
+from a2tg_jax.training.registry import SYSTEMS, system_from_dict, system_to_dict
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import jitted_step
 from a2tg_jax.training.terms import opacity
@@ -277,7 +278,7 @@ def test_a_training_without_gaussians_left_says_what_to_change(scene, name, reas
 def test_options_as_values_of_files_and_back(name):
     system = type(a2tg.find_system(name)).preset("smoke")
     assert system_from_dict(system_to_dict(system), "file") == system
-    assert changed_config(a2tg.find_system(name), differences(system), "file") == system
+    assert changed_config(a2tg.find_system(name), own_options(system, type(system)()), "file") == system
 
 
 def test_a_file_imports_nothing():

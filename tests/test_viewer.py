@@ -32,10 +32,11 @@ from a2tg_jax.io.compact import save_compact, unframed
 from a2tg_jax.io.model_file import save_model
 from a2tg_jax.io.ply import save_ply
 from a2tg_jax.results import viewing
+from a2tg_jax.results.compression import loss_measures
 from a2tg_jax.results.meshing import MeshOptions, write_mesh
 from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
-from a2tg_jax.results.viewing import ServedPhotographs, export_comparison, export_web, losses_of, routes_of
+from a2tg_jax.results.viewing import ServedPhotographs, export_comparison, export_web, routes_of
 from a2tg_jax.systems.a2tg import A2tg
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serve, served
@@ -403,4 +404,4 @@ def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkey
     with warned:
         assert json.loads(routes_of(source)["/photographs.json"].read()) == []
     with warned:
-        assert list(losses_of(source)) == ["for a model of 30 dB"]
+        assert list(loss_measures(source.model, source.load_scene_or_warn(), source.settings)) == ["if 30 dB"]

@@ -32,7 +32,7 @@ FLAGS = {
     "render": "edit fps frames model out overwrite path size supersample",
     "mesh": "clusters edit faces max-memory model out overwrite radius resolution texture texture-size unbounded voxel",
     "view": "edit host model open port",
-    "export": "edit float64 model overwrite photographs ply single-file title web world",
+    "export": "edit model overwrite photographs single-file title web",
     "convert": "bake bake-growth bake-iterations edit float64 model overwrite world",
     "edit": "background crop floaters model out overwrite upright",
     "compare": "out overwrite",

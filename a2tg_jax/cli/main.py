@@ -35,7 +35,6 @@ Adaptive anisotropic textured 2D Gaussian splatting: from photographs to a textu
   a2tg mesh runs/scene                 write the surface as triangles: GLB, PLY or OBJ
   a2tg view runs/scene                 show a run in a browser; also *.npz, *.ply, *.spz, ...
   a2tg export runs/scene --web out/    write the viewer for a web server, or as one HTML file
-  a2tg export runs/scene --ply x.ply   write the Gaussians for other programs
   a2tg compare runs/scene runs/b       write a page that shows two runs with a divider
   a2tg convert runs/scene scene.sog    convert splats to and from PLY, SPZ, SOG, glTF and others
   a2tg edit runs/scene --out x.npz     crop, turn upright, remove floaters, without a browser
@@ -54,7 +53,7 @@ COMMANDS = {
     "sfm": "inputs:Sfm", "download": "inputs:Download", "doctor": "doctor:Doctor",
 }  # fmt: skip
 """Module of `a2tg_jax.cli` and dataclass of each command."""
-CONVERTED = ("sog", "spz", "splat", "ksplat", "glb", "gltf", "usdz", "usda", "usdc", "npz", "a2tgz")
+CONVERTED = ("ply", "sog", "spz", "splat", "ksplat", "glb", "gltf", "usdz", "usda", "usdc", "npz", "a2tgz")
 """Suffixes of files that convert writes, tried as flags of export. `io.formats` has them too, but imports JAX."""
 SMALLER = {
     "train": "close other programs, or give a larger --downscale, or a smaller --memory-budget or --batch-size",

@@ -13,14 +13,13 @@ from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import counted
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.compression import MAX_LOSS, compress
-from a2tg_jax.results.conversion import BakeOptions, check_ply, convert, export_ply
+from a2tg_jax.results.conversion import BakeOptions, convert
 from a2tg_jax.results.editing import EditOptions, write_edit
 from a2tg_jax.results.finishing import finish_run
 from a2tg_jax.results.folder import (
     RunFolder,
     check_apart,
     check_export,
-    check_new,
     check_not_source,
     check_output,
     json_text,
@@ -250,25 +249,19 @@ class ViewCommand:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write a page that shows a scene in any browser, or a PLY file for other programs.
+    """Write a page that shows a scene in any browser.
 
-    The page is a folder for a web server, or one HTML file that opens without one. The PLY file holds the Gaussians,
-    upright, flat and without textures, as 3DGS programs read them.
+    The page is a folder for a web server, or one HTML file that opens without one. a2tg convert writes files for other
+    programs.
 
     Examples:
       a2tg export runs/fox --web site/fox
       a2tg export runs/fox --web fox.html
-      a2tg export runs/fox --ply fox.ply
     """
 
     source: RunOrFile
-    web: Path | None = None
+    web: Path
     """Output folder of the page, or one HTML file, if the name ends in .html."""
-    ply: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Output file of the Gaussians."""
-    float64: bool = False
-    """Write the positions of --ply as float64, so that map coordinates keep their precision."""
-    world: FileWorld = "upright"
     single_file: bool = False
     """Write one HTML file, whatever its name."""
     photographs: bool = False
@@ -278,33 +271,15 @@ class Export:
     model: LastModel = None
     edit: EditFile = None
     overwrite: bool = False
-    """Replace the outputs of --web and --ply if they exist."""
+    """Replace the page if it exists."""
 
     def run(self) -> None:
-        if self.web is None and (self.ply is None or self.single_file or self.photographs):
-            raise ValueError("give --web PATH for a page, or --ply FILE for other programs")
-        for name, other in (("float64", "ply"), ("world", "ply"), ("title", "web")):
-            if getattr(self, name) != getattr(Export, name) and getattr(self, other) is None:
-                raise ValueError(f"--{name} has no effect without --{other}: add it")
-        # All outputs are checked before the first one is written.
-        if self.ply is not None:
-            check_output(self.ply)
-            check_ply(self.ply)
-            check_not_source([self.ply], self.source, "--ply")
-            check_new(self.ply, "--ply", overwrite=self.overwrite)
         page = {"single_file": self.single_file, "photographs": self.photographs, "overwrite": self.overwrite}
-        if self.web is not None:
-            check_output(self.web)
-            files = check_page(self.web, **page)
-            if self.ply is not None:
-                check_apart(files[0], self.ply)  # A PLY file may be in the folder of a page.
-            check_not_source(files, self.source, "--web")
+        check_output(self.web)
+        check_not_source(check_page(self.web, **page), self.source, "--web")
         source = open_source(self.source, self.model, self.edit)
-        if self.web is not None:
-            titled = source if self.title is None else dataclasses.replace(source, title=self.title)
-            print(export_web(titled, self.web, **page))
-        if self.ply is not None:
-            print(export_ply(source, self.ply, float64=self.float64, world=self.world))
+        titled = source if self.title is None else dataclasses.replace(source, title=self.title)
+        print(export_web(titled, self.web, **page))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,6 +27,14 @@ Box = tuple[Array, Array, Array, Array]
 Floats = Array | np.ndarray
 
 
+def fibonacci(num: int, turn: float = 0.0) -> np.ndarray:
+    """Return unit vectors [num, 3] spread evenly over the sphere, a Fibonacci lattice, turned by radians about z."""
+    index = np.arange(num) + 0.5
+    z, angle = 1 - 2 * index / num, np.pi * (1 + 5**0.5) * index + turn  # 2π times the golden ratio
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
+
+
 def pixel_sizes(means: Floats, scales: Floats, viewmat: Floats, K: Floats) -> Floats:
     """Return the smaller standard deviation of Gaussians in pixels [N], of NumPy or JAX; 0 before the near plane."""
     depths = means @ viewmat[2, :3] + viewmat[2, 3]

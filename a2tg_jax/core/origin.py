@@ -77,6 +77,19 @@ class Origin:
             for viewmat, K, (width, height) in zip(self.viewmats, self.Ks, self.sizes, strict=True)
         ]
 
+    @property
+    def training_cameras(self) -> list[Camera]:
+        """Cameras of photographs that were trained on; all cameras if all were held out."""
+        trains_on_all = bool(self.is_test.all())
+        return [own for own, is_test in zip(self.cameras, self.is_test, strict=True) if trains_on_all or not is_test]
+
+    @property
+    def held_out_cameras(self) -> list[Camera]:
+        """Cameras of photographs that were held out for testing; none if all were."""
+        if self.is_test.all():
+            return []
+        return [own for own, is_test in zip(self.cameras, self.is_test, strict=True) if is_test]
+
     def moved(self, similarity: Similarity) -> "Origin":
         """Return the same cameras in the world that `similarity` leads to, without the corrections they contain."""
         viewmats = np.array([similarity.apply_to_viewmat(viewmat) for viewmat in self.viewmats]).reshape(-1, 4, 4)

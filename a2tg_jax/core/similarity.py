@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.core.cameras import MAX_SKEW
 from a2tg_jax.core.checks import LARGEST_NUMBER, check_array, check_kind, check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.geometry import fibonacci
 from a2tg_jax.core.sh import sh_basis
 
 
@@ -127,11 +128,7 @@ def sh_rotation(rotation: np.ndarray) -> np.ndarray:
 
     It is float64, block diagonal with one orthogonal block per degree.
     """
-    # A Fibonacci lattice: directions spread evenly over the sphere.
-    index = np.arange(NUM_DIRECTIONS) + 0.5
-    z, angle = 1 - 2 * index / NUM_DIRECTIONS, np.pi * (1 + 5**0.5) * index
-    radius = np.sqrt(1 - z * z)
-    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
+    directions = fibonacci(NUM_DIRECTIONS)
     # The fit is exact: rotations keep degrees apart, and 64 directions determine 7 functions.
     before, after = _basis(directions), _basis(directions @ rotation.T)
     matrix = np.zeros((16, 16))

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, assemble_scene, every_kth, rigid_viewmat
@@ -152,14 +153,9 @@ def viewmat_of(image: ImageRecord) -> np.ndarray:
     length = np.linalg.norm(quaternion)
     if length == 0:
         raise ValueError(f"{image.name}: its pose has a quaternion of zeros; remove it from the model")
-    # Division by an infinite length would hide a bad pose as zeros; rigid_viewmat reports NaN.
-    w, x, y, z = quaternion / length if np.isfinite(length) else np.full(4, np.nan)
-    # Rotation of the unit quaternion w + xi + yj + zk, in Hamilton's convention.
-    viewmat[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    # rigid_viewmat reports NaN.
+    is_finite = np.isfinite(length)
+    viewmat[:3, :3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix() if is_finite else np.nan
     return rigid_viewmat(viewmat, image.name)
 
 

@@ -60,7 +60,9 @@ def read_pixels(path: str | os.PathLike[str]) -> np.ndarray:
         converted = image.convert("RGBA" if has_alpha else "RGB")
         pixels = np.asarray(converted.transpose(AS_STORED[turn]) if turn in AS_STORED else converted)
     # One picture with alpha gives all batches an opacity (training.batches), so drop an opaque one.
-    return pixels[..., :3] if has_alpha and (pixels[..., 3] == 255).all() else pixels
+    if has_alpha and (pixels[..., 3] == 255).all():
+        return np.ascontiguousarray(pixels[..., :3])  # A view would keep the fourth channel in memory.
+    return pixels
 
 
 def picture_size(path: str | os.PathLike[str]) -> tuple[int, int]:

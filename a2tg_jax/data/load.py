@@ -67,7 +67,7 @@ class SceneSource:
         if self.path == SYNTHETIC:
             return SYNTHETIC
         # os.path, because Path would make one slash of the two in a URL.
-        folder = os.path.dirname(self.path) if Path(self.path).suffix == ".json" else self.path
+        folder = os.path.dirname(self.path) if Path(self.path).suffix in (".json", ".xml") else self.path
         return scene_name(folder if is_url(folder) else Path(folder))
 
     def load(self, room: int | None = None, *, is_divided: bool = False) -> Scene:

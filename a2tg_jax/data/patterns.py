@@ -140,11 +140,6 @@ def planks(rng: np.random.Generator, side: int, width: int, length: int) -> np.n
     return np.where(is_gap[..., None], GAP, color)
 
 
-def lettering(text: str, rows: int, columns: int, height: float, ink: np.ndarray, paper: np.ndarray) -> np.ndarray:
-    """Return text `height` texels high, centred on plain paper; short text repeats along the columns."""
-    return mix(paper, ink, _text_mask(text, rows, columns, height, repeat=True))
-
-
 def letter_block(letters: Sequence[str], side: int, colors: Sequence[np.ndarray]) -> np.ndarray:
     """Return the faces of toy blocks side by side: a framed letter each, the frame checked."""
     faces = []
@@ -153,12 +148,12 @@ def letter_block(letters: Sequence[str], side: int, colors: Sequence[np.ndarray]
         edge = np.minimum(np.minimum(u, 1 - u), np.minimum(v, 1 - v))
         checks = ((u * 8).astype(int) + (v * 8).astype(int)) % 2
         face = mix(color, CREAM, np.where(edge < 1 / 8, checks, edge > 1.5 / 8))
-        mask = _text_mask(letter, side, side, 0.58 * side, repeat=False)
+        mask = text_mask(letter, side, side, 0.58 * side, repeat=False)
         faces.append(face + mask[..., None] * (color * 0.8 - face))
     return np.concatenate(faces, axis=1)
 
 
-def _text_mask(text: str, rows: int, columns: int, height: float, *, repeat: bool) -> np.ndarray:
+def text_mask(text: str, rows: int, columns: int, height: float, *, repeat: bool) -> np.ndarray:
     """Return the coverage [rows, columns] in [0, 1] of text in Pillow's own font, vertically centred."""
     font = ImageFont.load_default(height)
     canvas = Image.new("L", (columns, rows))

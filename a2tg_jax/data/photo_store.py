@@ -291,8 +291,10 @@ class Shelf:
                     folder.mkdir(parents=True, exist_ok=True)
                     if os.access(folder, os.W_OK):
                         self._disk = int(SHARE_OF_DISK * shutil.disk_usage(folder).free)
+            if num_bytes > self._disk:
+                return False
             self._disk -= num_bytes
-            return self._disk >= 0
+            return True
 
 
 def _read_file(source: Path, view: Processing | None) -> np.ndarray:

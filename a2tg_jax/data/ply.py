@@ -173,17 +173,20 @@ def read_ply_points(path: Path) -> PointCloud:
     return PointCloud(points, _colors(vertices, ply.fields["vertex"]))
 
 
+def largest_color(colors: np.ndarray, *, is_float: bool) -> int:
+    """Return the number that stands for full brightness among finite colours [N, 3], by the colours themselves."""
+    if is_float:  # Some floats are a little above 1, or far: the mean decides.
+        mean = np.clip(colors, 0, FLOAT_RANGES[-1]).mean()
+        return next(largest for largest in FLOAT_RANGES if mean <= largest)
+    return next((largest for largest in INTEGER_RANGES if colors.max() <= largest), INTEGER_RANGES[-1])
+
+
 def _colors(vertices: np.ndarray, fields: Mapping[str, str]) -> np.ndarray:
     names = next((names for names in (*COLORS, SH_DEGREE0) if set(names).issubset(fields)), None)
     if names is None or not len(vertices):
         return np.full((len(vertices), 3), 128, np.uint8)
     # NaN as uint8 is undefined.
     given = np.nan_to_num(np.stack([vertices[name] for name in names], axis=-1).astype(np.float64))
-    if names == SH_DEGREE0:
-        colors = 0.5 + SH_C0 * given
-    elif fields[names[0]].startswith("f"):  # Some floats are a little above 1, or far: the mean decides.
-        mean = np.clip(given, 0, FLOAT_RANGES[-1]).mean()
-        colors = given / next(largest for largest in FLOAT_RANGES if mean <= largest)
-    else:
-        colors = given / next(largest for largest in INTEGER_RANGES if given.max() <= largest)
+    is_float = fields[names[0]].startswith("f")
+    colors = 0.5 + SH_C0 * given if names == SH_DEGREE0 else given / largest_color(given, is_float=is_float)
     return np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)

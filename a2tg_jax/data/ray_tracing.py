@@ -15,6 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import zoom
 
+from a2tg_jax.core.geometry import fibonacci
+
 NEAR = 1e-3
 """Smallest t of a hit; nearer ones are the point itself."""
 LAMP = np.array([[-1.7], [-1.9], [3.1]], np.float32)
@@ -233,14 +235,14 @@ def light(colored: list[tuple[ParametricSurface, np.ndarray]], rng: np.random.Ge
         points = points + np.float32(1e-3) * normals  # Off the surface, which would shade itself.
         # Of the sky, the share of the cosine-weighted hemisphere with nothing nearer than SKY_REACH.
         sky = np.zeros(points.shape[1], np.float32)
-        for offset in _unit_vectors(rng, NUM_SKY_RAYS):
+        for offset in fibonacci(NUM_SKY_RAYS, rng.uniform(0, 2 * np.pi)).astype(np.float32):
             # The sum of a normal and a random unit vector is distributed by the cosine; 0.999 keeps it from 0.
             directions = normals + np.float32(0.999) * offset[:, None]
             directions /= np.linalg.norm(directions, axis=0)
             sky += nearest_hits(shapes, points, directions)[0] > SKY_REACH
         # Of the lamp, the cosine of its direction times its visible share.
         lamp = np.zeros(points.shape[1], np.float32)
-        for offset in _unit_vectors(rng, NUM_LAMP_RAYS):
+        for offset in fibonacci(NUM_LAMP_RAYS, rng.uniform(0, 2 * np.pi)).astype(np.float32):
             towards = LAMP + np.float32(LAMP_RADIUS) * offset[:, None] - points
             cosine = (towards * normals).sum(axis=0) / np.linalg.norm(towards, axis=0)
             is_free = nearest_hits(shapes, points, towards)[0] > 1  # The lamp is at 1.
@@ -252,11 +254,3 @@ def light(colored: list[tuple[ParametricSurface, np.ndarray]], rng: np.random.Ge
         image = np.rint(255 * np.clip(colors * fine[..., None], 0, 1)).astype(np.uint8)
         surfaces.append(Surface(shape, image))
     return surfaces
-
-
-def _unit_vectors(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Return [count, 3] float32 unit vectors spread evenly over the sphere (a Fibonacci lattice, turned at random)."""
-    index = np.arange(count) + 0.5
-    z, angle = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index + rng.uniform(0, 2 * np.pi)
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1).astype(np.float32)

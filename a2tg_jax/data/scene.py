@@ -141,10 +141,9 @@ def check_scene(scene: Scene) -> None:
 
 def check_are_views(views: Sequence[View], call: str) -> None:
     """Raise ValueError, which shows the right call, unless the views are a list or a tuple of views."""
-    is_list = isinstance(views, list | tuple)
-    odd = next((item for item in views if not isinstance(item, View)), None) if is_list else views
-    if odd is not None:
-        raise ValueError(f"views must be views, such as scene.train; got {type(odd).__name__}: use {call}")
+    others = [item for item in views if not isinstance(item, View)] if isinstance(views, list | tuple) else [views]
+    if others:
+        raise ValueError(f"views must be views, such as scene.train; got {type(others[0]).__name__}: use {call}")
 
 
 def origin_of_scene(scene: Scene) -> Origin:

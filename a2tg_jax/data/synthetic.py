@@ -82,7 +82,7 @@ def synthetic_scene(
     surfaces = light(still_life(rng), rng)
     size = round(width / downscale), round(height / downscale)
     K = intrinsics(*size, FIELD_OF_VIEW)
-    viewmats = [viewmat_to_target(center) for center in camera_path(num_views)]
+    viewmats = [looking(center, TARGET - center, DOWN) for center in camera_path(num_views)]
     shots = [
         Shot(f"view_{index:03d}.png", viewmat, K, Picture.of(render(surfaces, viewmat, K, *size)))
         for index, viewmat in enumerate(viewmats)
@@ -104,7 +104,8 @@ def still_life(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.nda
     """Return shapes and their colours: a room, a round podium, and the objects on it. Lengths are about metres."""
     wall = patterns.bricks(rng, 320, 2560, (14, 33))
     motto = "A2TG - ADAPTIVE ANISOTROPIC TEXTURED GAUSSIANS -"
-    wall[142:206] = patterns.lettering(motto, 64, 2560, 50, patterns.CREAM, patterns.SLATE)
+    text = patterns.text_mask(motto, 64, 2560, 50, repeat=True)
+    wall[142:206] = patterns.mix(patterns.SLATE, patterns.CREAM, text)
     rim = patterns.checks(2, 120, patterns.INK, patterns.GOLD, texels=16)
     letters, colors = "A2TGA", (patterns.CORAL, patterns.TEAL, patterns.LEAF, patterns.SKY, patterns.GOLD)
     return [
@@ -128,11 +129,6 @@ def camera_path(num_views: int) -> np.ndarray:
     elevation = np.deg2rad(26.0) + np.deg2rad(11.0) * np.sin(2 * phase + 0.6)
     outward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     return TARGET + DISTANCE * np.stack(outward, axis=-1)
-
-
-def viewmat_to_target(center: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrix [4, 4] of a camera at `center` that looks at the target, +z up."""
-    return looking(center, TARGET - center, DOWN)
 
 
 def render(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:

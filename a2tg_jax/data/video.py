@@ -3,7 +3,6 @@
 A first pass scores small greyscale frames, a second one writes the chosen ones.
 """
 
-import importlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from PIL import Image
 from scipy.ndimage import laplace
 
 from a2tg_jax.data.decoding import MAX_PIXELS
+from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import counting
 
 DEFAULT_FRAMES = 150
@@ -91,10 +91,7 @@ def motion(before: np.ndarray, after: np.ndarray) -> float:
 
 
 def _frames(video: Path, phase: str, progress: bool) -> Iterator[Any]:
-    try:
-        av = importlib.import_module("av")
-    except ImportError:
-        raise ValueError("a video needs PyAV, which is not installed: pip install 'a2tg-jax[video]'") from None
+    av = optional("av", "a video needs PyAV", "video")
     try:
         with av.open(str(video), options=ONLY_VIDEOS) as container:
             if not container.streams.video:

@@ -12,11 +12,15 @@ import math
 import os
 import platform
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import psutil
 from jaxlib.version import __version__ as jaxlib_version
 
 from a2tg_jax.host.operating_system import num_cores, trim_heap
+
+if TYPE_CHECKING:
+    import jax
 
 VARIABLE = "A2TG_NUM_THREADS"
 LARGEST_SHARE = 0.6
@@ -198,13 +202,18 @@ class Devices:
 ALONE = Devices()
 
 
-def default_platform() -> str:
-    """Return JAX's platform of the device on which new arrays are placed ("cpu" or "gpu")."""
+def default_device() -> "jax.Device":
+    """Return JAX's device on which new arrays are placed."""
     import jax
 
     # jax.default_device may name another one than the first.
     (device,) = jax.numpy.zeros(()).devices()
-    return device.platform
+    return device
+
+
+def default_platform() -> str:
+    """Return JAX's platform of the device on which new arrays are placed ("cpu" or "gpu")."""
+    return default_device().platform
 
 
 def this_machine() -> Machine:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.origin import BLACK
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gltf import load_gltf, save_gltf
@@ -188,8 +189,10 @@ def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     if (model.gaussians.sh_degree if shown.bands is None else 3) > into.highest_degree:
         lost.append(f"spherical harmonics above degree {into.highest_degree}")
     lost += cut_numbers(into.name, model)
-    if origin is not None and origin.names and not into.keeps_origin:
+    if not into.keeps_origin and origin is not None and origin.names:
         lost.append("cameras and background")
+    elif not into.keeps_origin and model.background != BLACK:
+        lost.append("background")
     if origin is not None and not into.keeps_corrections:
         lost += [LEARNED.get(name, f"learned {name}") for name in sorted(origin.corrections)]
     if not into.is_exact:

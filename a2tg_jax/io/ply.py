@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.data.ply import OFFSET, ROTATION, PlyFile
+from a2tg_jax.data.ply import OFFSET, ROTATION, PlyFile, largest_color
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io import other_programs as others
@@ -226,14 +226,10 @@ def _vertices(ply: PlyFile) -> np.ndarray:
     wanted = (*MEANS, *(COLORS if has_colors else SH_DEGREE0), "opacity", *SCALES, *QUATS)
     ply.require_vertices(wanted, "a PLY of Gaussians")
     vertices = ply.read("vertex")
-    if not has_colors:
+    if not has_colors or not len(vertices):
         return vertices
     colors = np.stack([vertices[name].astype(np.float64) for name in COLORS], axis=1)
-    kind = np.dtype(fields[COLORS[0]])
-    if kind.kind != "f":
-        colors /= np.iinfo(kind).max
-    elif np.max(colors, initial=0.0, where=np.isfinite(colors)) > 1:
-        colors /= 255  # Floats of 0 to 255, as some programs write them.
+    colors /= largest_color(np.nan_to_num(colors), is_float=fields[COLORS[0]].startswith("f"))
     return append_fields(vertices, SH_DEGREE0, ((colors - 0.5) / SH_C0).T, usemask=False)
 
 

@@ -15,7 +15,6 @@ GaussianSplats3D reads.
 """
 
 import dataclasses
-import importlib
 import io
 import json
 import os
@@ -34,6 +33,7 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.ply import OFFSET, ROTATION, turn_of
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.operating_system import printing_to_stderr
+from a2tg_jax.host.optional import optional
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.columns import morton, room_of
@@ -140,10 +140,7 @@ def _zipped(contents: Mapping[str, bytes]) -> bytes:
 
 def import_gaussforge(path: Path) -> Any:
     """Return the library for a file. ValueError: it is not installed."""
-    try:
-        return importlib.import_module("gaussforge")
-    except ImportError as error:
-        raise ValueError(f"{path}: needs gaussforge: pip install 'a2tg-jax[formats]'") from error
+    return optional("gaussforge", f"{path}: needs gaussforge", "formats")
 
 
 def _kind_of(path: str | os.PathLike[str]) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from a2tg_jax.core.origin import BLACK
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
@@ -107,8 +108,9 @@ def _stage_of(model: Model, ellipsoids: bool) -> Any:
         reach = 3 * splats.scales.max(axis=1, keepdims=True)
         corners = np.stack([(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)])
         field.CreateExtentAttr(usd.Vt.Vec3fArray.FromNumpy(corners))
-    if model.origin is not None:
-        kept = others.origin_to_json(model.origin) | {"background": list(model.background)}
+    kept = {} if model.origin is None else others.origin_to_json(model.origin)
+    if kept or model.background != BLACK:
+        kept |= {"background": list(model.background)}
         prim.SetCustomDataByKey(ORIGIN, json.dumps(kept, allow_nan=False))
     return stage
 
@@ -161,10 +163,9 @@ def _model_of(usd: object, prim: Any, path: Path) -> Model:
         raise ValueError(f"its particle field {shortened(str(prim.GetPath()))} must have a kernel of Gaussians")
     gaussians = others.gaussians_of(_splats(usd, prim, path), path, is_flat=SURFLET in kernels)
     kept = prim.GetCustomDataByKey(ORIGIN)
-    described = parse_json(kept) if isinstance(kept, str) else None
-    origin = None if described is None else origin_of(described, described)
-    background = background_of({} if described is None else {"origin": described})
-    model = Model(gaussians, background=background, origin=origin)
+    described = parse_json(kept) if isinstance(kept, str) else {}
+    origin = origin_of(described, described) if set(described) - {"background"} else None
+    model = Model(gaussians, background=background_of(described), origin=origin)
     check_model(model)
     return model
 

@@ -1,10 +1,8 @@
 """Mesh extraction from a model: depths of views, their fusion, marching cubes, and cleaning (host)."""
 
 import dataclasses
-import importlib
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +15,7 @@ from scipy.spatial import cKDTree
 from a2tg_jax.core.camera_paths import nearest_point
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.similarity import camera_centers
+from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.host.text import counted
 from a2tg_jax.mesh.fusion import SIDE, VOXELS, BlockGrid, GridFullError, Space, fuse, rendered_depth
@@ -25,6 +24,7 @@ from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.renderer import Renderer
 
+MARCHING_CUBES = "skimage.measure", "a mesh needs scikit-image", "train"
 RESOLUTION = 512
 """Default number of voxels along the radius."""
 GRID_BYTES = 4 * 10**9
@@ -38,23 +38,6 @@ BRICK = 16
 """Blocks along a side of a brick; marching cubes run brick by brick."""
 SAME = 1e-3
 """Largest distance in voxels between two bricks' copies of a shared vertex."""
-
-
-class NoSurfaceError(ValueError):
-    """The views show no surface within the space, or only small parts."""
-
-    def __init__(self, radius: float, num_dropped: int, least_faces: int):
-        """Keep the radius in units of the model's world, and the number of parts below `least_faces`."""
-        self.radius, self.num_dropped, self.least_faces = radius, num_dropped, least_faces
-        advice = "raise the resolution, or lower least_faces" if num_dropped else "give a larger radius, or unbounded"
-        super().__init__(f"{self.reason()}: {advice}")
-
-    def reason(self, scale: float = 1.0) -> str:
-        """Return why there is no mesh, with lengths divided by `scale`."""
-        if self.num_dropped:
-            parts = counted(self.num_dropped, "part")
-            return f"there are only small parts of a surface; {parts} had fewer than {self.least_faces} faces"
-        return f"there is no surface within {self.radius / scale:.3g} units of the point that the cameras look at"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -130,18 +113,21 @@ def extract_mesh(
     """
     start = time.perf_counter()
     check_is_model(model)
-    cameras = training_cameras(model) if cameras is None else list(cameras)
+    if cameras is None:
+        cameras = [] if model.origin is None else model.origin.training_cameras
+    # Any pinhole camera will do, since depths are rendered: rays of a lens are left out.
+    cameras = [dataclasses.replace(camera, rays=None) for camera in cameras]
     if not model.num or not cameras:
         what = "the model has no Gaussians" if not model.num else "there are no cameras"
         raise ValueError(f"a mesh needs views of some Gaussians; {what}")
     check_lengths(resolution, voxel, radius)
-    _marching_cubes()  # It is used only after the views are fused, which takes minutes.
+    optional(*MARCHING_CUBES)  # It is used only after the views are fused, which takes minutes.
     if not 0 < max_bytes < np.inf:
         raise ValueError(f"max_bytes must be positive and finite; got {max_bytes}")
     if most_clusters < 1:
         raise ValueError(f"most_clusters must be at least 1; got {most_clusters}")
     renderer, depths_of = Renderer(model, cameras=cameras, settings=settings), jax.jit(rendered_depth)
-    own_center, own_radius = common_sphere([camera.viewmat for camera in cameras])
+    own_center, own_radius = common_sphere([camera.viewmat for camera in cameras], center)
     if not own_radius:  # Cameras in one place: the centre is at the median depth of the first.
         depth = np.asarray(depths_of(renderer(cameras[0]), cameras[0]).depth)
         middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
@@ -156,29 +142,28 @@ def extract_mesh(
         except GridFullError:
             raise GridFullError(
                 f"a resolution of {radius / voxel:.0f} voxels along the radius takes more than "
-                f"{max_bytes / 1e9:.3g} GB after {index + 1} of {len(cameras)} views: lower the resolution or the "
-                "radius, or raise max_bytes"
+                f"{max_bytes / 1e9:.3g} GB after {index + 1} of {len(cameras)} views: lower `resolution` or `radius`, "
+                "or allow more memory"
             ) from None
     mesh, num_dropped = largest_clusters(surface_of(grid, space, least_weight), most_clusters, least_faces)
     if not mesh.num_faces:
-        raise NoSurfaceError(radius, num_dropped, least_faces)
+        if num_dropped:
+            raise ValueError(
+                f"there are only small parts of a surface; {counted(num_dropped, 'part')} had fewer than {least_faces} "
+                "faces: raise `resolution` or lower `voxel`, or train longer or from more views"
+            )
+        raise ValueError(
+            "there is no surface within the radius around the point that the cameras look at: give a larger `radius`, "
+            "or `unbounded`"
+        )
     facts = center, radius, voxel, len(cameras), num_dropped, grid.num_bytes
     return MeshResult(mesh, *facts, seconds=time.perf_counter() - start)
-
-
-def training_cameras(model: Model) -> list[Camera]:
-    """Return the cameras that the model was trained on."""
-    if model.origin is None:
-        return []
-    pairs = list(zip(model.origin.cameras, model.origin.is_test, strict=True))
-    # A model all of whose cameras are test views is fused from these.
-    return [camera for camera, is_test in pairs if not is_test] or [camera for camera, _ in pairs]
 
 
 def check_lengths(resolution: int | None, voxel: float | None, radius: float | None) -> None:
     """Raise ValueError unless the lengths are positive, and at most one gives the voxel size."""
     if resolution is not None and voxel is not None:
-        raise ValueError("resolution and voxel both set the size of voxels; give one of them")
+        raise ValueError("`resolution` and `voxel` both set the size of voxels: leave one out")
     if resolution is not None and not 1 <= resolution <= 100_000:
         raise ValueError(f"resolution must be in 1..100000 voxels along the radius; got {resolution}")
     for name, value in (("voxel", voxel), ("radius", radius)):
@@ -186,15 +171,18 @@ def check_lengths(resolution: int | None, voxel: float | None, radius: float | N
             raise ValueError(f"{name} must be positive and finite; got {value}")
 
 
-def common_sphere(viewmats: ArrayLike) -> tuple[np.ndarray, float]:
+def common_sphere(viewmats: ArrayLike, center: ArrayLike | None = None) -> tuple[np.ndarray, float]:
     """Return centre [3] and radius of the sphere that cameras [V, 4, 4] look at.
 
-    The centre is the point nearest to all optical axes, the radius twice the median distance of the cameras from it.
+    The centre is the point nearest to all optical axes unless it is given, the radius twice the median distance of the
+    cameras from it.
     """
     viewmats = np.asarray(viewmats, np.float64)
     centers = camera_centers(viewmats)
-    # Row 2 of a rotation is the optical axis in the world.
-    center = nearest_point(centers, viewmats[:, 2, :3]) if len(viewmats) > 1 else centers[0]
+    if center is None:
+        # Row 2 of a rotation is the optical axis in the world.
+        center = nearest_point(centers, viewmats[:, 2, :3]) if len(viewmats) > 1 else centers[0]
+    center = np.asarray(center, np.float64)
     return center, float(RADII * np.median(np.linalg.norm(centers - center, axis=1)))
 
 
@@ -229,17 +217,9 @@ def surface_of(grid: BlockGrid, space: Space, least_weight: float = 0.0) -> Mesh
     return Mesh(positions, faces.astype(np.int32), colors)
 
 
-def _marching_cubes() -> Any:
-    """Return scikit-image's function. ValueError: it is not installed."""
-    try:
-        return importlib.import_module("skimage.measure").marching_cubes
-    except ImportError:
-        raise ValueError("a mesh needs scikit-image, which is not installed: pip install 'a2tg-jax[train]'") from None
-
-
 def _parts(grid: BlockGrid, least_weight: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield vertices in voxels, faces and colours of each brick that has a surface."""
-    marching_cubes = _marching_cubes()
+    marching_cubes = optional(*MARCHING_CUBES).marching_cubes
     # The last cells of a brick need the first voxels of the next ones.
     blocks = np.stack(np.meshgrid(*[np.arange(BRICK + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     for brick in np.unique(grid.coordinates // BRICK, axis=0):

@@ -136,6 +136,8 @@ def _save_glb(path: Path, mesh: Mesh, origin: Similarity | Origin | None) -> Non
     # original world is far from there. Without one, positions far from the origin are relative to the node's
     # translation.
     transform = origin.transform if isinstance(origin, Origin) else origin
+    if not mesh.num_faces:
+        raise ValueError("the mesh has no faces, and a GLB file needs one at least: write a PLY or OBJ file")
     builder = Builder()
     node: dict[str, Any] = {"name": "mesh", "mesh": 0}
     middle = _middle(mesh.vertices) if transform is None else np.zeros(3)

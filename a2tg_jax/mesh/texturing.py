@@ -1,14 +1,13 @@
 """Textures of meshes from pictures: each texel is a weighted mean over the views that show it (host)."""
 
-import importlib
 from collections.abc import Iterable, Iterator
-from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.host.optional import optional
 from a2tg_jax.mesh.triangles import Mesh
 
 POWER = 6
@@ -45,12 +44,15 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
       The mesh with `uv` and `texture`; vertices at the seams of charts are repeated.
 
     Raises:
-      ValueError: if xatlas is not installed (`pip install 'a2tg-jax[mesh]'`), or the size is out of range.
+      ValueError: if xatlas is not installed (`pip install 'a2tg-jax[mesh]'`), the size is out of range, or a camera has
+        the rays of a lens.
     """
     mesh, texels = _unwrapped(mesh, size)
     total = np.zeros((len(texels.place), 3), np.float32)
     weight = np.zeros(len(texels.place), np.float32)
     for camera, picture, mask in pictures:
+        if camera.rays is not None:
+            raise ValueError("a texture needs pictures of pinhole cameras; got one with the rays of a lens")
         depth = draw_view(mesh, camera).depth
         for start in range(0, len(weight), CHUNK):
             part = Texels(*(rows[start : start + CHUNK] for rows in texels))
@@ -66,14 +68,11 @@ def texture_mesh(mesh: Mesh, pictures: Iterable[Picture], *, size: int = 2048) -
     return Mesh(mesh.vertices, mesh.faces, mesh.colors, mesh.uv, atlas)
 
 
-def check_texture(size: int) -> ModuleType:
+def check_texture(size: int) -> Any:
     """Return the library xatlas. ValueError: it is not installed, or the side of an atlas is out of range."""
     if not SMALLEST_SIDE <= size <= LARGEST_SIDE:
         raise ValueError(f"texture_size must be in {SMALLEST_SIDE}..{LARGEST_SIDE} texels; got {size}")
-    try:
-        return importlib.import_module("xatlas")
-    except ImportError:
-        raise ValueError("a texture needs xatlas, which is not installed: pip install 'a2tg-jax[mesh]'") from None
+    return optional("xatlas", "a texture needs xatlas", "mesh")
 
 
 class Texels(NamedTuple):

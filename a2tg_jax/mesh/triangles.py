@@ -1,9 +1,7 @@
 """Triangle meshes: colours or a texture, connected parts, fewer triangles, distances of surfaces (host)."""
 
 import dataclasses
-import importlib
-from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -11,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.host.optional import optional
 
 LEAST_FACES = 4
 """Smallest number of faces to simplify to: a closed mesh has four."""
@@ -95,16 +94,11 @@ def largest_clusters(mesh: Mesh, most: int, least_faces: int) -> tuple[Mesh, int
     return mesh.with_faces(is_kept[cluster]), int((~is_kept).sum())
 
 
-def check_simplifying(num_faces: int) -> ModuleType:
+def check_simplifying(num_faces: int) -> Any:
     """Return the library fast-simplification. ValueError: it is not installed, or there are fewer than 4 faces."""
     if num_faces < LEAST_FACES:
         raise ValueError(f"faces must be at least {LEAST_FACES}; got {num_faces}")
-    try:
-        return importlib.import_module("fast_simplification")
-    except ImportError:
-        raise ValueError(
-            "fewer faces need fast-simplification, which is not installed: pip install 'a2tg-jax[mesh]'"
-        ) from None
+    return optional("fast_simplification", "fewer faces need fast-simplification", "mesh")
 
 
 def simplify_mesh(mesh: Mesh, num_faces: int) -> Mesh:

@@ -120,7 +120,11 @@ def compress(
         if scene is None:
             raise FileNotFoundError(f"tune_iterations needs the photographs of {source}, which are missing")
         tune = functools.partial(_tuned, scene, opened.system, tune_iterations, progress)
-    losses = _losses(model, scene, opened.settings)
+    losses = loss_measures(model, scene, opened.settings)
+    if not losses:
+        raise ValueError(
+            "the model has no cameras to measure a loss with; use save_compact in Python with your own choices"
+        )
     measures = list(losses.values())
     tunings = f", then training up to {MOST_TUNINGS} times" if tune else ""
     ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
@@ -215,19 +219,16 @@ def _tuned(
     return tune_compact(model, scene, system, choices, iterations=iterations, progress=progress, title=title)
 
 
-def _losses(model: Model, scene: Scene | None, settings: RenderSettings) -> dict[str, Loss]:
-    """Return loss measures by name; the first decides."""
+def loss_measures(model: Model, scene: Scene | None, settings: RenderSettings) -> dict[str, Loss]:
+    """Return measures of loss by name, in at most `MOST_VIEWS` views each; the first decides. Empty without photographs
+    and cameras."""
     if scene is not None:
         # Held-out views are measured as well, but never decide.
-        train = refined_views(scene.train[:: -(-len(scene.train) // MOST_VIEWS)], model)
-        losses = {"training views": loss_on_views(model, train, settings=settings)}
-        return losses | ({"test views": loss_on_views(model, scene.test, settings=settings)} if scene.test else {})
+        views = {"training views": refined_views(scene.train, model), "test views": scene.test}
+        chosen = {name: found[:: -(-len(found) // MOST_VIEWS)] for name, found in views.items() if found}
+        return {name: loss_on_views(model, found, settings=settings) for name, found in chosen.items()}
     if model.origin is None or not model.origin.names:
-        raise ValueError(
-            "the model has no cameras to measure a loss with; use save_compact in Python with your own choices"
-        )
-    pairs = zip(model.origin.cameras, model.origin.is_test, strict=True)
-    cameras = [camera for camera, is_test in pairs if not is_test]
-    # `or 1`: a step of 0 is an error if there are no training cameras.
-    cameras = cameras[:: -(-len(cameras) // MOST_VIEWS) or 1]
+        return {}
+    cameras = model.origin.training_cameras
+    cameras = cameras[:: -(-len(cameras) // MOST_VIEWS)]
     return {f"if {ASSUMED_PSNR:g} dB": loss_beside_renders(model, cameras, settings=settings)}

@@ -1,4 +1,4 @@
-"""Conversion of models between file formats, and export of their Gaussians as PLY."""
+"""Conversion of models between file formats."""
 
 import contextlib
 import dataclasses
@@ -8,8 +8,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.origin import Origin
 from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake, likeness, pictures
 from a2tg_jax.host.regular_files import is_regular, sha256_of
 from a2tg_jax.host.text import counted, in_bytes
@@ -145,7 +143,7 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
     shown = model.appearance
     if shown.is_portable and shown.texture is None and shown.exponents is None:
         return model, "baked: nothing, because the model is plain"
-    training, held_out = cameras_apart(model.origin)
+    training, held_out = model.origin.training_cameras, model.origin.held_out_cameras
     plain = bake(model, training, growth=options.growth, iterations=options.iterations, progress=True)
     # The bake has not seen held-out cameras, so that they judge it fairly.
     views = held_out or training
@@ -158,26 +156,3 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
         plain,
         f"baked: {numbers}, {ratio:.2f} times the numbers' bytes, {likeness_db:.1f} dB against the model in {judged}",
     )
-
-
-def cameras_apart(origin: Origin) -> tuple[list[Camera], list[Camera]]:
-    """Return the training cameras and the held-out ones. If all are held out, all count as training cameras."""
-    cameras = list(zip(origin.cameras, origin.is_test, strict=True))
-    training, held_out = ([camera for camera, is_test in cameras if is_test == kind] for kind in (False, True))
-    return (training, held_out) if training else (held_out, [])
-
-
-def check_ply(out: Path) -> None:
-    """Raise ValueError if `out` is a folder or has another suffix than ply."""
-    if out.is_dir() or out.suffix.lower() != ".ply":
-        raise ValueError(f"`ply` must be the path of a file that ends in .ply; got {out}")
-
-
-def export_ply(source: Source, out: Path, *, float64: bool = False, world: World = "upright") -> str:
-    """Write a model's Gaussians for 3DGS programs (`save_ply`), and return a summary and what PLY does not keep."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    save_ply(out, source.model, float64=float64, world=world)
-    lines = [f"file: {out}: {source.model.num:,} Gaussians"]
-    if lost := lost_by(source.model, ".ply"):
-        lines.append(f"not kept by this format: {', '.join(lost)}")
-    return "\n".join([*lines, world_line(source.model, world)])

@@ -7,13 +7,11 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import jax
-
 from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
-from a2tg_jax.host.machine import default_platform, memory_limit
+from a2tg_jax.host.machine import default_device, default_platform, memory_limit
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.results.record import RunPlan, RunRecord
 from a2tg_jax.training.cost import (
@@ -170,9 +168,10 @@ def _forecasts(scene: Scene, plan: RunPlan, num_given: int | None, num_devices: 
     return stages
 
 
-def time_after(scene: Scene, plan: RunPlan, names: Sequence[str]) -> dict[str, RestOfRun]:
-    """Return what follows each of the stages that are to be trained, the evaluation of the run included."""
-    stages, found = _forecasts(scene, plan, None, 1), dict[str, RestOfRun]()
+def time_after(scene: Scene, plan: RunPlan, names: Sequence[str], num_given: int | None = None) -> dict[str, RestOfRun]:
+    """Return what follows each of the stages that are to be trained, the evaluation of the run included. `num_given` as
+    in `forecast_run`."""
+    stages, found = _forecasts(scene, plan, num_given, 1), dict[str, RestOfRun]()
     drawn = DRAWN_SHARE * len(plan.names) * (len(scene.train) + len(scene.test))
     for index, name in enumerate(names):
         seconds = stages[name].seconds / plan[name].stage.iterations
@@ -246,7 +245,7 @@ def allowed_memory(max_memory: int | None, num_devices: int = 1) -> int:
     if max_memory is not None:
         return max_memory
     # CPUs have no such figures.
-    stats = jax.local_devices()[0].memory_stats() or {}
+    stats = default_device().memory_stats() or {}
     return num_devices * stats.get("bytes_limit", 0) or memory_limit()
 
 

@@ -175,12 +175,13 @@ def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER
         with Image.open(frames[0]) as first:
             right, bottom = first.width % 2, first.height % 2
         even_sides = f"format=gbrp,pad=iw+{right}:ih+{bottom},fillborders=right={right}:bottom={bottom}:mode=smear"
-        source = ["-framerate", str(frames_per_second), "-i", str(frames[0].with_name(FRAME_NAME))]
+        source = ["-framerate", str(frames_per_second), "-i", FRAME_NAME]
         # Otherwise ffmpeg continues with whatever numbered files follow.
         made = ["-frames:v", str(len(frames)), "-vf", even_sides, "-pix_fmt", "yuv420p", "-f", "mp4"]
         # ffmpeg chooses formats by suffix, which the temporary path lacks: hence -f mp4.
-        command = [program, "-y", "-loglevel", "error", *source, *made, str(temporary)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        command = [program, "-y", "-loglevel", "error", *source, *made, str(temporary.absolute())]
+        # Run in the folder: ffmpeg would take a % in its name for a number.
+        done = subprocess.run(command, cwd=path.parent, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise ValueError(f"ffmpeg could not make {path}: {done.stderr.strip()}")
     return path

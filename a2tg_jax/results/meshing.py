@@ -15,15 +15,8 @@ from a2tg_jax.data import view_image
 from a2tg_jax.host.machine import memory_limit
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.host.text import counted, in_bytes
-from a2tg_jax.mesh.extract import (
-    MOST_CLUSTERS,
-    NoSurfaceError,
-    check_lengths,
-    extract_mesh,
-    training_cameras,
-)
+from a2tg_jax.mesh.extract import MOST_CLUSTERS, check_lengths, extract_mesh
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
-from a2tg_jax.mesh.fusion import GridFullError
 from a2tg_jax.mesh.texturing import Picture, check_texture, texture_mesh
 from a2tg_jax.mesh.triangles import check_simplifying, simplify_mesh
 from a2tg_jax.renderer import Renderer
@@ -33,10 +26,6 @@ GRID_SHARE = 0.5
 """Default share of the free memory for voxels."""
 TEXTURED_FACES = 100_000
 """Default number of faces of a mesh with a texture."""
-GRID_FULL = "lower `resolution` or `radius`, or raise `max_memory`"
-NO_SURFACE = "give a larger `radius`, or `unbounded`"
-SMALL_PARTS = "raise `resolution` or lower `voxel`, or train longer or from more views"
-"""Advice on the command line for each kind of error."""
 TextureSource = Literal["none", "renders", "photographs"]
 
 
@@ -76,8 +65,6 @@ class MeshOptions:
     def check(self, out: Path) -> None:
         """Raise ValueError if an option is invalid or a library is missing, before any computation."""
         check_mesh_suffix(out, "`out`")
-        if self.resolution is not None and self.voxel is not None:
-            raise ValueError("`resolution` and `voxel` both set the size of voxels: leave one out")
         check_lengths(self.resolution, self.voxel, self.radius)
         if self.clusters < 1:
             raise ValueError(f"clusters must be at least 1; got {self.clusters}")
@@ -106,26 +93,20 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
     if origin is None or not origin.names:
         raise ValueError(f"{source.title} has no cameras to fuse depths from; give a run folder, or a model of a run")
     # Photographs are checked here, before minutes of fusion; they are read later.
-    pictures = _photographs(source, origin) if options.texture == "photographs" else _renders(source)
+    pictures = _photographs(source, origin) if options.texture == "photographs" else _renders(source, origin)
     scale, megabytes = origin.transform.scale, megabytes_of(options.max_memory, "max_memory")
-    try:
-        result = extract_mesh(
-            source.model,
-            resolution=options.resolution,
-            # Lengths of the original world times scale are lengths of the model's.
-            voxel=None if options.voxel is None else options.voxel * scale,
-            radius=None if options.radius is None else options.radius * scale,
-            unbounded=options.unbounded,
-            most_clusters=options.clusters,
-            max_bytes=int(GRID_SHARE * memory_limit()) if megabytes is None else bytes_of(megabytes),
-            settings=source.settings,
-            progress=True,
-        )
-    except GridFullError as error:
-        # The library's advice names its arguments; the command's options have other names.
-        raise ValueError(f"{str(error).partition(': ')[0]}: {GRID_FULL}") from None
-    except NoSurfaceError as error:
-        raise ValueError(f"{error.reason(scale)}: {SMALL_PARTS if error.num_dropped else NO_SURFACE}") from None
+    result = extract_mesh(
+        source.model,
+        resolution=options.resolution,
+        # Lengths of the original world times scale are lengths of the model's.
+        voxel=None if options.voxel is None else options.voxel * scale,
+        radius=None if options.radius is None else options.radius * scale,
+        unbounded=options.unbounded,
+        most_clusters=options.clusters,
+        max_bytes=int(GRID_SHARE * memory_limit()) if megabytes is None else bytes_of(megabytes),
+        settings=source.settings,
+        progress=True,
+    )
     mesh = result.mesh if options.most_faces is None else simplify_mesh(result.mesh, options.most_faces)
     if options.texture != "none":
         print(f"unwrapping {counted(mesh.num_faces, 'face')}", flush=True)
@@ -169,8 +150,8 @@ def _photographs(source: Source, origin: Origin) -> Iterator[Picture]:
     )
 
 
-def _renders(source: Source) -> Iterator[Picture]:
-    cameras = training_cameras(source.model)
+def _renders(source: Source, origin: Origin) -> Iterator[Picture]:
+    cameras = origin.training_cameras
     renderer = Renderer(source.model, cameras=cameras, settings=source.settings, has_geometry=False)
     for camera in progress_over(cameras, "texture", "view"):
         yield camera, np.asarray(renderer(camera).color), None

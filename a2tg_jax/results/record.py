@@ -42,7 +42,6 @@ from a2tg_jax.results.folder import RunFolder, read_json
 from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.training import Stage, System, find_system, like
 from a2tg_jax.training.options import own_options
-from a2tg_jax.training.registry import differences
 
 DEFAULT_SYSTEM = "bytewise"
 LONGEST_REASON = 500
@@ -173,7 +172,9 @@ def chosen_system(name: str, preset: str | None = None) -> System:
     """Return a system by name, with the options of a preset. Options set by an instance take precedence.
     Raises ValueError if there is no such system or preset."""
     found = find_system(name)
-    return found if preset is None else changed_config(type(found).preset(preset), differences(found), name)
+    if preset is None:
+        return found
+    return changed_config(type(found).preset(preset), own_options(found, type(found)()), name)
 
 
 def compared_system(name: str, other: System, preset: str | None = None) -> System:
@@ -185,7 +186,7 @@ def compared_system(name: str, other: System, preset: str | None = None) -> Syst
     system = like(kind() if preset is None else kind.presets().get(preset, kind()), other)
     if name in PLAIN:
         system = dataclasses.replace(system, sh_degree=other.initial_sh_degree)
-    return changed_config(system, differences(found), name)
+    return changed_config(system, own_options(found, kind()), name)
 
 
 def scene_place(scene: str, folder: Path = Path()) -> str:

@@ -233,7 +233,9 @@ def train_run(
     fit = functools.partial(
         fit_stage, scene, progress=options.progress, is_stopped=is_stopped, watch=watch, session=options.session
     )
-    after = time_after(scene, record.plan, [name for name in record.plan.names if not run.model(name).is_file()])
+    num_given = None if record.init is None else number_in_file(run.model(record.plan.main[0]))
+    to_train = [name for name in record.plan.names if not run.model(name).is_file()]
+    after = time_after(scene, record.plan, to_train, num_given)
     for planned in record.plan.stages:
         path = run.model(planned.name)
         if path.is_file():

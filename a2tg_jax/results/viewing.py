@@ -22,13 +22,13 @@ from PIL import Image
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.data.scene import origin_of_scene
-from a2tg_jax.finish.compaction import ASSUMED_PSNR, loss_beside_renders, loss_on_views
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.compact import decode_model
 from a2tg_jax.io.other_programs import matrix_of
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
+from a2tg_jax.results.compression import loss_measures
 from a2tg_jax.results.folder import check_new, read_json, remove_if_empty
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
@@ -54,8 +54,6 @@ NOTED_SECONDS = 0.5
 SHARE = 0.03
 """Largest share of the time for snapshots."""
 WAIT = 0.1
-MOST_VIEWS = 8
-"""Largest number of views for measuring the loss of an exported scene, evenly chosen."""
 
 
 class ServedPhotographs:
@@ -173,9 +171,9 @@ class LiveView:
             with self._lock:
                 self._scene_bytes = found
                 self._status |= {"version": self._status["version"] + 1, "message": ""}
-        except ValueError as error:
+        except Exception as error:  # The page says it; the training goes on.
             with self._lock:
-                self._status |= {"message": str(error)}
+                self._status |= {"message": str(error) or type(error).__name__}
         # Waiting 1 / SHARE times as long as a snapshot took bounds its share of the time.
         self._due = self._now() + max(SECONDS, (self._now() - began) / SHARE)
 
@@ -252,7 +250,11 @@ def export_web(
     model, size, total = source.model, len(data), sum(map(len, files.values()))
     ratio = f"1/{model.num_bytes / max(size, 1):.1f} of the model's {in_bytes(model.num_bytes)}"
     lines = [f"{model.num:,} Gaussians, whose scene takes {in_bytes(size)}, {ratio}"]
-    lines += [f"{loss_text(loss)}, {measure}" for measure, loss in losses_of(source).items()]
+    if model.num:
+        # The page's near plane.
+        settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
+        again, measures = decode_model(data), loss_measures(model, source.load_scene_or_warn(), settings)
+        lines += [f"{loss_text(loss_of(again))}, {measure}" for measure, loss_of in measures.items()]
     others_text = f" with {counted(len(files) - 1, 'file')} next to it" if others else ""
     return "\n".join([*lines, f"{page}: {in_bytes(total)}{others_text}"])
 
@@ -285,22 +287,3 @@ def _place_of(path: Path) -> str:
     """Return the run and the model of a run's file, or the name of another file."""
     path = path.absolute()
     return f"{path.parent.parent.name} · {path.stem}" if path.parent.name == "models" else path.name
-
-
-def losses_of(source: Source) -> dict[str, float]:
-    """Return the loss of a scene file in dB of PSNR: on photographs, or else on renders; empty without cameras."""
-    model = source.model
-    if not model.num:
-        return {}
-    # The page's near plane.
-    settings = dataclasses.replace(source.settings, near_plane=source.near_plane)
-    again, scene = decode_model(source.encoded), source.load_scene_or_warn()
-    if scene is not None:
-        views = {"training views": scene.train, "test views": scene.test}
-        chosen = {name: found[:: -(-len(found) // MOST_VIEWS)] for name, found in views.items() if found}
-        return {name: loss_on_views(model, found, settings=settings)(again) for name, found in chosen.items()}
-    if model.origin is None or not model.origin.cameras:
-        return {}
-    cameras = model.origin.cameras[:: -(-len(model.origin.cameras) // MOST_VIEWS)]
-    loss = loss_beside_renders(model, cameras, settings=settings)(again)
-    return {f"for a model of {ASSUMED_PSNR:g} dB": loss}

@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike
 
 from a2tg_jax.data.observations import ObservedPoints, stacked_points
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
-from a2tg_jax.host.machine import num_threads
+from a2tg_jax.host.machine import default_device, num_threads
 from a2tg_jax.parallel.exchange import Exchange, are_drawn_here, on_devices
 from a2tg_jax.parallel.sharded_rows import asked_by_any, everywhere
 
@@ -252,7 +252,7 @@ class Ahead:
 
 def device_room() -> float:
     """Return the bytes of the default device that photographs may take."""
-    stats = jax.local_devices()[0].memory_stats()
+    stats = default_device().memory_stats()
     return DEVICE_SHARE * stats["bytes_limit"] if stats and "bytes_limit" in stats else HOST_SHARE
 
 

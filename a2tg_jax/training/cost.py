@@ -104,6 +104,7 @@ def forecast_stages(
     train together.
     """
     stages = system.all_stages()
+    mean_pixels = sum(view.camera.width * view.camera.height for view in scene.train) / len(scene.train)
     num, floats, shown = initial_number(scene, system, stages[0]), 0.0, None
     if num_given is not None:
         num, stages = num_given, stages[1:]
@@ -120,9 +121,9 @@ def forecast_stages(
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
         whole = (1 + (STATES + 1) / num_devices) * model_bytes
-        seconds = stage.iterations * system.batch_size * iteration_seconds(scene.train, num)
+        seconds = stage.iterations * system.batch_size * (SECONDS_PER_ROW * num + SECONDS_PER_PIXEL * mean_pixels)
         needed = stage_bytes(scene, system, stage, num, model_bytes, num_devices)
-        yield StageForecast(needed, model_bytes, num, programs, seconds, whole)
+        yield StageForecast(needed, model_bytes, num, programs, seconds / num_threads(), whole)
         for event in stage.events:
             num = event.num_after(num, stage.iterations)
 
@@ -179,9 +180,3 @@ def fed_bytes(views: Sequence[View], batch_size: int, extras: Extras = NO_EXTRAS
 def largest_view(views: Sequence[View]) -> int:
     """Return the pixels of the largest view."""
     return max(view.camera.width * view.camera.height for view in views)
-
-
-def iteration_seconds(views: Sequence[View], num: int, downscale: int = 1) -> float:
-    """Return the seconds of an iteration with one view, downscaled by a further factor."""
-    pixels = sum(view.camera.width * view.camera.height for view in views) / len(views) / downscale**2
-    return (SECONDS_PER_ROW * num + SECONDS_PER_PIXEL * pixels) / num_threads()

@@ -102,19 +102,3 @@ def system_from_dict(data: Mapping[str, Any], where: str, kind: type[System] | N
             f"{where}: is of the system {shortened(name)!r}, which is not known here: import its module first"
         )
     return config_from_dict(kind, options, f"{where}: options")
-
-
-def differences(system: System) -> dict[str, object]:
-    """Return the options in which a system differs from its class's defaults, nested."""
-
-    def changed(values: Mapping[str, object], defaults: Mapping[str, Any]) -> dict[str, object]:
-        found: dict[str, object] = {}
-        for name, value in values.items():
-            if isinstance(value, Mapping):
-                inner = changed(value, defaults[name])
-                found |= {name: inner} if inner else {}
-            elif value != defaults[name]:
-                found[name] = value
-        return found
-
-    return changed(config_to_dict(system), config_to_dict(type(system)()))

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, sh_of_colors
+from a2tg_jax.core.geometry import fibonacci
 from a2tg_jax.data.scene import Scene, View
 
 DISTANCE = 10.0
@@ -255,11 +256,3 @@ def even_directions(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tup
 def _spacing(num: int) -> float:
     """Return the angle between neighbours of `num` directions all around."""
     return float(np.sqrt(4 * np.pi / num))
-
-
-def fibonacci(num: int) -> np.ndarray:
-    """Return unit vectors [num, 3] spread evenly over the sphere, a Fibonacci lattice."""
-    index = np.arange(num) + 0.5
-    z, angle = 1 - 2 * index / num, np.pi * (1 + 5**0.5) * index  # 2π times the golden ratio
-    across = np.sqrt(1 - z * z)
-    return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)

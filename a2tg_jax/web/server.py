@@ -6,7 +6,6 @@ access.
 
 import contextlib
 import dataclasses
-import importlib
 import ipaddress
 import secrets
 import socket
@@ -18,6 +17,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from a2tg_jax.host import signals
+from a2tg_jax.host.optional import optional
 
 LOOPBACK, ANY = "127.0.0.1", "0.0.0.0"
 ELSEWHERE = "192.0.2.1"
@@ -174,10 +174,7 @@ def served(routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0) 
 @contextlib.contextmanager
 def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tuple[str, Future[None]]]:
     """Yield the URL of a server in a thread, and a future for its end or the error that ended it."""
-    try:
-        waitress: Any = importlib.import_module("waitress")
-    except ImportError as error:
-        raise ValueError("the viewer's server needs waitress: pip install 'a2tg-jax[viewer]'") from error
+    waitress = optional("waitress", "the viewer's server needs waitress", "viewer")
     try:
         if not 0 <= port < 2**16:  # `create_server` would leave the socket open.
             raise OverflowError("ports are 0 to 65535")

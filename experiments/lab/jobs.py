@@ -26,7 +26,8 @@ from a2tg_jax.host.machine import num_threads, tidy_memory
 from a2tg_jax.host.source_commit import source_commit
 from a2tg_jax.results.folder import read_json, write_json
 from a2tg_jax.training import fit_stage
-from a2tg_jax.training.registry import differences, reference_of
+from a2tg_jax.training.options import own_options
+from a2tg_jax.training.registry import reference_of
 from lab.fingerprint import fingerprint, is_same_so_far
 from lab.scenes import few_views
 from lab.versions import is_from_before
@@ -207,10 +208,10 @@ def _load_checkpoint(path: Path, job: Job) -> a2tg.Checkpoint:
 
 def _training_facts(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Record:
     """Return what was trained and what it took."""
-    first = scene.test[0].camera
+    first, changed = scene.test[0].camera, own_options(job.system, type(job.system)())
     return {
         "scene": job.scene, "downscale": job.downscale, "pixels": [first.width, first.height],
-        "system": reference_of(job.system), "version": job.system.version, "options": differences(job.system),
+        "system": reference_of(job.system), "version": job.system.version, "options": changed,
         "stage": result.name, "iterations": job.iterations, "num": result.model.num, "mb": result.model.num_bytes / 1e6,
         "published_mb": result.model.num_published_bytes / 1e6, "sizes": texture_sizes(result.model),
         "seconds": result.seconds, "ms_per_step": milliseconds(result.history),

@@ -1,0 +1,13 @@
+"""Libraries that some functions alone need."""
+
+import importlib
+from typing import Any
+
+
+def optional(module: str, need: str, extra: str) -> Any:
+    """Import and return a module. ValueError: it is not installed; `need` says what for, as in "a mesh needs
+    scikit-image", and `extra` is the extra of this package that brings it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ValueError(f"{need}, which is not installed: pip install 'a2tg-jax[{extra}]'") from error
