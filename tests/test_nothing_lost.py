@@ -560,8 +560,8 @@ def test_a_run_with_a_file_budget_ends_with_its_file(tmp_path, monkeypatch, caps
     """If the program is killed before, the resumed run writes it, once. Without a file the run is finished, too."""
     asked = []
 
-    def compress(path, *, file_budget, tune_iterations, scene, progress):
-        asked.append((path, file_budget, tune_iterations, progress))
+    def compress(path, out, options, *, scene, progress):
+        asked.append((path, options.file_budget, options.tune_iterations, progress))
         if len(asked) == 1:
             raise KeyboardInterrupt
         if len(asked) == 2:

@@ -14,14 +14,9 @@ from tyro.conf import Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from a2tg_jax.host.remote_files import is_url, without_secrets
-from a2tg_jax.io.other_programs import World
+from a2tg_jax.io.config_json import defaulting_to
 
 Parsed = TypeVar("Parsed")
-
-
-def defaulting_to(text: str, metavar: str | None = None) -> Any:
-    """Return the annotation of an option whose help describes its default in words, instead of None."""
-    return arg(help_behavior_hint=f"(default: {text})", metavar=metavar)
 
 
 LastModel = Annotated[
@@ -35,13 +30,6 @@ RunOrFile = Annotated[
     arg(
         metavar="RUN_OR_FILE",
         help="Run folder, model (*.npz), compact scene (*.a2tgz), or splats of other programs (*.ply, *.spz, ...).",
-    ),
-]
-FileWorld = Annotated[
-    World,
-    arg(
-        help="Axes of files of other programs. upright: turned until +y is down, as these programs expect; map "
-        "coordinates are kept. original: as the capture has them."
     ),
 ]
 EditFile = Annotated[

@@ -8,7 +8,6 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import defaulting_to
 from a2tg_jax.data import run_sfm
 from a2tg_jax.data.download import BENCHMARK_SETS, fetch
 from a2tg_jax.data.load import is_scene
@@ -17,6 +16,7 @@ from a2tg_jax.data.sfm import CameraModel, Matching
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.host.text import did_you_mean
+from a2tg_jax.io.config_json import defaulting_to
 from a2tg_jax.results.figures import save_camera_picture
 from a2tg_jax.results.folder import check_apart, check_output
 from a2tg_jax.results.forecast import quick_flags

@@ -7,13 +7,14 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.cli.arguments import EditFile, FileWorld, LastModel, LpipsWeights, RunFolderPath, RunOrFile, defaulting_to
+from a2tg_jax.cli.arguments import EditFile, LastModel, LpipsWeights, RunFolderPath, RunOrFile
 from a2tg_jax.cli.train import open_browser, print_result
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import counted
+from a2tg_jax.io.config_json import defaulting_to
 from a2tg_jax.mesh.files import mesh_files
-from a2tg_jax.results.compression import MAX_LOSS, compress
-from a2tg_jax.results.conversion import BakeOptions, convert
+from a2tg_jax.results.compression import CompressOptions, compress
+from a2tg_jax.results.conversion import BakeOptions, FileOptions, convert
 from a2tg_jax.results.editing import EditOptions, write_edit
 from a2tg_jax.results.finishing import finish_run
 from a2tg_jax.results.folder import (
@@ -326,35 +327,20 @@ class Convert:
     """Output file."""
     model: LastModel = None
     edit: EditFile = None
-
-    bake: bool = False
-    """Turn splats with textures, or with kernels of other shapes, into plain ones."""
-    bake_growth: float = BakeOptions.growth
-    """Largest ratio of the numbers' bytes after --bake to the bytes before."""
-    bake_iterations: int = BakeOptions.iterations
-    """Iterations of training in --bake; each draws one view. 0 leaves training out."""
-
-    float64: bool = False
-    """Write the positions of a PLY as float64, so that map coordinates keep their precision."""
-    world: FileWorld = "upright"
-
+    baking: Annotated[BakeOptions, arg(name="")] = BakeOptions()
+    placing: Annotated[FileOptions, arg(name="")] = FileOptions()
     overwrite: bool = False
     """Replace the output file."""
 
     def run(self) -> None:
-        options = BakeOptions(self.bake_growth, self.bake_iterations)
-        if not self.bake and options != BakeOptions():
-            raise ValueError("--bake-growth and --bake-iterations have no effect without --bake: add it")
-        baking = options if self.bake else None
         print(
             convert(
                 self.source,
                 self.out,
                 self.model,
                 edit=self.edit,
-                baking=baking,
-                float64=self.float64,
-                world=self.world,
+                baking=self.baking,
+                placing=self.placing,
                 overwrite=self.overwrite,
             )
         )
@@ -403,31 +389,14 @@ class Compress:
     """Model file (*.npz), or run folder, whose last model is taken."""
     out: Annotated[Path | None, defaulting_to("NAME.a2tgz next to the model", "FILE")] = None
     """Output file, *.a2tgz."""
-    max_loss: Annotated[float | None, defaulting_to(f"{MAX_LOSS:g}", "DB")] = None
-    """Largest loss of PSNR in dB."""
-    file_budget: Annotated[str | None, defaulting_to("--max-loss decides", "SIZE")] = None
-    """Largest size of the file, such as 60kB, instead of --max-loss."""
-    tune_iterations: int = 0
-    """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. The model is
-    tuned up to 4 times, each time for other bits: first for bits that lose 0.5 dB, or twice --max-loss if that is more.
-    With --file-budget it is tuned until the file fits, mostly once. 0: numbers are only rounded."""
+    options: Annotated[CompressOptions, arg(name="")] = CompressOptions()
     overwrite: bool = False
     """Replace the output file. A file that a2tg compress wrote into a run folder is always replaced."""
     verbose: bool = False
     """Print a table of the loss and the bytes of each choice of bits."""
 
     def run(self) -> None:
-        print(
-            compress(
-                self.source,
-                self.out,
-                max_loss=self.max_loss,
-                file_budget=self.file_budget,
-                tune_iterations=self.tune_iterations,
-                overwrite=self.overwrite,
-                verbose=self.verbose,
-            )
-        )
+        print(compress(self.source, self.out, self.options, overwrite=self.overwrite, verbose=self.verbose))
 
 
 @dataclasses.dataclass(frozen=True)

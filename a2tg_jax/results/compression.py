@@ -1,11 +1,13 @@
 """Compression of a model to the smallest compact file within a loss, or the best one within some bytes, with a table of
 the choices tried."""
 
+import dataclasses
 import functools
 import math
 import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Annotated
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.data import Scene
@@ -37,6 +39,7 @@ from a2tg_jax.finish.tuning import (
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import in_bytes, shortened
 from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
+from a2tg_jax.io.config_json import defaulting_to
 from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
@@ -54,13 +57,45 @@ MOST_VIEWS = 16
 """Largest number of training views measured, evenly chosen."""
 
 
+@dataclasses.dataclass(frozen=True)
+class CompressOptions:
+    """Aim of a compression: a loss, or bytes."""
+
+    max_loss: Annotated[float | None, defaulting_to(f"{MAX_LOSS:g}", "DB")] = None
+    """Largest loss of PSNR in dB."""
+    file_budget: Annotated[float | str | None, defaulting_to("--max-loss decides", "SIZE")] = None
+    """Largest size of the file, such as 60kB, instead of --max-loss."""
+    tune_iterations: int = 0
+    """Iterations of training with rounding, which makes up for fewer bits; 1000 is a good number. The model is
+    tuned up to 4 times, each time for other bits: first for bits that lose 0.5 dB, or twice --max-loss if that is more.
+    With --file-budget it is tuned until the file fits, mostly once. 0: numbers are only rounded."""
+
+    @property
+    def max_bytes(self) -> int | None:
+        """File budget in bytes; None without one. Raises ValueError if it is invalid."""
+        megabytes = megabytes_of(self.file_budget, "file_budget")
+        return None if megabytes is None else bytes_of(megabytes)
+
+    @property
+    def most_loss(self) -> float:
+        """Largest loss in dB."""
+        return MAX_LOSS if self.max_loss is None else self.max_loss
+
+    def check(self) -> None:
+        """Raise ValueError, naming the option, if one is invalid."""
+        if self.max_bytes is not None and self.max_loss is not None:
+            raise ValueError("max_loss and file_budget exclude each other: give one of them")
+        if not 0 <= self.most_loss < math.inf:
+            raise ValueError(f"max_loss must be at least 0 dB; got {self.most_loss}")
+        if self.tune_iterations < 0:
+            raise ValueError(f"tune_iterations must be at least 0; got {self.tune_iterations}")
+
+
 def compress(
     source: Path,
-    out: Path | None = None,
+    out: Path | None,
+    options: CompressOptions,
     *,
-    max_loss: float | None = None,
-    file_budget: float | str | None = None,
-    tune_iterations: int = 0,
     overwrite: bool = False,
     verbose: bool = False,
     scene: Scene | None = None,
@@ -76,30 +111,20 @@ def compress(
       source: a run folder, for its last model; or a model, *.npz.
       out: the file, *.a2tgz; None: next to the model. Files that this function did not write into the run's folder
         need `overwrite`.
-      max_loss: largest loss in dB; None: `MAX_LOSS`, unless there is a file_budget.
-      file_budget: largest size of the file, a number of MB or a text such as "60kB".
-      tune_iterations: iterations of training with rounding for each choice of bits that is tuned
-        (`finish.tuning.smallest_tuned`, `best_tuned`); 0: the model's numbers are only rounded.
+      options: the loss or the bytes, and tuning (`finish.tuning.smallest_tuned`, `best_tuned`).
       verbose: return a table of the choices tried before that line.
       scene: the run's photographs, if they are loaded already.
       progress: show progress bars.
 
     Raises:
       ValueError, OSError: if the model or the photographs for tuning are missing, the file exists, a compact file
-        cannot hold the model, no file is within the loss or the bytes, or both are given.
+        cannot hold the model, no file is within the loss or the bytes, or an option is invalid.
     """
-    name = source.name.lower()
+    name, max_bytes, tune_iterations = source.name.lower(), options.max_bytes, options.tune_iterations
     if not source.is_dir() and name.endswith(tuple(FORMATS)) and not name.endswith(".npz"):
         done = ", which is compressed already" if name.endswith(SUFFIX) else ""
         raise ValueError(f"a2tg compress reads a run folder or *.npz; got {shortened(str(source))}{done}")
-    megabytes = megabytes_of(file_budget, "file_budget")
-    if megabytes is not None and max_loss is not None:
-        raise ValueError("max_loss and file_budget exclude each other: give one of them")
-    max_loss = MAX_LOSS if max_loss is None else max_loss
-    if not 0 <= max_loss < math.inf:
-        raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
-    if tune_iterations < 0:
-        raise ValueError(f"tune_iterations must be at least 0; got {tune_iterations}")
+    options.check()
     if out is not None and (out.is_dir() or out.suffix.lower() != SUFFIX):
         raise ValueError(f"out must be the path of a file that ends in {SUFFIX}; got {out}")
     opened = open_source(source)
@@ -110,7 +135,6 @@ def compress(
     # Before the photographs are loaded, and minutes of trials.
     check_encodable(model.appearance)
     ladder = TUNED_LADDER if tune_iterations else LADDER
-    max_bytes = None if megabytes is None else bytes_of(megabytes)
     if max_bytes is not None:
         check_fits(model, max_bytes, ladder)
     scene, tune = scene or opened.load_scene(), None
@@ -130,8 +154,8 @@ def compress(
     ways = f"up to {sum(map(len, ladder.values()))} ways to round the model's numbers"
     print(f"trying {ways}{tunings}; on a CPU this takes minutes", flush=True)
     trials = measure_choices(model, measures, ladder, progress=progress)
-    untuned, found = _search(model, measures, max_loss, max_bytes, trials, tune)
-    chosen, data = _better(model, untuned, found, max_loss, max_bytes)
+    untuned, found = _search(model, measures, options.most_loss, max_bytes, trials, tune)
+    chosen, data = _better(model, untuned, found, options.most_loss, max_bytes)
     # Only the default path is listed in the marker: any other file is the user's.
     if source.is_dir() and out == default:
         RunFolder(source).own(out)

@@ -34,15 +34,32 @@ from a2tg_jax.results.model_source import Source, open_source
 class BakeOptions:
     """Baking of textured splats into plain ones."""
 
-    growth: float = MOST_GROWTH
-    iterations: int = ITERATIONS
+    bake: bool = False
+    """Turn splats with textures, or with kernels of other shapes, into plain ones."""
+    bake_growth: float = MOST_GROWTH
+    """Largest ratio of the numbers' bytes after --bake to the bytes before."""
+    bake_iterations: int = ITERATIONS
+    """Iterations of training in --bake; each draws one view. 0 leaves training out."""
 
     def check(self) -> None:
-        """Raise ValueError, naming the option, if one is out of range."""
-        if not 1 <= self.growth < math.inf:
-            raise ValueError(f"bake_growth must be a finite number of at least 1; got {self.growth}")
-        if self.iterations < 0:
-            raise ValueError(f"bake_iterations must be at least 0; got {self.iterations}")
+        """Raise ValueError, naming the option, if one is out of range, or has no effect."""
+        if not self.bake and self != BakeOptions():
+            raise ValueError("`bake_growth` and `bake_iterations` have no effect without `bake`: add it")
+        if not 1 <= self.bake_growth < math.inf:
+            raise ValueError(f"bake_growth must be a finite number of at least 1; got {self.bake_growth}")
+        if self.bake_iterations < 0:
+            raise ValueError(f"bake_iterations must be at least 0; got {self.bake_iterations}")
+
+
+@dataclasses.dataclass(frozen=True)
+class FileOptions:
+    """Options of files for other programs."""
+
+    float64: bool = False
+    """Write the positions of a PLY as float64, so that map coordinates keep their precision."""
+    world: World = "upright"
+    """Axes of files of other programs. upright: turned until +y is down, as these programs expect; map coordinates are
+    kept. original: as the capture has them."""
 
 
 def convert(
@@ -51,33 +68,34 @@ def convert(
     name: str | None = None,
     *,
     edit: Path | None = None,
-    baking: BakeOptions | None = None,
-    float64: bool = False,
-    world: World = "upright",
+    baking: BakeOptions = BakeOptions(),
+    placing: FileOptions = FileOptions(),
     overwrite: bool = False,
 ) -> str:
     """Write a run's model `name`, or a file of any known format, in another suffix's format, and return a summary.
-    `edit` is as in `open_source`; `baking` turns textured splats into plain ones (None: no baking); `float64` and
-    `world` are as in `save_ply`. Raises ValueError or OSError if a format is unknown, or a file cannot be read or
-    written."""
-    check_conversion(source, out, float64=float64, world=world, overwrite=overwrite)  # Baking takes minutes.
-    if baking is not None:
-        baking.check()
+    `edit` is as in `open_source`. Raises ValueError or OSError if a format is unknown, an option is invalid, or a file
+    cannot be read or written."""
+    baking.check()
+    check_conversion(source, out, placing, overwrite=overwrite)  # Baking takes minutes.
     start = time.perf_counter()
     opened = open_source(source, name, edit)
-    model, baked = (opened.model, "") if baking is None else _kept_or_baked(source, opened, baking, edit)
+    model, baked = _kept_or_baked(source, opened, baking, edit) if baking.bake else (opened.model, "")
     lines = [baked] if baked else []
-    return "\n".join([*lines, write_converted(opened.path, model, out, start, float64=float64, world=world)])
+    return "\n".join([*lines, write_converted(opened.path, model, out, start, placing)])
 
 
 def check_conversion(
-    source: Path, out: Path, *, float64: bool = False, world: World = "upright", overwrite: bool = False
+    source: Path,
+    out: Path,
+    placing: FileOptions = FileOptions(),
+    *,
+    overwrite: bool = False,
 ) -> None:
     """Raise ValueError or OSError unless `out` can be written from a source. Arguments as in `convert`."""
     writer_of(out)
-    if float64 and format_of(out).save is not save_ply:
+    if placing.float64 and format_of(out).save is not save_ply:
         raise ValueError(f"`float64` needs an OUT that ends in .ply and is not packed; got {out}")
-    if world == "original" and format_of(out).keeps_origin:
+    if placing.world == "original" and format_of(out).keeps_origin:
         raise ValueError(
             f"`world` has no effect on {out}, which also holds the way to the original world: leave it out"
         )
@@ -94,11 +112,16 @@ def check_conversion(
 
 
 def write_converted(
-    source_file: Path, model: Model, out: Path, start: float, *, float64: bool = False, world: World = "upright"
+    source_file: Path,
+    model: Model,
+    out: Path,
+    start: float,
+    placing: FileOptions = FileOptions(),
 ) -> str:
     """Write a model that was read from a file, after `check_conversion`, and return a summary with the seconds since
     `start` (`time.perf_counter`). Other arguments as in `convert`."""
-    if float64:
+    world = placing.world
+    if placing.float64:
         save_ply(out, model, float64=True, world=world)
     else:
         save_splats(out, model, world=world)
@@ -144,7 +167,7 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
     if shown.is_portable and shown.texture is None and shown.exponents is None:
         return model, "baked: nothing, because the model is plain"
     training, held_out = model.origin.training_cameras, model.origin.held_out_cameras
-    plain = bake(model, training, growth=options.growth, iterations=options.iterations, progress=True)
+    plain = bake(model, training, growth=options.bake_growth, iterations=options.bake_iterations, progress=True)
     # The bake has not seen held-out cameras, so that they judge it fairly.
     views = held_out or training
     views = views[:: -(-len(views) // MOST_VIEWS)]

@@ -4,10 +4,9 @@ import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from tyro.conf import arg
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.core.origin import Origin
@@ -15,6 +14,7 @@ from a2tg_jax.data import view_image
 from a2tg_jax.host.machine import memory_limit
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.host.text import counted, in_bytes
+from a2tg_jax.io.config_json import defaulting_to
 from a2tg_jax.mesh.extract import MOST_CLUSTERS, check_lengths, extract_mesh
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
 from a2tg_jax.mesh.texturing import Picture, check_texture, texture_mesh
@@ -29,32 +29,28 @@ TEXTURED_FACES = 100_000
 TextureSource = Literal["none", "renders", "photographs"]
 
 
-def _defaulting_to(default: str, metavar: str) -> Any:
-    return arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
-
-
 @dataclasses.dataclass(frozen=True)
 class MeshOptions:
     """Options of a mesh; lengths are in units of the original world."""
 
-    resolution: Annotated[int | None, _defaulting_to("512, unless --voxel is given", "N")] = None
+    resolution: Annotated[int | None, defaulting_to("512, unless --voxel is given", "N")] = None
     """Voxels along the radius."""
-    voxel: Annotated[float | None, _defaulting_to("radius / resolution", "LENGTH")] = None
+    voxel: Annotated[float | None, defaulting_to("radius / resolution", "LENGTH")] = None
     """Side of a voxel in units of the original world."""
-    radius: Annotated[float | None, _defaulting_to("twice the cameras' median distance from it", "LENGTH")] = None
+    radius: Annotated[float | None, defaulting_to("twice the cameras' median distance from it", "LENGTH")] = None
     """Radius around the point that the cameras look at, in units of the original world."""
     unbounded: bool = False
     """Continue beyond the radius, with voxels that grow with the distance."""
     clusters: int = MOST_CLUSTERS
     """Largest number of connected parts to keep; smaller ones are floaters."""
-    faces: Annotated[int | None, _defaulting_to(f"all, or {TEXTURED_FACES:,} with a texture", "N")] = None
+    faces: Annotated[int | None, defaulting_to(f"all, or {TEXTURED_FACES:,} with a texture", "N")] = None
     """Largest number of faces. Needs pip install 'a2tg-jax[mesh]'."""
     texture: TextureSource = "none"
     """Fill a texture atlas from renders or photographs of the training views (GLB and OBJ). Needs xatlas (pip install
     'a2tg-jax[mesh]')."""
     texture_size: int = 2048
     """Side of the atlas in texels."""
-    max_memory: Annotated[str | None, _defaulting_to("half of the free memory", "SIZE")] = None
+    max_memory: Annotated[str | None, defaulting_to("half of the free memory", "SIZE")] = None
     """Memory budget of the voxels, such as 4GB."""
 
     @property

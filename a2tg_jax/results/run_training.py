@@ -32,7 +32,7 @@ from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.io.model_file import FORMAT, load_model, number_in_file, save_model
 from a2tg_jax.parallel.processes import broadcast, team
-from a2tg_jax.results.compression import SUFFIX, command_for_file, compress
+from a2tg_jax.results.compression import SUFFIX, CompressOptions, command_for_file, compress
 from a2tg_jax.results.folder import (
     DAMAGED,
     RunFolder,
@@ -204,7 +204,8 @@ def _write_file(run: RunFolder, record: RunRecord, max_bytes: int, scene: Scene,
         return
     budget = record.file_budget
     try:
-        line = compress(run.path, file_budget=budget, tune_iterations=ITERATIONS, scene=scene, progress=progress)
+        options = CompressOptions(file_budget=budget, tune_iterations=ITERATIONS)
+        line = compress(run.path, None, options, scene=scene, progress=progress)
         print(line, flush=True)
     except ValueError as error:
         again = command_for_file(run, "SIZE")
