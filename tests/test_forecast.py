@@ -364,6 +364,8 @@ def test_what_would_show_little_is_asked_about(monkeypatch, capsys):
         "`memory_budget` has room for more Gaussians (1,785,714) than the photographs have pixels (115,200): 645kB "
         "holds one for ten pixels"
     ]
+    tiny = RunRecord(SceneSource("fox"), file_budget="1kB").budgeted()
+    assert doubts_about(scene, tiny) == ["`file_budget` has room for few Gaussians, and scenes need thousands: raise it"]
     for stream in (sys.stdin, sys.stderr):
         monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(sys.stdin, "readline", iter(["Y\n", "\n"]).__next__, raising=False)
@@ -388,6 +390,7 @@ def test_a_run_is_forecast_with_its_later_stages_and_its_evaluation():
     after, alone = time_after(scene, plan, plan.names), time_after(scene, plan, [last])
     views = len(scene.train) + len(scene.test)
     assert alone[last] == after[last] == (2 * views, 2)
+    assert time_after(scene, plan, [last], num_tuning=1000)[last] == (2 * views + 1000, 2)
     assert after[first].iterations > 2 * views + plan[last].stage.iterations / 2 and after[first].programs > 2
 
 

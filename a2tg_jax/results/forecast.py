@@ -13,7 +13,7 @@ from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.host.machine import default_device, default_platform, memory_limit
 from a2tg_jax.host.text import in_bytes
-from a2tg_jax.results.record import RunPlan, RunRecord
+from a2tg_jax.results.record import MEMORY_OF_FILE, RunPlan, RunRecord
 from a2tg_jax.training.cost import (
     COMPILER,
     FIRST_PROGRAM,
@@ -168,15 +168,17 @@ def _forecasts(scene: Scene, plan: RunPlan, num_given: int | None, num_devices: 
     return stages
 
 
-def time_after(scene: Scene, plan: RunPlan, names: Sequence[str], num_given: int | None = None) -> dict[str, RestOfRun]:
-    """Return what follows each of the stages that are to be trained, the evaluation of the run included. `num_given` as
-    in `forecast_run`."""
+def time_after(
+    scene: Scene, plan: RunPlan, names: Sequence[str], num_given: int | None = None, num_tuning: int = 0
+) -> dict[str, RestOfRun]:
+    """Return what follows each of the stages that are to be trained: others, the run's evaluation, and `num_tuning`
+    iterations that tune a file. `num_given` as in `forecast_run`."""
     stages, found = _forecasts(scene, plan, num_given, 1), dict[str, RestOfRun]()
     drawn = DRAWN_SHARE * len(plan.names) * (len(scene.train) + len(scene.test))
     for index, name in enumerate(names):
         seconds = stages[name].seconds / plan[name].stage.iterations
         later = [stages[other] for other in names[index + 1 :]]
-        iterations = sum(other.seconds for other in later) / seconds + drawn
+        iterations = sum(other.seconds for other in later) / seconds + drawn + num_tuning
         found[name] = RestOfRun(iterations, sum(other.num_programs for other in later) + len(plan.names))
     return found
 
@@ -207,7 +209,12 @@ def doubts_about(scene: Scene, record: RunRecord) -> list[str]:
     """Return why a run would show little or take long, with better values: a small or huge memory budget, or a
     downscale that leaves few pixels."""
     found, downscale = [], record.scene.downscale
-    if record.options.small_budget:
+    # A file budget without a memory budget sets that as well.
+    of_file = record.unbudgeted() != record
+    name, share = ("file_budget", MEMORY_OF_FILE) if of_file else ("memory_budget", 1.0)
+    if record.options.small_budget and of_file:
+        found.append("`file_budget` has room for few Gaussians, and scenes need thousands: raise it")
+    elif record.options.small_budget:
         found.append(f"{record.options.small_budget}; it is in bytes of the model in memory")
     # The built-in scene is drawn as small as tests need it.
     is_captured = record.scene.path != SYNTHETIC
@@ -215,8 +222,8 @@ def doubts_about(scene: Scene, record: RunRecord) -> list[str]:
     one = record.options.initial_bytes
     if is_captured and budget is not None and budget > pixels * one:
         found.append(
-            f"`memory_budget` has room for more Gaussians ({budget / one:,.0f}) than the photographs have pixels "
-            f"({pixels:,}): {in_bytes(0.1 * pixels * one).replace(' ', '')} holds one for ten pixels"
+            f"`{name}` has room for more Gaussians ({budget / one:,.0f}) than the photographs have pixels "
+            f"({pixels:,}): {in_bytes(0.1 * pixels * one / share).replace(' ', '')} holds one for ten pixels"
         )
     size = max(((view.camera.width, view.camera.height) for view in scene.train), key=max)
     if is_captured and downscale > 1 and max(size) < SMALL_SIDE:

@@ -236,7 +236,7 @@ def train_run(
     )
     num_given = None if record.init is None else number_in_file(run.model(record.plan.main[0]))
     to_train = [name for name in record.plan.names if not run.model(name).is_file()]
-    after = time_after(scene, record.plan, to_train, num_given)
+    after = time_after(scene, record.plan, to_train, num_given, 0 if record.file_bytes is None else ITERATIONS)
     for planned in record.plan.stages:
         path = run.model(planned.name)
         if path.is_file():
