@@ -365,7 +365,8 @@ def test_what_would_show_little_is_asked_about(monkeypatch, capsys):
         "holds one for ten pixels"
     ]
     tiny = RunRecord(SceneSource("fox"), file_budget="1kB").budgeted()
-    assert doubts_about(scene, tiny) == ["`file_budget` has room for few Gaussians, and scenes need thousands: raise it"]
+    (doubt,) = doubts_about(scene, tiny)
+    assert doubt == "`file_budget` has room for few Gaussians, and scenes need thousands: raise it"
     for stream in (sys.stdin, sys.stderr):
         monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(sys.stdin, "readline", iter(["Y\n", "\n"]).__next__, raising=False)
