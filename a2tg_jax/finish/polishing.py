@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
@@ -21,12 +20,13 @@ from a2tg_jax.appearance.base import color_sums
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.optim import solve_cg
-from a2tg_jax.data import View, counted_pixels, view_image, views_by_kind
+from a2tg_jax.data import View, views_by_kind
 from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
+from a2tg_jax.training.batches import Photographs, over_background, stack_views
 
 HIGHEST_DEGREE = 3
 
@@ -37,16 +37,6 @@ class Colors(NamedTuple):
     sh: Array  # [N, K, 3] of the Gaussians.
     bands: Any  # Coefficients of higher degrees, or ().
     rgb: tuple[Array, ...]  # [capacity, Tv, Tu, 3] of each bucket of textures.
-
-
-class Targets(NamedTuple):
-    """Photographs over the background, of V views of one image size and lens, with the weights of their pixels."""
-
-    viewmats: Array
-    Ks: Array
-    images: Array  # [V, H, W, 3] over the background.
-    weights: Array  # [V, H, W, 1]: 1 where a pixel counts, else 0; [V, 1, 1, 1] if all do.
-    rays: Array | None = None  # [H, W, 2] rays of the lens; None for a pinhole.
 
 
 def polish(
@@ -88,45 +78,40 @@ def polish(
     # Planned once: colours do not change which splats a tile lists.
     settings = plan_render(model, [view.camera for view in views])
     # Views of one size and lens share a program.
-    groups = [
-        Targets(
-            jnp.stack([jnp.asarray(view.camera.viewmat, dtype) for view in own]),
-            jnp.stack([jnp.asarray(view.camera.K, dtype) for view in own]),
-            jnp.stack([jnp.asarray(view_image(view, np.asarray(background)), dtype) for view in own]),
-            jnp.asarray(counted_pixels(own), dtype),
-            None if own[0].camera.rays is None else jnp.asarray(own[0].camera.rays, dtype),
-        )
-        for own in views_by_kind(views)
-    ]
+    groups = [stack_views(list(own)).of(None, dtype) for own in views_by_kind(views)]
     changes = jax.jit(_solve, static_argnums=(3, 4))(model, groups, background, settings, num_steps, ridge)
     return with_colors(model, jax.tree.map(jnp.add, colors_of(model), changes))
 
 
 def _solve(
-    model: Model, groups: list[Targets], background: Array, settings: RenderSettings, num_steps: int, ridge: ArrayLike
-) -> Colors:
+    model: Model, groups: list[Photographs], background: Array, settings: RenderSettings, num_steps: int,
+    ridge: ArrayLike,
+) -> Colors:  # fmt: skip
     """Return the changes of the colours."""
     # A linear function has the same derivative everywhere: it is taken at 0.
     nothing = jax.tree.map(jnp.zeros_like, colors_of(model))
 
-    def pulled(residual: Callable[[Camera, Targets], Array]) -> Colors:
-        """Return the transpose of `draw_change`, summed over all views, of a function's weighted images."""
+    def pulled(residual: Callable[[Camera, Photographs], Array]) -> Colors:
+        """Return the transpose of `draw_change`, summed over all views, of a function's images where pixels count."""
         total: Colors = nothing
         for group in groups:
 
-            def step(total: Colors, view: Targets, rays: Array | None = group.rays) -> tuple[Colors, None]:
+            def step(total: Colors, view: Photographs, rays: Array | None = group.rays) -> tuple[Colors, None]:
                 height, width = view.images.shape[:2]
                 camera = Camera(view.viewmats, view.Ks, width, height, rays)
                 _, back = jax.vjp(lambda change: draw_change(model, change, camera, settings), nothing)
-                return jax.tree.map(jnp.add, total, back(view.weights * residual(camera, view))[0]), None
+                counted = residual(camera, view)
+                if view.masks is not None:
+                    counted = jnp.where(view.masks[..., None], counted, 0)
+                return jax.tree.map(jnp.add, total, back(counted)[0]), None
 
             # scan slices every leaf by view; all views of a group share the rays.
             total, _ = jax.lax.scan(step, total, group._replace(rays=None))
         return total
 
-    def missing(camera: Camera, view: Targets) -> Array:
+    def missing(camera: Camera, view: Photographs) -> Array:
         output, _ = render_traced(model.gaussians, camera, model.appearance, background, settings, has_geometry=False)
-        return view.images - output.color
+        return over_background(view.images, view.alphas, background) - output.color
 
     def normal(change: Colors) -> Colors:
         return pulled(lambda camera, _: draw_change(model, change, camera, settings))

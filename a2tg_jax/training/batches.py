@@ -81,6 +81,16 @@ class Photographs(NamedTuple):
         return batch
 
 
+def over_background(image: Array, alpha: Array | None, background: Array) -> Array:
+    """Return a photograph [H, W, 3] uint8 with its opacity [H, W] uint8 over a colour [3]: floats in [0, 1], of the
+    colour's dtype; traced."""
+    photograph = image.astype(background.dtype) / 255
+    if alpha is None:
+        return photograph
+    weight = alpha.astype(photograph.dtype)[..., None] / 255
+    return weight * photograph + (1 - weight) * background[None, None, :]
+
+
 class BatchOrder:
     """Batches of views of one image size and lens, in shuffled epochs. The order depends on the seed and the iteration
     alone, so a resumed run has the same one."""

@@ -24,7 +24,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.parallel.exchange import map_views
 from a2tg_jax.parallel.sharded_rows import spread
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.training.batches import Photographs
+from a2tg_jax.training.batches import Photographs, over_background
 from a2tg_jax.training.corrections import (
     CorrectionState,
     corrected_camera,
@@ -263,10 +263,7 @@ def batch_gradients(
         shown: Model, seen: TracedView, output: RenderOutput
     ) -> tuple[Array, tuple[Array, Array, dict[str, Array]]]:
         image, alpha, mask, depth, points = seen.target
-        photograph = image.astype(seen.background.dtype) / 255
-        if alpha is not None:
-            weight = alpha.astype(photograph.dtype)[..., None] / 255
-            photograph = weight * photograph + (1 - weight) * seen.background[None, None, :]
+        photograph = over_background(image, alpha, seen.background)
         color = corrected_color(seen.corrections, seen.rows, output.color)
         if mask is not None:  # Excluded pixels of both are black, so that they add to no loss term.
             photograph, color = (jnp.where(mask[..., None], x, jnp.zeros_like(x)) for x in (photograph, color))
