@@ -9,7 +9,7 @@ import oracle
 import pytest
 from scenes_random import as_camera, as_gaussians, as_textures, draw_scene, draw_smooth_scene, quick_then_long
 
-from a2tg_jax import Appearance, Model, RenderSettings, pytree, render_appearance, render_image
+from a2tg_jax import Appearance, Model, Renderer, RenderSettings, pytree, render_appearance, render_image
 
 SCENE = draw_scene(4, num=8, width=11, height=9)
 SMOOTH = draw_smooth_scene(53, width=8, height=8)
@@ -124,6 +124,13 @@ def test_an_appearance_may_have_other_colours_than_three():
     color = render_appearance(gaussians, camera, Two()).color
     assert color.shape == (9, 11, 2) and jnp.abs(color).max() > 0.1
     np.testing.assert_allclose(color[..., 0], -color[..., 1], atol=1e-6)
+    model = Model(gaussians, Two(), background=(1.0, 1.0, 1.0))  # A colour, which two channels do not have.
+    np.testing.assert_array_equal(model.render(camera).color, color)
+    np.testing.assert_array_equal(Renderer(model)(camera).color, color)
+    shifted = Renderer(model, background=(0.5, 0.25))(camera)
+    np.testing.assert_allclose(
+        shifted.color - color, (1 - shifted.alpha)[..., None] * jnp.array([0.5, 0.25]), atol=1e-6
+    )
 
 
 def test_mistakes_are_named():

@@ -246,7 +246,7 @@ def test_on_an_accelerator_its_own_memory_counts(monkeypatch):
 
     scene, system = scene_of(600, 400), a2tg.Gaussians2dMcmc()
     monkeypatch.setattr(forecast, "default_platform", lambda: "gpu")
-    monkeypatch.setattr(forecast.jax, "local_devices", lambda: [Device()])
+    monkeypatch.setattr(forecast, "default_device", Device)
     found = run_of(scene, system)
     assert allowed_memory(None) == 6e9 and allowed_memory(5e9) == 5e9
     assert found.peak[1].program == 0

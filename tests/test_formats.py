@@ -176,6 +176,7 @@ def test_what_a_format_does_not_keep():
     assert lost_by(model, "a.ply") == [TEXTURES, "cameras and background"]
     assert lost_by(model, "a.SPZ") == [TEXTURES, CUT, "cameras and background", "last digits"]
     assert "spherical harmonics above degree 2" in lost_by(Model(some_gaussians()), "a.ksplat")
+    assert lost_by(Model(some_gaussians(), background=(1.0, 1.0, 1.0)), "a.ply") == ["background"]
     assert lost_by(Model(some_gaussians()), "a.splat") == ["spherical harmonics above degree 0", "last digits"]
     shaped = showing(Appearance(texture=Texture(), exponents=Exponents()))
     assert lost_by(shaped, "a.ply") == ["textures and shapes of kernels (bake turns them into plain splats)"]

@@ -111,6 +111,7 @@ def test_ply_in_text_and_of_the_other_byte_order(tmp_path, encoding):
         ("uchar", 255, "binary_little_endian"),
         ("uchar", 255, "ascii"),
         ("ushort", 65535, "binary_big_endian"),
+        ("int", 255, "binary_little_endian"),
         ("float", 1, "binary_little_endian"),
         ("float", 255, "binary_little_endian"),
     ],

@@ -12,6 +12,7 @@ import pytest
 import surface_quality
 
 import a2tg_jax as a2tg
+from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.synthetic import exact_points
 from a2tg_jax.io.other_programs import upright
 from a2tg_jax.mesh import extract, triangles
@@ -227,6 +228,28 @@ def test_a_model_becomes_a_mesh(model):
     center, radius = common_sphere(model.origin.viewmats)
     np.testing.assert_allclose(center, 0, atol=1e-6)
     assert radius == pytest.approx(2.4, rel=1e-3)
+
+
+def test_a_given_centre_and_cameras_of_a_lens(model):
+    """The radius is measured from the centre. Depths are rendered by pinholes, whatever the lens of the photographs."""
+    cameras = [dataclasses.replace(own, rays=jnp.zeros((own.height, own.width, 2))) for own in model.origin.cameras]
+    center = np.array([0.5, 0, 0])
+    result = a2tg.extract_mesh(model, cameras, resolution=20, center=center, least_faces=1)
+    apart = np.linalg.norm(camera_centers(model.origin.viewmats) - center, axis=1)
+    assert result.radius == pytest.approx(2 * np.median(apart))
+    plain = a2tg.extract_mesh(model, resolution=20, center=center, least_faces=1)
+    np.testing.assert_array_equal(result.mesh.vertices, plain.mesh.vertices)
+    picture = np.zeros((cameras[0].height, cameras[0].width, 3))
+    pytest.importorskip("xatlas")
+    with pytest.raises(ValueError, match="pinhole cameras; got one with the rays of a lens"):
+        a2tg.texture_mesh(result.mesh, [(cameras[0], picture, None)], size=64)
+
+
+def test_an_empty_mesh_is_no_glb(tmp_path):
+    empty = a2tg.Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    with pytest.raises(ValueError, match=r"has no faces.*: write a PLY or OBJ file"):
+        a2tg.save_mesh(tmp_path / "a.glb", empty)
+    assert a2tg.save_mesh(tmp_path / "a.ply", empty)
 
 
 def test_one_camera_looks_at_what_it_sees(model):
