@@ -31,7 +31,7 @@ def write_ply(path, names, rows, encoding="binary_little_endian", types=None) ->
     types = {name: (types or {}).get(name, "float") for name in names}
     properties = "".join(f"property {kind} {name}\n" for name, kind in types.items())
     header = f"ply\nformat {encoding} 1.0\ncomment made by hand\nelement vertex {len(rows)}\n{properties}end_header\n"
-    kinds = {"float": "f4", "uchar": "u1", "ushort": "u2"}
+    kinds = {"float": "f4", "uchar": "u1", "ushort": "u2", "int": "i4"}
     dtype = [(name, (">" if "big" in encoding else "<") + kinds[kind]) for name, kind in types.items()]
     body = np.array([tuple(row) for row in np.asarray(rows).tolist()], dtype)
     text = "".join(" ".join(repr(number) for number in row) + "\n" for row in body.tolist())
