@@ -100,7 +100,7 @@ def test_the_command_on_a_model(tmp_path, monkeypatch, capsys):
     assert text.count("\n") == 2
     assert cli.main(["compress", str(tmp_path / "scene.npz"), "--max-loss", "0.3", "--overwrite", "--verbose"]) == 0
     text = capsys.readouterr().out
-    assert "dB lost, if 30 dB" in text and "opacities 2 " in text and "texels" not in text
+    assert "dB lost, for a model of 30 dB" in text and "opacities 2 " in text and "texels" not in text
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def test_compress(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(SceneSource, "load", gone)
     out = tmp_path / "other.a2tgz"
     assert cli.main(["compress", str(run.path), "--out", str(out), "--max-loss", "0.5", "--verbose"]) == 0
-    assert "dB lost, if 30 dB" in capsys.readouterr().out and load_compact(out).num == 60
+    assert "dB lost, for a model of 30 dB" in capsys.readouterr().out and load_compact(out).num == 60
     out = tmp_path / "no.a2tgz"
     assert "--tune-iterations needs the photographs of" in fails(capsys, *TUNE, str(run.path), "--out", out)
     assert not out.exists()

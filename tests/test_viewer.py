@@ -214,9 +214,8 @@ def test_without_waitress_one_line_says_what_to_do(monkeypatch, tmp_path, capsys
 
     monkeypatch.setattr(importlib, "import_module", missing)
     assert main(["view", str(tmp_path / "a.ply"), "--no-open"]) == 2
-    assert (
-        capsys.readouterr().err == "a2tg: error: the viewer's server needs waitress: pip install 'a2tg-jax[viewer]'\n"
-    )
+    needed = "the viewer's server needs waitress, which is not installed: pip install 'a2tg-jax[viewer]'"
+    assert capsys.readouterr().err == f"a2tg: error: {needed}\n"
 
 
 # The page
@@ -404,4 +403,6 @@ def test_photographs_that_cannot_be_read_are_not_called_missing(tmp_path, monkey
     with warned:
         assert json.loads(routes_of(source)["/photographs.json"].read()) == []
     with warned:
-        assert list(loss_measures(source.model, source.load_scene_or_warn(), source.settings)) == ["if 30 dB"]
+        assert list(loss_measures(source.model, source.load_scene_or_warn(), source.settings)) == [
+            "for a model of 30 dB"
+        ]

@@ -255,4 +255,4 @@ def loss_measures(model: Model, scene: Scene | None, settings: RenderSettings) -
         return {}
     cameras = model.origin.training_cameras
     cameras = cameras[:: -(-len(cameras) // MOST_VIEWS)]
-    return {f"if {ASSUMED_PSNR:g} dB": loss_beside_renders(model, cameras, settings=settings)}
+    return {f"for a model of {ASSUMED_PSNR:g} dB": loss_beside_renders(model, cameras, settings=settings)}
