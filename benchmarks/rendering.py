@@ -52,13 +52,11 @@ def measure_view(
     textures: a2tg_jax.Textures | None,
     settings: a2tg_jax.RenderSettings,
 ) -> dict:
-    """Measure forward, forward with backward, and count the composited pairs."""
+    """Measure forward, and forward with backward."""
     made = passes(gaussians, camera, textures, settings)
-    counts = made.counts(gaussians, textures, jnp.zeros((gaussians.num, 4)))
     return {
         "forward": timed(made.forward, gaussians, textures, wait=jax.block_until_ready),
         "both": timed(made.both, gaussians, textures, wait=jax.block_until_ready),
-        "composited_pairs": float(counts[:, 3].sum()),
     }
 
 
@@ -69,8 +67,6 @@ class Passes(NamedTuple):
     """Image."""
     both: Callable
     """Gradient of L1 against a fixed random image."""
-    counts: Callable
-    """Gradient at the statistic's probe, a further argument (`rasterize.compositor.composite`)."""
 
 
 def passes(gaussians, camera, textures, settings: a2tg_jax.RenderSettings) -> Passes:
@@ -78,12 +74,11 @@ def passes(gaussians, camera, textures, settings: a2tg_jax.RenderSettings) -> Pa
     settings = a2tg_jax.plan_render(gaussians, camera, textures, settings=settings)
     target = jnp.asarray(random_image(camera.width, camera.height))
 
-    def image(gaussians, textures, probe=None):
+    def image(gaussians, textures):
         shown = appearance_of(gaussians, textures, settings)
-        return render_traced(gaussians, camera, shown, jnp.zeros(3), settings, has_geometry=False, probe=probe)[0].color
+        return render_traced(gaussians, camera, shown, jnp.zeros(3), settings, has_geometry=False)[0].color
 
-    def loss(gaussians, textures, probe=None):
-        return jnp.mean(jnp.abs(image(gaussians, textures, probe) - target))
+    def loss(gaussians, textures):
+        return jnp.mean(jnp.abs(image(gaussians, textures) - target))
 
-    both, counts = jax.grad(loss, argnums=(0, 1), allow_int=True), jax.grad(loss, argnums=2)
-    return Passes(jax.jit(image), jax.jit(both), jax.jit(counts))
+    return Passes(jax.jit(image), jax.jit(jax.grad(loss, argnums=(0, 1), allow_int=True)))

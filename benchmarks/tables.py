@@ -91,24 +91,6 @@ def ratios(report: dict) -> str:
     return table(["N", "image", "textures", "forward", "ratio", "forward + backward", "ratio"], rows)
 
 
-def growth(report: dict) -> str:
-    head = ["threads", "pass", "a, ms", "b, ns per Gaussian", "c, ns per pair", "cases", "largest error of the fit"]
-    names = {"forward": "forward", "both": "forward + backward"}
-    rows = [
-        [
-            str(fit["threads"]),
-            names[fit["which"]],
-            f"{fit['ms']:.1f}",
-            f"{fit['ns_per_gaussian']:.0f}",
-            f"{fit['ns_per_composited_pair']:.1f}",
-            str(fit["num_cases"]),
-            f"{100 * fit['largest_relative_error']:.0f} %",
-        ]
-        for fit in report["growth"]
-    ]
-    return table(head, rows)
-
-
 def stages(report: dict) -> str:
     cases = measured(report["stages"])
     head = [f"{c['num'] // 1000}k, {TEXTURES[c['textures']]}, {c['threads']} thr." for c in cases]
@@ -189,7 +171,6 @@ TABLES: dict[str, tuple[Callable[[dict], str], tuple[str, ...]]] = {
     "machine": (machine, ("machine", "render")),
     "render": (render, ("machine", "render", "pixels", "full_size")),
     "ratios": (ratios, ("ratios",)),
-    "growth": (growth, ("growth",)),
     "stages": (stages, ("stages",)),
     "limit": (limit, ("limit", "render", "stages")),
     "others": (others, ("others",)),
