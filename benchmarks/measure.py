@@ -24,7 +24,6 @@ def main() -> None:
     a2tg_jax.configure_cpu(use_cache="cache" in case)
     measures = {
         "render": rendering.measure_render,
-        "ratios": rendering.measure_ratios,
         "stages": stages.measure_stages,
         "step": stages.measure_step,
         "limit": limit.measure_limit,

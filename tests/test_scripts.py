@@ -48,7 +48,6 @@ RANDOM = {"num": 40, "width": 24, "height": 16, "textures": "mixed"}
     [
         {"case": "limit", "multiply_adds": 20, "pairs": 1e4},
         {"case": "render", **RANDOM},
-        pytest.param({"case": "ratios", **RANDOM, "rounds": 2}, marks=pytest.mark.long),
         pytest.param({"case": "stages", **RANDOM}, marks=pytest.mark.long),
     ],
     ids=lambda case: case["case"],
