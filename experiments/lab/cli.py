@@ -115,10 +115,9 @@ class Lab:
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
-    def model(self, result: Result, *, first_stage: bool = False) -> a2tg.Model | None:
-        """Return the model of a run, or of its first stage; print a line and return None if it is missing."""
-        job = dataclasses.replace(result.run.job, stage=0) if first_stage else result.run.job
-        path = self.folders.model(job)
+    def model(self, result: Result) -> a2tg.Model | None:
+        """Return the model of a run; print a line and return None if it is missing."""
+        path = self.folders.model(result.run.job)
         if path.is_file():
             return a2tg.load_model(path)
         print(
