@@ -31,7 +31,7 @@ from a2tg_jax.host import signals
 from a2tg_jax.host.text import did_you_mean
 
 MODULES = (
-    "choose_plain", "findings", "ablation", "texture_resolution", "memory_charts", "resolution_shares", "decomposition",
+    "choose_plain", "findings", "ablation", "texture_resolution", "resolution_shares", "decomposition",
     "comparison_pictures", "efficiency",
 )  # fmt: skip
 """Modules of this folder that hold an EXPERIMENT; the one that measures time comes last."""
