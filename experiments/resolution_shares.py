@@ -7,7 +7,7 @@ from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.images import save_picture, to_uint8
+from a2tg_jax.results.images import save_picture, side_by_side, to_uint8
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
@@ -45,7 +45,7 @@ def _picture(lab: Lab, result: tables.Result) -> None:
         return
     camera = model.origin.cameras[0]
     shown = [to_uint8(a2tg.Renderer(one)(camera).color) for one in (model, pictures.colored_by_shape(model))]
-    sheet = pictures.sheet(shown, ["full", "blue: 2×2, 4×4; red: not square"])
+    sheet = side_by_side(shown, ["full", "blue: 2×2, 4×4; red: not square"])
     save_picture(lab.pages / f"{EXPERIMENT.name}-{result.run.cell.scene.label.replace('/', '-')}.png", sheet)
 
 
