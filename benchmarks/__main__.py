@@ -19,7 +19,6 @@ import platform
 import shlex
 import subprocess
 
-from benchmarks.fit import fit_growth
 from benchmarks.sections import SECTIONS, device
 
 OTHER_HELP = """a program to measure beside this library; may be repeated. COMMAND gets one more argument, a case such
@@ -35,8 +34,6 @@ def main() -> None:
     for name, section in SECTIONS.items():
         if not args.only or name in args.only:
             report[name] = section(args)
-            cases = [case for each in SECTIONS if isinstance(report.get(each), list) for case in report[each]]
-            report["growth"] = fit_growth(cases)
             # After every section: what was measured is kept if the rest is interrupted.
             args.out.write_text(json.dumps(report, indent=1) + "\n")
     print(f"\nwritten to {args.out}")

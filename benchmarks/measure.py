@@ -8,7 +8,6 @@ prints a line of JSON. Times are in milliseconds, medians over several warm runs
 
 import json
 import os
-import resource
 import sys
 
 
@@ -19,12 +18,11 @@ def main() -> None:
     import jax
 
     import a2tg_jax
-    from benchmarks import limit, rendering, stages, training
+    from benchmarks import limit, rendering, stages, timing, training
 
     a2tg_jax.configure_cpu(use_cache="cache" in case)
     measures = {
         "render": rendering.measure_render,
-        "ratios": rendering.measure_ratios,
         "stages": stages.measure_stages,
         "step": stages.measure_step,
         "limit": limit.measure_limit,
@@ -32,7 +30,7 @@ def main() -> None:
         "trained": training.measure_trained,
     }
     figures = measures[case["case"]](case)
-    figures["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    figures["peak_mb"] = timing.memory_peak() / 1e6
     on_device = jax.local_devices()[0].memory_stats()
     if on_device and "peak_bytes_in_use" in on_device:
         figures["device_peak_mb"] = on_device["peak_bytes_in_use"] / 1e6

@@ -1,13 +1,7 @@
 """Forward and backward passes of one view."""
 
-import functools
-import time
-from collections.abc import Callable
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import a2tg_jax
 from a2tg_jax.rasterize.views import render_traced
@@ -25,65 +19,25 @@ def measure_render(case: dict) -> dict:
     return measure_view(gaussians, camera, textures, settings)
 
 
-def measure_ratios(case: dict) -> dict:
-    """Measure textured and untextured passes in turn in one process, which a noisy machine distorts least."""
-    gaussians, camera = random_scene(case["num"], case["width"], case["height"])
-    calls, kinds = {}, ("none", "mixed", "4x4")
-    for kind in kinds:
-        textures = random_textures(case["num"], kind)
-        made = passes(gaussians, camera, textures, a2tg_jax.RenderSettings())
-        for which in ("forward", "both"):
-            calls[kind, which] = functools.partial(getattr(made, which), gaussians, textures)
-    for call in calls.values():
-        jax.block_until_ready(call())
-    times: dict[tuple[str, str], list[float]] = {key: [] for key in calls}
-    for _ in range(case["rounds"]):
-        for key, call in calls.items():
-            start = time.perf_counter()
-            jax.block_until_ready(call())
-            times[key].append(time.perf_counter() - start)
-    medians = {key: {"ms": float(np.median(of_call)) * 1e3} for key, of_call in times.items()}
-    return {"renders": [{"textures": k, **{which: medians[k, which] for which in ("forward", "both")}} for k in kinds]}
-
-
 def measure_view(
     gaussians: a2tg_jax.Gaussians,
     camera: a2tg_jax.Camera,
     textures: a2tg_jax.Textures | None,
     settings: a2tg_jax.RenderSettings,
 ) -> dict:
-    """Measure forward, forward with backward, and count the composited pairs."""
-    made = passes(gaussians, camera, textures, settings)
-    counts = made.counts(gaussians, textures, jnp.zeros((gaussians.num, 4)))
-    return {
-        "forward": timed(made.forward, gaussians, textures, wait=jax.block_until_ready),
-        "both": timed(made.both, gaussians, textures, wait=jax.block_until_ready),
-        "composited_pairs": float(counts[:, 3].sum()),
-    }
-
-
-class Passes(NamedTuple):
-    """Jitted functions of Gaussians and textures."""
-
-    forward: Callable
-    """Image."""
-    both: Callable
-    """Gradient of L1 against a fixed random image."""
-    counts: Callable
-    """Gradient at the statistic's probe, a further argument (`rasterize.compositor.composite`)."""
-
-
-def passes(gaussians, camera, textures, settings: a2tg_jax.RenderSettings) -> Passes:
-    """Return the measured functions of a view."""
+    """Measure the image, and the gradient of L1 against a fixed random image."""
     settings = a2tg_jax.plan_render(gaussians, camera, textures, settings=settings)
     target = jnp.asarray(random_image(camera.width, camera.height))
 
-    def image(gaussians, textures, probe=None):
+    def image(gaussians, textures):
         shown = appearance_of(gaussians, textures, settings)
-        return render_traced(gaussians, camera, shown, jnp.zeros(3), settings, has_geometry=False, probe=probe)[0].color
+        return render_traced(gaussians, camera, shown, jnp.zeros(3), settings, has_geometry=False)[0].color
 
-    def loss(gaussians, textures, probe=None):
-        return jnp.mean(jnp.abs(image(gaussians, textures, probe) - target))
+    def loss(gaussians, textures):
+        return jnp.mean(jnp.abs(image(gaussians, textures) - target))
 
-    both, counts = jax.grad(loss, argnums=(0, 1), allow_int=True), jax.grad(loss, argnums=2)
-    return Passes(jax.jit(image), jax.jit(both), jax.jit(counts))
+    both = jax.grad(loss, argnums=(0, 1), allow_int=True)
+    return {
+        name: timed(jax.jit(function), gaussians, textures, wait=jax.block_until_ready)
+        for name, function in (("forward", image), ("both", both))
+    }

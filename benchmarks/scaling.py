@@ -20,7 +20,6 @@ This trains so many Gaussians for some steps on several devices of this CPU, and
 import argparse
 import json
 import math
-import resource
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -39,6 +38,7 @@ from a2tg_jax.parallel.exchange import BorderRoom, ImageBands
 from a2tg_jax.rasterize.splats import drawn_splats
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
+from benchmarks.timing import memory_peak
 from benchmarks.workload import random_scene
 from experiments.lab.markdown import table as markdown
 
@@ -50,7 +50,6 @@ CHANNELS = 4
 """Numbers of a pixel that travel: its colour and its transmittance."""
 SKY, KEPT_IN_SKY = 0.3, 7
 """Share of the image that is sky; of so many Gaussians in it one is kept."""
-KIBIBYTE = 1024
 STATES = 4
 """Parameters, their gradients, and the two moments of Adam."""
 
@@ -166,7 +165,7 @@ def training(num: int, steps: int) -> dict[str, float]:
         "last_loss": float(result.history.loss[-1]),
         "seconds_a_step": float(np.median(paces)),
         "state_gb": BYTES_PER_FLOAT * STATES * floats_per_gaussian(own.initial_sh_degree) * num / 1e9,
-        "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIBIBYTE / 1e9,
+        "peak_gb": memory_peak() / 1e9,
     }
 
 

@@ -35,12 +35,6 @@ def render_section(args: argparse.Namespace) -> list[dict]:
     return measure_all(cases, args.largest)
 
 
-def ratios_section(args: argparse.Namespace) -> list[dict]:
-    """Measure the cost of textures side by side."""
-    cases = [{**random_case(num, size, threads=ALL), "case": "ratios", "rounds": 25} for num, size in TYPICAL]
-    return measure_all(cases, args.largest)
-
-
 def pixels_section(args: argparse.Namespace) -> list[dict]:
     """Measure the same Gaussians at growing image sizes."""
     cases = [random_case(10_000, size, textures="none", threads=threads) for size in PIXELS for threads in THREADS]
@@ -158,7 +152,6 @@ def device() -> str:
 
 SECTIONS = {
     "render": render_section,
-    "ratios": ratios_section,
     "pixels": pixels_section,
     "stages": stages_section,
     "limit": limit_section,

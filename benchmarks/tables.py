@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 
+from benchmarks.sections import TYPICAL
 from experiments.lab.markdown import table
 
 TEXTURES = {"none": "none", "mixed": "mixed", "4x4": "all 4×4"}
@@ -80,33 +81,19 @@ def render(report: dict) -> str:
 
 
 def ratios(report: dict) -> str:
+    """Return the cost of textures on all threads."""
+    cases = [
+        case for case in measured(report["render"])
+        if (case["num"], (case["width"], case["height"])) in TYPICAL and case["threads"] == report["machine"]["cores"]
+    ]  # fmt: skip
+    plain = {case["num"]: case for case in cases if case["textures"] == "none"}
     rows = []
-    for case in measured(report["ratios"]):
-        plain = case["renders"][0]
-        for view in case["renders"]:
-            row = [f"{case['num']:,}", size(case), TEXTURES[view["textures"]]]
-            for which in ("forward", "both"):
-                row += [ms(view[which]), f"{view[which]['ms'] / plain[which]['ms']:.2f}"]
-            rows.append(row)
+    for case in cases:
+        row = [f"{case['num']:,}", size(case), TEXTURES[case["textures"]]]
+        for which in ("forward", "both"):
+            row += [ms(case[which]), f"{case[which]['ms'] / plain[case['num']][which]['ms']:.2f}"]
+        rows.append(row)
     return table(["N", "image", "textures", "forward", "ratio", "forward + backward", "ratio"], rows)
-
-
-def growth(report: dict) -> str:
-    head = ["threads", "pass", "a, ms", "b, ns per Gaussian", "c, ns per pair", "cases", "largest error of the fit"]
-    names = {"forward": "forward", "both": "forward + backward"}
-    rows = [
-        [
-            str(fit["threads"]),
-            names[fit["which"]],
-            f"{fit['ms']:.1f}",
-            f"{fit['ns_per_gaussian']:.0f}",
-            f"{fit['ns_per_composited_pair']:.1f}",
-            str(fit["num_cases"]),
-            f"{100 * fit['largest_relative_error']:.0f} %",
-        ]
-        for fit in report["growth"]
-    ]
-    return table(head, rows)
 
 
 def stages(report: dict) -> str:
@@ -188,8 +175,7 @@ def gpu(report: dict) -> str:
 TABLES: dict[str, tuple[Callable[[dict], str], tuple[str, ...]]] = {
     "machine": (machine, ("machine", "render")),
     "render": (render, ("machine", "render", "pixels", "full_size")),
-    "ratios": (ratios, ("ratios",)),
-    "growth": (growth, ("growth",)),
+    "ratios": (ratios, ("machine", "render")),
     "stages": (stages, ("stages",)),
     "limit": (limit, ("limit", "render", "stages")),
     "others": (others, ("others",)),

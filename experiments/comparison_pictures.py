@@ -10,7 +10,7 @@ from skimage.metrics import peak_signal_noise_ratio
 
 import a2tg_jax as a2tg
 from a2tg_jax.data import view_image
-from a2tg_jax.results.images import largest_gain, save_picture, to_uint8
+from a2tg_jax.results.images import largest_gain, save_picture, side_by_side, to_uint8
 
 ZOOM = 4
 
@@ -38,10 +38,10 @@ def _save_sheets(lab: Lab, stem: str, views: Sequence[a2tg.View], models: dict[s
     rows.sort(key=lambda row: _decibels(row[0], row[1]) - _decibels(row[0], row[2]))
     target, first, second, *others = rows[len(rows) // 2]
     images, captions = [target, first, second, *others], ["photograph", *models]
-    save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}.png", pictures.sheet(images, captions))
+    save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}.png", side_by_side(images, captions))
     crop = largest_gain(target, second, first)
     close = [pictures.enlarged(image[crop], ZOOM) for image in images]
-    save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}-close.png", pictures.sheet(close, captions))
+    save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}-close.png", side_by_side(close, captions))
 
 
 def _decibels(target: np.ndarray, image: np.ndarray) -> float:

@@ -10,7 +10,7 @@ from lab.jobs import background_of
 from PIL import Image
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.images import save_picture, to_uint8
+from a2tg_jax.results.images import save_picture, side_by_side, to_uint8
 
 NUM_TEXTURES, ZOOM = 16, 12
 
@@ -28,7 +28,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         camera = model.origin.cameras[0]
         shown = [to_uint8(a2tg.Renderer(one)(camera).color) for one in views.values()]
         stem = name.replace("/", "-")
-        save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}.png", pictures.sheet(shown, list(views)))
+        save_picture(lab.pages / f"{EXPERIMENT.name}-{stem}.png", side_by_side(shown, list(views)))
         save_picture(lab.pages / f"learned_textures-{stem}.png", _textures_picture(model))
         scene = lab.folders.load_scene(result.run.job)
         quality = [a2tg.evaluate(scene.test, one, background=background_of(scene)) for one in views.values()]

@@ -13,9 +13,10 @@ from lab import tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.jobs import Job
-from lab.measured import Figures, measured_once
+from lab.kept import Figures, read_kept
 
 import a2tg_jax as a2tg
+from a2tg_jax.results.folder import write_json
 from a2tg_jax.training import fit_stage
 
 TIMED_ITERATIONS, TIMED_ROUNDS = 150, 3
@@ -25,7 +26,7 @@ SMOKE_ITERATIONS, SMOKE_ROUNDS = 20, 1
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
     """Write our times, measured once on this machine, then the paper's."""
     (grid,) = grids
-    text = table_of_times(lab, EXPERIMENT.name, grid)
+    text = table_of_times(lab, grid)
     columns = (
         ("mb", "MB"),
         ("fps", "frames/s"),
@@ -36,9 +37,18 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     lab.write(EXPERIMENT.name, f"# {grid.title}\n\n{text}\n## In the paper\n\n{paper}")
 
 
-def table_of_times(lab: Lab, name: str, grid: Grid) -> str:
-    """Return size and speed of a grid's models, measured once and kept in NAME.json."""
-    rows = [_row(result, times) for result, times in measured_once(lab, name, grid, _times)]
+def table_of_times(lab: Lab, grid: Grid) -> str:
+    """Return size and speed of a grid's models, measured once and kept in efficiency.json; runs without times are left
+    out."""
+    path, rows = lab.out / f"{EXPERIMENT.name}.json", []
+    kept = read_kept(path)
+    for result in tables.results_of(grid, lab.records):
+        key = result.run.job.key
+        if key not in kept and not lab.args.tables_only and (model := lab.model(result)) is not None:
+            kept[key] = _times(lab, result, model)
+            write_json(path, kept)
+        if key in kept:
+            rows.append(_row(result, kept[key]))
     header = ["scene", "method", "Gaussians", "MB", "frames/s", "ms a frame", "ms a step, stages 1, 2", "training, min"]
     return tables.markdown([*header, "machine"], rows)
 

@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 
-from lab import pictures, plots, tables
+from lab import pictures, tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid
 
 import a2tg_jax as a2tg
-from a2tg_jax.results.figures import save_figure
-from a2tg_jax.results.images import save_picture, to_uint8
+from a2tg_jax.results.images import save_picture, side_by_side, to_uint8
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Write a table and a chart of the shares, and a picture of each scene with a model."""
+    """Write a table of the shares, and a picture of each scene with a model."""
     results = [result for grid in grids for result in tables.results_of(grid, lab.records)]
     label = grids[0].reference.label
     results = [result for result in results if result.label == label and not result.run.cell.seed]
@@ -23,10 +22,6 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     text = tables.markdown(["scene", *(size.replace("x", "×") for size in sizes)], rows)
     wording = f"In the paper, on {paper['scene']}, {tables.percent(paper['1x1'])} keep 1×1 texels.\n"
     lab.write(EXPERIMENT.name, f"# Shares of texture resolutions (rows × columns)\n\n{text}\n{wording}")
-    densest = {result.run.cell.scene.label: result for result in sorted(results, key=lambda result: result["num"])}
-    if densest:
-        charted = {_place(result): shares[_place(result)] for result in densest.values()}
-        save_figure(lab.pages / f"{EXPERIMENT.name}.png", plots.shares_chart(charted))
     for result in tables.results_of(grids[-1], lab.records):
         if result.label == label:
             _picture(lab, result)
@@ -50,7 +45,7 @@ def _picture(lab: Lab, result: tables.Result) -> None:
         return
     camera = model.origin.cameras[0]
     shown = [to_uint8(a2tg.Renderer(one)(camera).color) for one in (model, pictures.colored_by_shape(model))]
-    sheet = pictures.sheet(shown, ["full", "blue: 2×2, 4×4; red: not square"])
+    sheet = side_by_side(shown, ["full", "blue: 2×2, 4×4; red: not square"])
     save_picture(lab.pages / f"{EXPERIMENT.name}-{result.run.cell.scene.label.replace('/', '-')}.png", sheet)
 
 

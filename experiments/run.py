@@ -12,23 +12,26 @@ do and about how long it takes. docs/sweeps.md says how to write a grid file of 
 """
 
 import argparse
+import contextlib
 import importlib
+import shlex
+import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lab import pages
 from lab.cli import Experiment, argument_parser, run_experiments, stop
 from lab.grid import has_scale
 from lab.grid_file import SUFFIX
-from lab.interrupts import interruptible
 from lab.standard import STANDARD, file_experiment
 
 from a2tg_jax import configure_cpu
+from a2tg_jax.host import signals
 from a2tg_jax.host.text import did_you_mean
 
 MODULES = (
-    "choose_plain", "findings", "ablation", "texture_resolution", "memory_charts", "resolution_shares", "decomposition",
+    "choose_plain", "findings", "ablation", "texture_resolution", "resolution_shares", "decomposition",
     "comparison_pictures", "efficiency",
 )  # fmt: skip
 """Modules of this folder that hold an EXPERIMENT; the one that measures time comes last."""
@@ -104,6 +107,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     is_committed = lab is not None and lab.out.resolve().parent == pages.EXPERIMENTS / "results" and not lab.is_partial
     if (EVERYTHING in args.names and is_committed) or (PAGES in args.names and not args.plan):
         pages.refresh()
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """End the program with one line if a signal comes within the block: exit code 130 for Ctrl-C, 143 for SIGTERM."""
+    try:
+        with signals.raised():
+            yield
+    except KeyboardInterrupt as stop:
+        code = signals.Stopped.of(stop).exit_code
+        wording = "interrupted" if code == 128 + signals.CTRL_C else "terminated"
+        command = shlex.join([Path(sys.executable).name, *sys.argv])
+        print(f"\n{wording}; what is finished is kept; continue with: {command}", file=sys.stderr)
+        sys.exit(code)
 
 
 if __name__ == "__main__":

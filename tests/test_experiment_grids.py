@@ -12,7 +12,6 @@ import pytest
 from experiment_records import CELL, record, result
 from lab import tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
-from lab.figures import figures_table
 from lab.fingerprint import fingerprint
 from lab.grid import Method, has_scale, read_grid, splats_in
 from lab.grid_file import GRIDS, SCALES, Block
@@ -234,7 +233,7 @@ def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
     runs = [result("own", 21.0), result("other", 20.0)]
     runs = [tables.Result(dataclasses.replace(one.run, cell=cell), one.record) for one in runs]
     assert "1,000 (5.00 a pixel)" in tables.gains_table(runs, "own", ["other"])
-    assert "| other | 1,000 | 1.00 | 20.00 / .800 / .200 | 21.00 | 1 |" in figures_table(runs)
+    assert "| other | 1,000 | 1.00 | 20.00 / .800 / .200 | 21.00 | 1 |" in tables.figures_table(runs)
     larger = dataclasses.replace(cell, budget=0.6)
     richer = [tables.Result(dataclasses.replace(one.run, cell=larger), one.record) for one in runs]
     assert "fox, 0.3 MB: dB · LPIPS | fox, 0.6 MB" in tables.choices_table([*runs, *richer], "own")

@@ -14,12 +14,11 @@ from experiment_records import record
 from lab import queue, versions
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.grid import read_grid
-from lab.interrupts import interruptible
 from lab.jobs import Folders, Job, _load_checkpoint, milliseconds, model_bytes
 from lab.plan import Machine, duration, finished_pace, plan_of
 from lab.progress import Progress
 from lab.stages import stages_of
-from run import experiments, parse_arguments
+from run import experiments, interruptible, parse_arguments
 
 import a2tg_jax as a2tg
 from a2tg_jax.training import fit_stage
@@ -138,7 +137,7 @@ def test_records_of_an_earlier_version_are_told_and_trained_again_on_request(tmp
 def test_a_second_sigterm_ends_at_once():
     code = (
         "import signal\n"
-        "from lab.interrupts import interruptible\n"
+        "from run import interruptible\n"
         "with interruptible():\n"
         "    try:\n"
         "        signal.raise_signal(signal.SIGTERM)\n"

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.gaussians import init_from_points
+from a2tg_jax.core.gaussians import Gaussians, init_from_points
 from a2tg_jax.host.machine import VARIABLE, memory_limit, num_threads
 from a2tg_jax.host.operating_system import cuda_of_driver
 from a2tg_jax.host.startup import compilation_cache_folder
@@ -20,10 +20,11 @@ from a2tg_jax.rasterize.kernels import platforms
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.splats import Compositor
 from a2tg_jax.render import render_image
+from a2tg_jax.texture import Textures, allocate_textures
 
 PACKAGES = ("jax", "jaxlib", "jax-cuda13-plugin", "jaxopt", "numpy", "llvmlite", "nvidia-cuda-nvrtc", "pycolmap")
 MOST_DIFFERENCE = 1e-3
-"""Largest rounding difference between compositors, of colours in [0, 1]."""
+"""Largest rounding difference between compositors, as a share of an array's norm."""
 WIDTH, HEIGHT, NUM = 96, 64, 400
 
 
@@ -90,19 +91,31 @@ def _version(package: str) -> str:
 
 
 def _compare(available: Sequence[Compositor]) -> float:
-    """Render an image by each compositor; return the largest difference from XLA's, infinite if it is not finite."""
+    """Render a textured image by each compositor, with gradients; return the largest difference of an array from XLA's,
+    relative to the array's norm, and infinite if it is not finite."""
     rng = np.random.default_rng(0)
     gaussians = init_from_points(rng.uniform(-1, 1, (NUM, 3)), rng.uniform(0, 1, (NUM, 3)), opacity=0.5)
+    textures = allocate_textures(np.tile([[1, 1], [2, 4]], (NUM // 2, 1)))
     K = [[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]]
     camera = Camera(jnp.eye(4, dtype=jnp.float32).at[2, 3].set(4), jnp.asarray(K, jnp.float32), WIDTH, HEIGHT)
-    colors, largest = {}, 0.0
+
+    def loss(gaussians: Gaussians, textures: Textures, settings: RenderSettings) -> tuple[jax.Array, jax.Array]:
+        color = render_image(gaussians, camera, textures, settings=settings).color
+        return jnp.sum(color**2), color
+
+    found, largest = {}, 0.0
     for name in ("xla", *available):  # First, to compare the others with it.
         start = time.perf_counter()
-        colors[name] = np.asarray(render_image(gaussians, camera, settings=RenderSettings(compositor=name)).color)
+        settings = RenderSettings(compositor=name, capacity=1 << 16)  # Room for all Gaussians in all tiles.
+        gradient = jax.grad(loss, argnums=(0, 1), has_aux=True, allow_int=True)(gaussians, textures, settings)
+        arrays = [np.asarray(leaf) for leaf in jax.tree.leaves(gradient)]
+        found[name] = [array for array in arrays if np.issubdtype(array.dtype, np.floating)]
         text = f"{name}: {time.perf_counter() - start:.2f} s with compiling"
         if name != "xla":
+            pairs = zip(found[name], found["xla"], strict=True)
+            shares = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs]
             # max of Python would drop NaN.
-            difference = float(np.nan_to_num(abs(colors[name] - colors["xla"]), nan=np.inf).max())
-            text, largest = f"{text}, at most {difference:.1g} from XLA's image", max(largest, difference)
+            difference = float(np.nan_to_num(shares, nan=np.inf).max())
+            text, largest = f"{text}, at most {difference:.1g} from XLA's image and gradients", max(largest, difference)
         _print("render", text)
     return largest

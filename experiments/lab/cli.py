@@ -3,7 +3,9 @@
 import argparse
 import contextlib
 import dataclasses
+import functools
 import math
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,10 +14,12 @@ from typing import Any, NoReturn
 import a2tg_jax as a2tg
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.machine import cpu_quota, memory_limit
+from a2tg_jax.host.operating_system import num_cores
 from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.results.folder import write_json
-from lab import machine, spreadsheet, tables, versions
+from lab import spreadsheet, tables, versions
 from lab.grid import Grid, read_grid
 from lab.grid_file import SCALES
 from lab.jobs import Folders, Job, Record
@@ -32,7 +36,7 @@ RUNS = EXPERIMENTS.parent / "runs"
 USAGE = 2
 """Exit code of a call that cannot be run as it is."""
 MEMORY_SHARE = 0.8
-"""Default share of the machine's memory for all jobs together."""
+"""Default share of the available memory for all jobs together."""
 MOST_SENT = 1_000
 """Largest number of jobs in a cluster's queue."""
 CLUSTER_DEFAULTS = {"slurm": {"timeout_min": 24 * 60, "gpus_per_node": 1, "cpus_per_task": 4, "mem_gb": 32}}
@@ -115,10 +119,9 @@ class Lab:
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
-    def model(self, result: Result, *, first_stage: bool = False) -> a2tg.Model | None:
-        """Return the model of a run, or of its first stage; print a line and return None if it is missing."""
-        job = dataclasses.replace(result.run.job, stage=0) if first_stage else result.run.job
-        path = self.folders.model(job)
+    def model(self, result: Result) -> a2tg.Model | None:
+        """Return the model of a run; print a line and return None if it is missing."""
+        path = self.folders.model(result.run.job)
         if path.is_file():
             return a2tg.load_model(path)
         print(
@@ -183,20 +186,33 @@ class Lab:
 
     def machine(self) -> Machine:
         """Return what --plan plans for."""
-        return Machine(self.args.jobs or machine.default_jobs(), self._memory(), machine.num_gpus() > 0)
+        return Machine(self.args.jobs or default_jobs(), self._memory(), num_gpus() > 0)
 
     def _memory(self) -> float:
         """Return the bytes that jobs of this machine may take together."""
-        return self.args.memory_gb * 1e9 if self.args.memory_gb is not None else MEMORY_SHARE * machine.memory_bytes()
+        return self.args.memory_gb * 1e9 if self.args.memory_gb is not None else MEMORY_SHARE * memory_limit()
 
     def _pool(self) -> Pool:
         args, inf, memory = self.args, float("inf"), self._memory()
         if args.cluster:
             parameters = {**CLUSTER_DEFAULTS.get(args.cluster, {}), **dict(map(_parameter, args.cluster_parameter))}
             is_here = args.cluster == "local"
-            slots = args.jobs or (machine.default_jobs() if is_here else MOST_SENT)
+            slots = args.jobs or (default_jobs() if is_here else MOST_SENT)
             return SubmititPool(args.cluster, self.work / "submitit", slots, memory if is_here else inf, **parameters)
-        return LocalPool(args.jobs or machine.default_jobs(), memory, machine.num_gpus())
+        return LocalPool(args.jobs or default_jobs(), memory, num_gpus())
+
+
+@functools.cache
+def num_gpus() -> int:
+    """Return the number of GPUs that JAX sees. Another process looks, since JAX would take their memory in this one."""
+    script = "import jax; print(len(jax.devices()) if jax.default_backend() == 'gpu' else 0)"
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False).stdout.split()
+    return int(found[-1]) if found and found[-1].isdigit() else 0
+
+
+def default_jobs() -> int:
+    """Return one job a GPU, whose memory jobs would share, else one a core that the process may use in full."""
+    return num_gpus() or max(1, math.floor(min(num_cores(), cpu_quota())))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -284,7 +300,7 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--work", type=Path, help="folder of models and checkpoints; default: runs/experiments/SCALE")
     add("--lpips-weights", type=Path, help="weights of LPIPS (AlexNet); without them LPIPS is left out")
     add("--jobs", type=int, help="number of jobs at a time; default: one a GPU, else one a core")
-    add("--memory-gb", type=float, help="memory of all jobs on this machine together; default: 80%% of it")
+    add("--memory-gb", type=float, help="memory of all jobs on this machine together; default: 80%% of what is free")
     add("--cluster", help='send jobs out with submitit: "slurm", or "local" for processes of this machine')
     add("--cluster-parameter", action="append", default=[], metavar="NAME=VALUE",
         help="parameter of submitit, such as mem_gb=32; may be repeated")  # fmt: skip

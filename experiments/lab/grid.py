@@ -27,11 +27,11 @@ from lab.grid_file import (
     blocks_of,
     method_tables,
     read_grid_file,
+    read_toml,
     shared_scale,
 )
 from lab.jobs import Job, Record
 from lab.scenes import SceneAt, chosen_scenes, read_scenes
-from lab.toml_tables import read_toml
 
 REHEARSAL = 100
 """Factor by which a rehearsal is shorter."""

@@ -1,26 +1,15 @@
 """Models changed so that a render shows the effect of textures and the places of large ones."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
-from PIL import Image
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.results.figures import with_flat_colors
-from a2tg_jax.results.images import side_by_side
 
-LEAST_WIDTH = 300
-"""Least width of an image in a sheet, in pixels."""
 SQUARE, OBLONG = (0.15, 0.35, 0.95), (0.9, 0.12, 0.1)
 """The paper's colours: blue for textures of 2×2 and 4×4 texels, red for those that are not square."""
-
-
-def sheet(images: Sequence[np.ndarray], captions: Sequence[str]) -> Image.Image:
-    """Return images side by side under their captions, enlarged without smoothing until captions fit."""
-    zoom = -(-LEAST_WIDTH // images[0].shape[1])
-    return side_by_side([enlarged(image, zoom) for image in images], captions)
 
 
 def enlarged(image: np.ndarray, zoom: int) -> np.ndarray:

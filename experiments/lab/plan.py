@@ -118,7 +118,7 @@ class Forecaster:
 
     def __init__(self, folders: Folders):
         self._folders = folders
-        self._scenes: dict[tuple[str, int], a2tg.Scene] = {}
+        self._scenes: dict[tuple, a2tg.Scene] = {}
         self._chains: dict[str, list[float]] = {}
 
     def seconds(self, job: Job) -> float:
@@ -129,7 +129,7 @@ class Forecaster:
         return self._chains[last][job.stage]
 
     def _scene(self, job: Job) -> a2tg.Scene:
-        place = job.scene, job.downscale
+        place = job.scene, job.downscale, job.fold, job.validation
         if place not in self._scenes:
             self._scenes[place] = self._folders.load_scene(job, room=0)
         return self._scenes[place]

@@ -47,26 +47,18 @@ def lines(axes: Axes, curves: Mapping[str, Sequence[Point]], x_label: str, y_lab
 COLUMNS, LEGEND_COLUMNS = 3, 4
 
 
-def charts(
-    panels: Sequence[tuple[str, Mapping[str, Sequence[Point]], str, str]], *, log_y: Sequence[bool] = ()
-) -> Figure:
+def charts(panels: Sequence[tuple[str, Mapping[str, Sequence[Point]], str, str]]) -> Figure:
     """Return several charts, three in a row, with one legend.
 
     Args:
       panels: title, curves by label, and labels of the axes.
-      log_y: whether each panel has a logarithmic y.
     """
     columns = min(COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(4.4 * columns, 3.4 * rows + 0.5), layout="constrained")
     row = [figure.add_subplot(rows, columns, index + 1) for index in range(len(panels))]
-    for index, (axes, (title, curves, x_label, y_label)) in enumerate(zip(row, panels, strict=True)):
+    for axes, (title, curves, x_label, y_label) in zip(row, panels, strict=True):
         lines(axes, curves, x_label, y_label, title)
-        if index < len(log_y) and log_y[index]:
-            axes.set_yscale("log")
-            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
-            axes.yaxis.set_minor_formatter(NullFormatter())
     handles = {label: handle for axes in row for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     columns = min(LEGEND_COLUMNS, max(1, len(handles)))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, fontsize=8)
@@ -90,29 +82,3 @@ def forest(found: Mapping[str, tuple[Sequence[float], float, float]], x_label: s
     axes.set_xlabel(x_label)
     axes.grid(alpha=0.25, axis="x")
     return figure
-
-
-def shares_chart(shares: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Return bars of the share of Gaussians with a texture of each size.
-
-    Args:
-      shares: shares by scene, then by "rows×columns".
-    """
-    sizes = sorted({size for own in shares.values() for size in own}, key=_area)
-    figure = Figure(figsize=(1.5 + 0.9 * len(sizes), 3.6), layout="constrained")
-    axes = figure.add_subplot()
-    width = 0.8 / max(1, len(shares))
-    for index, (scene, own) in enumerate(shares.items()):
-        x = np.arange(len(sizes)) + (index - (len(shares) - 1) / 2) * width
-        axes.bar(x, [100 * own.get(size, 0.0) for size in sizes], width, label=scene)
-    axes.set_xticks(range(len(sizes)), [size.replace("x", "×") for size in sizes])
-    axes.set_xlabel("texels along v × along u")
-    axes.set_ylabel("share of the Gaussians, %")
-    axes.grid(alpha=0.25, axis="y")
-    axes.legend(fontsize=8)
-    return figure
-
-
-def _area(size: str) -> tuple[int, int]:
-    rows, columns = map(int, size.split("x"))
-    return rows * columns, rows

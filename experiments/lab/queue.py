@@ -20,7 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from a2tg_jax.host.text import shortened
 from lab.jobs import Folders, Job, Record, model_bytes, run_job
@@ -46,37 +46,6 @@ class Failure:
     reason: str
 
 
-class Handle(Protocol):
-    """A running job, as in `concurrent.futures` and submitit."""
-
-    def done(self) -> bool: ...
-
-    def result(self) -> Any: ...
-
-
-class Pool(Protocol):
-    """Processes that run jobs."""
-
-    slots: int
-    """Largest number of jobs at a time."""
-    memory: float
-    """Bytes that the jobs may take together."""
-
-    def submit(self, job: Job, folders: Folders) -> Handle: ...
-
-    def is_death(self, error: Exception) -> bool:
-        """Return whether an error means that a job's process died, not that the job failed."""
-        ...
-
-    def abort(self) -> None:
-        """End the running jobs at once; they continue from their checkpoints."""
-        ...
-
-    def close(self) -> None:
-        """Release processes and memory."""
-        ...
-
-
 class LocalPool:
     """Processes of this machine, each with its share of the cores and GPUs.
 
@@ -95,7 +64,7 @@ class LocalPool:
             shares.put((cores[index :: self.slots] or cores, index % self._num_gpus if self._num_gpus else None))
         return concurrent.futures.ProcessPoolExecutor(self.slots, context, _begin_worker, (shares,))
 
-    def submit(self, job: Job, folders: Folders) -> Handle:
+    def submit(self, job: Job, folders: Folders) -> concurrent.futures.Future:
         with _interrupts_ignored():  # The processes that begin here leave Ctrl-C to this one.
             try:
                 return self._executor.submit(run_job, job, folders)
@@ -104,13 +73,16 @@ class LocalPool:
                 return self._executor.submit(run_job, job, folders)
 
     def is_death(self, error: Exception) -> bool:
+        """Return whether an error means that a job's process died, not that the job failed."""
         return isinstance(error, concurrent.futures.BrokenExecutor)
 
     def abort(self) -> None:
+        """End the running jobs at once; they continue from their checkpoints."""
         for process in multiprocessing.active_children():
             process.terminate()
 
     def close(self) -> None:
+        """Release processes and memory."""
         self._executor.shutdown(cancel_futures=True)
 
 
@@ -178,7 +150,7 @@ class SubmititPool:
         self._executor.update_parameters(**parameters)
         self._sent: list[Any] = []
 
-    def submit(self, job: Job, folders: Folders) -> Handle:
+    def submit(self, job: Job, folders: Folders) -> Any:
         self._sent.append(self._executor.submit(Elsewhere(), job, folders))
         return self._sent[-1]
 
@@ -193,6 +165,9 @@ class SubmititPool:
         for handle in self._sent:
             if not handle.done():
                 handle.cancel()
+
+
+Pool = LocalPool | SubmititPool
 
 
 class Elsewhere:
@@ -220,7 +195,7 @@ def error_text(error: Exception) -> str:
     return shortened(f"{type(error).__name__}: {' '.join(lines)}", LONGEST_REASON)
 
 
-def log_text(handle: Handle) -> str:
+def log_text(handle: Any) -> str:
     """Return where the log of a job lies, if it has one."""
     paths = getattr(handle, "paths", None)
     return f"; log: {paths.stderr}" if paths is not None else ""
@@ -249,7 +224,7 @@ def run_all(
     Returns:
       The failed jobs. Jobs that need their results are not run.
     """
-    running: dict[str, tuple[Job, Handle]] = {}
+    running: dict[str, tuple[Job, Any]] = {}
     failures: dict[str, Failure] = {}
     deaths: collections.Counter[str] = collections.Counter()
 

@@ -10,8 +10,7 @@ import numpy as np
 import a2tg_jax as a2tg
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.host.text import did_you_mean
-from lab.grid_file import Block
-from lab.toml_tables import table_as
+from lab.grid_file import Block, table_as
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from lab import tables
 from lab.cli import Experiment, Lab
-from lab.figures import figures_table
 from lab.grid import Grid
 from lab.grid_file import SUFFIX
 from lab.tables import Result
@@ -13,7 +12,7 @@ from lab.tables import Result
 
 def _gains(grid: Grid, results: Sequence[Result]) -> str:
     gains = tables.variants_of_reference(grid, results)
-    return f"{gains}\n## Figures of every method\n\n{figures_table(results)}"
+    return f"{gains}\n## Figures of every method\n\n{tables.figures_table(results)}"
 
 
 def _choices(grid: Grid, results: Sequence[Result]) -> str:

@@ -337,3 +337,17 @@ def _mean_gain(results: Sequence[Result], base: Mapping[Cell, Result]) -> tuple[
 def _gain_text(gain: Sequence[float]) -> str:
     decibels, distance = gain
     return f"{signed(decibels, 2)} · {signed(distance, 3)}"
+
+
+def figures_table(results: Sequence[Result]) -> str:
+    """Return a row for every method in each cell, averaged over seeds, with its figures, which gains alone do not
+    show."""
+    rows = []
+    for _, block in grouped(results, lambda result: dataclasses.replace(result.run.cell, seed=0)):
+        for label, own in grouped(block, lambda result: result.label):
+            width, height = own[0].record["pixels"]
+            place = [own[0].run.cell.scene.label, f"{width}×{height}", iterations(own), label, num_gaussians(own)]
+            figures = [number(mean(own, "mb"), 2), quality(own), number(mean(own, "train_psnr"), 2)]
+            rows.append([*place, *figures, str(len(own))])
+    header = ["scene", "pixels", "iterations", "method", "Gaussians", "MB", "PSNR / SSIM / LPIPS", "train PSNR"]
+    return markdown([*header, "seeds"], rows)
