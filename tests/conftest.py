@@ -13,21 +13,29 @@ import pathlib
 import sys
 
 import jax
+import psutil
 import pytest
+
+from a2tg_jax.host.operating_system import trim_heap
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Tracing makes so many objects that their collection takes a fifteenth of the tests' time. What was imported stays.
-gc.freeze()
+# Tracing makes so many objects that their collection takes a fifteenth of the tests' time.
 gc.set_threshold(100_000, 50, 50)
 
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 READERS = pathlib.Path(__file__).resolve().parents[1] / "docs" / "reference"
 
 
-LONGEST = {"test_bytewise", "test_experiments", "test_systems", "test_viewer_browser"}
+LONGEST = {
+    "test_bytewise", "test_devices", "test_experiments", "test_processes", "test_systems", "test_viewer_browser",
+}  # fmt: skip
 """Files that come first, so that no process is left with one of them while the others have nothing to do."""
+MOST_BYTES = 2.5e9
+"""Memory of a process beyond which compiled programs are dropped: about 6,000 pieces of memory on Linux."""
+OTHER_KERNELS = {"test_gpu_kernels", "test_losses", "test_platforms"}
+"""Modules whose programs are made of other kernels than those of this machine."""
 
 
 def pytest_addoption(parser):
@@ -51,13 +59,21 @@ def pytest_collection_modifyitems(config, items):
                 item.add_marker(pytest.mark.skip(reason="takes long: pytest --long"))
 
 
-@pytest.fixture(autouse=True, scope="module")
-def fresh_caches():
-    """Compiled programs go with the module that needed them: a process may only have so many pieces of memory, and XLA
-    waits for ever where it gets none (vm.max_map_count)."""
-    yield
-    jax.clear_caches()
+def pytest_collection_finish():
+    """What was imported stays: no collection looks at it again."""
     gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def fresh_caches(request):
+    """Compiled programs are dropped before there are too many. They take memory, in pieces of which a process may only
+    have so many, and XLA waits for ever where it gets none (vm.max_map_count)."""
+    yield
+    if request.module.__name__ in OTHER_KERNELS or psutil.Process().memory_info().rss > MOST_BYTES:
+        jax.clear_caches()
+        gc.collect()
+        trim_heap()
 
 
 @pytest.fixture

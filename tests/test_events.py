@@ -113,6 +113,7 @@ def test_an_event_that_removes_rows_compiles_nothing(scene):
         assert result.num_regrown == 0
         return result, num_compiled(jitted_step()) - before
 
+    jitted_step().clear_cache()
     kept, num_kept = trained("rows")
     assert num_kept == 1 and kept.model.num == 50 - 5 * 5
     message = (

@@ -5,20 +5,23 @@ import dataclasses
 import json
 import re
 import shutil
+from types import SimpleNamespace
 
 import choose_plain
 import efficiency
 import numpy as np
 import pytest
+import small_models
 from experiment_records import CELL, GRID, record, result
 from lab import pages, spreadsheet, tables
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.grid import Grid, Method, Run, read_grid
-from lab.jobs import Job
+from lab.jobs import Folders, Job
 from lab.kept import read_kept
 from lab.plan import duration
 from lab.scenes import SceneAt
-from run import experiments, main
+from lab.stages import chain
+from run import experiments, main, parse_arguments
 
 import a2tg_jax as a2tg
 
@@ -73,6 +76,36 @@ def test_short_times_are_not_zero():
     assert efficiency._row(result("own", 20.0), times)[-2] == "0.02"
     assert efficiency._row(result("own", 20.0), {**times, "iterations": [6000, 4000]})[-2] == "1.9"
     assert duration(59) == "a minute"
+
+
+def test_times_of_the_efficiency_page_are_measured_once(tmp_path, monkeypatch):
+    """Every stage so far with all Gaussians of the first stage's model; a second page measures nothing."""
+    given = ["efficiency", "--scale", "smoke", "--out", str(tmp_path / "out"), "--work", str(tmp_path / "work")]
+    lab = Lab(parse_arguments(experiments(), given))
+    grid, fitted = lab.grid("efficiency"), []
+    for job in (one for last in grid.jobs({}) for one in chain(last)):
+        path = lab.folders.model(job)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        a2tg.save_model(path, small_models.some_model())
+        lab.records[job.key] = record(mb=0.5)
+
+    def fit(scene, system, index, start, progress):
+        fitted.append((index, system.stages()[index].iterations, start.num))
+        pace = 10.0 + 5 * index
+        history = SimpleNamespace(seconds=np.arange(3) * pace, iteration=1000 * np.arange(3))
+        return SimpleNamespace(history=history)
+
+    monkeypatch.setattr(Folders, "load_scene", lambda *_: SimpleNamespace(test=()))
+    monkeypatch.setattr(efficiency, "fit_stage", fit)
+    monkeypatch.setattr(a2tg, "evaluate", lambda *_: SimpleNamespace(frames_per_second=40.0), raising=False)
+    for _ in range(2):
+        efficiency.present(lab, [grid])
+    num = small_models.some_model().num
+    assert fitted == [(0, 20, num), (1, 20, num), (0, 20, num)]
+    page = (lab.out / "efficiency.md").read_text(encoding="utf-8")
+    rows = [line for line in page.splitlines() if "| built-in |" in line]
+    assert "| A²TG | 1,000 | 0.50 | 40.0 | 25.0 | 10.0, 15.0 | 0.01 |" in rows[0]
+    assert "| 2DGS*-MCMC, first stage | 1,000 | 0.50 | 40.0 | 25.0 | 10.0 | 0.01 |" in rows[1] and len(rows) == 2
 
 
 def test_finished_runs_are_rows_of_a_spreadsheet():

@@ -13,6 +13,7 @@ from a2tg_jax.host.machine import keep_room_for_programs, memory_limit, tidy_mem
 from a2tg_jax.host.operating_system import trim_heap
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import Session
+from a2tg_jax.training.step import jitted_step
 
 
 def proc(folder, count: int, limit: str):
@@ -51,6 +52,7 @@ def test_training_calls_its_session_after_compiling(monkeypatch):
         tidy_memory()
         dropped.append(double._cache_size())
 
+    jitted_step().clear_cache()
     fit(scene, Gaussians2dMcmc(stage1_iterations=2), progress=False, session=Session(tidy))
     assert dropped[:2] == [1, 0]
 

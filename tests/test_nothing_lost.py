@@ -500,18 +500,6 @@ def test_a_second_signal_ends_the_program_at_once():
     assert raised.value.exit_code == 143
 
 
-@pytest.mark.long
-def test_a_closed_pipe_is_quiet(tmp_path):
-    run = filled(tmp_path / "run")
-    run.model(NAME).unlink()
-    command = f"{sys.executable} -m a2tg_jax info {run.path}; echo $? >&2"
-    done = subprocess.run(
-        ["bash", "-c", f"({command}) | true"], capture_output=True, text=True, check=False,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )  # fmt: skip
-    assert done.stderr.strip() == "141"
-
-
 def test_errors_of_training_come_with_advice(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_training, "save_checkpoint", raising(OSError(28, "No space left on device")))
     assert cli.main([*TRAIN, "--out", str(tmp_path / "run")]) == 2

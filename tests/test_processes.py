@@ -46,11 +46,6 @@ def test_two_processes_train_as_one(tmp_path):
 
 
 @pytest.mark.long
-def test_events_change_the_same_in_two_processes():
-    ended(pair(["--what", "events"]))
-
-
-@pytest.mark.long
 def test_another_seed_than_the_first_process_has_is_refused(tmp_path):
     first, other = trainings(tmp_path / "run", SHORT, (), ("--seed", "1"))
     printed, _ = [process.communicate(timeout=120)[1] for process in (first, other)]
@@ -58,9 +53,9 @@ def test_another_seed_than_the_first_process_has_is_refused(tmp_path):
     assert first.returncode == LOST
 
 
-def waiting(what="wait"):
-    """Two processes that have met, and read photographs before if that is asked for."""
-    processes = pair(["--what", what, "--seconds", "2"])
+def waiting(what="wait", seconds=2):
+    """Two processes that have met, and shared photographs and rows before if that is asked for."""
+    processes = pair(["--what", what, "--seconds", str(seconds)])
     for process in processes:
         if process.stdout.readline() != "met\n":
             pytest.fail(str(ended(processes, 10)))
@@ -68,22 +63,18 @@ def waiting(what="wait"):
 
 
 @pytest.mark.long
-def test_each_process_reads_what_it_draws_and_an_error_of_the_first_ends_both_at_once():
-    first, other = waiting("read")
+def test_each_process_has_its_share_and_an_error_of_the_first_ends_both_at_once():
+    """Of the photographs that it draws, and of rows that events on the host change."""
+    first, other = waiting("share", 60)
     first.send_signal(signal.SIGINT)
     printed = [process.communicate(timeout=20)[1] for process in (first, other)]
     assert "KeyboardInterrupt" in printed[0] and first.returncode == -signal.SIGINT
     assert printed[1] == "" and other.returncode == LOST
 
 
-@pytest.mark.parametrize(
-    ("victim", "number"), [(0, signal.SIGKILL), pytest.param(1, signal.SIGSTOP, marks=pytest.mark.long)]
-)
-def test_a_lost_process_is_noticed(victim, number):
-    processes = waiting()
-    took, printed = survivor_of(processes, victim, number, 60)
-    reason = "has ended" if number == signal.SIGKILL else "was not heard from for 2 s"
-    assert printed == f"a2tg: error: process {victim} of 2 {reason}; go on\n" and took < 8
+def test_a_lost_process_is_noticed():
+    took, printed = survivor_of(waiting(), 0, signal.SIGKILL, 60)
+    assert printed == "a2tg: error: process 0 of 2 has ended; go on\n" and took < 8
 
 
 def test_a_process_that_does_not_come_is_reported():

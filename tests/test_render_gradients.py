@@ -130,6 +130,7 @@ def assert_gradients_close(gradient: Any, expected: Float, name: str):
     np.testing.assert_allclose(np.asarray(gradient) / scale, expected / scale, atol=1e-5, rtol=0, err_msg=name)
 
 
+@functools.cache
 def smooth_scene(seed: int, rules: Rules) -> Scene:
     """A scene whose every pixel keeps clear of thresholds and kinks, and in which every splat shows."""
     scene = draw_smooth_scene(seed)
@@ -141,20 +142,36 @@ def smooth_scene(seed: int, rules: Rules) -> Scene:
     return scene
 
 
-def assert_leaves_match(gradient: Inputs, scene: Scene, rules: Rules, texels: list[Float] | None = None):
-    """Every leaf, by differences with the given lookups or, without them, with lookups that move; and every texel."""
-    for name in LEAVES:
-        found = getattr(gradient, name) if hasattr(gradient, name) else getattr(gradient.gaussians, name)
-        assert_gradients_close(found, differences(getattr(scene, name), oracle_loss(scene, rules, name, texels)), name)
-    if gradient.textures is None:
-        return
+def expected_gradient(scene: Scene, rules: Rules, texels: list[Float] | None = None) -> dict[str, Float]:
+    """Differences by every leaf, with the given lookups or, without them, with lookups that move; and by each texel."""
+    found = {name: differences(getattr(scene, name), oracle_loss(scene, rules, name, texels)) for name in LEAVES}
+    if scene.textures is None:
+        return found
     loss = oracle_loss(scene, rules, "textures")
-    for i, found in enumerate(a2tg.texture_arrays(gradient.textures)):
+    for i, texture in enumerate(scene.textures):
 
         def loss_of_one(texture: Float, i: int = i) -> float:
             return loss([*scene.textures[:i], texture, *scene.textures[i + 1 :]])
 
-        assert_gradients_close(found, differences(scene.textures[i], loss_of_one), f"texture {i}")
+        found[f"texture {i}"] = differences(texture, loss_of_one)
+    return found
+
+
+@functools.cache
+def expected_by_default(seed: int) -> dict[str, Float]:
+    """Differences of a smooth scene under the default rules, which several tests compare with."""
+    return expected_gradient(smooth_scene(seed, DEFAULT_RULES), DEFAULT_RULES)
+
+
+def assert_leaves_match(gradient: Inputs, expected: dict[str, Float]):
+    """Every leaf and every texel."""
+    leaves = {**vars(gradient.gaussians), **gradient._asdict()}
+    found = {name: leaves[name] for name in LEAVES}
+    if gradient.textures is not None:
+        found |= {f"texture {i}": texels for i, texels in enumerate(a2tg.texture_arrays(gradient.textures))}
+    assert found.keys() == expected.keys()
+    for name, own in found.items():
+        assert_gradients_close(own, expected[name], name)
 
 
 @pytest.mark.usefixtures("x64")
@@ -165,7 +182,7 @@ def assert_leaves_match(gradient: Inputs, scene: Scene, rules: Rules, texels: li
 def test_every_leaf_against_differences(seed, compositor):
     scene = smooth_scene(seed, DEFAULT_RULES)
     _, gradient = package_gradient(scene, "float64", a2tg.RenderSettings(compositor=compositor))
-    assert_leaves_match(gradient, scene, DEFAULT_RULES)
+    assert_leaves_match(gradient, expected_by_default(seed))
 
 
 @long
@@ -175,10 +192,10 @@ def test_official_gradients_stop_at_the_lookup_and_textures_may_be_missing():
     scene = smooth_scene(SMOOTH_SEEDS[0], OFFICIAL)
     texels = [layer.texel for layer in oracle.splat_layers(scene, OFFICIAL)]
     _, gradient = package_gradient(scene, "float64", a2tg.RenderSettings.official())
-    assert_leaves_match(gradient, scene, OFFICIAL, texels)
+    assert_leaves_match(gradient, expected_gradient(scene, OFFICIAL, texels))
     plain = smooth_scene(SMOOTH_SEEDS[0], DEFAULT_RULES)._replace(textures=None)
     _, gradient = package_gradient(plain, "float64", a2tg.RenderSettings())
-    assert_leaves_match(gradient, plain, DEFAULT_RULES)
+    assert_leaves_match(gradient, expected_gradient(plain, DEFAULT_RULES))
 
 
 @long

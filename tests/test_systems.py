@@ -25,6 +25,8 @@ from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.step import jitted_step
 from a2tg_jax.training.terms import opacity
 
+BUDGETS = {"textured-gaussians": "39.1kB", "supergaussians": "27.3kB", "bbsplat": "346kB"}
+"""Room for 80 Gaussians; the other systems have budgets in `test_budget`."""
 TINY = {"stage1_iterations": 24, "initial_gaussians": 60, "densify": {"cap": 80}}
 
 
@@ -90,9 +92,12 @@ def check_run(scene, system, folder, every: int = 8):
 
 @pytest.mark.parametrize("name", by_system(*SYSTEMS))
 def test_every_system_trains_resumes_saves_and_renders(scene, tmp_path, name):
-    system = tiny(name)
+    system = tiny(name, memory_budget=BUDGETS.get(name))
     result = check_run(scene, system, tmp_path)
     history = result.history
+    if system.memory_budget is not None:
+        assert history.megabytes.max() <= system.memory_budget
+        assert 0.995 * system.budget_bytes <= result.model.num_bytes
     assert np.isfinite(history.loss).all() and history.loss[-1] < history.loss[0]
     assert [stage.name for stage in result.stages] == [stage.name for stage in system.stages()]
 
@@ -182,48 +187,6 @@ def test_official_is_a_preset_of_all_options():
     assert official.noise_in_stage2 and official.stages()[0].appearance.max_alpha == 0.999
     first, second = (stage.appearance for stage in tiny("textured-gaussians", lookup={"max_alpha": 0.95}).stages())
     assert first.alpha_limit == second.alpha_limit == 0.95
-
-
-VARIANTS = [
-    {},
-    {"seed": 1},
-    {"rates": {"means": 2e-4, "sh_rest": 2e-4}},
-    {"loss": {"ssim_weight": 0.1, "scale_weight": 0.1}},
-    {"loss": {"ssim_weight": 0.3, "scale_weight": 5.0}},
-    {"stage1_iterations": 20, "stage2_iterations": 20},
-]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "name, event, thresholds",
-    [
-        ("gaussians-2d", "densify", [{"threshold": number} for number in (3e-4, 4e-4)]),
-        ("a2tg", "texture", [{"threshold": number, "select": "threshold"} for number in (1e-6, 4e-6)]),
-    ],
-)
-def test_a_sweep_compiles_each_step_once(scene, name, event, thresholds):
-    """In a process that has compiled nothing yet. A traced weight is the weight: large scales cost more."""
-    session, counts, scales = a2tg.Session(), [], []
-    jitted_step().clear_cache()
-    fixed: dict = {"loss": {"scale_weight": 0.01}}
-    if name == "a2tg":
-        fixed["texture"] = {"at": [0.5]}
-    for changes in [*VARIANTS, *({event: threshold} for threshold in thresholds)]:
-        before, rooms = num_compiled(jitted_step()), copy.deepcopy(session.capacities)
-        merged = {key: {**fixed.get(key, {}), **changes.get(key, {})} for key in ("loss", "texture")}
-        merged = {**changes, **{key: value for key, value in merged.items() if value}}
-        result = a2tg.fit(scene, tiny(name, **merged), progress=False, session=session)
-        # Lists that grow in the middle of a run are compiled again; a run records how often that was.
-        count = max(0, num_compiled(jitted_step()) - before - result.num_regrown)
-        counts.append((count, session.capacities == rooms))
-        scales.append(float(jnp.mean(result.stages[0].model.gaussians.scales)))
-    # So are lists that must be longer from the start, as where a seed puts more splats on the screen. The events of
-    # another rule (select) are another program.
-    chosen = counts[1:] if name != "a2tg" else [*counts[1 : len(VARIANTS)], *counts[len(VARIANTS) + 1 :]]
-    again = [count for count, had_room in chosen if had_room]
-    assert len(again) > 3 and not any(again), f"traces per run, and whether it had room: {counts}"
-    assert scales[3] > scales[4]
 
 
 def test_the_host_waits_once_for_many_steps(scene, monkeypatch):
@@ -368,3 +331,46 @@ def test_the_opacity_term_acts_on_what_a_billboard_shows():
     slopes = jax.grad(lambda floats: opacity(combine(floats, rest), None, None))(floats)
     assert not np.asarray(slopes.gaussians.logit_opacities).any()
     assert sum(float(jnp.sum(leaf)) for leaf in jax.tree.leaves(slopes.appearance)) > 0
+
+
+VARIANTS = [
+    {},
+    {"seed": 1},
+    {"rates": {"means": 2e-4, "sh_rest": 2e-4}},
+    {"loss": {"ssim_weight": 0.1, "scale_weight": 0.1}},
+    {"loss": {"ssim_weight": 0.3, "scale_weight": 5.0}},
+    {"stage1_iterations": 20, "stage2_iterations": 20},
+]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "name, event, thresholds",
+    [
+        ("gaussians-2d", "densify", [{"threshold": number} for number in (3e-4, 4e-4)]),
+        ("a2tg", "texture", [{"threshold": number, "select": "threshold"} for number in (1e-6, 4e-6)]),
+    ],
+)
+def test_a_sweep_compiles_each_step_once(scene, name, event, thresholds):
+    """In a process that has compiled nothing yet: it comes last in this file, since it drops what others compiled. A
+    traced weight is the weight: large scales cost more."""
+    session, counts, scales = a2tg.Session(), [], []
+    jitted_step().clear_cache()
+    fixed: dict = {"loss": {"scale_weight": 0.01}}
+    if name == "a2tg":
+        fixed["texture"] = {"at": [0.5]}
+    for changes in [*VARIANTS, *({event: threshold} for threshold in thresholds)]:
+        before, rooms = num_compiled(jitted_step()), copy.deepcopy(session.capacities)
+        merged = {key: {**fixed.get(key, {}), **changes.get(key, {})} for key in ("loss", "texture")}
+        merged = {**changes, **{key: value for key, value in merged.items() if value}}
+        result = a2tg.fit(scene, tiny(name, **merged), progress=False, session=session)
+        # Lists that grow in the middle of a run are compiled again; a run records how often that was.
+        count = max(0, num_compiled(jitted_step()) - before - result.num_regrown)
+        counts.append((count, session.capacities == rooms))
+        scales.append(float(jnp.mean(result.stages[0].model.gaussians.scales)))
+    # So are lists that must be longer from the start, as where a seed puts more splats on the screen. The events of
+    # another rule (select) are another program.
+    chosen = counts[1:] if name != "a2tg" else [*counts[1 : len(VARIANTS)], *counts[len(VARIANTS) + 1 :]]
+    again = [count for count, had_room in chosen if had_room]
+    assert len(again) > 3 and not any(again), f"traces per run, and whether it had room: {counts}"
+    assert scales[3] > scales[4]

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bits import bits_of
 from kept_checkpoints import fit_keeping_checkpoints
 from own_fusions import passes_in_its_own_process
 
@@ -14,6 +15,7 @@ from a2tg_jax import (
     A2tg,
     Change,
     Checkpoint,
+    Interrupted,
     RenderSettings,
     StepEvent,
     Term,
@@ -28,8 +30,9 @@ from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
 from a2tg_jax.core.pytree import num_compiled, pytree
 from a2tg_jax.core.table import Shape
+from a2tg_jax.densify.clone_split import CloneSplitPrune
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.systems.baselines import Gaussians2dMcmc
+from a2tg_jax.systems.baselines import Gaussians2d, Gaussians2dMcmc
 from a2tg_jax.training import LossConfig, Session, Stage, fit_stage, like, loop
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.start import initial_model, padded
@@ -54,9 +57,9 @@ def scene():
 @pytest.fixture(scope="module")
 def trained(scene):
     """A whole run, its checkpoints, and how many traces it took."""
-    before = num_compiled(jitted_step())
+    jitted_step().clear_cache()
     result, checkpoints = fit_keeping_checkpoints(scene, CONFIG)
-    return result, checkpoints, num_compiled(jitted_step()) - before
+    return result, checkpoints, num_compiled(jitted_step())
 
 
 def assert_same(a, b):
@@ -88,26 +91,60 @@ def test_a_second_or_resumed_run_is_the_same(scene, trained, tmp_path, place):
 
 
 @pytest.mark.long
+def test_what_ran_before_in_the_process_changes_nothing(scene, trained):
+    """Runs in between leave larger tile lists, other buckets of textures, other programs, another seed's orders."""
+    before, texture = trained[0], Upscale(at=(0.5,), cap=8, fraction=0.9)
+    other = fit(scene, dataclasses.replace(CONFIG, densify=Mcmc(cap=150), texture=texture, seed=4), progress=False)
+    fit(scene, Gaussians2d(stage1_iterations=20, densify=CloneSplitPrune(cap=200), batch_size=2), progress=False)
+    again = fit(scene, CONFIG, progress=False)
+    assert bits_of(again.model) == bits_of(before.model)
+    jax.tree.map(np.testing.assert_array_equal, again.stages[0].model, before.stages[0].model)
+    np.testing.assert_array_equal(again.history.loss, before.history.loss)
+    assert bits_of(other.model) != bits_of(before.model)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("calls", "stage"), [(17, 0), (40, 1)])
+def test_a_stop_between_any_two_steps_changes_nothing(scene, trained, tmp_path, calls, stage):
+    left, kept = iter(range(calls)), []
+
+    def keep(checkpoint):
+        kept.append((checkpoint.stage, checkpoint.iteration))
+        save_checkpoint(tmp_path / "checkpoint.npz", checkpoint)
+
+    rows = []
+    with pytest.raises(Interrupted, match=f"of stage {stage + 1}; the model is error.checkpoint.model") as stopped:
+        is_stopped = lambda: next(left, None) is None  # noqa: E731
+        fit(scene, CONFIG, on_checkpoint=keep, on_log=rows.append, progress=False, is_stopped=is_stopped)
+    assert kept[-1][0] == stage and 0 < kept[-1][1] < 20 and kept[-1][1] % 10
+    saved, history = load_checkpoint(tmp_path / "checkpoint.npz"), stopped.value.checkpoint.history.to_dict()
+    jax.tree.map(np.testing.assert_array_equal, stopped.value.checkpoint.model, saved.model)
+    last = [row for row in rows if row["stage"] == stage + 1]
+    assert {name: [row[name] for row in last] for name in history} == jax.tree.map(list, history)
+    assert_same(fit(scene, CONFIG, resume=load_checkpoint(tmp_path / "checkpoint.npz"), progress=False), trained[0])
+
+
+@pytest.mark.long
 def test_shapes_of_earlier_runs_change_nothing(scene, tmp_path, request):
-    """Buckets with the room of another run's textures, one of them for a size that nobody has here."""
+    """Textures grow in buckets with the room of another run's textures, one of them for a size that nobody has here."""
     if passes_in_its_own_process(request):
         return
-    trained = request.getfixturevalue("trained")
-    model = trained[0].model
-    capacities = (*(len(bucket) + 2 for bucket in model.textures.buckets), 1)
-    session = Session()
-    session.shapes.add(Shape((*model.textures.bucket_sizes, (5, 5)), capacities))
+    start = initial_model(scene, CONFIG)
+    whole = fit_stage(scene, CONFIG, 1, start, progress=False)
+    textures, session = whole.model.textures, Session()
+    capacities = (*(len(bucket) + 2 for bucket in textures.buckets), 1)
+    session.shapes.add(Shape((*textures.bucket_sizes, (5, 5)), capacities))
     path, rooms = tmp_path / "checkpoint.npz", []
 
     def keep(checkpoint):
-        if checkpoint.iteration == 16 and checkpoint.stage == 1:
+        if checkpoint.iteration == 16:
             save_checkpoint(path, checkpoint)
             rooms.append(tuple(map(len, checkpoint.state.model.textures.buckets)))
 
     options = {"progress": False, "session": session}
-    assert_same(fit(scene, CONFIG, on_checkpoint=keep, checkpoint_every=8, **options), trained[0])
+    assert_same(fit_stage(scene, CONFIG, 1, start, on_checkpoint=keep, checkpoint_every=8, **options), whole)
     assert rooms == [capacities]
-    assert_same(fit(scene, CONFIG, resume=load_checkpoint(path), **options), trained[0])
+    assert_same(fit_stage(scene, CONFIG, 1, resume=load_checkpoint(path), **options), whole)
 
 
 @pytree

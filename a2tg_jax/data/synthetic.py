@@ -4,7 +4,9 @@ Its patterns have details of about 4 to 10 pixels, finer than one or two thousan
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
@@ -79,7 +81,7 @@ def synthetic_scene(
         )
     check_test_every(test_every)
     rng = np.random.default_rng(seed)
-    surfaces = light(still_life(rng), rng)
+    surfaces, rng.bit_generator.state = _lit_surfaces(seed)
     size = round(width / downscale), round(height / downscale)
     K = intrinsics(*size, FIELD_OF_VIEW)
     viewmats = [looking(center, TARGET - center, DOWN) for center in camera_path(num_views)]
@@ -98,6 +100,13 @@ def synthetic_scene(
         points = observed_points(xy[is_seen], depths[is_seen], shot.picture.size)
         shots[index] = dataclasses.replace(shot, points=points)
     return assemble_scene("synthetic", *every_kth(shots, test_every), cloud, source="the synthetic scene")
+
+
+@functools.lru_cache(maxsize=1)
+def _lit_surfaces(seed: int) -> tuple[list[Surface], Any]:
+    """Return the surfaces of a seed, and the state of its generator after them; neither depends on size or views."""
+    rng = np.random.default_rng(seed)
+    return light(still_life(rng), rng), rng.bit_generator.state
 
 
 def still_life(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.ndarray]]:

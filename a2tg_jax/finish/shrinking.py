@@ -10,6 +10,7 @@ of texels.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ from a2tg_jax.data import View
 from a2tg_jax.data.scene import check_are_views
 from a2tg_jax.finish.compaction import loss_on_views
 from a2tg_jax.model import Model, check_is_model
+from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, Textures
@@ -160,27 +162,35 @@ def texel_weights(model: Model, cameras: Sequence[Camera], background: ArrayLike
     assert model.textures is not None
     settings = plan_render(model, cameras)
     background = jnp.asarray(background, model.gaussians.means.dtype)
-
-    def weights_in(model: Model, camera: Camera, background: Array, key: Array) -> tuple[Array, ...]:
-        """Return the weights from one view, bucket by bucket."""
-        textures = model.textures
-        assert textures is not None
-
-        def draw(buckets: tuple[Array, ...]) -> Array:
-            shown = model.with_textures(dataclasses.replace(textures, buckets=buckets))
-            drawn = shown.gaussians, camera, shown.appearance, background, settings
-            return render_traced(*drawn, has_geometry=False)[0].color
-
-        color, back = jax.vjp(draw, textures.buckets)
-        # Hutchinson: for random signs ε, E[(Jᵀε)²] is the sum of J² over the pixels, h.
-        (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
-        return tuple(map(jnp.square, slopes))
-
-    total, jitted = tuple(map(jnp.zeros_like, model.textures.buckets)), jax.jit(weights_in)
+    total, jitted = tuple(map(jnp.zeros_like, model.textures.buckets)), _jitted_weights()
     for index, camera in enumerate(cameras):
         # A key for each view, fixed, so that the same model shrinks in the same way.
-        total = jax.tree.map(jnp.add, total, jitted(model, camera, background, jax.random.key(index)))
+        total = jax.tree.map(jnp.add, total, jitted(model, camera, background, jax.random.key(index), settings))
     return dataclasses.replace(model.textures, buckets=total)
+
+
+def _weights_in_view(
+    model: Model, camera: Camera, background: Array, key: Array, settings: RenderSettings
+) -> tuple[Array, ...]:
+    """Return h of every texel in one view, bucket by bucket."""
+    textures = model.textures
+    assert textures is not None
+
+    def draw(buckets: tuple[Array, ...]) -> Array:
+        shown = model.with_textures(dataclasses.replace(textures, buckets=buckets))
+        drawn = shown.gaussians, camera, shown.appearance, background, settings
+        return render_traced(*drawn, has_geometry=False)[0].color
+
+    color, back = jax.vjp(draw, textures.buckets)
+    # Hutchinson: for random signs ε, E[(Jᵀε)²] is the sum of J² over the pixels, h.
+    (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
+    return tuple(map(jnp.square, slopes))
+
+
+@functools.cache
+def _jitted_weights() -> Callable[[Model, Camera, Array, Array, RenderSettings], tuple[Array, ...]]:
+    """Return `_weights_in_view` under jit, with static settings; made at the first call."""
+    return jax.jit(_weights_in_view, static_argnums=(4,))
 
 
 # Textures of few texels in all

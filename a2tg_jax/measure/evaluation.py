@@ -1,13 +1,15 @@
 """Image quality and speed of a trained model on given views."""
 
 import dataclasses
+import functools
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
@@ -148,7 +150,6 @@ def evaluate(
     background = model.background if background is None else background
     cameras = [view.camera for view in views]
     renderer = Renderer(model, cameras=cameras, background=background, settings=settings, has_geometry=False)
-    measure = jax.jit(lambda *compared: (psnr(*compared), ssim(*compared), flat_psnr(*compared[1:])))
     per_view: list[ViewMetrics] = []
     seconds: list[float] = []
     renders: list[np.ndarray] = []
@@ -160,13 +161,24 @@ def evaluate(
         # Not clipped here: the metrics clip both images.
         if fit_colors:
             image = exposed(jnp.asarray(color_fit(image, target, mask), image.dtype), image)
-        decibels, similarity, flat = (float(figure) for figure in measure(image, target, mask))
+        decibels, similarity, flat = (float(figure) for figure in _jitted_figures()(image, target, mask))
         distance = None if weights is None else float(lpips(image, target, weights, mask))
         per_view.append(ViewMetrics(view.name, decibels, similarity, distance, flat))
         if len(renders) < num_renders:
             renders.append(np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8))
     network = None if weights is None else weights.network
     return Evaluation(tuple(per_view), network, 1.0 / float(np.median(seconds)), tuple(renders))
+
+
+def _figures_of(image: Array, target: Array, mask: Array | None) -> tuple[Array, Array, Array]:
+    """Return PSNR, SSIM and flat PSNR of a render and its photograph."""
+    return psnr(image, target, mask), ssim(image, target, mask), flat_psnr(target, mask)
+
+
+@functools.cache
+def _jitted_figures() -> Callable[[Array, Array, Array | None], tuple[Array, Array, Array]]:
+    """Return `_figures_of` under jit, made at the first call."""
+    return jax.jit(_figures_of)
 
 
 def _seconds(renderer: Renderer, camera: Camera) -> float:
