@@ -126,7 +126,7 @@ class Model:
         return int(allocated) - BYTES_PER_FLOAT * filled
 
     @property
-    def background_shown(self) -> tuple[float, ...]:
+    def default_background(self) -> tuple[float, ...]:
         """Background of renders that name none: the model's own, or 0 if its splats have other than three numbers."""
         num_colors = num_colors_of(self.appearance)
         return self.background if num_colors == len(self.background) else (0.0,) * num_colors
@@ -192,8 +192,8 @@ class Model:
         Args:
           camera: the view.
           features: [N, D] numbers to show instead of colours (`render_image`), one row for each allocated Gaussian.
-          background: [3] colour, or [D] features; None is the model's own, or 0 behind features and other than three
-            colours.
+          background: [3] colour, or [D] features; None is the model's own, or 0 for features and for appearances of
+            other than three colours.
           settings: static options; `texture` is ignored, since the appearance has its own options. Under jit they
             need a capacity: `plan_render(model, cameras)`.
 
@@ -205,7 +205,7 @@ class Model:
         """
         appearance = with_features(self.appearance, features, self.gaussians)
         if background is None and features is None:
-            background = self.background_shown
+            background = self.default_background
         return render_appearance(
             self.gaussians, camera, appearance, background=background, settings=settings, num_live=self.num_live
         )

@@ -133,7 +133,7 @@ class Renderer:
             model = Model(model, appearance or appearance_of(model, None, settings))
         check_gaussians(model.gaussians)
         check_is_appearance(model.appearance, model.gaussians)
-        background = model.background_shown if background is None else background
+        background = model.default_background if background is None else background
         check_background(background, num_colors_of(model.appearance))
         self._gaussians, self._num_live = model.gaussians, model.num_live
         self._appearance = model.appearance

@@ -111,12 +111,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """End the program with one line if a signal comes within the block: exit code 130 for Ctrl-C, 143 for SIGTERM."""
+    """End the program with one line if a signal comes within the block. The exit code is 128 plus the signal's number:
+    130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
     try:
         with signals.raised():
             yield
-    except KeyboardInterrupt as stop:
-        code = signals.Stopped.of(stop).exit_code
+    except KeyboardInterrupt as interrupt:
+        code = signals.Stopped.of(interrupt).exit_code
         wording = "interrupted" if code == 128 + signals.CTRL_C else "terminated"
         command = shlex.join([Path(sys.executable).name, *sys.argv])
         print(f"\n{wording}; what is finished is kept; continue with: {command}", file=sys.stderr)

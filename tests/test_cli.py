@@ -435,7 +435,7 @@ def test_render(run, tmp_path, monkeypatch, capsys):
     monkeypatch.delattr(SceneSource, "load")
     program = tmp_path / "bin" / "ffmpeg"
     program.parent.mkdir()
-    program.write_text('#!/bin/sh\nfor last; do :; done\necho "$@" > "$last"\n')
+    program.write_text('#!/bin/sh\nfor last; do :; done\necho "$PWD: $@" > "$last"\n')
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
     assert cli.main(["render", str(run.path), "--frames", "3", "--fps", "12"]) == 0
@@ -443,6 +443,7 @@ def test_render(run, tmp_path, monkeypatch, capsys):
     assert [path.name for path in frames] == [f"frame_{index:04d}.png" for index in range(3)]
     words = (run.path / "frames" / "flight.mp4").read_text()
     assert all(pair in words for pair in ("-framerate 12.0 ", "-frames:v 3 ", "-i frame_%04d.png "))
+    assert words.startswith(f"{run.path}/frames: "), "ffmpeg would take a % in the folder's name for a number"
     assert "right=0:bottom=0:mode=smear" in words
     with Image.open(frames[0]) as frame:
         assert frame.size == (1280, 720) and np.asarray(frame).std() > 1

@@ -97,7 +97,7 @@ def test_times_of_the_efficiency_page_are_measured_once(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Folders, "load_scene", lambda *_: SimpleNamespace(test=()))
     monkeypatch.setattr(efficiency, "fit_stage", fit)
-    monkeypatch.setattr(a2tg, "evaluate", lambda *_: SimpleNamespace(frames_per_second=40.0), raising=False)
+    monkeypatch.setattr(a2tg, "evaluate", lambda *_: SimpleNamespace(frames_per_second=40.0))
     for _ in range(2):
         efficiency.present(lab, [grid])
     num = small_models.some_model().num

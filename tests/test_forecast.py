@@ -366,7 +366,8 @@ def test_what_would_show_little_is_asked_about(monkeypatch, capsys):
     ]
     tiny = RunRecord(SceneSource("fox"), file_budget="1kB").budgeted()
     (doubt,) = doubts_about(scene, tiny)
-    assert doubt == "`file_budget` has room for few Gaussians, and scenes need thousands: raise it"
+    holds = "80.0kB holds about 10,000"
+    assert doubt == f"`file_budget` has room for about 125 Gaussians, and scenes need thousands: {holds}"
     for stream in (sys.stdin, sys.stderr):
         monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(sys.stdin, "readline", iter(["Y\n", "\n"]).__next__, raising=False)

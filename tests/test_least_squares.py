@@ -11,7 +11,7 @@ from test_view_dependence import banded
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Appearance, Exponents, Texture, TextureOptions, allocate_appearance
-from a2tg_jax.data import View
+from a2tg_jax.data import View, view_image
 from a2tg_jax.finish.polishing import colors_of, draw_change, polish, with_colors
 from a2tg_jax.renderer import plan_render
 
@@ -62,18 +62,37 @@ def test_many_steps_are_at_the_least_error():
     model = dataclasses.replace(model, gaussians=model.gaussians, num_live=jnp.int32(4)).live
     # Half a grey above zero, no colour is cut off before or after.
     model = dataclasses.replace(model, gaussians=dataclasses.replace(model.gaussians, sh=0.1 * model.gaussians.sh))
-    views = some_views(model, camera, num=2)
+    model = dataclasses.replace(model, background=(0.25, 0.5, 0.75))
+    views, rng = some_views(model, camera, num=2), np.random.default_rng(1)
+    # One has an opacity and a mask.
+    alpha, mask = (
+        rng.integers(0, 256, views[0].image.shape[:2], np.uint8),
+        rng.uniform(size=views[0].image.shape[:2]) < 0.7,
+    )
+    views[0] = View("0.png", views[0].camera, np.dstack([views[0].image, alpha]), mask)
+    counts = np.concatenate(
+        [np.ravel(np.broadcast_to(own[..., None], views[0].image.shape)) for own in (mask, mask | True)]
+    )
     settings = plan_render(model, [view.camera for view in views])
     flat, unflatten = jax.flatten_util.ravel_pytree(colors_of(model))
     columns = [
         np.concatenate([np.ravel(draw_change(model, unflatten(unit), view.camera, settings)) for view in views])
         for unit in np.eye(len(flat))
     ]
-    J, ridge = np.stack(columns, axis=1), 0.5
-    residual = np.concatenate([np.ravel(v.image / 255 - model.render(v.camera).color) for v in views])
+    J, ridge = counts[:, None] * np.stack(columns, axis=1), 0.5
+    residual = np.concatenate(
+        [np.ravel(view_image(v, model.background) - np.asarray(model.render(v.camera).color)) for v in views]
+    )
     expected = np.linalg.solve(J.T @ J + ridge * np.eye(len(flat)), J.T @ residual)
     found, _ = jax.flatten_util.ravel_pytree(colors_of(polish(model, views, num_steps=200, ridge=ridge)))
     np.testing.assert_allclose(found - flat, expected, atol=1e-4)
+    # The rays of the same pinhole: the centres of its pixels.
+    rays = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
+    views = [
+        dataclasses.replace(view, camera=dataclasses.replace(view.camera, rays=jnp.asarray(rays))) for view in views
+    ]
+    by_rays, _ = jax.flatten_util.ravel_pytree(colors_of(polish(model, views, num_steps=200, ridge=ridge)))
+    np.testing.assert_allclose(by_rays, found, atol=1e-4)
 
 
 @pytest.mark.long

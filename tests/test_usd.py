@@ -32,6 +32,13 @@ def test_models_come_back(tmp_path, name, suffix):
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
+def test_a_background_without_cameras_comes_back(tmp_path):
+    model = Model(some_gaussians(), background=(0.25, 0.5, 1.0))
+    save_usd(tmp_path / "m.usda", model)
+    found = load_usd(tmp_path / "m.usda")
+    assert found.background == model.background and found.origin is None
+
+
 @pytest.mark.parametrize("ellipsoids", [False, True])
 def test_the_stage_is_as_the_schema_says(tmp_path, ellipsoids):
     path, model = tmp_path / "m.usdc", plain(9)

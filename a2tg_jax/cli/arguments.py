@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from a2tg_jax.host.remote_files import is_url, without_secrets
-from a2tg_jax.io.config_json import defaulting_to
+from a2tg_jax.host.text import defaulting_to
 
 Parsed = TypeVar("Parsed")
 

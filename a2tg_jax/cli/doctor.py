@@ -30,7 +30,7 @@ WIDTH, HEIGHT, NUM = 96, 64, 400
 
 @dataclasses.dataclass(frozen=True)
 class Doctor:
-    """Print what this machine computes with, and render an image by each compositor to compare them.
+    """Print what this machine computes with, and compare images and gradients of all compositors.
 
     Include the output when you report a problem.
     """

@@ -15,8 +15,7 @@ from a2tg_jax.data.photo_folder import CAMERA_PICTURE, holds_photos
 from a2tg_jax.data.sfm import CameraModel, Matching
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
-from a2tg_jax.host.text import did_you_mean
-from a2tg_jax.io.config_json import defaulting_to
+from a2tg_jax.host.text import defaulting_to, did_you_mean
 from a2tg_jax.results.figures import save_camera_picture
 from a2tg_jax.results.folder import check_apart, check_output
 from a2tg_jax.results.forecast import quick_flags

@@ -10,11 +10,10 @@ from tyro.conf import Positional, arg
 from a2tg_jax.cli.arguments import EditFile, LastModel, LpipsWeights, RunFolderPath, RunOrFile
 from a2tg_jax.cli.train import open_browser, print_result
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.text import counted
-from a2tg_jax.io.config_json import defaulting_to
+from a2tg_jax.host.text import counted, defaulting_to
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.compression import CompressOptions, compress
-from a2tg_jax.results.conversion import BakeOptions, FileOptions, convert
+from a2tg_jax.results.conversion import BakeOptions, PlacementOptions, convert
 from a2tg_jax.results.editing import EditOptions, write_edit
 from a2tg_jax.results.finishing import finish_run
 from a2tg_jax.results.folder import (
@@ -328,7 +327,7 @@ class Convert:
     model: LastModel = None
     edit: EditFile = None
     baking: Annotated[BakeOptions, arg(name="")] = BakeOptions()
-    placing: Annotated[FileOptions, arg(name="")] = FileOptions()
+    placement: Annotated[PlacementOptions, arg(name="")] = PlacementOptions()
     overwrite: bool = False
     """Replace the output file."""
 
@@ -340,7 +339,7 @@ class Convert:
                 self.model,
                 edit=self.edit,
                 baking=self.baking,
-                placing=self.placing,
+                placement=self.placement,
                 overwrite=self.overwrite,
             )
         )

@@ -21,8 +21,8 @@ from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC, SceneSource
 from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.host.operating_system import has_display
-from a2tg_jax.host.text import counted
-from a2tg_jax.io.config_json import defaulting_to, flatten_config
+from a2tg_jax.host.text import counted, defaulting_to
+from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.parallel.processes import AUTO, ProcessPlace, joined
 from a2tg_jax.results.compression import command_for_file

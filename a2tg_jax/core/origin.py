@@ -85,7 +85,8 @@ class Origin:
 
     @property
     def held_out_cameras(self) -> list[Camera]:
-        """Cameras of photographs that were held out for testing; none if all were."""
+        """Cameras of photographs that were held out for testing; empty if all were, which then count as training
+        cameras."""
         if self.is_test.all():
             return []
         return [own for own, is_test in zip(self.cameras, self.is_test, strict=True) if is_test]

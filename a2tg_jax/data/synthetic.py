@@ -81,7 +81,8 @@ def synthetic_scene(
         )
     check_test_every(test_every)
     rng = np.random.default_rng(seed)
-    surfaces, rng.bit_generator.state = _lit_surfaces(seed)
+    lit, rng.bit_generator.state = _lit_surfaces(seed)
+    surfaces = list(lit)
     size = round(width / downscale), round(height / downscale)
     K = intrinsics(*size, FIELD_OF_VIEW)
     viewmats = [looking(center, TARGET - center, DOWN) for center in camera_path(num_views)]
@@ -103,10 +104,10 @@ def synthetic_scene(
 
 
 @functools.lru_cache(maxsize=1)
-def _lit_surfaces(seed: int) -> tuple[list[Surface], Any]:
+def _lit_surfaces(seed: int) -> tuple[tuple[Surface, ...], Any]:
     """Return the surfaces of a seed, and the state of its generator after them; neither depends on size or views."""
     rng = np.random.default_rng(seed)
-    return light(still_life(rng), rng), rng.bit_generator.state
+    return tuple(light(still_life(rng), rng)), rng.bit_generator.state
 
 
 def still_life(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.ndarray]]:

@@ -1,4 +1,4 @@
-"""Libraries that some functions alone need."""
+"""Libraries that only some functions need."""
 
 import importlib
 from typing import Any

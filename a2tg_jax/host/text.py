@@ -4,6 +4,7 @@ import difflib
 import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 PROGRAM = "a2tg-jax"
 """Name of this program in files that it writes, as in the tag Software of pictures."""
@@ -16,6 +17,13 @@ def shortened(value: object, most: int = 80) -> str:
     text = " ".join((value if isinstance(value, str) else repr(value))[: 10 * most].split())
     text = "".join(letter if letter.isprintable() else "\ufffd" for letter in text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def defaulting_to(text: str, metavar: str | None = None) -> Any:
+    """Return tyro's annotation of an option whose help describes its default in words, instead of None."""
+    from tyro.conf import arg  # Models are read without it.
+
+    return arg(help_behavior_hint=f"(default: {text})", metavar=metavar)
 
 
 def as_argument(path: Path) -> str:

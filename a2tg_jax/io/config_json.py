@@ -7,8 +7,6 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from tyro.conf import arg
-
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.host.text import did_you_mean, shortened
 
@@ -16,11 +14,6 @@ ConfigT = TypeVar("ConfigT")
 LARGEST_INTEGER = 2**64  # JSON's integers have no bound in Python; NumPy and JAX take 64 bits.
 NONE = "None"
 """Text for None in formats that lack it, such as TOML."""
-
-
-def defaulting_to(text: str, metavar: str | None = None) -> Any:
-    """Return the annotation of an option whose help describes its default in words, instead of None."""
-    return arg(help_behavior_hint=f"(default: {text})", metavar=metavar)
 
 
 def config_to_dict(config: Any) -> dict[str, Any]:

@@ -226,10 +226,11 @@ def _vertices(ply: PlyFile) -> np.ndarray:
     wanted = (*MEANS, *(COLORS if has_colors else SH_DEGREE0), "opacity", *SCALES, *QUATS)
     ply.require_vertices(wanted, "a PLY of Gaussians")
     vertices = ply.read("vertex")
-    if not has_colors or not len(vertices):
+    if not has_colors:
         return vertices
     colors = np.stack([vertices[name].astype(np.float64) for name in COLORS], axis=1)
-    colors /= largest_color(np.nan_to_num(colors), is_float=fields[COLORS[0]].startswith("f"))
+    if len(colors):
+        colors /= largest_color(np.nan_to_num(colors), is_float=fields[COLORS[0]].startswith("f"))
     return append_fields(vertices, SH_DEGREE0, ((colors - 0.5) / SH_C0).T, usemask=False)
 
 

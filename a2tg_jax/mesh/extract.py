@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.camera_paths import nearest_point
-from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.cameras import Camera, checked_cameras
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import progress_over
@@ -85,7 +85,7 @@ def extract_mesh(
 
     Args:
       model: a model of any appearance.
-      cameras: the views to fuse; None takes the model's training views.
+      cameras: the views to fuse, as pinholes: rays of a lens have no effect. None takes the model's training views.
       resolution: number of voxels along the radius, 512 by default.
       voxel: side of a voxel in units of the model's world, instead of the resolution.
       center: [3] centre of the space to fuse, in the model's world; None is the point nearest to all optical axes.
@@ -116,7 +116,7 @@ def extract_mesh(
     if cameras is None:
         cameras = [] if model.origin is None else model.origin.training_cameras
     # Any pinhole camera will do, since depths are rendered: rays of a lens are left out.
-    cameras = [dataclasses.replace(camera, rays=None) for camera in cameras]
+    cameras = [dataclasses.replace(camera, rays=None) for camera in checked_cameras(cameras)]
     if not model.num or not cameras:
         what = "the model has no Gaussians" if not model.num else "there are no cameras"
         raise ValueError(f"a mesh needs views of some Gaussians; {what}")
@@ -143,14 +143,14 @@ def extract_mesh(
             raise GridFullError(
                 f"a resolution of {radius / voxel:.0f} voxels along the radius takes more than "
                 f"{max_bytes / 1e9:.3g} GB after {index + 1} of {len(cameras)} views: lower `resolution` or `radius`, "
-                "or allow more memory"
+                "or raise `max_memory` (max_bytes in Python)"
             ) from None
     mesh, num_dropped = largest_clusters(surface_of(grid, space, least_weight), most_clusters, least_faces)
     if not mesh.num_faces:
         if num_dropped:
             raise ValueError(
                 f"there are only small parts of a surface; {counted(num_dropped, 'part')} had fewer than {least_faces} "
-                "faces: raise `resolution` or lower `voxel`, or train longer or from more views"
+                "faces: raise `resolution`, lower `voxel` (in Python also least_faces), or train from more views"
             )
         raise ValueError(
             "there is no surface within the radius around the point that the cameras look at: give a larger `radius`, "

@@ -37,9 +37,8 @@ from a2tg_jax.finish.tuning import (
     tune_compact,
 )
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.text import in_bytes, shortened
+from a2tg_jax.host.text import defaulting_to, in_bytes, shortened
 from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
-from a2tg_jax.io.config_json import defaulting_to
 from a2tg_jax.io.formats import FORMATS
 from a2tg_jax.io.model_rows import check_encodable
 from a2tg_jax.model import Model
@@ -244,8 +243,8 @@ def _tuned(
 
 
 def loss_measures(model: Model, scene: Scene | None, settings: RenderSettings) -> dict[str, Loss]:
-    """Return measures of loss by name, in at most `MOST_VIEWS` views each; the first decides. Empty without photographs
-    and cameras."""
+    """Return measures of loss by name, in at most `MOST_VIEWS` views each; `compress` decides by the first. Empty
+    without photographs and cameras."""
     if scene is not None:
         # Held-out views are measured as well, but never decide.
         views = {"training views": refined_views(scene.train, model), "test views": scene.test}

@@ -52,8 +52,8 @@ class BakeOptions:
 
 
 @dataclasses.dataclass(frozen=True)
-class FileOptions:
-    """Options of files for other programs."""
+class PlacementOptions:
+    """Positions and axes in files for other programs."""
 
     float64: bool = False
     """Write the positions of a PLY as float64, so that map coordinates keep their precision."""
@@ -69,33 +69,33 @@ def convert(
     *,
     edit: Path | None = None,
     baking: BakeOptions = BakeOptions(),
-    placing: FileOptions = FileOptions(),
+    placement: PlacementOptions = PlacementOptions(),
     overwrite: bool = False,
 ) -> str:
     """Write a run's model `name`, or a file of any known format, in another suffix's format, and return a summary.
     `edit` is as in `open_source`. Raises ValueError or OSError if a format is unknown, an option is invalid, or a file
     cannot be read or written."""
     baking.check()
-    check_conversion(source, out, placing, overwrite=overwrite)  # Baking takes minutes.
+    check_conversion(source, out, placement, overwrite=overwrite)  # Baking takes minutes.
     start = time.perf_counter()
     opened = open_source(source, name, edit)
     model, baked = _kept_or_baked(source, opened, baking, edit) if baking.bake else (opened.model, "")
     lines = [baked] if baked else []
-    return "\n".join([*lines, write_converted(opened.path, model, out, start, placing)])
+    return "\n".join([*lines, write_converted(opened.path, model, out, start, placement)])
 
 
 def check_conversion(
     source: Path,
     out: Path,
-    placing: FileOptions = FileOptions(),
+    placement: PlacementOptions = PlacementOptions(),
     *,
     overwrite: bool = False,
 ) -> None:
     """Raise ValueError or OSError unless `out` can be written from a source. Arguments as in `convert`."""
     writer_of(out)
-    if placing.float64 and format_of(out).save is not save_ply:
+    if placement.float64 and format_of(out).save is not save_ply:
         raise ValueError(f"`float64` needs an OUT that ends in .ply and is not packed; got {out}")
-    if placing.world == "original" and format_of(out).keeps_origin:
+    if placement.world == "original" and format_of(out).keeps_origin:
         raise ValueError(
             f"`world` has no effect on {out}, which also holds the way to the original world: leave it out"
         )
@@ -116,12 +116,12 @@ def write_converted(
     model: Model,
     out: Path,
     start: float,
-    placing: FileOptions = FileOptions(),
+    placement: PlacementOptions = PlacementOptions(),
 ) -> str:
     """Write a model that was read from a file, after `check_conversion`, and return a summary with the seconds since
     `start` (`time.perf_counter`). Other arguments as in `convert`."""
-    world = placing.world
-    if placing.float64:
+    world = placement.world
+    if placement.float64:
         save_ply(out, model, float64=True, world=world)
     else:
         save_splats(out, model, world=world)

@@ -28,6 +28,7 @@ from a2tg_jax.training.cost import (
     held_bytes,
     largest_view,
 )
+from a2tg_jax.training.options import SENSIBLE_GAUSSIANS
 from a2tg_jax.training.reports import RestOfRun
 
 REPORT = 290 * MB
@@ -209,17 +210,21 @@ def doubts_about(scene: Scene, record: RunRecord) -> list[str]:
     """Return why a run would show little or take long, with better values: a small or huge memory budget, or a
     downscale that leaves few pixels."""
     found, downscale = [], record.scene.downscale
-    # A file budget without a memory budget sets that as well.
-    of_file = record.unbudgeted() != record
-    name, share = ("file_budget", MEMORY_OF_FILE) if of_file else ("memory_budget", 1.0)
-    if record.options.small_budget and of_file:
-        found.append("`file_budget` has room for few Gaussians, and scenes need thousands: raise it")
-    elif record.options.small_budget:
-        found.append(f"{record.options.small_budget}; it is in bytes of the model in memory")
     # The built-in scene is drawn as small as tests need it.
     is_captured = record.scene.path != SYNTHETIC
     pixels, budget = sum(view.camera.width * view.camera.height for view in scene.train), record.options.budget_bytes
     one = record.options.initial_bytes
+    # A file budget without a memory budget sets that as well.
+    of_file = record.unbudgeted() != record
+    name, share = ("file_budget", MEMORY_OF_FILE) if of_file else ("memory_budget", 1.0)
+    if record.options.small_budget and not of_file:
+        found.append(f"{record.options.small_budget}; it is in bytes of the model in memory")
+    elif record.options.small_budget and budget is not None:
+        enough = in_bytes(SENSIBLE_GAUSSIANS * one / share).replace(" ", "")
+        found.append(
+            f"`file_budget` has room for about {budget // one:.0f} Gaussians, and scenes need thousands: {enough} "
+            f"holds about {SENSIBLE_GAUSSIANS:,}"
+        )
     if is_captured and budget is not None and budget > pixels * one:
         found.append(
             f"`{name}` has room for more Gaussians ({budget / one:,.0f}) than the photographs have pixels "

@@ -5,6 +5,7 @@ The folder has a list of rendered files. No other file is replaced without `over
 
 import contextlib
 import dataclasses
+import os
 import re
 import shutil
 import subprocess
@@ -179,7 +180,7 @@ def write_video(frames: Sequence[Path], *, frames_per_second: float = FRAMES_PER
         # Otherwise ffmpeg continues with whatever numbered files follow.
         made = ["-frames:v", str(len(frames)), "-vf", even_sides, "-pix_fmt", "yuv420p", "-f", "mp4"]
         # ffmpeg chooses formats by suffix, which the temporary path lacks: hence -f mp4.
-        command = [program, "-y", "-loglevel", "error", *source, *made, str(temporary.absolute())]
+        command = [os.path.abspath(program), "-y", "-loglevel", "error", *source, *made, str(temporary.absolute())]
         # Run in the folder: ffmpeg would take a % in its name for a number.
         done = subprocess.run(command, cwd=path.parent, capture_output=True, text=True, check=False)
         if done.returncode != 0:

@@ -13,8 +13,7 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.data import view_image
 from a2tg_jax.host.machine import memory_limit
 from a2tg_jax.host.progress_bars import progress_over
-from a2tg_jax.host.text import counted, in_bytes
-from a2tg_jax.io.config_json import defaulting_to
+from a2tg_jax.host.text import counted, defaulting_to, in_bytes
 from a2tg_jax.mesh.extract import MOST_CLUSTERS, check_lengths, extract_mesh
 from a2tg_jax.mesh.files import check_mesh_suffix, save_mesh
 from a2tg_jax.mesh.texturing import Picture, check_texture, texture_mesh

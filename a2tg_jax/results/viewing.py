@@ -171,7 +171,7 @@ class LiveView:
             with self._lock:
                 self._scene_bytes = found
                 self._status |= {"version": self._status["version"] + 1, "message": ""}
-        except Exception as error:  # The page says it; the training goes on.
+        except Exception as error:  # Shown on the page; training continues.
             with self._lock:
                 self._status |= {"message": str(error) or type(error).__name__}
         # Waiting 1 / SHARE times as long as a snapshot took bounds its share of the time.

@@ -36,7 +36,7 @@ RUNS = EXPERIMENTS.parent / "runs"
 USAGE = 2
 """Exit code of a call that cannot be run as it is."""
 MEMORY_SHARE = 0.8
-"""Default share of the available memory for all jobs together."""
+"""Default share of the free memory for all jobs together."""
 MOST_SENT = 1_000
 """Largest number of jobs in a cluster's queue."""
 CLUSTER_DEFAULTS = {"slurm": {"timeout_min": 24 * 60, "gpus_per_node": 1, "cpus_per_task": 4, "mem_gb": 32}}
@@ -300,7 +300,11 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--work", type=Path, help="folder of models and checkpoints; default: runs/experiments/SCALE")
     add("--lpips-weights", type=Path, help="weights of LPIPS (AlexNet); without them LPIPS is left out")
     add("--jobs", type=int, help="number of jobs at a time; default: one a GPU, else one a core")
-    add("--memory-gb", type=float, help="memory of all jobs on this machine together; default: 80%% of what is free")
+    add(
+        "--memory-gb",
+        type=float,
+        help="memory of all jobs on this machine together; default: 80%% of what is free at the start",
+    )
     add("--cluster", help='send jobs out with submitit: "slurm", or "local" for processes of this machine')
     add("--cluster-parameter", action="append", default=[], metavar="NAME=VALUE",
         help="parameter of submitit, such as mem_gb=32; may be repeated")  # fmt: skip
