@@ -128,6 +128,12 @@ def test_ply_with_red_green_and_blue(tmp_path, kind, largest, encoding):
     np.testing.assert_allclose(0.5 + sh[:, 0] / (2 * np.sqrt(np.pi)), colors, atol=1e-6)
 
 
+def test_an_empty_ply_with_colours_is_an_empty_model(tmp_path):
+    names = [name for name in ATTRIBUTES if not name.startswith(("f_", "n"))] + ["red", "green", "blue"]
+    write_ply(tmp_path / "g.ply", names, np.zeros((0, len(names))))
+    assert load_ply(tmp_path / "g.ply").num == 0
+
+
 @pytest.mark.parametrize("name", ["x", "f_dc_1", "f_rest_44", "opacity", "scale_1", "rot_3"])
 def test_rows_of_nan_are_left_out_and_counted(tmp_path, name):
     rows = np.random.default_rng(0).normal(size=(6, len(ATTRIBUTES)))
