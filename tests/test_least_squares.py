@@ -75,10 +75,8 @@ def test_many_steps_are_at_the_least_error():
     )
     settings = plan_render(model, [view.camera for view in views])
     flat, unflatten = jax.flatten_util.ravel_pytree(colors_of(model))
-    columns = [
-        np.concatenate([np.ravel(draw_change(model, unflatten(unit), view.camera, settings)) for view in views])
-        for unit in np.eye(len(flat))
-    ]
+    draw = jax.jit(lambda change, camera: draw_change(model, unflatten(change), camera, settings).ravel())
+    columns = [np.concatenate([draw(unit, view.camera) for view in views]) for unit in np.eye(len(flat))]
     J, ridge = counts[:, None] * np.stack(columns, axis=1), 0.5
     residual = np.concatenate(
         [np.ravel(view_image(v, model.background) - np.asarray(model.render(v.camera).color)) for v in views]
