@@ -66,8 +66,8 @@ class Row:
 
 
 def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result]) -> list[Row]:
-    """Return the comparisons of `bytewise`, by stratum and budget; the plain methods of `results` were trained for the
-    time of the first version, those of `in_equal_time` for that of the second."""
+    """Return the comparisons of `bytewise`, by stratum and budget. At equal time, plain methods in `results` trained
+    for as long as the first version, and in `in_equal_time` for as long as the second."""
     rows = []
     for stratum in (DENSE, FEW):
         for budget in (0.3, 1.2):
