@@ -13,6 +13,7 @@ import numpy as np
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, init_from_points
+from a2tg_jax.core.numerics import MOST_DIFFERENCE, relative_difference
 from a2tg_jax.host.machine import VARIABLE, memory_limit, num_threads
 from a2tg_jax.host.operating_system import cuda_of_driver
 from a2tg_jax.host.startup import compilation_cache_folder
@@ -23,8 +24,6 @@ from a2tg_jax.render import render_image
 from a2tg_jax.texture import Textures, allocate_textures
 
 PACKAGES = ("jax", "jaxlib", "jax-cuda13-plugin", "jaxopt", "numpy", "llvmlite", "nvidia-cuda-nvrtc", "pycolmap")
-MOST_DIFFERENCE = 1e-3
-"""Largest rounding difference between compositors, as a share of an array's norm."""
 WIDTH, HEIGHT, NUM = 96, 64, 400
 
 
@@ -91,8 +90,8 @@ def _version(package: str) -> str:
 
 
 def _compare(available: Sequence[Compositor]) -> float:
-    """Render a textured image by each compositor, with gradients; return the largest difference of an array from XLA's,
-    relative to the array's norm, and infinite if it is not finite."""
+    """Render a textured image by each compositor, with gradients; return the largest `relative_difference` from XLA's,
+    infinite if it is not finite."""
     rng = np.random.default_rng(0)
     gaussians = init_from_points(rng.uniform(-1, 1, (NUM, 3)), rng.uniform(0, 1, (NUM, 3)), opacity=0.5)
     textures = allocate_textures(np.tile([[1, 1], [2, 4]], (NUM // 2, 1)))
@@ -112,10 +111,7 @@ def _compare(available: Sequence[Compositor]) -> float:
         found[name] = [array for array in arrays if np.issubdtype(array.dtype, np.floating)]
         text = f"{name}: {time.perf_counter() - start:.2f} s with compiling"
         if name != "xla":
-            pairs = zip(found[name], found["xla"], strict=True)
-            shares = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs]
-            # max of Python would drop NaN.
-            difference = float(np.nan_to_num(shares, nan=np.inf).max())
+            difference = float(np.nan_to_num(relative_difference(found[name], found["xla"]), nan=np.inf))
             text, largest = f"{text}, at most {difference:.1g} from XLA's image and gradients", max(largest, difference)
         _print("render", text)
     return largest

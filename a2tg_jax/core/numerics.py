@@ -1,16 +1,29 @@
 """Safe division, roots and norms, with finite values and gradients where the plain formulas have none.
 
-Also the broadcast from splats to pixels, with a gradient that CPUs compute fast.
+Also the broadcast from splats to pixels, with a gradient that CPUs compute fast, and the difference of arrays that two
+programs computed.
 """
 
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 Integer = Array | int
 """An integer, traced or not."""
+MOST_DIFFERENCE = 1e-3
+"""Largest `relative_difference` that counts as rounding of float32."""
+
+
+def relative_difference(found: Sequence[ArrayLike], wanted: Sequence[ArrayLike]) -> float:
+    """Return the largest |a − b| / |b| of pairs of arrays, Euclidean norms over a whole array; NaN if one is (host)."""
+    pairs = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in zip(found, wanted, strict=True)]
+    # max of Python would drop NaN.
+    return float(np.max([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs if b.size]))
 
 
 def safe_divide(numerator: Array, denominator: Array, fallback: float = 0.0) -> Array:

@@ -174,7 +174,7 @@ def read_ply_points(path: Path) -> PointCloud:
 
 
 def largest_color(colors: np.ndarray, *, is_float: bool) -> int:
-    """Return the number that stands for full brightness among finite colours [N, 3], by the colours themselves."""
+    """Return the number that means full brightness, guessed from finite colours [N, 3]: 1, 255, 65535 or 2³² − 1."""
     if is_float:  # Some floats are a little above 1, or far: the mean decides.
         mean = np.clip(colors, 0, FLOAT_RANGES[-1]).mean()
         return next(largest for largest in FLOAT_RANGES if mean <= largest)

@@ -5,7 +5,7 @@ Its patterns have details of about 4 to 10 pixels, finer than one or two thousan
 
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -81,8 +81,7 @@ def synthetic_scene(
         )
     check_test_every(test_every)
     rng = np.random.default_rng(seed)
-    lit, rng.bit_generator.state = _lit_surfaces(seed)
-    surfaces = list(lit)
+    surfaces, rng.bit_generator.state = _lit_surfaces(seed)
     size = round(width / downscale), round(height / downscale)
     K = intrinsics(*size, FIELD_OF_VIEW)
     viewmats = [looking(center, TARGET - center, DOWN) for center in camera_path(num_views)]
@@ -141,7 +140,7 @@ def camera_path(num_views: int) -> np.ndarray:
     return TARGET + DISTANCE * np.stack(outward, axis=-1)
 
 
-def render(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
+def render(surfaces: Sequence[Surface], viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
     """Return the image [height, width, 3] uint8 that a camera sees, the mean of a few rays a pixel (SAMPLE_OFFSETS)."""
     center = _center(viewmat)
     x, y = (grid.ravel() for grid in np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
@@ -149,7 +148,7 @@ def render(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, width: i
     seen_grid = seen.reshape(height, width)
     is_inside = (maximum_filter(seen_grid, 3) == minimum_filter(seen_grid, 3)).ravel()
     # Most pixels and their neighbours see one surface, the only one that their rays then need to be tested against.
-    groups = [(surfaces, ~is_inside)]
+    groups: list[tuple[Sequence[Surface], np.ndarray]] = [(surfaces, ~is_inside)]
     groups += [([surface], is_inside & (seen == number)) for number, surface in enumerate(surfaces)]
     image = np.empty((width * height, 3), np.uint8)
     for candidates, is_member in groups:
@@ -161,7 +160,7 @@ def render(surfaces: list[Surface], viewmat: np.ndarray, K: np.ndarray, width: i
     return image.reshape(height, width, 3)
 
 
-def sample_points(surfaces: list[Surface], shots: list[Shot], count: int, rng: np.random.Generator) -> PointCloud:
+def sample_points(surfaces: Sequence[Surface], shots: list[Shot], count: int, rng: np.random.Generator) -> PointCloud:
     """Return surface points under `count` random pixels of the shots, with the colours of those pixels."""
     shares = np.bincount(rng.integers(len(shots), size=count), minlength=len(shots))
     points, colors = [], []

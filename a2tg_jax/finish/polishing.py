@@ -78,7 +78,7 @@ def polish(
     # Planned once: colours do not change which splats a tile lists.
     settings = plan_render(model, [view.camera for view in views])
     # Views of one size and lens share a program.
-    groups = [stack_views(list(own)).of(None, dtype) for own in views_by_kind(views)]
+    groups = [stack_views(own).of(None, dtype) for own in views_by_kind(views)]
     changes = jax.jit(_solve, static_argnums=(3, 4))(model, groups, background, settings, num_steps, ridge)
     return with_colors(model, jax.tree.map(jnp.add, colors_of(model), changes))
 

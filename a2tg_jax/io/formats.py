@@ -189,10 +189,11 @@ def lost_by(model: Model, path: str | os.PathLike[str]) -> list[str]:
     if (model.gaussians.sh_degree if shown.bands is None else 3) > into.highest_degree:
         lost.append(f"spherical harmonics above degree {into.highest_degree}")
     lost += cut_numbers(into.name, model)
-    if not into.keeps_origin and origin is not None and origin.names:
-        lost.append("cameras and background")
-    elif not into.keeps_origin and model.background != BLACK:
-        lost.append("background")
+    if not into.keeps_origin:
+        if origin is not None and origin.names:
+            lost.append("cameras and background")
+        elif model.background != BLACK:
+            lost.append("background")
     if origin is not None and not into.keeps_corrections:
         lost += [LEARNED.get(name, f"learned {name}") for name in sorted(origin.corrections)]
     if not into.is_exact:

@@ -163,8 +163,9 @@ def _model_of(usd: object, prim: Any, path: Path) -> Model:
         raise ValueError(f"its particle field {shortened(str(prim.GetPath()))} must have a kernel of Gaussians")
     gaussians = others.gaussians_of(_splats(usd, prim, path), path, is_flat=SURFLET in kernels)
     kept = prim.GetCustomDataByKey(ORIGIN)
-    described = parse_json(kept) if isinstance(kept, str) else {}
-    origin = origin_of(described, described) if set(described) - {"background"} else None
+    described = parse_json(kept) if isinstance(kept, str) else {"background": BLACK}
+    # A model without an origin has a background alone.
+    origin = None if set(described) == {"background"} else origin_of(described, described)
     model = Model(gaussians, background=background_of(described), origin=origin)
     check_model(model)
     return model

@@ -53,7 +53,7 @@ SUFFIX = ".a2tgz"
 MAX_LOSS = 0.05
 """Default of `max_loss`."""
 MOST_VIEWS = 16
-"""Largest number of training views measured, evenly chosen."""
+"""Largest number of views of a kind, training or test, that are measured, evenly chosen."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,6 +12,7 @@ from jaxlib.version import __version__ as jaxlib_version
 
 from a2tg_jax.appearance import Appearance, StaticShading, Texture, gaussian_cutoff
 from a2tg_jax.core.bilinear import TextureRegion
+from a2tg_jax.core.numerics import MOST_DIFFERENCE, relative_difference
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.operating_system import cuda_of_driver
 from a2tg_jax.host.startup import cache_folder
@@ -22,8 +23,6 @@ from a2tg_jax.rasterize.kernels.jaxprs import in_clean_context
 from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats
 from a2tg_jax.rasterize.tiles import TileGrid, tile_lists
 
-MOST_DIFFERENCE = 1e-3
-"""Largest difference that counts as rounding of float32: |a − b| / |b|, Euclidean norms over a whole array."""
 NUM = 400
 """Number of splats: lists of tiles then have several batches of 64."""
 GRID = TileGrid(width=48, height=32, tile_size=16)
@@ -79,8 +78,7 @@ def largest_difference(device: object) -> float:
     with jax.default_device(device):
         draw = jax.jit(drawn, static_argnums=0)
         found, wanted = (draw(module, splats, texels, regions, cutoff, jacobian, probe, g) for module in (cuda, xla))
-    pairs = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in zip(found, wanted, strict=True)]
-    return float(np.max([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs if b.size]))
+    return relative_difference(found, wanted)
 
 
 def _inputs() -> tuple[PassSettings, tuple[Any, ...]]:
