@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 import time
+import weakref
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -98,26 +99,43 @@ def test_linux_needs_a_display_for_a_browser(monkeypatch, variable):
         assert operating_system.has_display() == (system != "linux" or variable is not None)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_lost(number):
-    """Python prints and ignores what such a callback raises; JAX has one, which runs often while modules load."""
-    sent = []
+class Deleted:
+    """An object that calls a function when it goes."""
+
+    def __init__(self, call):
+        self.call = call
+
+    def __del__(self):
+        self.call()
+
+
+def collect_with(call):
+    """Collect garbage, with a callback that calls a function when it begins."""
 
     def callback(phase, info):
-        if not sent:
-            sent.append(number)
-            signal.raise_signal(number)
+        if phase == "start":
+            call()
 
     gc.callbacks.append(callback)
-    try:
-        start = time.monotonic()
-        with pytest.raises(KeyboardInterrupt), signals.raised():
-            gc.collect()
-            assert sent
-            time.sleep(20)
-        assert time.monotonic() - start < 10, "waiting of the main thread is interrupted"
-    finally:
-        gc.callbacks.remove(callback)
+    gc.collect()
+    gc.callbacks.remove(callback)
+
+
+def finalize_with(call):
+    """Delete an object whose weak reference calls a function."""
+    held = {1}
+    weakref.finalize(held, call)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("run", [collect_with, finalize_with, lambda call: Deleted(call) and None])
+def test_a_signal_is_not_lost_where_python_ignores_exceptions(number, run):
+    """Callbacks of the garbage collector and of weak references, and `__del__`, of which JAX has many."""
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), signals.raised():
+        run(lambda: signal.raise_signal(number))
+        time.sleep(20)
+    assert time.monotonic() - start < 10, "waiting of the main thread is interrupted"
 
 
 def without_encoding(path):

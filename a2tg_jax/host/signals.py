@@ -1,7 +1,7 @@
 """Ctrl-C, SIGTERM and SIGHUP: orderly shutdown of a program.
 
-Python ignores exceptions in callbacks of the garbage collector, and JAX has such a callback. A signal that comes while
-one runs is therefore sent again.
+Python ignores exceptions in callbacks of the garbage collector and of weak references, and in `__del__`; JAX has many
+of them. A signal that comes while one runs is therefore sent again.
 """
 
 import contextlib
@@ -83,21 +83,31 @@ def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
 
 @dataclasses.dataclass(frozen=True)
 class _Heard:
-    """Signal handler that sends the signal again if it would raise within a callback of the garbage collector."""
+    """Signal handler that sends the signal again while Python would ignore what it raises."""
 
     handler: Callable[..., Any]
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
-        above = frame
-        while above is not None:
-            if above.f_code in callbacks:
-                again = threading.Timer(SOON, _send, (number,))
-                again.daemon = True  # The process may end first.
-                again.start()
-                return
-            above = above.f_back
-        self.handler(number, frame)
+        if _ignores_exceptions(frame):
+            again = threading.Timer(SOON, _send, (number,))
+            again.daemon = True  # The process may end first.
+            again.start()
+        else:
+            self.handler(number, frame)
+
+
+def _ignores_exceptions(frame: FrameType | None) -> bool:
+    """Whether a frame lies within a callback whose exceptions Python prints and ignores."""
+    callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
+    while frame is not None:
+        if (
+            frame.f_code in callbacks
+            or frame.f_code.co_name == "__del__"
+            or frame.f_globals.get("__name__") in ("weakref", "_weakrefset")
+        ):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _send(number: int) -> None:
