@@ -68,7 +68,7 @@ def test_points_may_be_left_out(given):
     few = {name: given[name] for name in ("images", "viewmats", "Ks")}
     with pytest.warns(UserWarning, match="the scene mine: has no sparse points"):
         scene = a2tg.scene_from_arrays(**few, name="mine")
-    assert [view.name for view in scene.test] == ["0000"] and len(scene.points) == 10_000
+    assert [view.name for view in scene.test] == ["0000"] and 1000 < len(scene.points) <= 10_000
     grey = a2tg.scene_from_arrays(**few, points=given["points"])
     np.testing.assert_allclose(grey.colors, 128 / 255, atol=1e-6)
 
@@ -126,7 +126,7 @@ CONVENTIONS = {
 
 @pytest.mark.parametrize("has_points", [True, False])
 @pytest.mark.parametrize("advice", CONVENTIONS)
-@pytest.mark.filterwarnings("ignore:.*starting from 10,000 random points")
+@pytest.mark.filterwarnings("ignore:.*starting from .* random points")
 def test_poses_of_another_convention_are_named(given, advice, has_points):
     """The advice is right. Flipped axes alone are noticed by points only, for cameras may look outwards."""
     if not has_points and CONVENTIONS[advice] is of_opengl:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from a2tg_jax.data import load_scene
+from a2tg_jax.data import assembly, load_scene
 from a2tg_jax.data.colmap_library import pycolmap
 
 TARGET = np.array([0.2, -0.1, 0.3])
@@ -327,7 +327,12 @@ def test_random_points_of_nerfs_objects_fill_their_cube(tmp_path):
     places *= 4.031128874 / np.linalg.norm(places, axis=1, keepdims=True)
     write_poses(tmp_path, places, -places, "transforms_train.json")
     scene = load_scene(tmp_path)
-    original = scene.transform.inverse().apply(scene.points)
+    sights = [
+        assembly.Sight.of(np.asarray(view.camera.viewmat), np.asarray(view.camera.K), view.picture.size, None)
+        for view in scene.train
+    ]
+    points = assembly.random_points(sights, scene.transform.rotation)
+    original = scene.transform.inverse().apply(points[: len(points) // 2])
     np.testing.assert_allclose(np.abs(original).max(axis=0), 1.3, atol=2e-3)
 
 
@@ -346,7 +351,7 @@ def test_every_view_sees_random_points(tmp_path, look, name):
     places = ring()
     write_poses(tmp_path, places, LOOKS[look](places), name)
     scene = load_scene(tmp_path)
-    assert len(scene.points) == 10_000 and shares_seen(scene).min() >= 0.12
+    assert 2_000 < len(scene.points) <= 10_000 and shares_seen(scene).min() >= 0.1
 
 
 @pytest.mark.parametrize(

@@ -204,7 +204,7 @@ def test_masks_of_another_programs_pixels_are_made_by_one_process_each(tmp_path,
         pixels = np.full_like(Image.open(file), 200)
         pixels[:, :10] = 0
         Image.fromarray(pixels).save(file)
-    alone = divided(tmp_path / "scene", together, decoded, 4)
+    alone = divided(tmp_path / "scene", together, decoded, 4 + 2 * 3)  # Both compare 3 photographs, without points.
     masks = [view.mask for view in (*alone.train, *alone.test)]
     assert len({mask for mask in masks if mask is not None}) > 1, "borders of two kinds"
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from small_values import assert_same
+from test_data_transforms import write_points
 
 from a2tg_jax import Gaussians2dMcmc, Mcmc, fit, load_scene, synthetic_scene
 from a2tg_jax.data import photo_store as pictures
@@ -28,7 +29,6 @@ KINDS = {
     "undistorted": {"k1": 0.05},
     "with opacity": {"alpha": True},
 }
-pytestmark = pytest.mark.filterwarnings("ignore:.*random points")
 
 
 @pytest.fixture(autouse=True)
@@ -58,6 +58,8 @@ def write_scene(folder, *, alpha=False, **intrinsics):
     K = np.asarray(built_in().train[0].camera.K, float)
     values = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], **intrinsics}
     (folder / "transforms.json").write_text(json.dumps({**values, "frames": frames}))
+    colors = np.rint(255 * built_in().colors[::5]).astype(int)
+    write_points(folder / "points3d.ply", built_in().points[::5], colors)
     return folder
 
 

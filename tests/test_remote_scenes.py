@@ -104,14 +104,15 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_scene_is_that_of_the_folder(tmp_path, store, kind):
-    """Folders are listed once, and photographs fetched once. Those without room are fetched again, and only those."""
+    """Folders are listed once, and photographs fetched once. Those without room are fetched again, and only those; at
+    once, if there are no points."""
     write, options = KINDS[kind]
     folder = tmp_path / "fox"
     folder.mkdir()
     write(folder)
     store.put(folder)
     here, there = load_scene(folder, **options), load_scene(URL, room=0, **options)
-    assert max(store.num.values()) == 1 and store.num_of("info") == 0
+    assert max(store.num.values()) == (2 if kind == "Blender" else 1) and store.num_of("info") == 0
     assert here.name == there.name == "fox"
     np.testing.assert_array_equal(here.points, there.points)
     for one, other in zip(views_of(here), views_of(there), strict=True):
@@ -129,8 +130,7 @@ def test_the_scene_is_that_of_the_folder(tmp_path, store, kind):
 
 
 def load(room=0):
-    with pytest.warns(UserWarning, match="random points"):
-        return load_scene(URL, room=room)
+    return load_scene(URL, room=room)
 
 
 @pytest.fixture(scope="module")

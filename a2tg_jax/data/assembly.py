@@ -19,11 +19,15 @@ from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_ca
 from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.observations import ObservedPoints
+from a2tg_jax.data.photo_points import Photo, agreeing_points
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.host.text import counted
 
-NUM_RANDOM_POINTS = 10_000
+NUM_POINTS = 10_000
+"""Most points that a scene without any gets."""
+NUM_CANDIDATES = 100_000
+"""Random points among which these are chosen."""
 OBJECT_SHARE = 0.8958
 """Half the side of an object's cube over half the width that cameras see at its centre: the cube of ±1.3 of NeRF's
 synthetic objects, whose cameras are 4.031 away and see 39.6°."""
@@ -82,11 +86,12 @@ def assemble_scene(
     Args:
       name: name of the scene.
       train, test: shots to train and to test on, in any order.
-      cloud: surface points. With fewer than two, or if no training view sees one, random points where the cameras look
-        are used, with a warning. Another warning counts training views that see no point.
+      cloud: surface points. With fewer than two, or if no training view sees one, random points where the cameras look,
+        at which the training views agree, or else any, with a warning. Another warning counts training views that
+        see no point.
       source: name of the input in messages.
-      is_object: whether all views show one whole object: random points then fill a cube around it, without a
-        warning.
+      is_object: whether all views show one whole object: half of the random points then fill a cube around it, and
+        there is no warning.
 
     Raises:
       ValueError: if the shots or their poses make no scene.
@@ -113,12 +118,22 @@ def assemble_scene(
     points = None if cloud is None or len(cloud.points) < 2 else transform.apply(cloud.points)
     unseen_by = [] if points is None else unseeing(points, sights)
     if cloud is None or points is None or len(unseen_by) == len(sights):
+        lack = "has no" if points is None else "no training view sees any of its"
+        candidates = random_points(sights, transform.rotation if is_object else None)
+        photos = [
+            Photo(shot.picture, shot.mask, sight.viewmat, shot.K)
+            for shot, sight in zip(train, sights, strict=True)
+            if shot.rays is None
+        ]
+        points, shades = agreeing_points(photos, candidates, NUM_POINTS)
+        colors = np.rint(255 * shades).astype(np.uint8)
+        where = " where photographs agree"
+        if len(points) < 2:
+            points, where = candidates[:NUM_POINTS], ""
+            colors = np.full(points.shape, RANDOM_COLOR, np.uint8)
         if cloud is not None or not is_object:
-            lack = "has no" if points is None else "no training view sees any of its"
-            message = f"{source}: {lack} sparse points; starting from {NUM_RANDOM_POINTS:,} random points instead"
+            message = f"{source}: {lack} sparse points; starting from {len(points):,} random points{where} instead"
             warnings.warn(message, stacklevel=3)
-        points = random_points(sights, transform.rotation if is_object else None)
-        colors = np.full(points.shape, RANDOM_COLOR, np.uint8)
     else:
         colors = cloud.colors
         if unseen_by:
@@ -172,16 +187,17 @@ def unseeing(points: np.ndarray, sights: Sequence[Sight]) -> list[int]:
 
 
 def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None, seed: int = 0) -> np.ndarray:
-    """Return random points [NUM_RANDOM_POINTS, 3] where cameras look; each view sees some.
+    """Return random points [NUM_CANDIDATES, 3] where cameras look; each view sees some.
 
-    They are in a cube around an object that all views show, or else in the pyramids that the views show.
+    They are in the pyramids that the views show; the first half of them in a cube around an object, if all views show
+    one.
 
     Args:
       sights: what each training view shows. The origin is the point nearest to their optical axes.
       object_axes: [3, 3] axes of the object's cube, as columns; None for other scenes.
       seed: random seed.
     """
-    rng = np.random.default_rng(seed)
+    rng, cube = np.random.default_rng(seed), np.zeros((0, 3))
     viewmats = np.stack([sight.viewmat for sight in sights])
     centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
     distances = np.linalg.norm(centers, axis=1)
@@ -189,15 +205,15 @@ def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None
     slopes = np.stack([(sight.high - sight.low) / np.diag(sight.K)[:2] for sight in sights])
     if object_axes is not None:
         half_side = OBJECT_SHARE * np.median(distances * slopes.min(axis=1) / 2)
-        points: np.ndarray = rng.uniform(-half_side, half_side, (NUM_RANDOM_POINTS, 3)) @ object_axes.T
-        if not unseeing(points, sights):
-            return points
-    # Each point is on a random ray of one view, at a random depth, and the views take turns.
-    view = np.arange(NUM_RANDOM_POINTS) % len(sights)
+        filled = rng.uniform(-half_side, half_side, (NUM_CANDIDATES // 2, 3)) @ object_axes.T
+        cube = cube if unseeing(filled, sights) else filled
+    # Each other point is on a random ray of one view, at a random depth, and the views take turns.
+    num = NUM_CANDIDATES - len(cube)
+    view = np.arange(num) % len(sights)
     low, high = (np.stack([getattr(sight, side) for sight in sights])[view] for side in ("low", "high"))
-    places = np.concatenate([rng.uniform(low, high), np.ones((NUM_RANDOM_POINTS, 1))], axis=1)
+    places = np.concatenate([rng.uniform(low, high), np.ones((num, 1))], axis=1)
     to_rays = np.linalg.inv(np.stack([sight.K for sight in sights]))[view]
-    share = rng.uniform(size=NUM_RANDOM_POINTS)
+    share = rng.uniform(size=num)
     # Cosine between the optical axis and the direction to the origin: near 1 if the cameras surround a subject.
     facing = -np.einsum("vi,vi->v", centers, axes) / np.maximum(distances, 1e-12)
     if np.median(facing) >= LEAST_FACING:
@@ -208,9 +224,8 @@ def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None
         depths = SHALLOWEST * (DEEPEST / SHALLOWEST) ** share
     own = np.einsum("pij,pj->pi", to_rays, places) * depths[:, None]
     # Back to the world, x = Rᵀ·own + centre; "pji" transposes R.
-    offsets: np.ndarray = np.einsum("pji,pj->pi", viewmats[view, :3, :3], own)
-    offsets += centers[view]
-    return offsets
+    offsets = np.einsum("pji,pj->pi", viewmats[view, :3, :3], own)
+    return np.concatenate([cube, offsets + centers[view]])
 
 
 def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:

@@ -80,8 +80,8 @@ def load_transforms(file: Path, options: Options) -> Scene:
 def load_blender(folder: Path, options: Options) -> Scene:
     """Read a Blender scene in the format of NeRF: transforms_train.json, transforms_test.json, images with alpha.
 
-    Most such scenes have no points, and start from random ones in a cube around what all cameras look at. Without a
-    test file, every test_every-th training view is a test view.
+    Most such scenes have no points, and start where their photographs agree. Without a test file, every test_every-th
+    training view is a test view.
     """
     train_file, test_file = (folder / name for name in BLENDER_FILES)
     files = [train_file, test_file] if is_regular(test_file) else [train_file]

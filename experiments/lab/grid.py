@@ -165,7 +165,15 @@ class Grid:
         if method.by_number and cell.budget is not None:
             cell = dataclasses.replace(cell, budget=None, gaussians=splats_in(cell.budget, method))
         system = _system(place, self.preset, method, cell)
-        return Job(scene.path, scene.downscale, system, len(system.stages()) - 1, self.validation, scene.fold)
+        return Job(
+            scene.path,
+            scene.downscale,
+            system,
+            len(system.stages()) - 1,
+            self.validation,
+            scene.fold,
+            scene.random_start,
+        )
 
 
 @functools.lru_cache(maxsize=10_000)

@@ -29,7 +29,7 @@ from a2tg_jax.training import fit_stage
 from a2tg_jax.training.options import own_options
 from a2tg_jax.training.registry import reference_of
 from lab.fingerprint import fingerprint, is_same_so_far
-from lab.scenes import few_views
+from lab.scenes import few_views, from_random_points
 from lab.versions import is_from_before
 
 TEST, VALIDATION = "test", "validation"
@@ -56,6 +56,8 @@ class Job:
     """Whether validation views, taken from the training views, are held out instead of the test views."""
     fold: int | None = None
     """Number of the split of a capture of few views (`scenes.few_views`); None: all training and test views."""
+    random_start: bool = False
+    """Whether it starts from random points (`scenes.from_random_points`)."""
 
     @property
     def views(self) -> str:
@@ -87,8 +89,9 @@ class Job:
 @functools.lru_cache(maxsize=10_000)
 def _key(job: Job) -> str:
     numbers = [fingerprint(job.system, index) for index in range(job.stage + 1)]
-    held_out = [name for name in (job.views,) if name != TEST]
-    digest = hashlib.sha256(repr((job.scene, job.downscale, numbers, *held_out)).encode()).hexdigest()[:12]
+    others = [job.views] if job.views != TEST else []
+    others += ["random start"] if job.random_start else []
+    digest = hashlib.sha256(repr((job.scene, job.downscale, numbers, *others)).encode()).hexdigest()[:12]
     return f"{_readable(job.scene)}-{job.downscale}-{job.system.stages()[job.stage].name}-{digest}"
 
 
@@ -152,9 +155,9 @@ class Folders:
         """Return a job's scene; `room` as in `SceneSource.load`."""
         is_folder = job.scene != "synthetic"
         path = str(self.scenes / job.scene) if is_folder else job.scene
-        if job.fold is None:
-            return SceneSource(path, job.downscale, validation=job.validation).load(room)
-        scene = few_views(SceneSource(path, job.downscale).load(room), job.fold)
+        scene = SceneSource(path, job.downscale).load(room)
+        scene = scene if job.fold is None else few_views(scene, job.fold)
+        scene = from_random_points(scene) if job.random_start else scene
         return with_validation_views(scene) if job.validation else scene
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import a2tg_jax as a2tg
+from a2tg_jax.data.assembly import NUM_POINTS, RANDOM_COLOR, Sight, random_points
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.host.text import did_you_mean
 from lab.grid_file import Block, table_as
@@ -25,6 +26,8 @@ class SceneAt:
     """Width and height of its photographs in full, where bytes are given for each pixel."""
     fold: int | None = None
     """Number of the split of its views into few for training and others to score; None: as the scene has them."""
+    random_start: bool = False
+    """Whether a scene without points starts from random ones, not from those where its photographs agree."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
     """Options of every system, such as its background."""
 
@@ -64,6 +67,18 @@ def few_views(scene: a2tg.Scene, fold: int) -> a2tg.Scene:
         scored = {others[int(place)] for place in np.linspace(0, len(others) - 1, min(MOST_SCORED, len(others)))}
     train, test = (tuple(views[index] for index in sorted(found)) for found in (kept, scored))
     return dataclasses.replace(scene, train=train, test=test)
+
+
+def from_random_points(scene: a2tg.Scene) -> a2tg.Scene:
+    """Return a scene of one object with random points in a cube around it, as the library made them until November
+    2026."""
+    cameras = [view.camera for view in scene.train]
+    sights = [
+        Sight.of(np.asarray(c.viewmat, float), np.asarray(c.K, float), (c.height, c.width), None) for c in cameras
+    ]
+    points = random_points(sights, scene.transform.rotation)[:NUM_POINTS].astype(np.float32)
+    grey = np.full_like(points, RANDOM_COLOR / np.float32(255))
+    return dataclasses.replace(scene, points=points, colors=grey)
 
 
 def own_scene(path: Path, downscale: int) -> SceneAt:

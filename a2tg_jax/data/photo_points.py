@@ -1,0 +1,164 @@
+"""Points where photographs agree, from which scenes without points start.
+
+A point of a surface has the same colour in all photographs that show it; a point in the air has the colours of whatever
+is behind it (voxel colouring, Seitz and Dyer 1997; space carving, Kutulakos and Seitz 2000). Of random candidates,
+those before a transparent pixel are dropped, and in each cell of each photograph the one of the most similar colours is
+best. Others around the best ones may then be better (as in PatchMatch, Barnes et al. 2009).
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from a2tg_jax.core.geometry import NEAR_PLANE
+from a2tg_jax.data.photo_store import Mask, Picture
+
+# Chosen in experiments/NOTEBOOK.md, "A start from photographs".
+MOST_VIEWS = 32
+"""Number of photographs that are compared, evenly chosen."""
+SIDE = 100
+"""Longer side, in pixels, of the photographs that are compared; larger ones are averaged down to about this."""
+CELLS = 64
+"""Cells along the longer side of a photograph."""
+FEW_VIEWS = 2.0
+"""Difference that a point counts more, divided by the number of photographs that show it: few agree by chance, and what
+hangs before a camera hides much."""
+SHARE = 0.4
+"""Share of the photographs that show a point whose largest difference counts: the others may show what hides it."""
+LEAST = 1e-6
+"""Lower bound of what is divided by."""
+TRANSPARENT = 0.02
+"""Opacity below which a pixel shows nothing of the object."""
+ROUNDS = 4
+"""Rounds in which others are tried around the best candidates, half as many as at first."""
+CHUNK = 50_000
+"""Candidates that are looked at together."""
+
+
+class Photo(NamedTuple):
+    """A photograph with its pinhole camera."""
+
+    picture: Picture
+    mask: Mask | None
+    viewmat: np.ndarray
+    """[4, 4] world to camera."""
+    K: np.ndarray
+    """[3, 3] in pixels of the picture."""
+
+
+def agreeing_points(photos: Sequence[Photo], candidates: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points [P, 3] of the candidates [C, 3] at which photographs agree, P ≤ `most`, and their colours
+    [P, 3] in [0, 1]. The same arguments give the same points; no photographs give none."""
+    if not photos:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    looks, rng = [_Look(photo) for photo in photos[:: -(-len(photos) // MOST_VIEWS)]], np.random.default_rng(0)
+    found = _best(_compared(looks, candidates))
+    for _ in range(ROUNDS if len(found.points) > 1 else 0):
+        # Others around the best ones, as far away as these are from each other.
+        distances = cKDTree(found.points).query(found.points, k=2)[0][:, 1]
+        around = rng.integers(len(found.points), size=len(candidates) // 2)
+        moved = found.points[around] + distances[around, None] * rng.normal(size=(len(around), 3))
+        found = _best(found.followed_by(_compared(looks, moved)))
+    chosen = slice(None) if len(found.points) <= most else rng.choice(len(found.points), most, replace=False)
+    return found.points[chosen], found.colors[chosen]
+
+
+class _Compared(NamedTuple):
+    """Candidates that are before no transparent pixel, and that a photograph shows."""
+
+    points: np.ndarray
+    colors: np.ndarray  # [P, 3], the mean of the photographs that agree.
+    differences: np.ndarray  # [P].
+    num_seen: np.ndarray  # [P], photographs that show a point.
+    cells: np.ndarray  # [P, V], the cell of each photograph, -1 where it does not show the point.
+
+    def at(self, rows: np.ndarray) -> "_Compared":
+        return _Compared(*(column[rows] for column in self))
+
+    def followed_by(self, other: "_Compared") -> "_Compared":
+        return _Compared(*map(np.concatenate, zip(self, other, strict=True)))
+
+
+def _compared(looks: "Sequence[_Look]", points: np.ndarray) -> _Compared:
+    """Compare the colours of points [C, 3] in the photographs."""
+    parts = [_compared_part(looks, points[start : start + CHUNK]) for start in range(0, len(points), CHUNK)]
+    return functools.reduce(_Compared.followed_by, parts)
+
+
+def _compared_part(looks: "Sequence[_Look]", points: np.ndarray) -> _Compared:
+    colors, cells, is_free = (np.stack(each) for each in zip(*(look.at(points) for look in looks), strict=True))
+    num_seen = (cells >= 0).sum(axis=0)
+    kept = ~is_free.any(axis=0) & (num_seen > 0)
+    points, colors, cells, num_seen = points[kept], colors[:, kept], cells[:, kept], num_seen[kept]
+    # Unseen colours are NaN, which is sorted to the end.
+    middle = _at_share(colors, 0.5, num_seen)
+    distances = np.abs(colors - middle).sum(axis=2)
+    agrees = distances <= _at_share(distances, 0.5, num_seen)
+    mean = np.where(agrees[..., None], colors, 0).sum(axis=0) / np.maximum(agrees.sum(axis=0), 1)[:, None]
+    differences = _at_share(np.abs(colors - mean).sum(axis=2), SHARE, num_seen)
+    return _Compared(points, mean, differences, num_seen, cells.T)
+
+
+def _best(found: _Compared) -> _Compared:
+    """Return the candidate of the most similar colours in each cell of each photograph."""
+    order = np.argsort(found.differences + FEW_VIEWS / found.num_seen, kind="stable")
+    is_best = np.zeros(len(order), bool)
+    for own in found.cells[order].T:
+        cell, first = np.unique(own, return_index=True)
+        is_best[order[first[cell >= 0]]] = True
+    return found.at(np.flatnonzero(is_best))
+
+
+def _at_share(values: np.ndarray, share: float, counts: np.ndarray) -> np.ndarray:
+    """Return the quantile of values [V, P, …] over the first axis, of the `counts` [P] that are not NaN."""
+    place = np.floor(share * np.maximum(counts - 1, 0)).astype(int).reshape(1, -1, *[1] * (values.ndim - 2))
+    return np.take_along_axis(np.sort(values, axis=0), place, axis=0)[0]
+
+
+def _averaged(image: np.ndarray, factor: int) -> np.ndarray:
+    """Return an image [H, W, C] averaged over squares of `factor` pixels; those at its end may be smaller."""
+    for axis in (0, 1):
+        starts = np.arange(0, image.shape[axis], factor)
+        sizes = np.diff(np.append(starts, image.shape[axis]))
+        image = np.add.reduceat(image, starts, axis=axis) / np.expand_dims(sizes, (1 - axis, 2))
+    return image.astype(np.float32)
+
+
+class _Look:
+    """A photograph at about `SIDE` pixels, to look points up in."""
+
+    def __init__(self, photo: Photo):
+        picture = photo.picture.read()
+        self.viewmat, self.K, self.size = photo.viewmat, photo.K, picture.shape[:2]
+        factor = max(1, round(max(self.size) / SIDE))
+        step = max(1, factor // 4)  # Some of many pixels are enough for a mean.
+        self.factor = factor // step * step
+        pixels = picture[::step, ::step].astype(np.float32) / 255
+        counts = np.ones_like(pixels[..., :1])
+        if photo.mask is not None:
+            counts = photo.mask.read()[::step, ::step, None].astype(np.float32)
+        opacity = pixels[..., 3:] if pixels.shape[2] == 4 else np.ones_like(counts)
+        columns = [counts, counts * opacity, counts * opacity * pixels[..., :3]]
+        means = _averaged(np.concatenate(columns, axis=2), self.factor // step)
+        self.counts, self.opacity = means[..., 0], means[..., 1] / np.maximum(means[..., 0], LEAST)
+        self.colors = means[..., 2:] / np.maximum(means[..., 1:2], LEAST)
+
+    def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return colours [P, 3] of points, NaN where they are not shown, their cells [P], -1 there, and whether they
+        are before a transparent pixel [P]."""
+        own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = (own @ self.K[:2].T / own[:, 2:]).T
+        height, width = self.size
+        is_in = (own[:, 2] > NEAR_PLANE) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        column, row = (np.where(is_in, place, 0).astype(int) for place in (x, y))
+        pixel = row // self.factor, column // self.factor
+        is_in &= self.counts[pixel] > 0.5
+        is_free = is_in & (self.opacity[pixel] < TRANSPARENT)
+        is_in &= ~is_free
+        side = max(self.size) / CELLS
+        cells = np.where(is_in, (row // side).astype(int) * CELLS + (column // side).astype(int), -1)
+        return np.where(is_in[:, None], self.colors[pixel], np.nan), cells, is_free
