@@ -97,7 +97,7 @@ class _Heard:
 
 
 def _ignores_exceptions(frame: FrameType | None) -> bool:
-    """Whether a frame lies within a callback whose exceptions Python prints and ignores."""
+    """Whether a frame is called by a callback whose exceptions Python prints and ignores."""
     callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
     while frame is not None:
         if (
