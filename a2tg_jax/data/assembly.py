@@ -19,7 +19,7 @@ from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_ca
 from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.observations import ObservedPoints
-from a2tg_jax.data.photo_points import Photo, agreeing_points
+from a2tg_jax.data.photo_points import MOST_VIEWS, Look, agreeing_points
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.host.text import counted
@@ -120,12 +120,10 @@ def assemble_scene(
     if cloud is None or points is None or len(unseen_by) == len(sights):
         lack = "has no" if points is None else "no training view sees any of its"
         candidates = random_points(sights, transform.rotation if is_object else None)
-        photos = [
-            Photo(shot.picture, shot.mask, sight.viewmat, shot.K)
-            for shot, sight in zip(train, sights, strict=True)
-            if shot.rays is None
-        ]
-        points, shades = agreeing_points(photos, candidates, NUM_POINTS)
+        pinholes = [shot for shot in train if shot.rays is None]
+        compared = pinholes[:: -(-len(pinholes) // MOST_VIEWS) or 1]
+        looks = [Look(shot.picture, shot.mask, viewmats[shot.name], shot.K) for shot in compared]
+        points, shades = agreeing_points(looks, candidates, NUM_POINTS)
         colors = np.rint(255 * shades).astype(np.uint8)
         where = " where photographs agree"
         if len(points) < 2:

@@ -6,7 +6,6 @@ those before a transparent pixel are dropped, and in each cell of each photograp
 best. Others around the best ones may then be better (as in PatchMatch, Barnes et al. 2009).
 """
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ from a2tg_jax.data.photo_store import Mask, Picture
 
 # Chosen in experiments/NOTEBOOK.md, "A start from photographs".
 MOST_VIEWS = 32
-"""Number of photographs that are compared, evenly chosen."""
+"""Number of photographs that are compared."""
 SIDE = 100
 """Longer side, in pixels, of the photographs that are compared; larger ones are averaged down to about this."""
 CELLS = 64
@@ -34,27 +33,60 @@ TRANSPARENT = 0.02
 """Opacity below which a pixel shows nothing of the object."""
 ROUNDS = 4
 """Rounds in which others are tried around the best candidates, half as many as at first."""
-CHUNK = 50_000
-"""Candidates that are looked at together."""
 
 
-class Photo(NamedTuple):
-    """A photograph with its pinhole camera."""
+class Look:
+    """A photograph of a pinhole camera at about `SIDE` pixels, to look points up in."""
 
-    picture: Picture
-    mask: Mask | None
-    viewmat: np.ndarray
-    """[4, 4] world to camera."""
-    K: np.ndarray
-    """[3, 3] in pixels of the picture."""
+    def __init__(self, picture: Picture, mask: Mask | None, viewmat: np.ndarray, K: np.ndarray):
+        """Args:
+        picture: the photograph, which is read.
+        mask: which of its pixels count; None: all.
+        viewmat: [4, 4] world to camera.
+        K: [3, 3] in pixels of the picture.
+        """
+        pixels, self.viewmat, self.K = picture.read(), viewmat, K
+        self.size = pixels.shape[:2]
+        factor = max(1, round(max(self.size) / SIDE))
+        step = max(1, factor // 4)  # Some of many pixels are enough for a mean.
+        self.factor = factor // step * step
+        pixels = pixels[::step, ::step].astype(np.float32) / 255
+        counts = np.ones_like(pixels[..., :1])
+        if mask is not None:
+            counts = mask.read()[::step, ::step, None].astype(np.float32)
+        opacity = pixels[..., 3:] if pixels.shape[2] == 4 else np.ones_like(counts)
+        columns = [counts, counts * opacity, counts * opacity * pixels[..., :3]]
+        means = _averaged(np.concatenate(columns, axis=2), self.factor // step)
+        self.counts, self.opacity = means[..., 0], means[..., 1] / np.maximum(means[..., 0], LEAST)
+        self.colors = means[..., 2:] / np.maximum(means[..., 1:2], LEAST)
+
+    def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return colours [P, 3] of points, NaN where they are not shown, their cells [P], -1 there, and whether they
+        are before a transparent pixel [P]."""
+        own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = (own @ self.K[:2].T / own[:, 2:]).T
+        height, width = self.size
+        is_in = (own[:, 2] > NEAR_PLANE) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        column, row = (np.where(is_in, place, 0).astype(int) for place in (x, y))
+        pixel = row // self.factor, column // self.factor
+        is_in &= self.counts[pixel] > 0.5
+        is_free = is_in & (self.opacity[pixel] < TRANSPARENT)
+        is_in &= ~is_free
+        side = max(self.size) / CELLS
+        cells = np.where(is_in, (row // side).astype(int) * CELLS + (column // side).astype(int), -1)
+        return np.where(is_in[:, None], self.colors[pixel], np.nan), cells, is_free
 
 
-def agreeing_points(photos: Sequence[Photo], candidates: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points [P, 3] of the candidates [C, 3] at which photographs agree, P ≤ `most`, and their colours
-    [P, 3] in [0, 1]. The same arguments give the same points; no photographs give none."""
-    if not photos:
+def agreeing_points(looks: Sequence[Look], candidates: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points [P, 3], P ≤ `most`, at which photographs agree, and their colours [P, 3] in [0, 1].
+
+    They are among the candidates [C, 3], or near those. The same arguments give the same points; no photographs give
+    none.
+    """
+    if not looks:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    looks, rng = [_Look(photo) for photo in photos[:: -(-len(photos) // MOST_VIEWS)]], np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     found = _best(_compared(looks, candidates))
     for _ in range(ROUNDS if len(found.points) > 1 else 0):
         # Others around the best ones, as far away as these are from each other.
@@ -82,13 +114,8 @@ class _Compared(NamedTuple):
         return _Compared(*map(np.concatenate, zip(self, other, strict=True)))
 
 
-def _compared(looks: "Sequence[_Look]", points: np.ndarray) -> _Compared:
+def _compared(looks: Sequence[Look], points: np.ndarray) -> _Compared:
     """Compare the colours of points [C, 3] in the photographs."""
-    parts = [_compared_part(looks, points[start : start + CHUNK]) for start in range(0, len(points), CHUNK)]
-    return functools.reduce(_Compared.followed_by, parts)
-
-
-def _compared_part(looks: "Sequence[_Look]", points: np.ndarray) -> _Compared:
     colors, cells, is_free = (np.stack(each) for each in zip(*(look.at(points) for look in looks), strict=True))
     num_seen = (cells >= 0).sum(axis=0)
     kept = ~is_free.any(axis=0) & (num_seen > 0)
@@ -125,40 +152,3 @@ def _averaged(image: np.ndarray, factor: int) -> np.ndarray:
         sizes = np.diff(np.append(starts, image.shape[axis]))
         image = np.add.reduceat(image, starts, axis=axis) / np.expand_dims(sizes, (1 - axis, 2))
     return image.astype(np.float32)
-
-
-class _Look:
-    """A photograph at about `SIDE` pixels, to look points up in."""
-
-    def __init__(self, photo: Photo):
-        picture = photo.picture.read()
-        self.viewmat, self.K, self.size = photo.viewmat, photo.K, picture.shape[:2]
-        factor = max(1, round(max(self.size) / SIDE))
-        step = max(1, factor // 4)  # Some of many pixels are enough for a mean.
-        self.factor = factor // step * step
-        pixels = picture[::step, ::step].astype(np.float32) / 255
-        counts = np.ones_like(pixels[..., :1])
-        if photo.mask is not None:
-            counts = photo.mask.read()[::step, ::step, None].astype(np.float32)
-        opacity = pixels[..., 3:] if pixels.shape[2] == 4 else np.ones_like(counts)
-        columns = [counts, counts * opacity, counts * opacity * pixels[..., :3]]
-        means = _averaged(np.concatenate(columns, axis=2), self.factor // step)
-        self.counts, self.opacity = means[..., 0], means[..., 1] / np.maximum(means[..., 0], LEAST)
-        self.colors = means[..., 2:] / np.maximum(means[..., 1:2], LEAST)
-
-    def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return colours [P, 3] of points, NaN where they are not shown, their cells [P], -1 there, and whether they
-        are before a transparent pixel [P]."""
-        own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = (own @ self.K[:2].T / own[:, 2:]).T
-        height, width = self.size
-        is_in = (own[:, 2] > NEAR_PLANE) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        column, row = (np.where(is_in, place, 0).astype(int) for place in (x, y))
-        pixel = row // self.factor, column // self.factor
-        is_in &= self.counts[pixel] > 0.5
-        is_free = is_in & (self.opacity[pixel] < TRANSPARENT)
-        is_in &= ~is_free
-        side = max(self.size) / CELLS
-        cells = np.where(is_in, (row // side).astype(int) * CELLS + (column // side).astype(int), -1)
-        return np.where(is_in[:, None], self.colors[pixel], np.nan), cells, is_free
