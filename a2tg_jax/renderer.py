@@ -12,6 +12,7 @@ from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.core.cameras import Camera, check_camera, checked_cameras, resize_camera
 from a2tg_jax.core.checks import check_kind, check_number
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
@@ -141,7 +142,7 @@ class Renderer:
         self._settings, self._has_geometry = settings, has_geometry
         own = [] if model.origin is None else model.origin.cameras
         # Evenly chosen. `or 1`: without cameras the step would be 0.
-        self._known = own[:: -(-len(own) // PLANNED_CAMERAS) or 1]
+        self._known = evenly_chosen(own, PLANNED_CAMERAS)
         self.capacities: dict[Size, int] = dict(capacities or {})
         """Capacities for (splat, tile) pairs by image size, (width, height)."""
         for camera in checked_cameras(cameras):

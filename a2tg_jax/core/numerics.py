@@ -6,6 +6,7 @@ programs computed.
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,11 @@ Integer = Array | int
 """An integer, traced or not."""
 MOST_DIFFERENCE = 1e-3
 """Largest `relative_difference` that counts as rounding of float32."""
+
+
+def evenly_chosen(items: Any, most: int) -> Any:
+    """Return at most `most` items of a list, a tuple or an array, evenly chosen."""
+    return items[:: max(1, -(-len(items) // most))]
 
 
 def relative_difference(found: Sequence[ArrayLike], wanted: Sequence[ArrayLike]) -> float:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.core.camera_paths import LEAST_FACING, nearest_point
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
 from a2tg_jax.core.geometry import NEAR_PLANE
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.data.photo_points import MOST_VIEWS, Look, agreeing_points
@@ -121,7 +122,7 @@ def assemble_scene(
         lack = "has no" if points is None else "no training view sees any of its"
         candidates = random_points(sights, transform.rotation if is_object else None)
         pinholes = [shot for shot in train if shot.rays is None]
-        compared = pinholes[:: -(-len(pinholes) // MOST_VIEWS) or 1]
+        compared = evenly_chosen(pinholes, MOST_VIEWS)
         looks = [Look(shot.picture, shot.mask, viewmats[shot.name], shot.K) for shot in compared]
         points, shades = agreeing_points(looks, candidates, NUM_POINTS)
         colors = np.rint(255 * shades).astype(np.uint8)

@@ -22,6 +22,7 @@ from a2tg_jax.appearance.parts import MAX_DEGREE, curves_of, falloff_of, nearest
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, floats_per_gaussian, logit, rotation_matrices
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, camera_centers
@@ -73,7 +74,7 @@ def bake(
         raise ValueError(f"baking needs cameras and a growth of at least 1; got {len(cameras)} and {growth}")
     model = model.live
     # Splitting renders each view several times, for which some of them suffice; training uses all.
-    baked = split_splats(model, cameras[:: -(-len(cameras) // MOST_VIEWS)], growth)
+    baked = split_splats(model, evenly_chosen(cameras, MOST_VIEWS), growth)
     return distill(baked, model, cameras, iterations=iterations, progress=progress) if iterations else baked
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from a2tg_jax.core.camera_paths import central_camera
 from a2tg_jax.core.gaussians import check_gaussians
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.io.columns import Choice, opacities_of
 from a2tg_jax.io.compact import CompactChoices, encode_model
 from a2tg_jax.io.edit_file import scores_of
@@ -82,7 +83,7 @@ def importance(model: Model) -> np.ndarray:
     areas: np.ndarray = opacities_of(np.asarray(gaussians.logit_opacities)) * np.exp(log_areas)
     if origin is None or not len(origin.viewmats):
         return areas
-    viewmats = origin.viewmats[:: -(-len(origin.viewmats) // MOST_CAMERAS)]  # Evenly chosen.
+    viewmats = evenly_chosen(origin.viewmats, MOST_CAMERAS)
     # −Rᵀ·t.
     centers = -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
     means = np.asarray(gaussians.means)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.data import Scene
 from a2tg_jax.finish.compaction import (
     ASSUMED_PSNR,
@@ -248,10 +249,10 @@ def loss_measures(model: Model, scene: Scene | None, settings: RenderSettings) -
     if scene is not None:
         # Held-out views are measured as well, but never decide.
         views = {"training views": refined_views(scene.train, model), "test views": scene.test}
-        chosen = {name: found[:: -(-len(found) // MOST_VIEWS)] for name, found in views.items() if found}
+        chosen = {name: evenly_chosen(found, MOST_VIEWS) for name, found in views.items() if found}
         return {name: loss_on_views(model, found, settings=settings) for name, found in chosen.items()}
     if model.origin is None or not model.origin.names:
         return {}
     cameras = model.origin.training_cameras
-    cameras = cameras[:: -(-len(cameras) // MOST_VIEWS)]
+    cameras = evenly_chosen(cameras, MOST_VIEWS)
     return {f"for a model of {ASSUMED_PSNR:g} dB": loss_beside_renders(model, cameras, settings=settings)}

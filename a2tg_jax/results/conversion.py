@@ -8,6 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.finish.baking import ITERATIONS, MOST_GROWTH, MOST_VIEWS, bake, likeness, pictures
 from a2tg_jax.host.regular_files import is_regular, sha256_of
 from a2tg_jax.host.text import counted, in_bytes
@@ -170,7 +171,7 @@ def _baked(source: Path, model: Model, options: BakeOptions) -> tuple[Model, str
     plain = bake(model, training, growth=options.bake_growth, iterations=options.bake_iterations, progress=True)
     # The bake has not seen held-out cameras, so that they judge it fairly.
     views = held_out or training
-    views = views[:: -(-len(views) // MOST_VIEWS)]
+    views = evenly_chosen(views, MOST_VIEWS)
     likeness_db = likeness(pictures(plain, views), pictures(model, views))
     degree, ratio = plain.gaussians.sh_degree, plain.num_bytes / model.num_bytes
     numbers = f"{counted(model.num, 'splat')} into {plain.num:,} plain ones of SH degree {degree}"

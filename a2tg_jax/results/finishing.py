@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.data import Scene
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
@@ -115,7 +116,7 @@ def _changed(model: Model, scene: Scene, options: FinishOptions) -> Iterator[tup
     """Yield the name of each step and the model after it."""
     views = refined_views(scene.train, model)
     if options.max_loss and can_shrink(model):
-        some = views[:: -(-len(views) // MOST_VIEWS)]
+        some = evenly_chosen(views, MOST_VIEWS)
         model = shrink_textures(model, some, max_loss=options.max_loss)
         yield "shrunk", model
     if options.polish_steps and model.appearance.is_linear:

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.pytree import num_compiled
 from a2tg_jax.core.table import Shape
 from a2tg_jax.data.scene import Scene
@@ -374,7 +375,7 @@ class StageRun:
         if size not in self.capacities:
             dtype, appearance = model.gaussians.means.dtype, model.appearance
             views = [view for view in self.views if view.picture.size == size]
-            sample = views[:: -(-len(views) // PLANNED_VIEWS)]
+            sample = evenly_chosen(views, PLANNED_VIEWS)
             cameras = [jax.tree.map(lambda x: jnp.asarray(x, dtype), view.camera) for view in sample]
             pairs = max(
                 pairs_of_view(model.gaussians, camera, appearance, settings, model.num_live) for camera in cameras

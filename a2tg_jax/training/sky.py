@@ -15,6 +15,7 @@ from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, sh_of_colors
 from a2tg_jax.core.geometry import fibonacci
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.data.scene import Scene, View
 
 DISTANCE = 10.0
@@ -169,7 +170,7 @@ def is_bare(camera: Camera, cells: tuple[np.ndarray, float], points: np.ndarray,
     the view's `cell_rays` and vertical [3]."""
     rays, spacing = cells
     # The step is rounded up, so that at most MOST_POINTS are left.
-    towards = _units(points[:: -(-len(points) // MOST_POINTS)] - np.asarray(camera.center, np.float64))
+    towards = _units(evenly_chosen(points, MOST_POINTS) - np.asarray(camera.center, np.float64))
     is_far = cKDTree(towards).query(rays)[0] > REACH * spacing
     return has_ray(rays) & is_far & (rays @ up > LOWEST)
 

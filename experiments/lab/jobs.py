@@ -18,6 +18,7 @@ import numpy as np
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian, no_rows
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import WHITE
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.assembly import with_validation_views
@@ -226,7 +227,7 @@ def _training_facts(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Re
 
 def _quality(scene: a2tg.Scene, model: a2tg.Model, folders: Folders) -> Record:
     """Return quality on the held-out views and on some training views."""
-    train = scene.train[:: -(-len(scene.train) // MOST_TRAIN_VIEWS)]
+    train = evenly_chosen(scene.train, MOST_TRAIN_VIEWS)
     background = background_of(scene)
     on_test = a2tg.evaluate(scene.test, model, background=background, lpips_weights=folders.lpips_weights)
     on_train = a2tg.evaluate(train, model, background=background)
