@@ -117,18 +117,28 @@ def collect_with(call):
             call()
 
     gc.callbacks.append(callback)
-    gc.collect()
-    gc.callbacks.remove(callback)
+    try:
+        gc.collect()
+    finally:
+        gc.callbacks.remove(callback)
 
 
 def finalize_with(call):
-    """Delete an object whose weak reference calls a function."""
+    """Delete an object whose finalizer calls a function."""
     held = {1}
     weakref.finalize(held, call)
 
 
+def refer_with(call):
+    """Delete an object whose weak reference calls a function."""
+    held = {1}
+    reference = weakref.ref(held, lambda _: call())
+    del held
+    assert reference() is None
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("run", [collect_with, finalize_with, lambda call: Deleted(call) and None])
+@pytest.mark.parametrize("run", [collect_with, finalize_with, refer_with, lambda call: Deleted(call) and None])
 def test_a_signal_is_not_lost_where_python_ignores_exceptions(number, run):
     """Callbacks of the garbage collector and of weak references, and `__del__`, of which JAX has many."""
     start = time.monotonic()

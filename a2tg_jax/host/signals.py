@@ -1,16 +1,14 @@
 """Ctrl-C, SIGTERM and SIGHUP: orderly shutdown of a program.
 
 Python ignores exceptions in callbacks of the garbage collector and of weak references, and in `__del__`; JAX has many
-of them. A signal that comes while one runs is therefore sent again.
+of them. A signal whose exception was ignored is therefore sent again.
 """
 
 import contextlib
-import dataclasses
-import gc
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
-from types import FrameType
 from typing import Any
 
 CTRL_C = signal.SIGINT
@@ -68,8 +66,12 @@ def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
             raise Stopped(number)
 
     default = (signal.default_int_handler, signal.SIG_DFL)
-    # _Heard: a handler of an outer block.
-    own = tuple(n for n in numbers if (old := signal.getsignal(n)) in default or isinstance(old, _Heard))
+    own = tuple(
+        # Or a handler of an outer block.
+        n
+        for n in numbers
+        if (old := signal.getsignal(n)) in default or getattr(old, "__module__", None) == __name__
+    )
     with _handled_by(note, own):
         try:
             yield lambda: bool(found)
@@ -79,35 +81,6 @@ def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
             raise
     if found:
         raise Stopped(found[-1])
-
-
-@dataclasses.dataclass(frozen=True)
-class _Heard:
-    """Signal handler that sends the signal again while Python would ignore what it raises."""
-
-    handler: Callable[..., Any]
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        if _ignores_exceptions(frame):
-            again = threading.Timer(SOON, _send, (number,))
-            again.daemon = True  # The process may end first.
-            again.start()
-        else:
-            self.handler(number, frame)
-
-
-def _ignores_exceptions(frame: FrameType | None) -> bool:
-    """Whether a frame is called by a callback whose exceptions Python prints and ignores."""
-    callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
-    while frame is not None:
-        if (
-            frame.f_code in callbacks
-            or frame.f_code.co_name == "__del__"
-            or frame.f_globals.get("__name__") in ("weakref", "_weakrefset")
-        ):
-            return True
-        frame = frame.f_back
-    return False
 
 
 def _send(number: int) -> None:
@@ -128,9 +101,20 @@ def _handled_by(handler: Callable[..., object], numbers: tuple[int, ...]) -> Ite
         # None: a handler that C code installed, which Python could not restore.
         before = {number: old for number, old in before.items() if old not in (signal.SIG_IGN, None)}
     for number in before:
-        signal.signal(number, _Heard(handler))
+        signal.signal(number, handler)
+    ignored = sys.unraisablehook
+
+    def send_again(unraisable: Any) -> None:
+        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            return ignored(unraisable)
+        again = threading.Timer(SOON, _send, (Stopped.of(unraisable.exc_value or KeyboardInterrupt()).number,))
+        again.daemon = True  # The process may end first.
+        again.start()
+
+    sys.unraisablehook = send_again if before else ignored
     try:
         yield
     finally:
+        sys.unraisablehook = ignored
         for number, old in before.items():
             signal.signal(number, old)  # type: ignore[arg-type]
