@@ -141,7 +141,6 @@ class Renderer:
         self._background = jnp.asarray(background, model.gaussians.means.dtype)
         self._settings, self._has_geometry = settings, has_geometry
         own = [] if model.origin is None else model.origin.cameras
-        # Evenly chosen. `or 1`: without cameras the step would be 0.
         self._known = evenly_chosen(own, PLANNED_CAMERAS)
         self.capacities: dict[Size, int] = dict(capacities or {})
         """Capacities for (splat, tile) pairs by image size, (width, height)."""

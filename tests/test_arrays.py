@@ -126,7 +126,7 @@ CONVENTIONS = {
 
 @pytest.mark.parametrize("has_points", [True, False])
 @pytest.mark.parametrize("advice", CONVENTIONS)
-@pytest.mark.filterwarnings("ignore:.*starting from .* random points")
+@pytest.mark.filterwarnings("ignore:.*sparse points")
 def test_poses_of_another_convention_are_named(given, advice, has_points):
     """The advice is right. Flipped axes alone are noticed by points only, for cameras may look outwards."""
     if not has_points and CONVENTIONS[advice] is of_opengl:

@@ -25,7 +25,7 @@ from test_data_transforms import (
 
 from a2tg_jax.data import decoding, load_scene
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*sparse points; starting from")
+pytestmark = pytest.mark.filterwarnings("ignore:.*sparse points; starts from")
 COUNT = 4
 OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -409,7 +409,7 @@ def test_points_of_another_coordinate_system_are_left_out(tmp_path):
         scene = load_scene(tmp_path)
     texts = " ".join(str(warning.message) for warning in printed)
     assert "the points beside it are far from its cameras" in texts
-    assert "starting from" in texts and np.abs(scene.points).max() < 100
+    assert "starts from" in texts and np.abs(scene.points).max() < 100
 
 
 def test_a_world_of_a_map_stays_there(tmp_path):

@@ -347,11 +347,13 @@ LOOKS = {
 @no_points
 @pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])
 @pytest.mark.parametrize("look", LOOKS)
-def test_every_view_sees_random_points(tmp_path, look, name):
+def test_every_view_sees_points(tmp_path, look, name):
+    """Black photographs agree everywhere, so that each cell has a point."""
     places = ring()
     write_poses(tmp_path, places, LOOKS[look](places), name)
     scene = load_scene(tmp_path)
-    assert 2_000 < len(scene.points) <= 10_000 and shares_seen(scene).min() >= 0.1
+    # At most one for each of 40 × 40 pixels of 6 photographs, some of which share points; more for views without any.
+    assert 2_000 < len(scene.points) < 8 * 40 * 40 and shares_seen(scene).min() >= 0.1
 
 
 @pytest.mark.parametrize(
@@ -416,7 +418,7 @@ def test_points_that_some_or_all_views_do_not_see(tmp_path):
         scene = load_scene(tmp_path)
     assert len(scene.points) == 3 and (shares_seen(scene) > 0).any() and not (shares_seen(scene) > 0).all()
     write_points(tmp_path / "sparse_pc.ply", TARGET + np.array([[0, 0, 300.0], [5, 0, 300], [0, 5, 320]]))
-    with pytest.warns(UserWarning, match="no training view sees any of its sparse points; starting from 10,000 random"):
+    with pytest.warns(UserWarning, match="no training view sees any of its sparse points; starts from .* points where"):
         assert shares_seen(load_scene(tmp_path)).min() > 0.1
 
 

@@ -20,7 +20,7 @@ from a2tg_jax.data import decoding, load, photo_reading, photo_store
 from a2tg_jax.data.division import Division, sharing_errors
 from a2tg_jax.data.load import SYNTHETIC, SceneSource
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*random points")
+pytestmark = pytest.mark.filterwarnings("ignore:.*sparse points")
 
 
 @pytest.fixture(autouse=True)
@@ -204,7 +204,7 @@ def test_masks_of_another_programs_pixels_are_made_by_one_process_each(tmp_path,
         pixels = np.full_like(Image.open(file), 200)
         pixels[:, :10] = 0
         Image.fromarray(pixels).save(file)
-    alone = divided(tmp_path / "scene", together, decoded, 4 + 2 * 3)  # Both compare 3 photographs, without points.
+    alone = divided(tmp_path / "scene", together, decoded, 4 + 2 * 2)  # Both compare 2 photographs, without points.
     masks = [view.mask for view in (*alone.train, *alone.test)]
     assert len({mask for mask in masks if mask is not None}) > 1, "borders of two kinds"
 

@@ -15,9 +15,10 @@ from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.fingerprint import fingerprint
 from lab.grid import Method, has_scale, read_grid, splats_in
 from lab.grid_file import GRIDS, SCALES, Block
-from lab.jobs import Folders, step_seconds
-from lab.scenes import SceneAt, chosen_scenes, few_views, own_scene
+from lab.jobs import Folders, Job, step_seconds
+from lab.scenes import SceneAt, chosen_scenes, few_views, from_random_points, own_scene
 from run import chosen, experiments, main, parse_arguments
+from test_data_transforms import write_blender
 
 import a2tg_jax as a2tg
 from a2tg_jax.io.config_json import flatten_config
@@ -427,3 +428,15 @@ def test_the_time_of_steps_leaves_compilation_out():
     seconds = 0.02 * iteration + 5.0 * (iteration >= 100)  # A program is compiled before the 100th iteration.
     history = dataclasses.replace(a2tg.History.empty(), iteration=iteration, seconds=seconds)
     assert step_seconds(history) == pytest.approx(6.0)
+
+
+def test_a_random_start_is_grey_points_in_the_cube_of_an_object(tmp_path):
+    """As the library made them until November 2026; another key tells the runs apart."""
+    write_blender(tmp_path)
+    found = from_random_points(a2tg.load_scene(tmp_path))
+    original = found.transform.inverse().apply(found.points)
+    assert original.shape == (10_000, 3) and np.abs(original).max() < 1.01 * np.abs(original[:, 0]).max()
+    np.testing.assert_allclose(found.colors, 128 / 255, atol=1e-6)
+    job = Job("lego", 2, a2tg.Gaussians2d(), 0)
+    random = dataclasses.replace(job, random_start=True)
+    assert random.key != job.key != dataclasses.replace(job, fold=1).key

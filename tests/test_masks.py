@@ -121,7 +121,7 @@ def test_mask_path_of_nerfstudio(tmp_path):
         frame["mask_path"] = f"held/{index}.png"
         write_mask(tmp_path / "held" / f"{index}.png", left_half(SIZE["w"], SIZE["h"]))
     write_json(tmp_path, frames, **FOCAL, **SIZE)
-    with pytest.warns(UserWarning, match="random points"):
+    with pytest.warns(UserWarning, match="sparse points"):
         views = views_of(load_scene(tmp_path))
     for view in views:
         np.testing.assert_array_equal(view.mask.read(), left_half(SIZE["w"], SIZE["h"]))
@@ -137,7 +137,7 @@ def test_alpha_is_transparency_or_a_mask(tmp_path):
         pixels[..., 3] = np.minimum(2 * pixels[..., 3].astype(int), 255)
         Image.fromarray(pixels).save(tmp_path / frame["file_path"])
     write_json(tmp_path, frames, **FOCAL, **SIZE)
-    with pytest.warns(UserWarning, match="random points"):
+    with pytest.warns(UserWarning, match="sparse points"):
         transparent, masked = load_scene(tmp_path), load_scene(tmp_path, alpha="mask")
     for before, after in zip(views_of(transparent), views_of(masked), strict=True):
         assert before.mask is None and not after.has_alpha

@@ -85,14 +85,45 @@ def test_a_photograph_may_stand_alone_or_lack(candidates):
             np.testing.assert_array_equal(found, wanted)
 
 
-def test_large_photographs_are_averaged():
-    """Of 4,000 pixels a side, 16 a square are; the mean counts what is opaque."""
-    image = np.zeros((300, 400, 4), np.uint8)
-    image[:, :200] = 200, 100, 0, 255
-    image[:, 201::2, :3] = 90  # Transparent.
-    large = np.kron(image, np.ones((10, 10, 1), np.uint8))
-    for pixels in (image, large):
-        look = Look(Picture.of(pixels), None, np.eye(4), np.eye(3))
-        assert max(look.colors.shape) == 100
-        np.testing.assert_allclose(look.colors[:, :50], np.tile([200 / 255, 100 / 255, 0], (75, 50, 1)), atol=1e-6)
-        assert (look.opacity[:, :50] == 1).all() and (look.opacity[:, 50:] == 0).all()
+@pytest.mark.parametrize("times", [1, 10])
+def test_large_photographs_are_averaged(times):
+    """Means are of what is opaque. Of a large photograph, 16 pixels of each square count; the last ones are smaller."""
+    image = np.zeros((300, 403, 4), np.uint8)
+    image[:, :202] = 200, 100, 0, 255
+    image[:, 202:, :3] = 90  # Transparent.
+    look = Look(Picture.of(np.kron(image, np.ones((times, times, 1), np.uint8))), None, np.eye(4), np.eye(3))
+    assert look.colors.shape == (75, 101, 3)
+    np.testing.assert_allclose(look.colors[:, :51], np.tile([200 / 255, 100 / 255, 0], (75, 51, 1)), atol=1e-6)
+    np.testing.assert_allclose(look.opacity[0], [1.0] * 50 + [0.5] + [0.0] * 50, atol=1e-6)
+
+
+def test_one_bad_cut_out_loses_no_points(candidates):
+    looks = looks_at_ball()
+    blank = Look(Picture.of(np.zeros((60, 60, 4), np.uint8)), None, looks[0].viewmat, looks[0].K)
+    points, _ = agreeing_points([*looks, blank], candidates, 5_000)
+    assert len(points) > 500 and np.linalg.norm(points[:, :2], axis=1).max() < 1.5
+
+
+def test_the_start_does_not_depend_on_validation_views_and_leaves_no_view_without_points():
+    """Of six headings in turn at each place, every one is compared. Each eighth training view is another's to judge."""
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, (24, 24, 3), np.uint8) for _ in range(96)]
+    places = [np.array([np.cos(place), np.sin(place), 0]) for place in range(16)]
+    headings = [np.array([np.cos(turn), np.sin(turn), 0]) for turn in np.arange(6) * np.pi / 3]
+    cameras = [a2tg.look_at(place, place + turn, width=24, height=24) for place in places for turn in headings]
+    viewmats, K = np.stack([camera.viewmat for camera in cameras]), cameras[0].K
+
+    def load(images):
+        with pytest.warns(UserWarning, match="starts from [0-9,]+ points where photographs agree"):
+            return a2tg.scene_from_arrays(images, viewmats, K, test_every=0)
+
+    scene = load(images)
+    for view in scene.train:
+        own = scene.points @ np.asarray(view.camera.viewmat)[:3, :3].T + np.asarray(view.camera.viewmat)[:3, 3]
+        place = own @ np.asarray(view.camera.K)[:2].T / own[:, 2:]
+        assert ((own[:, 2] > 0) & (place >= 0).all(axis=1) & (place <= 24).all(axis=1)).sum() > 10
+    changed = load([255 - image if index % 8 == 0 else image for index, image in enumerate(images)])
+    np.testing.assert_array_equal(changed.points, scene.points)
+    np.testing.assert_array_equal(changed.colors, scene.colors)
+    others = load([images[0], 255 - images[1], *images[2:]])
+    assert others.points.shape != scene.points.shape or (others.points != scene.points).any()

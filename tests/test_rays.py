@@ -218,8 +218,8 @@ def test_a_kept_photograph_has_the_rays_of_its_lens(kept, tmp_path):
         warnings.simplefilter("ignore")
         undistorted = a2tg.load_scene(write_fisheye(tmp_path))
     assert undistorted.train[0].camera.rays is None
-    for scene, count in ((kept, 1), (undistorted, 100)):  # Only pinholes are compared for points.
-        assert len(np.unique(scene.colors, axis=0)) >= count and len(scene.points) > 1000
+    # Only photographs of pinholes are compared.
+    assert len(np.unique(undistorted.colors, axis=0)) > 100
     assert len(kept.points) == 10_000 and (kept.colors == kept.colors[0]).all()
 
 

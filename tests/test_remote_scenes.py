@@ -256,7 +256,7 @@ def test_a_photograph_that_changes_or_goes_is_named(fox, store):
 
 
 @pytest.mark.long
-@pytest.mark.filterwarnings("ignore:.*random points", "ignore:.*it is read again")
+@pytest.mark.filterwarnings("ignore:.*sparse points", "ignore:.*it is read again")
 def test_a_run_that_loses_its_store_is_resumed(tmp_path, monkeypatch, capsys, fox, store):
     """The newest checkpoint stays. run.toml has the URL, which `--resume` and `a2tg info` take from there."""
     monkeypatch.setattr(cli, "configure_cpu", lambda: None)

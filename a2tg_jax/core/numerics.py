@@ -21,7 +21,8 @@ MOST_DIFFERENCE = 1e-3
 
 
 def evenly_chosen(items: Any, most: int) -> Any:
-    """Return at most `most` items of a list, a tuple or an array, evenly chosen."""
+    """Return every k-th item of a list, a tuple or an array, at most `most` of them."""
+    # The step is rounded up, and is 1 if there are no items.
     return items[:: max(1, -(-len(items) // most))]
 
 

@@ -45,8 +45,8 @@ def scene_from_arrays(
       images: V images [H, W, 3] or, with straight alpha, [H, W, 4], uint8; sizes may differ. They are not copied.
       viewmats: [V, 4, 4] world-to-camera matrices, rigid; x is right, y down, z forward (OpenCV).
       Ks: [V, 3, 3] intrinsics in pixels, or [3, 3] for all.
-      points: [P, 3] points to start from, in the same world; None: random ones where the images agree, with
-        a warning.
+      points: [P, 3] points to start from, in the same world; None: some where the images agree, with a
+        warning.
       colors: [P, 3] uint8 colours of the points; None: grey.
       names: names of the views, all different; None: numbers.
       masks: [H, W] bool for each image, True at pixels that count, or None.

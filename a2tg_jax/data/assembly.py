@@ -6,7 +6,7 @@ Every scene gets the same origin, orientation and size before training. All of i
 import dataclasses
 import itertools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.core.camera_paths import LEAST_FACING, nearest_point
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
 from a2tg_jax.core.geometry import NEAR_PLANE
-from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.data.photo_points import MOST_VIEWS, Look, agreeing_points
@@ -38,7 +37,8 @@ SHALLOWEST, DEEPEST = 0.5, 10.0
 """Depths of random points in front of other cameras."""
 FIRST_LOOK = 10_000
 """Number of evenly chosen points that a view is tested with first."""
-RANDOM_COLOR = 128
+GREY = 128 / 255
+"""Colour of points whose colour is unknown."""
 FARTHEST = 1e5
 """Largest distance of a camera from the median centre, in units of the median distance."""
 MIN_UP_LENGTH = 1e-3
@@ -87,12 +87,12 @@ def assemble_scene(
     Args:
       name: name of the scene.
       train, test: shots to train and to test on, in any order.
-      cloud: surface points. With fewer than two, or if no training view sees one, random points where the cameras look,
-        at which the training views agree, or else any, with a warning. Another warning counts training views that
-        see no point.
+      cloud: surface points. With fewer than two, or if no training view sees one, points where the photographs agree
+        are used, or else random ones where the cameras look, with a warning. Another warning counts training views
+        that see no point.
       source: name of the input in messages.
-      is_object: whether all views show one whole object: half of the random points then fill a cube around it, and
-        there is no warning.
+      is_object: whether all views show one whole object: it is then searched in a cube as well, and there is no
+        warning.
 
     Raises:
       ValueError: if the shots or their poses make no scene.
@@ -119,20 +119,20 @@ def assemble_scene(
     points = None if cloud is None or len(cloud.points) < 2 else transform.apply(cloud.points)
     unseen_by = [] if points is None else unseeing(points, sights)
     if cloud is None or points is None or len(unseen_by) == len(sights):
-        lack = "has no" if points is None else "no training view sees any of its"
-        candidates = random_points(sights, transform.rotation if is_object else None)
-        pinholes = [shot for shot in train if shot.rays is None]
-        compared = evenly_chosen(pinholes, MOST_VIEWS)
-        looks = [Look(shot.picture, shot.mask, viewmats[shot.name], shot.K) for shot in compared]
-        points, shades = agreeing_points(looks, candidates, NUM_POINTS)
-        colors = np.rint(255 * shades).astype(np.uint8)
-        where = " where photographs agree"
-        if len(points) < 2:
-            points, where = candidates[:NUM_POINTS], ""
-            colors = np.full(points.shape, RANDOM_COLOR, np.uint8)
-        if cloud is not None or not is_object:
-            message = f"{source}: {lack} sparse points; starting from {len(points):,} random points{where} instead"
-            warnings.warn(message, stacklevel=3)
+        lacks = "has no" if points is None else "no training view sees any of its"
+        random = random_points(sights, transform.rotation if is_object else None)
+        points, colors = agreeing_points(_compared_photographs(train, viewmats), random, NUM_POINTS)
+        what, agrees = "points where photographs agree", len(points) >= 2
+        if not agrees:
+            points, colors = random[:NUM_POINTS], np.full((NUM_POINTS, 3), GREY)
+            what = "random points, since photographs agree nowhere"
+        elif lost := unseeing(points, sights):
+            # As many for each of them as for the others, at random.
+            more = random_points([sights[index] for index in lost])[: NUM_POINTS * len(lost) // len(sights)]
+            points, colors = np.concatenate([points, more]), np.concatenate([colors, np.full(more.shape, GREY)])
+        colors = np.rint(255 * colors).astype(np.uint8)
+        if cloud is not None or not (is_object and agrees):
+            warnings.warn(f"{source}: {lacks} sparse points; starts from {len(points):,} {what}", stacklevel=3)
     else:
         colors = cloud.colors
         if unseen_by:
@@ -148,6 +148,15 @@ def assemble_scene(
         transform=transform,
         scale=scene_scale(camera_centers(np.stack(list(viewmats.values())))),
     )
+
+
+def _compared_photographs(train: Sequence[Shot], viewmats: Mapping[str, np.ndarray]) -> list[Look]:
+    """Return photographs of pinhole cameras, evenly chosen, without those that validation holds out."""
+    pinholes = [shot for shot in every_kth(train, VALIDATION_EVERY)[0] or train if shot.rays is None]
+    # Not every second or third one, which may all look the same way.
+    chosen = {round(place) for place in np.linspace(0, len(pinholes) - 1, MOST_VIEWS)} if pinholes else set()
+    compared = [pinholes[index] for index in sorted(chosen)]
+    return [Look(shot.picture, shot.mask, viewmats[shot.name], shot.K) for shot in compared]
 
 
 class Sight(NamedTuple):

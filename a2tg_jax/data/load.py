@@ -111,7 +111,8 @@ def load_scene(
       lens: "undistort" photographs to pinholes, which crops wide angles; or "keep" them and draw through the lens,
         with a ray for each pixel (`Camera.rays`). Pixels more than 80° off the direction of view do not count.
       is_divided: whether the processes of `jax.distributed` call this together. Each then reads an equal share of the
-        photographs, plus as many of the others as its memory has room for. An error of one is raised in all.
+        photographs, plus as many of the others as its memory has room for, and up to 32 to find points. An error
+        of one is raised in all.
 
     Returns:
       The scene in its normalised world; `Scene.transform` leads there from the input's.

@@ -2,8 +2,8 @@
 
 A point of a surface has the same colour in all photographs that show it; a point in the air has the colours of whatever
 is behind it (voxel colouring, Seitz and Dyer 1997; space carving, Kutulakos and Seitz 2000). Of random candidates,
-those before a transparent pixel are dropped, and in each cell of each photograph the one of the most similar colours is
-best. Others around the best ones may then be better (as in PatchMatch, Barnes et al. 2009).
+those where photographs are transparent are dropped, and in each cell of each photograph the one of the most similar
+colours is kept. Then points near those are tried, in four rounds (as in PatchMatch, Barnes et al. 2009).
 """
 
 from collections.abc import Sequence
@@ -23,16 +23,18 @@ SIDE = 100
 CELLS = 64
 """Cells along the longer side of a photograph."""
 FEW_VIEWS = 2.0
-"""Difference that a point counts more, divided by the number of photographs that show it: few agree by chance, and what
-hangs before a camera hides much."""
+"""A point that n photographs show has this / n added to its difference: few agree by chance, and points close to a
+camera hide much."""
 SHARE = 0.4
-"""Share of the photographs that show a point whose largest difference counts: the others may show what hides it."""
+"""Of a point's differences the one at this share counts: in other photographs something may hide it."""
 LEAST = 1e-6
 """Lower bound of what is divided by."""
 TRANSPARENT = 0.02
 """Opacity below which a pixel shows nothing of the object."""
+MOST_SPOILT = 0.05
+"""Share of the photographs, or a single one, that may be transparent before a point: some are cut out badly."""
 ROUNDS = 4
-"""Rounds in which others are tried around the best candidates, half as many as at first."""
+"""Rounds in which points near the kept ones are tried, half as many as at first."""
 
 
 class Look:
@@ -89,7 +91,7 @@ def agreeing_points(looks: Sequence[Look], candidates: np.ndarray, most: int) ->
     rng = np.random.default_rng(0)
     found = _best(_compared(looks, candidates))
     for _ in range(ROUNDS if len(found.points) > 1 else 0):
-        # Others around the best ones, as far away as these are from each other.
+        # As far from the kept ones as these are from each other.
         distances = cKDTree(found.points).query(found.points, k=2)[0][:, 1]
         around = rng.integers(len(found.points), size=len(candidates) // 2)
         moved = found.points[around] + distances[around, None] * rng.normal(size=(len(around), 3))
@@ -99,7 +101,7 @@ def agreeing_points(looks: Sequence[Look], candidates: np.ndarray, most: int) ->
 
 
 class _Compared(NamedTuple):
-    """Candidates that are before no transparent pixel, and that a photograph shows."""
+    """Candidates that a photograph shows, and before which others are not transparent."""
 
     points: np.ndarray
     colors: np.ndarray  # [P, 3], the mean of the photographs that agree.
@@ -118,7 +120,7 @@ def _compared(looks: Sequence[Look], points: np.ndarray) -> _Compared:
     """Compare the colours of points [C, 3] in the photographs."""
     colors, cells, is_free = (np.stack(each) for each in zip(*(look.at(points) for look in looks), strict=True))
     num_seen = (cells >= 0).sum(axis=0)
-    kept = ~is_free.any(axis=0) & (num_seen > 0)
+    kept = (is_free.sum(axis=0) <= max(1, MOST_SPOILT * len(looks))) & (num_seen > 0)
     points, colors, cells, num_seen = points[kept], colors[:, kept], cells[:, kept], num_seen[kept]
     # Unseen colours are NaN, which is sorted to the end.
     middle = _at_share(colors, 0.5, num_seen)

@@ -169,7 +169,6 @@ def is_bare(camera: Camera, cells: tuple[np.ndarray, float], points: np.ndarray,
     """Return [C] whether a cell of a view has a ray, is above the ground, and no point [P, 3] projects near it; given
     the view's `cell_rays` and vertical [3]."""
     rays, spacing = cells
-    # The step is rounded up, so that at most MOST_POINTS are left.
     towards = _units(evenly_chosen(points, MOST_POINTS) - np.asarray(camera.center, np.float64))
     is_far = cKDTree(towards).query(rays)[0] > REACH * spacing
     return has_ray(rays) & is_far & (rays @ up > LOWEST)

@@ -166,14 +166,9 @@ class Grid:
             cell = dataclasses.replace(cell, budget=None, gaussians=splats_in(cell.budget, method))
         system = _system(place, self.preset, method, cell)
         return Job(
-            scene.path,
-            scene.downscale,
-            system,
-            len(system.stages()) - 1,
-            self.validation,
-            scene.fold,
-            scene.random_start,
-        )
+            scene.path, scene.downscale, system, len(system.stages()) - 1, validation=self.validation, fold=scene.fold,
+            random_start=scene.random_start,
+        )  # fmt: skip
 
 
 @functools.lru_cache(maxsize=10_000)

@@ -222,6 +222,7 @@ def _training_facts(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Re
         "step_seconds": step_seconds(result.history), "seed": job.system.seed, "views": job.views,
         "commit": source_commit(), "threads": num_threads(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        **({"random_start": True} if job.random_start else {}),
     }  # fmt: skip
 
 

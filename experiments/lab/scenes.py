@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.data.assembly import NUM_POINTS, RANDOM_COLOR, Sight, random_points
+from a2tg_jax.data.assembly import GREY, NUM_POINTS, Sight, random_points, unseeing
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.host.text import did_you_mean
 from lab.grid_file import Block, table_as
@@ -71,14 +71,21 @@ def few_views(scene: a2tg.Scene, fold: int) -> a2tg.Scene:
 
 def from_random_points(scene: a2tg.Scene) -> a2tg.Scene:
     """Return a scene of one object with random points in a cube around it, as the library made them until November
-    2026."""
+    2026.
+
+    Raises:
+      ValueError: if some view does not show the cube.
+    """
     cameras = [view.camera for view in scene.train]
     sights = [
         Sight.of(np.asarray(c.viewmat, float), np.asarray(c.K, float), (c.height, c.width), None) for c in cameras
     ]
-    points = random_points(sights, scene.transform.rotation)[:NUM_POINTS].astype(np.float32)
-    grey = np.full_like(points, RANDOM_COLOR / np.float32(255))
-    return dataclasses.replace(scene, points=points, colors=grey)
+    points = random_points(sights, scene.transform.rotation)[:NUM_POINTS]
+    if lost := unseeing(points, sights):
+        raise ValueError(
+            f"{scene.name}: random_start needs views of one object; {scene.train[lost[0]].name} shows none"
+        )
+    return dataclasses.replace(scene, points=points.astype(np.float32), colors=np.full(points.shape, GREY, np.float32))
 
 
 def own_scene(path: Path, downscale: int) -> SceneAt:
