@@ -321,6 +321,7 @@ def ring(count=8, radius=1.0):
     return radius * np.stack([np.cos(angles), np.sin(angles), 0.2 + 0.1 * np.sin(3 * angles)], axis=1)
 
 
+@no_points
 def test_random_points_of_nerfs_objects_fill_their_cube(tmp_path):
     """Cameras 4.031 from the origin with 39.6° see objects within ±1.3 (github.com/bmild/nerf)."""
     places = ring()
@@ -347,13 +348,12 @@ LOOKS = {
 @no_points
 @pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])
 @pytest.mark.parametrize("look", LOOKS)
-def test_every_view_sees_points(tmp_path, look, name):
-    """Black photographs agree everywhere, so that each cell has a point."""
+def test_every_view_sees_random_points(tmp_path, look, name):
+    """Black photographs are too plain to be compared."""
     places = ring()
     write_poses(tmp_path, places, LOOKS[look](places), name)
     scene = load_scene(tmp_path)
-    # At most one for each of 40 × 40 pixels of 6 photographs, some of which share points; more for views without any.
-    assert 2_000 < len(scene.points) < 8 * 40 * 40 and shares_seen(scene).min() >= 0.1
+    assert len(scene.points) == 10_000 and shares_seen(scene).min() >= 0.12
 
 
 @pytest.mark.parametrize(
@@ -418,7 +418,7 @@ def test_points_that_some_or_all_views_do_not_see(tmp_path):
         scene = load_scene(tmp_path)
     assert len(scene.points) == 3 and (shares_seen(scene) > 0).any() and not (shares_seen(scene) > 0).all()
     write_points(tmp_path / "sparse_pc.ply", TARGET + np.array([[0, 0, 300.0], [5, 0, 300], [0, 5, 320]]))
-    with pytest.warns(UserWarning, match="no training view sees any of its sparse points; starts from .* points where"):
+    with pytest.warns(UserWarning, match="no training view sees any of its sparse points; starts from 10,000 random"):
         assert shares_seen(load_scene(tmp_path)).min() > 0.1
 
 

@@ -97,6 +97,17 @@ def test_large_photographs_are_averaged(times):
     np.testing.assert_allclose(look.opacity[0], [1.0] * 50 + [0.5] + [0.0] * 50, atol=1e-6)
 
 
+def test_the_air_before_a_plain_background_has_no_points(candidates):
+    """It agrees in all photographs that do not show the ball behind it. Opaque walls with detail are compared."""
+
+    def opaque(behind):
+        return lambda image: np.where(image[..., 3:] > 0, image[..., :3], behind).astype(np.uint8)
+
+    plain, wall = 255, np.random.default_rng(0).integers(0, 256, (60, 60, 3))
+    assert len(agreeing_points(looks_at_ball(change=opaque(plain)), candidates, 5_000)[0]) == 0
+    assert len(agreeing_points(looks_at_ball(change=opaque(wall)), candidates, 5_000)[0]) > 300
+
+
 def test_one_bad_cut_out_loses_no_points(candidates):
     looks = looks_at_ball()
     blank = Look(Picture.of(np.zeros((60, 60, 4), np.uint8)), None, looks[0].viewmat, looks[0].K)

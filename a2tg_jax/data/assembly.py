@@ -125,7 +125,7 @@ def assemble_scene(
         what, agrees = "points where photographs agree", len(points) >= 2
         if not agrees:
             points, colors = random[:NUM_POINTS], np.full((NUM_POINTS, 3), GREY)
-            what = "random points, since photographs agree nowhere"
+            what = "random points, since photographs agree nowhere or are plain"
         elif lost := unseeing(points, sights):
             # As many for each of them as for the others, at random.
             more = random_points([sights[index] for index in lost])[: NUM_POINTS * len(lost) // len(sights)]

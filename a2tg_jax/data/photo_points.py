@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.geometry import NEAR_PLANE
@@ -27,6 +28,12 @@ FEW_VIEWS = 2.0
 camera hide much."""
 SHARE = 0.4
 """Of a point's differences the one at this share counts: in other photographs something may hide it."""
+LEAST_DETAIL = 0.06
+"""Least range of a colour channel around a cell's pixel in an opaque photograph: before a plain background, photographs
+agree anywhere in the air."""
+MOST_PLAIN = 0.5
+"""Largest plain share of the photographs. Beyond it, points hang before a background that they match from most sides,
+and training keeps them: chair on opaque white loses 6 dB by them."""
 LEAST = 1e-6
 """Lower bound of what is divided by."""
 TRANSPARENT = 0.02
@@ -61,10 +68,12 @@ class Look:
         means = _averaged(np.concatenate(columns, axis=2), self.factor // step)
         self.counts, self.opacity = means[..., 0], means[..., 1] / np.maximum(means[..., 0], LEAST)
         self.colors = means[..., 2:] / np.maximum(means[..., 1:2], LEAST)
+        ranges = maximum_filter(self.colors, (3, 3, 1)) - minimum_filter(self.colors, (3, 3, 1))
+        self.is_plain = (ranges.max(axis=2) < LEAST_DETAIL) & (self.opacity.min() >= 1 - TRANSPARENT)
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return colours [P, 3] of points, NaN where they are not shown, their cells [P], -1 there, and whether they
-        are before a transparent pixel [P]."""
+        """Return colours [P, 3] of points, NaN where they are not shown, their cells [P], -1 there and where the
+        photograph is plain, and whether they are before a transparent pixel [P]."""
         own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = (own @ self.K[:2].T / own[:, 2:]).T
@@ -76,17 +85,19 @@ class Look:
         is_free = is_in & (self.opacity[pixel] < TRANSPARENT)
         is_in &= ~is_free
         side = max(self.size) / CELLS
-        cells = np.where(is_in, (row // side).astype(int) * CELLS + (column // side).astype(int), -1)
+        cells = np.where(
+            is_in & ~self.is_plain[pixel], (row // side).astype(int) * CELLS + (column // side).astype(int), -1
+        )
         return np.where(is_in[:, None], self.colors[pixel], np.nan), cells, is_free
 
 
 def agreeing_points(looks: Sequence[Look], candidates: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the points [P, 3], P ≤ `most`, at which photographs agree, and their colours [P, 3] in [0, 1].
 
-    They are among the candidates [C, 3], or near those. The same arguments give the same points; no photographs give
-    none.
+    They are among the candidates [C, 3], or near those. The same arguments give the same points; no photographs, or
+    plain ones, give none.
     """
-    if not looks:
+    if not looks or np.mean([look.is_plain.mean() for look in looks]) > MOST_PLAIN:
         return np.zeros((0, 3)), np.zeros((0, 3))
     rng = np.random.default_rng(0)
     found = _best(_compared(looks, candidates))
@@ -107,7 +118,7 @@ class _Compared(NamedTuple):
     colors: np.ndarray  # [P, 3], the mean of the photographs that agree.
     differences: np.ndarray  # [P].
     num_seen: np.ndarray  # [P], photographs that show a point.
-    cells: np.ndarray  # [P, V], the cell of each photograph, -1 where it does not show the point.
+    cells: np.ndarray  # [P, V], the cell of each photograph, -1 where it shows nothing or is plain.
 
     def at(self, rows: np.ndarray) -> "_Compared":
         return _Compared(*(column[rows] for column in self))
@@ -119,7 +130,7 @@ class _Compared(NamedTuple):
 def _compared(looks: Sequence[Look], points: np.ndarray) -> _Compared:
     """Compare the colours of points [C, 3] in the photographs."""
     colors, cells, is_free = (np.stack(each) for each in zip(*(look.at(points) for look in looks), strict=True))
-    num_seen = (cells >= 0).sum(axis=0)
+    num_seen = (~np.isnan(colors[..., 0])).sum(axis=0)
     kept = (is_free.sum(axis=0) <= max(1, MOST_SPOILT * len(looks))) & (num_seen > 0)
     points, colors, cells, num_seen = points[kept], colors[:, kept], cells[:, kept], num_seen[kept]
     # Unseen colours are NaN, which is sorted to the end.
