@@ -69,7 +69,8 @@ class Look:
         self.counts, self.opacity = means[..., 0], means[..., 1] / np.maximum(means[..., 0], LEAST)
         self.colors = means[..., 2:] / np.maximum(means[..., 1:2], LEAST)
         ranges = maximum_filter(self.colors, (3, 3, 1)) - minimum_filter(self.colors, (3, 3, 1))
-        self.is_plain = (ranges.max(axis=2) < LEAST_DETAIL) & (self.opacity.min() >= 1 - TRANSPARENT)
+        is_opaque = bool(((self.opacity >= 1 - TRANSPARENT) | (self.counts <= 0.5)).all())
+        self.is_plain = (ranges.max(axis=2) < LEAST_DETAIL) & is_opaque
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return colours [P, 3] of points, NaN where they are not shown, their cells [P], -1 there and where the
