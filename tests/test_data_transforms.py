@@ -328,10 +328,7 @@ def test_random_points_of_nerfs_objects_fill_their_cube(tmp_path):
     places *= 4.031128874 / np.linalg.norm(places, axis=1, keepdims=True)
     write_poses(tmp_path, places, -places, "transforms_train.json")
     scene = load_scene(tmp_path)
-    sights = [
-        assembly.Sight.of(np.asarray(view.camera.viewmat), np.asarray(view.camera.K), view.picture.size, None)
-        for view in scene.train
-    ]
+    sights = [assembly.Sight.of_camera(view.camera) for view in scene.train]
     points = assembly.random_points(sights, scene.transform.rotation)
     original = scene.transform.inverse().apply(points[: len(points) // 2])
     np.testing.assert_allclose(np.abs(original).max(axis=0), 1.3, atol=2e-3)

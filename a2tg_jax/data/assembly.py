@@ -25,7 +25,7 @@ from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.host.text import counted
 
 NUM_POINTS = 10_000
-"""Most points that a scene without any gets."""
+"""Most points that a scene without any gets, but for more in views that would see none."""
 NUM_CANDIDATES = 100_000
 """Random points among which these are chosen."""
 OBJECT_SHARE = 0.8958
@@ -120,19 +120,15 @@ def assemble_scene(
     unseen_by = [] if points is None else unseeing(points, sights)
     if cloud is None or points is None or len(unseen_by) == len(sights):
         lacks = "has no" if points is None else "no training view sees any of its"
-        random = random_points(sights, transform.rotation if is_object else None)
-        points, colors = agreeing_points(_compared_photographs(train, viewmats), random, NUM_POINTS)
-        what, agrees = "points where photographs agree", len(points) >= 2
-        if not agrees:
-            points, colors = random[:NUM_POINTS], np.full((NUM_POINTS, 3), GREY)
-            what = "random points, since photographs agree nowhere or are plain"
-        elif lost := unseeing(points, sights):
-            # As many for each of them as for the others, at random.
-            more = random_points([sights[index] for index in lost])[: NUM_POINTS * len(lost) // len(sights)]
-            points, colors = np.concatenate([points, more]), np.concatenate([colors, np.full(more.shape, GREY)])
-        colors = np.rint(255 * colors).astype(np.uint8)
+        points, colors, agrees = _start_without_points(
+            train, viewmats, sights, transform.rotation if is_object else None
+        )
         if cloud is not None or not (is_object and agrees):
-            warnings.warn(f"{source}: {lacks} sparse points; starts from {len(points):,} {what}", stacklevel=3)
+            kind = (
+                "points where photographs agree" if agrees
+                else "random points, since photographs agree nowhere or are plain"
+            )  # fmt: skip
+            warnings.warn(f"{source}: {lacks} sparse points; starts from {len(points):,} {kind}", stacklevel=3)
     else:
         colors = cloud.colors
         if unseen_by:
@@ -148,6 +144,23 @@ def assemble_scene(
         transform=transform,
         scale=scene_scale(camera_centers(np.stack(list(viewmats.values())))),
     )
+
+
+def _start_without_points(
+    train: Sequence[Shot], viewmats: Mapping[str, np.ndarray], sights: "Sequence[Sight]", object_axes: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return points [P, 3] where photographs agree, their colours [P, 3] uint8, and True; or random grey ones, and
+    False. Each view sees some."""
+    random = random_points(sights, object_axes)
+    points, colors = agreeing_points(_compared_photographs(train, viewmats), random, NUM_POINTS)
+    agrees = len(points) >= 2
+    if not agrees:
+        points, colors = random[:NUM_POINTS], np.full((NUM_POINTS, 3), GREY)
+    elif lost := unseeing(points, sights):
+        # As many for each of them as for the others, at random.
+        more = random_points([sights[index] for index in lost])[: NUM_POINTS * len(lost) // len(sights)]
+        points, colors = np.concatenate([points, more]), np.concatenate([colors, np.full(more.shape, GREY)])
+    return points, np.rint(255 * colors).astype(np.uint8), agrees
 
 
 def _compared_photographs(train: Sequence[Shot], viewmats: Mapping[str, np.ndarray]) -> list[Look]:
@@ -178,6 +191,12 @@ class Sight(NamedTuple):
             return Sight(viewmat, K, np.zeros(2), np.array(size[::-1], np.float64))
         # NaN: pixels without a ray.
         return Sight(viewmat, K, np.nanmin(rays, axis=(0, 1)), np.nanmax(rays, axis=(0, 1)))
+
+    @staticmethod
+    def of_camera(camera: Camera) -> "Sight":
+        """Return what a camera shows."""
+        viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+        return Sight.of(viewmat, K, (camera.height, camera.width), camera.rays)
 
     def num_seen(self, points: np.ndarray) -> int:
         """Return the number of points [P, 3] in the picture and beyond the near plane."""

@@ -14,6 +14,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from a2tg_jax.core.geometry import NEAR_PLANE
+from a2tg_jax.data.observations import pinhole_pixels
 from a2tg_jax.data.photo_store import Mask, Picture
 
 # Chosen in experiments/NOTEBOOK.md, "A start from photographs".
@@ -27,7 +28,7 @@ FEW_VIEWS = 2.0
 """A point that n photographs show has this / n added to its difference: few agree by chance, and points close to a
 camera hide much."""
 SHARE = 0.4
-"""Of a point's differences the one at this share counts: in other photographs something may hide it."""
+"""Quantile of a point's differences by which it is judged: larger ones may be of photographs in which it is hidden."""
 LEAST_DETAIL = 0.06
 """Least range of a colour channel around a cell's pixel in an opaque photograph: before a plain background, photographs
 agree anywhere in the air."""
@@ -77,7 +78,7 @@ class Look:
         photograph is plain, and whether they are before a transparent pixel [P]."""
         own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = (own @ self.K[:2].T / own[:, 2:]).T
+            x, y = pinhole_pixels(own, self.K).T
         height, width = self.size
         is_in = (own[:, 2] > NEAR_PLANE) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         column, row = (np.where(is_in, place, 0).astype(int) for place in (x, y))
@@ -138,7 +139,7 @@ def _compared(looks: Sequence[Look], points: np.ndarray) -> _Compared:
     middle = _at_share(colors, 0.5, num_seen)
     distances = np.abs(colors - middle).sum(axis=2)
     agrees = distances <= _at_share(distances, 0.5, num_seen)
-    mean = np.where(agrees[..., None], colors, 0).sum(axis=0) / np.maximum(agrees.sum(axis=0), 1)[:, None]
+    mean = np.where(agrees[..., None], colors, 0).sum(axis=0) / agrees.sum(axis=0)[:, None]
     differences = _at_share(np.abs(colors - mean).sum(axis=2), SHARE, num_seen)
     return _Compared(points, mean, differences, num_seen, cells.T)
 
@@ -154,8 +155,8 @@ def _best(found: _Compared) -> _Compared:
 
 
 def _at_share(values: np.ndarray, share: float, counts: np.ndarray) -> np.ndarray:
-    """Return the quantile of values [V, P, …] over the first axis, of the `counts` [P] that are not NaN."""
-    place = np.floor(share * np.maximum(counts - 1, 0)).astype(int).reshape(1, -1, *[1] * (values.ndim - 2))
+    """Return the quantile of values [V, P, …] over the first axis, of the `counts` [P] ≥ 1 that are not NaN."""
+    place = np.floor(share * (counts - 1)).astype(int).reshape(1, -1, *[1] * (values.ndim - 2))
     return np.take_along_axis(np.sort(values, axis=0), place, axis=0)[0]
 
 

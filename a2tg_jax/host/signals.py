@@ -66,12 +66,9 @@ def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
             raise Stopped(number)
 
     default = (signal.default_int_handler, signal.SIG_DFL)
-    own = tuple(
-        # Or a handler of an outer block.
-        n
-        for n in numbers
-        if (old := signal.getsignal(n)) in default or getattr(old, "__module__", None) == __name__
-    )
+    before = {number: signal.getsignal(number) for number in numbers}
+    # Handlers of this module are those of an outer block.
+    own = tuple(n for n, old in before.items() if old in default or getattr(old, "__module__", None) == __name__)
     with _handled_by(note, own):
         try:
             yield lambda: bool(found)

@@ -113,8 +113,7 @@ def check_start(scene: Scene, system: System, num_given: int | None = None) -> N
     else:
         points, first = np.asarray(scene.points), system.stages()[0]
         if np.isfinite(points).all() and not system.sky_gaussians:  # `init_from_points` names others.
-            cameras = [view.camera for view in scene.train]
-            sights = [Sight.of(np.asarray(c.viewmat), np.asarray(c.K), (c.height, c.width), c.rays) for c in cameras]
+            sights = [Sight.of_camera(view.camera) for view in scene.train]
             if len(unseeing(points, sights)) == len(sights):
                 raise ValueError(
                     f"scene.points: no training view sees any of the {len(points):,} points: they must be in the "

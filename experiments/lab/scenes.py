@@ -76,10 +76,7 @@ def from_random_points(scene: a2tg.Scene) -> a2tg.Scene:
     Raises:
       ValueError: if some view does not show the cube.
     """
-    cameras = [view.camera for view in scene.train]
-    sights = [
-        Sight.of(np.asarray(c.viewmat, float), np.asarray(c.K, float), (c.height, c.width), None) for c in cameras
-    ]
+    sights = [Sight.of_camera(view.camera) for view in scene.train]
     points = random_points(sights, scene.transform.rotation)[:NUM_POINTS]
     if lost := unseeing(points, sights):
         raise ValueError(
