@@ -155,7 +155,7 @@ def test_a_view_and_a_scene_are_pictures():
     np.testing.assert_array_equal(decoded(view._repr_png_())[::factor, ::factor], view.picture.read())
     text = some_scene()._repr_html_()
     assert text.count("<img ") == 8 and "12 training views" in text
-    assert 'title="&lt;0&gt;.png"' in text and 'title="&lt;10&gt;.png"' in text
+    assert 'title="&lt;0&gt;.png"' in text and 'title="&lt;11&gt;.png"' in text
     assert some_scene(2)._repr_html_().count("<img ") == 2
 
 

@@ -21,9 +21,11 @@ MOST_DIFFERENCE = 1e-3
 
 
 def evenly_chosen(items: Any, most: int) -> Any:
-    """Return every k-th item of a list, a tuple or an array, at most `most` of them."""
-    # The step is rounded up, and is 1 if there are no items.
-    return items[:: max(1, -(-len(items) // most))]
+    """Return at most `most` items of a list, a tuple or an array, evenly spaced, with the first and the last one."""
+    if len(items) <= most:
+        return items
+    chosen = np.linspace(0, len(items) - 1, most).round().astype(int)
+    return items[chosen] if isinstance(items, np.ndarray | Array) else [items[index] for index in chosen]
 
 
 def relative_difference(found: Sequence[ArrayLike], wanted: Sequence[ArrayLike]) -> float:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from a2tg_jax.core.camera_paths import nearest_point
 from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, check_test_every, every_kth, rigid_viewmat
 from a2tg_jax.data.observations import before_camera, observed_points, pinhole_pixels
@@ -150,7 +151,7 @@ def _likelier_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
 
     With points, the test is how many of them are in the images; without, whether all cameras look at one place.
     """
-    chosen = [shots[i] for i in np.unique(np.linspace(0, len(shots) - 1, MOST_COMPARED).astype(int))]
+    chosen = evenly_chosen(shots, MOST_COMPARED)
     given = np.stack([shot.viewmat for shot in chosen])
     flip = np.diag([1.0, -1.0, -1.0, 1.0])  # Between the camera axes of OpenGL and OpenCV.
     others = {
@@ -160,7 +161,7 @@ def _likelier_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
         "np.diag([1, -1, -1, 1]) @ viewmats, if these have y up and z backward, as in OpenGL": flip @ given,
     }
     if points is not None and len(points):
-        some = points[np.unique(np.linspace(0, len(points) - 1, 10 * MOST_COMPARED).astype(int))]
+        some = evenly_chosen(points, 10 * MOST_COMPARED)
         own, *found = (_share_seen(chosen, viewmats, some) for viewmats in (given, *others.values()))
         best = int(np.argmax(found))
         if found[best] < LEAST_SEEN or own * CLEARLY > found[best]:

@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.core.camera_paths import LEAST_FACING, nearest_point
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
 from a2tg_jax.core.geometry import NEAR_PLANE
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.similarity import Similarity, camera_centers
-from a2tg_jax.data.observations import ObservedPoints
+from a2tg_jax.data.observations import ObservedPoints, pinhole_pixels
 from a2tg_jax.data.photo_points import MOST_VIEWS, Look, agreeing_points
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
 from a2tg_jax.data.scene import Scene, View
@@ -166,9 +167,7 @@ def _start_without_points(
 def _compared_photographs(train: Sequence[Shot], viewmats: Mapping[str, np.ndarray]) -> list[Look]:
     """Return photographs of pinhole cameras, evenly chosen, without those that validation holds out."""
     pinholes = [shot for shot in every_kth(train, VALIDATION_EVERY)[0] or train if shot.rays is None]
-    # Not every second or third one, which may all look the same way.
-    chosen = {round(place) for place in np.linspace(0, len(pinholes) - 1, MOST_VIEWS)} if pinholes else set()
-    compared = [pinholes[index] for index in sorted(chosen)]
+    compared = evenly_chosen(pinholes, MOST_VIEWS)
     return [Look(shot.picture, shot.mask, viewmats[shot.name], shot.K) for shot in compared]
 
 
@@ -201,8 +200,7 @@ class Sight(NamedTuple):
     def num_seen(self, points: np.ndarray) -> int:
         """Return the number of points [P, 3] in the picture and beyond the near plane."""
         own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        own = own[own[:, 2] > NEAR_PLANE]
-        places = own @ self.K[:2].T / own[:, 2:]
+        places = pinhole_pixels(own[own[:, 2] > NEAR_PLANE], self.K)
         return int(((places >= self.low) & (places <= self.high)).all(axis=1).sum())
 
 

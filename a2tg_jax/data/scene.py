@@ -13,6 +13,7 @@ from jax import Array
 from a2tg_jax.core.cameras import Camera, check_is_camera
 from a2tg_jax.core.checks import check_array, check_kind, check_number, check_shape
 from a2tg_jax.core.notebook_display import THUMBNAIL, enlarged, html_image, png
+from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.data.observations import ObservedPoints
@@ -118,8 +119,7 @@ class Scene:
 
     def _repr_html_(self) -> str:
         """Return the line above thumbnails of a few training views, evenly spaced, for notebooks."""
-        chosen = {len(self.train) * place // NUM_THUMBNAILS for place in range(NUM_THUMBNAILS)} if self.train else set()
-        views = [self.train[index] for index in sorted(chosen)]
+        views = evenly_chosen(self.train, NUM_THUMBNAILS)
         images = (html_image(png(view.picture.read(), THUMBNAIL), view.name) for view in views)
         return f"<div>{html.escape(repr(self))}</div><div>{' '.join(images)}</div>"
 

@@ -248,9 +248,8 @@ def even_directions(num: int, is_sky: Callable[[np.ndarray], np.ndarray]) -> tup
         found = found[is_sky(found)]
         # Falls in each round, so that the loop ends.
         share = min(max(len(found), 1) / total, share / MORE)
-    chosen = np.linspace(0, len(found) - 1, num).round().astype(int)
     # Directions that are left out make room for wider gaps.
-    return found[chosen], _spacing(total) * float(np.sqrt(len(found) / num))
+    return evenly_chosen(found, num), _spacing(total) * float(np.sqrt(len(found) / num))
 
 
 def _spacing(num: int) -> float:
