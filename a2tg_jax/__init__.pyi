@@ -37,6 +37,7 @@ from .densify.clone_split import (
     FillingDensity as FillingDensity,
     OpacityReset as OpacityReset,
 )
+from .densify.placing import PlaceByError as PlaceByError
 from .densify.pruning import Prune as Prune, PruneFloaters as PruneFloaters
 from .densify.splitting import SplitByGradient as SplitByGradient
 from .densify.view_dependence import AdaptDegrees as AdaptDegrees

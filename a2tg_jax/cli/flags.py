@@ -19,13 +19,13 @@ FLAGS = {
         "loss.depth-kind loss.depth-weight loss.distortion-weight loss.normal-weight loss.opacity-weight "
         "loss.points-weight loss.robust-factor loss.robust-share loss.scale-weight loss.ssim-weight lpips-weights "
         "mask-as max-memory memory-budget more noise-in-stage2 num-processes on-nan opacity-reset.most out overwrite "
-        "preset process-id prune.at prune.keep prune.share quiet rates.log-scales rates.logit-opacities rates.means "
-        "rates.means-final-factor rates.quats rates.sh-degree0 rates.sh-rest refine-poses resume seed sh-degree "
-        "single-texel-rate sky-gaussians stage1-iterations stage2-iterations system tensorboard test-every texel-rate "
-        "texture-share texture-side texture.anisotropic texture.at texture.axes texture.budget-mb texture.cap "
-        "texture.fraction texture.gradient texture.k-a texture.k-s texture.moments texture.select texture.threshold "
-        "tile-size validation view view-dependence-rate view-dependence-share view-dependence.at "
-        "view-dependence.budget-mb view-dependence.highest view-dependence.idle yes "
+        "place.at place.cap place.share preset process-id prune.at prune.keep prune.share quiet rates.log-scales "
+        "rates.logit-opacities rates.means rates.means-final-factor rates.quats rates.sh-degree0 rates.sh-rest "
+        "refine-poses resume seed sh-degree single-texel-rate sky-gaussians stage1-iterations stage2-iterations system "
+        "tensorboard test-every texel-rate texture-share texture-side texture.anisotropic texture.at texture.axes "
+        "texture.budget-mb texture.cap texture.fraction texture.gradient texture.k-a texture.k-s texture.moments "
+        "texture.select texture.threshold tile-size validation view view-dependence-rate view-dependence-share "
+        "view-dependence.at view-dependence.budget-mb view-dependence.highest view-dependence.idle yes "
     ),
     "eval": "json lpips-weights",
     "finish": "lpips-weights max-loss out polish-steps",

@@ -219,6 +219,19 @@ def crop_camera(camera: Camera, width: int, height: int) -> Camera:
     return Camera(camera.viewmat, scaled.K.at[:2, 2].add(shift), width, height)
 
 
+def back_project(depth: Array, camera: Camera) -> Array:
+    """Return the world points [H, W, 3] of the pixels at depths [H, W] along the camera's z axis; pixels
+    without a ray give points without meaning."""
+    height, width = depth.shape
+    x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
+    if camera.rays is not None:
+        x, y = jnp.moveaxis(jnp.where(jnp.isfinite(camera.rays), camera.rays, 0.0), -1, 0)
+    rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ jnp.linalg.inv(camera.K).T
+    rotation = camera.viewmat[:3, :3]
+    # Rays are rows: r·Rc is Rcᵀ·r, transposed.
+    return (rays @ rotation) * depth[..., None] + camera.center[None, None]
+
+
 def intrinsics(width: int, height: int, field_of_view: float) -> np.ndarray:
     """Return K [3, 3] of square pixels with the principal point in the middle. The field of view is in radians, across
     the longer side."""

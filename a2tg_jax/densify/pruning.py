@@ -22,15 +22,13 @@ from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.data import View, counted_pixels, views_by_kind
+from a2tg_jax.densify.placing import room_for
 from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, iterations_at, keep_rows
 from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.exchange import exchange_of
-from a2tg_jax.parallel.exchange_room import room_of_view
 from a2tg_jax.parallel.sharded_rows import everywhere, mesh_of, of_first, on_host, spread
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
-from a2tg_jax.renderer import plan_render
 
 
 @pytree
@@ -112,21 +110,7 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contrib
     if not len(total):
         return Contributions(total, num_views)
     mesh, dtype = mesh_of(model.gaussians.means), model.gaussians.means.dtype
-    settings, appearance = RenderSettings(exchange=exchange_of(model.gaussians.means)), model.appearance
-    all_cameras = [view.camera for view in views]
-
-    def rounded_up(number: int) -> int:
-        return 1 << number.bit_length()  # Programs are compiled for a room: for few of them.
-
-    if settings.exchange is None:
-        capacity = plan_render(model, all_cameras, settings=settings).capacity
-        settings = dataclasses.replace(settings, capacity=rounded_up(capacity or 1))
-    else:
-        rooms = [room_of_view(model.gaussians, one, appearance, settings, model.num_live) for one in all_cameras]
-        capacity = rounded_up(max(room.pairs for room in rooms))
-        rows_per_pair = rounded_up(max(room.rows for room in rooms)) / capacity
-        exchange = dataclasses.replace(settings.exchange, rows_per_pair=rows_per_pair)
-        settings = dataclasses.replace(settings, capacity=capacity, exchange=exchange)
+    settings = room_for(model, [view.camera for view in views])
     for own in views_by_kind(views):
         rays = own[0].camera.rays
         rays = None if rays is None else jnp.asarray(rays, dtype)

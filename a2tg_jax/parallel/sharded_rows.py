@@ -140,6 +140,15 @@ def rows_moved(x: Array, rows: Array | np.ndarray) -> Array:
     return placed_like(on_host(x)[np.asarray(rows)], x)
 
 
+def rows_replaced(x: Array, rows: np.ndarray, new: ArrayLike) -> Array:
+    """Return the array with other values at some rows (host)."""
+    if mesh_of(x) is None:
+        return x.at[rows].set(new)
+    found = np.array(on_host(x))
+    found[rows] = new
+    return placed_like(found, x)
+
+
 def readable(tree: T) -> T:
     """Return arrays that this process can read: those that are also on other processes' devices are read (host)."""
     return jax.tree.map(lambda x: x if not isinstance(x, jax.Array) or x.is_fully_addressable else on_host(x), tree)

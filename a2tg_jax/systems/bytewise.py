@@ -13,6 +13,7 @@ from a2tg_jax.core.budget import MEGABYTE, bytes_of, bytes_per_gaussian
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree
+from a2tg_jax.densify.placing import PlaceByError
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.densify.view_dependence import AdaptDegrees
@@ -69,6 +70,9 @@ class Bytewise(TwoStages):
     prune: Prune = PRUNING
     """Pruning of the Gaussians that show least, up to 0.8 of the first stage; others grow in their place. The end of
     the stage prunes in any case."""
+    place: PlaceByError = PlaceByError()
+    """New Gaussians in the first stage where pictures are wrong, instead of the pruned ones. Its cap is the one of
+    densify, which replaces what else is pruned."""
     fading_weight: float = 0.01  # measured in experiments/NOTEBOOK.md, "A weight on opacities"
     """Weight of the mean opacity in the loss of the first stage, so that Gaussians that show little fade and move; 0:
     none. It adds to loss.opacity_weight."""
@@ -93,7 +97,7 @@ class Bytewise(TwoStages):
     """Options of the texture lookup."""
 
     name: ClassVar[str] = "bytewise"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     @property
     def initial_sh_degree(self) -> int:
@@ -107,8 +111,9 @@ class Bytewise(TwoStages):
         # Growth fills all bytes; the end of the first stage makes room for details.
         grow = dataclasses.replace(self.densify, cap=self._num_gaussians())
         pruning = pruned(self.prune, self.stage1_iterations, densify_times)
+        placing = (dataclasses.replace(self.place, cap=grow.cap),) if self.place.share else ()
         last = (Prune(keep=self._num_kept()),) if self._share else ()
-        first = self.growing_stage((Noise(), grow, *pruning, *last, *limits), plain, kernels or None)
+        first = self.growing_stage((Noise(), grow, *pruning, *placing, *last, *limits), plain, kernels or None)
         fading = dataclasses.replace(self.loss, opacity_weight=self.loss.opacity_weight + self.fading_weight)
         first = dataclasses.replace(first, losses=fading.terms())
         # Degrees rise up to their share of the bytes; textures, empty at first, take the rest.
@@ -171,14 +176,16 @@ class Bytewise(TwoStages):
         for name in ("fading_weight", "kernel_rate", "view_dependence_rate", "texel_rate"):
             check_number(name, getattr(self, name), least=0)
         view, details = self.view_dependence, self.details
-        by_shares: tuple[tuple[str, Any, str], ...] = (
-            *(("details", details, name) for name in ("select", "fraction", "threshold", "budget_mb")),
-            ("view_dependence", view, "budget_mb"),
+        by_shares = "the shares decide"
+        decided: tuple[tuple[str, Any, str, str], ...] = (
+            *(("details", details, name, by_shares) for name in ("select", "fraction", "threshold", "budget_mb")),
+            ("view_dependence", view, "budget_mb", by_shares),
+            ("place", self.place, "cap", f"{self._limit} decides"),
         )
-        for path, event, name in by_shares:
+        for path, event, name, reason in decided:
             if getattr(event, name) != getattr(type(event), name):
                 raise ValueError(
-                    f"{path}.{name} must stay {getattr(type(event), name)!r}, because the shares decide; got "
+                    f"{path}.{name} must stay {getattr(type(event), name)!r}, because {reason}; got "
                     f"{getattr(event, name)!r}"
                 )
         if self.texture_share:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.cameras import Camera, check_is_camera
+from a2tg_jax.core.cameras import Camera, back_project, check_is_camera
 from a2tg_jax.core.checks import check_array, check_floats, check_number, check_shape, plain_array
 from a2tg_jax.core.numerics import normalize, safe_divide
 from a2tg_jax.rasterize.kernels import window_scores
@@ -152,16 +152,3 @@ def check_same_shape(image: Array, target: Array) -> None:
         raise ValueError(f"image and target must both be [H, W, 3]; got {image.shape} and {target.shape}")
     if not (jnp.issubdtype(image.dtype, jnp.floating) and jnp.issubdtype(target.dtype, jnp.floating)):
         raise ValueError(f"image and target must be floats in [0, 1]; got {image.dtype} and {target.dtype}")
-
-
-def back_project(depth: Array, camera: Camera) -> Array:
-    """Return the world points [H, W, 3] of the pixels at depths [H, W] along the camera's z axis; pixels
-    without a ray give points without meaning."""
-    height, width = depth.shape
-    x, y = jnp.meshgrid(jnp.arange(width, dtype=depth.dtype) + 0.5, jnp.arange(height, dtype=depth.dtype) + 0.5)
-    if camera.rays is not None:
-        x, y = jnp.moveaxis(jnp.where(jnp.isfinite(camera.rays), camera.rays, 0.0), -1, 0)
-    rays = jnp.stack([x, y, jnp.ones_like(x)], -1) @ jnp.linalg.inv(camera.K).T
-    rotation = camera.viewmat[:3, :3]
-    # Rays are rows: r·Rc is Rcᵀ·r, transposed.
-    return (rays @ rotation) * depth[..., None] + camera.center[None, None]

@@ -1,0 +1,174 @@
+"""New Gaussians where pictures are wrong, on the surface that is rendered there.
+
+Splitting and MCMC make new Gaussians of old ones, close to these. Here pixels of training views are drawn in proportion
+to their error, and each gets a Gaussian: at the rendered depth, in the plane of the rendered surface, as wide as the
+pixel, and of its colour in the photograph. After ConeGS (Baranowski et al., 2025), whose depths are another model's.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from a2tg_jax.appearance import allocate_appearance, template_of
+from a2tg_jax.core.cameras import Camera, back_project
+from a2tg_jax.core.checks import check_number
+from a2tg_jax.core.gaussians import Gaussians, sh_of_colors
+from a2tg_jax.core.numerics import evenly_chosen
+from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.origin import BLACK
+from a2tg_jax.core.pytree import pytree, static
+from a2tg_jax.core.table import is_table
+from a2tg_jax.data import View, counted_pixels, view_image
+from a2tg_jax.events import Change, Due, HostEvent, iterations_at
+from a2tg_jax.model import Model
+from a2tg_jax.parallel.exchange import exchange_of
+from a2tg_jax.parallel.exchange_room import room_of_view
+from a2tg_jax.parallel.sharded_rows import everywhere, mesh_of, of_first, on_host, placed_like, rows_replaced
+from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
+from a2tg_jax.render import jitted_render
+from a2tg_jax.renderer import plan_render
+
+# Chosen in experiments/NOTEBOOK.md, "New Gaussians where pictures are wrong".
+MOST_VIEWS = 48
+"""Number of training views in which errors are measured each time."""
+OPACITY = 0.3
+"""Opacity of new Gaussians."""
+LEAST_ALPHA = 0.5
+"""Alpha of a pixel from which on it can get a Gaussian; where less is drawn, the depth is of no surface."""
+
+
+@pytree
+class PlaceByError(HostEvent):
+    """Event that adds Gaussians on the rendered surface, at pixels drawn in proportion to their error.
+
+    After ConeGS (Baranowski et al., 2025). It uses the cameras of the scene, not refined ones, and photographs without
+    their exposures.
+
+    Examples:
+      >>> a2tg.PlaceByError(share=0.1, at=(0.25, 0.5)).iterations(1000)
+      (250, 500)
+    """
+
+    share: float = 0.1
+    """Number of Gaussians to add each time, as a share of those that exist; 0: none."""
+    at: tuple[float, ...] = static(default=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8))
+    """Fractions of the stage at which Gaussians are added."""
+    cap: int = static(default=500_000)
+    """Largest number of Gaussians, for which densification has allocated rows."""
+
+    def check_options(self) -> None:
+        check_number("share", self.share, least=0, most=1)
+        check_number("cap", self.cap, least=2)
+        self.iterations(1)  # checks `at`
+
+    def iterations(self, num_iterations: int) -> tuple[int, ...]:
+        return iterations_at(self.at, num_iterations)
+
+    def num_programs(self, num_iterations: int) -> int:
+        return 1  # Only the views that are drawn; rows keep their number.
+
+    def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
+        if any(map(is_table, jax.tree.leaves(model.appearance, is_leaf=is_table))):
+            raise ValueError("share must be 0 in a stage whose Gaussians have textures or view dependence of their own")
+        num = model.num
+        wanted = min(round(num * float(self.share)), min(self.cap, model.gaussians.num) - num)
+        if wanted <= 0:
+            reason = "share adds no Gaussian, because there are as many as the cap allows; prune some before"
+            return Change(model, moments, state, unused=reason)
+        added = gaussians_at_errors(model, due.views, wanted, np.random.default_rng(due.index))
+        appearance = allocate_appearance(template_of(model.appearance), jax.random.key(due.index), added)
+        rows = np.arange(num, num + added.num)
+
+        def replaced(old: Array, new: ArrayLike) -> Array:
+            return rows_replaced(old, rows, new)
+
+        gaussians, shown = jax.tree.map(replaced, (model.gaussians, model.appearance), (added, appearance))
+        moments = dataclasses.replace(
+            moments, **{name: jax.tree.map(lambda x: replaced(x, 0), getattr(moments, name)) for name in ("mu", "nu")}
+        )
+        num_live = placed_like(np.asarray(num + added.num, np.int32), model.gaussians.means)
+        model = dataclasses.replace(model, gaussians=gaussians, appearance=shown, num_live=num_live)
+        return Change(model, moments, state)
+
+
+def gaussians_at_errors(model: Model, views: Sequence[View], num: int, rng: np.random.Generator) -> Gaussians:
+    """Return `num` Gaussians at pixels of some views, drawn in proportion to the mean difference of their colours;
+    none where masks do not count or no surface is drawn. None at all if no pixel is wrong (host)."""
+    settings, mesh = room_for(model, [view.camera for view in views]), mesh_of(model.gaussians.means)
+    background = everywhere(mesh, jnp.asarray(BLACK, model.gaussians.means.dtype))
+    totals, drawn = [], []
+    for view in evenly_chosen(views, MOST_VIEWS):
+        camera = everywhere(mesh, view.camera)
+        output, _ = jitted_render()(
+            model.gaussians, camera, model.appearance, background, settings, num_live=model.num_live
+        )
+        total, found = _drawn_pixels(view, jax.tree.map(on_host, output), num, rng)
+        totals.append(total)
+        drawn.append(found)
+    if not sum(totals):
+        num, view_of = 0, np.zeros(0, int)
+    else:
+        view_of = rng.choice(len(totals), num, p=np.asarray(totals) / sum(totals))
+    # Of each view as many as its share of the error, from as many that were drawn in it.
+    points, normals, colors, sizes = (np.stack(column)[view_of, np.arange(num)] for column in zip(*drawn, strict=True))
+    quats = Rotation.from_matrix(_axes(normals, rng)).as_quat(scalar_first=True) if num else np.zeros((0, 4))
+    arrays = (
+        points,
+        quats,
+        np.log(sizes)[:, None].repeat(2, axis=1),
+        np.full(num, np.log(OPACITY / (1 - OPACITY))),
+        sh_of_colors(colors, model.gaussians.sh_degree),
+    )
+    dtype = model.gaussians.means.dtype
+    return Gaussians(*(jnp.asarray(array, dtype) for array in of_first(mesh, arrays)))
+
+
+def _drawn_pixels(
+    view: View, output: RenderOutput, num: int, rng: np.random.Generator
+) -> tuple[float, tuple[np.ndarray, ...]]:
+    """Return the sum of the errors of a view, and of `num` pixels that are drawn in proportion to them: points [P, 3],
+    normals [P, 3], colours [P, 3] and widths [P]."""
+    photograph = view_image(view, BLACK)
+    is_usable = counted_pixels([view])[0, ..., 0] & (output.alpha >= LEAST_ALPHA)
+    if view.camera.rays is not None:
+        is_usable &= np.isfinite(np.asarray(view.camera.rays)).all(axis=2)
+    errors = np.where(is_usable, np.abs(output.color - photograph).mean(axis=2), 0).astype(np.float64)
+    sums = np.cumsum(errors)
+    pixels = np.searchsorted(sums, rng.random(num) * sums[-1], side="right").clip(0, errors.size - 1)
+    depth = jnp.asarray(output.depth / np.maximum(output.alpha, LEAST_ALPHA))
+    points = np.asarray(back_project(depth, view.camera)).reshape(-1, 3)[pixels]
+    K = np.asarray(view.camera.K, np.float64)
+    sizes = np.asarray(depth, np.float64).ravel()[pixels] / np.sqrt(K[0, 0] * K[1, 1])
+    normals = np.asarray(output.normal, np.float64).reshape(-1, 3)[pixels]
+    return sums[-1], (points, normals, photograph.reshape(-1, 3)[pixels], sizes)
+
+
+def _axes(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return rotations [P, 3, 3] whose third axis is along a normal [P, 3], turned at random around it."""
+    across = np.cross(normals, rng.normal(size=normals.shape))
+    axes = np.stack([across, np.cross(normals, across), normals], axis=-1)
+    return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
+
+
+def room_for(model: Model, cameras: Sequence[Camera]) -> RenderSettings:
+    """Return settings with room for a model's tile lists in each view. The devices over which its rows are spread draw
+    each view together (host)."""
+
+    def rounded_up(number: int) -> int:
+        return 1 << number.bit_length()  # Programs are compiled for a room: for few of them.
+
+    settings, appearance = RenderSettings(exchange=exchange_of(model.gaussians.means)), model.appearance
+    if settings.exchange is None:
+        capacity = plan_render(model, cameras, settings=settings).capacity
+        return dataclasses.replace(settings, capacity=rounded_up(capacity or 1))
+    rooms = [room_of_view(model.gaussians, one, appearance, settings, model.num_live) for one in cameras]
+    capacity = rounded_up(max(room.pairs for room in rooms))
+    rows_per_pair = rounded_up(max(room.rows for room in rooms)) / capacity
+    exchange = dataclasses.replace(settings.exchange, rows_per_pair=rows_per_pair)
+    return dataclasses.replace(settings, capacity=capacity, exchange=exchange)
