@@ -344,10 +344,10 @@ def textures(folder):
 
 
 def pruned_and_detailed():
-    """A system whose stages prune, raise degrees and let textures grow."""
+    """A system whose stages prune, place Gaussians, raise degrees and let textures grow."""
     return system(
         a2tg.Bytewise, densify={"cap": 120}, stage1_iterations=20, stage2_iterations=20,
-        prune={"share": 0.3, "at": (0.2,)}, floaters={"min_views": 3, "at": (0.4,)},
+        prune={"share": 0.3, "at": (0.2,)}, place={"at": (0.2,)}, floaters={"min_views": 3, "at": (0.4,)},
         view_dependence_share=0.2, view_dependence={"at": (0.2,)}, texture_share=0.2, details={"at": (0.4,)},
     )  # fmt: skip
 
@@ -381,7 +381,7 @@ def events_change_the_same(session):
             happened += [(type(each).__name__, together.model.num, together.model.num_bytes) for each in events]
         alone.photographs.close()
         together.photographs.close()
-    names = ["Prune", "PruneFloaters", "Prune", "AdaptDegrees", "Upscale"]
+    names = ["Prune", "PlaceByError", "PruneFloaters", "Prune", "AdaptDegrees", "Upscale"]
     assert [name for name, *_ in happened] == names, happened
     assert len({(num, num_bytes) for _, num, num_bytes in happened}) > 3, happened
 

@@ -7,7 +7,6 @@ prunes Gaussians that matter in too few training views, or are close to a camera
 """
 
 import dataclasses
-import functools
 import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -118,15 +117,10 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contrib
         stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves), dtype), *cameras)
         counted = jnp.asarray(counted_pixels(own), dtype)
         arrays: Any = everywhere(mesh, (stacked, rays, counted, jnp.asarray(least, dtype)))
-        weights, num = _jitted()(model, *arrays, settings)
+        weights, num = jax.jit(_weights, static_argnums=(5,))(model, *arrays, settings)
         total += on_host(weights).astype(np.float64)
         num_views += on_host(num)
     return Contributions(*of_first(mesh, (total, num_views)))
-
-
-@functools.cache
-def _jitted() -> jax.stages.Wrapped:
-    return jax.jit(_weights, static_argnums=(5,))
 
 
 def _weights(
