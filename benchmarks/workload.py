@@ -65,7 +65,6 @@ def training_step(
     num: int,
     size: tuple[int, int],
     textures: a2tg_jax.Textures | None,
-    capacity: int | None = None,
     **settings: Any,
 ) -> TrainingStep:
     """Return the step of a system's stage on the random scene and photographs of noise; further arguments are fields
@@ -74,9 +73,7 @@ def training_step(
     gaussians, camera = random_scene(num, width, height)
     stage = find_system(system).preset("paper").stages()[index]
     appearance = stage.appearance if stage.appearance.texture is None else stage.appearance.with_textures(textures)
-    render = a2tg_jax.RenderSettings(capacity=capacity, **settings)
-    if capacity is None:
-        render = a2tg_jax.plan_render(gaussians, camera, textures, settings=render)
+    render = a2tg_jax.plan_render(gaussians, camera, textures, settings=a2tg_jax.RenderSettings(**settings))
     model = Model(gaussians, appearance, num_live=jnp.asarray(num, jnp.int32))
     clock = stage.clock()
     step = StepSettings(render, "black", tuple(times is None for times in clock.times))
