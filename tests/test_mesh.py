@@ -422,18 +422,6 @@ def test_exact_points_lie_where_the_pictures_say():
     assert a2tg.surface_distance(known, points, threshold=0.4).precision == 1
 
 
-def test_dtu_counts_what_was_observed_above_the_table():
-    grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [5.0]), -1).reshape(-1, 3)
-    mask = np.ones((20, 20, 20), bool)
-    mask[10:] = False
-    plane, bounds = np.array([0, 1, 0, -9.5]), np.array([[0, 0, 0], [19, 19, 19]])
-    found = surface_quality.dtu_distance(grid + np.array([0, 0, 0.5]), grid, mask, bounds, 1.0, plane)
-    assert found.accuracy == found.completeness == found.chamfer == 0.5 and found.f_score == 1
-    wrong = grid + np.where(grid[:, :1] >= 10, 7.0, 0.0) * np.array([0, 0, 1])
-    found = surface_quality.dtu_distance(wrong, grid, mask, bounds, 1.0, plane)
-    assert found.accuracy == 0 and found.completeness > 1
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
