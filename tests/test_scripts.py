@@ -5,7 +5,6 @@ import json
 import os
 import pathlib
 import shutil
-import subprocess
 import sys
 
 import numpy as np
@@ -69,13 +68,10 @@ SMALLEST = {
     "large_scene": "--photographs 4 --size 60 40 --downscale 2 --out {out}",
     "meshes": "--num 300 --views 2 --size 32 24 --resolution 12",
     "plots": "benchmarks/results/cpu.json {folder}",
-    "remote_scene": "--photographs 4 --size 24 16 --iterations 2 --latency 0 --out {out}",
     "scaling": "--largest 10000 --out {out}",
     "tables": "benchmarks/results/cpu.json {folder}/performance.md {folder}/NOTEBOOK.md",
 }
 """Arguments of the scripts of `benchmarks`."""
-ALONE = {"remote_scene"}
-"""Scripts that replace functions of libraries, so that they have a process of their own."""
 
 
 @pytest.mark.long
@@ -87,19 +83,13 @@ def test_it_runs(name, tmp_path, monkeypatch, capsys):
         shutil.copy(page, tmp_path)
     monkeypatch.chdir(ROOT)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # For the processes that scripts start.
-    if name in ALONE:
-        command = [sys.executable, "-m", f"benchmarks.{name}", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr[-2000:]
-        printed = done.stdout
-    else:
-        monkeypatch.setattr("a2tg_jax.configure_cpu", lambda **_: None)
-        monkeypatch.setattr("benchmarks.sections.THREADS", (1,))
-        monkeypatch.setattr("benchmarks.sections.MULTIPLY_ADDS", {"forward": 20})
-        monkeypatch.setattr("benchmarks.meshes.SMALL", (48, 32))
-        monkeypatch.setattr(sys, "argv", [name, *arguments])
-        importlib.import_module(f"benchmarks.{name}").main()
-        printed = capsys.readouterr().out
+    monkeypatch.setattr("a2tg_jax.configure_cpu", lambda **_: None)
+    monkeypatch.setattr("benchmarks.sections.THREADS", (1,))
+    monkeypatch.setattr("benchmarks.sections.MULTIPLY_ADDS", {"forward": 20})
+    monkeypatch.setattr("benchmarks.meshes.SMALL", (48, 32))
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    importlib.import_module(f"benchmarks.{name}").main()
+    printed = capsys.readouterr().out
     assert "failed" not in printed
     assert all((tmp_path / page.name).read_bytes() == page.read_bytes() for page in pages), "the tables are current"
     assert printed or any(tmp_path.iterdir())
