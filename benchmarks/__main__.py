@@ -2,7 +2,7 @@
 
     python -m benchmarks --out benchmarks/results/cpu.json                     # everything: most of an hour
     python -m benchmarks --only render --largest 10000                         # a part of it
-    python -m benchmarks --scene SCENES/herz_jesus_p25 --mitsuba python3       # with a real scene and Mitsuba 3
+    python -m benchmarks --scene SCENES/herz_jesus_p25                         # with a real scene
     python -m benchmarks --only others --other 'name=./program --fast'         # another program on the same workload
     python -m benchmarks --only gpu --gsplat python3                           # on a GPU, beside gsplat
 
@@ -45,7 +45,6 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), help="run these sections only")
     parser.add_argument("--largest", type=int, default=1_000_000, help="leave out workloads of more Gaussians")
     parser.add_argument("--scene", type=pathlib.Path, help="a real scene of photographs, to train and to render")
-    parser.add_argument("--mitsuba", metavar="PYTHON", help="a Python with Mitsuba 3 installed, to measure beside it")
     parser.add_argument("--gsplat", metavar="PYTHON", help="a Python with gsplat, to measure beside it on a GPU")
     parser.add_argument("--other", metavar="NAME=COMMAND", type=named_command, action="append", help=OTHER_HELP)
     parser.set_defaults(other=[])

@@ -107,15 +107,12 @@ def trained_section(args: argparse.Namespace) -> list[dict]:
 
 def others_section(args: argparse.Namespace) -> list[dict]:
     """Measure other programs on the same workload, one thread, beside this library."""
-    programs = dict(args.other)
-    if args.mitsuba is not None:
-        programs["mitsuba"] = [args.mitsuba, "-m", "benchmarks.mitsuba"]
-    if not programs:
+    if not args.other:
         return []
     found = []
     for case in (random_case(num, size, threads=1) for num, size in TYPICAL if num <= args.largest):
         found.append(measure(case))
-        found += [measure({**case, "case": name}, command) for name, command in programs.items()]
+        found += [measure({**case, "case": name}, command) for name, command in args.other]
     return found
 
 

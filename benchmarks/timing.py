@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 
 
-def timed(
-    function: Callable, *args: Any, wait: Callable[[Any], Any] = lambda result: result, least_runs: int = 5
-) -> dict[str, float]:
+def timed(function: Callable, *args: Any, wait: Callable[[Any], Any] = lambda result: result) -> dict[str, float]:
     """Return seconds of the first call, and the median and least milliseconds of the following ones.
+
+    Those are at least five, and up to 40 while they take less than a second together.
 
     Args:
       function: called with `args`.
       wait: called with its result; returns when that is computed.
-      least_runs: number of calls after the first; more, up to 40, while they take less than a second together.
     """
 
     def seconds() -> float:
@@ -28,7 +27,7 @@ def timed(
 
     first = seconds()
     times: list[float] = []
-    while len(times) < least_runs or (sum(times) < 1.0 and len(times) < 40):
+    while len(times) < 5 or (sum(times) < 1.0 and len(times) < 40):
         times.append(seconds())
     return {"first_s": first, "ms": float(np.median(times)) * 1e3, "least_ms": min(times) * 1e3}
 

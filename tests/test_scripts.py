@@ -18,7 +18,7 @@ from a2tg_jax.results.model_source import Source
 ROOT = pathlib.Path(__file__).parents[1]
 sys.path.append(str(ROOT))  # Last, so that the installed package comes first.
 
-OTHERS = {"gsplat", "torch", "mitsuba"}
+OTHERS = {"gsplat", "torch"}
 """Programs that scripts compare with, and that no extra installs."""
 SCRIPTS = [
     *("benchmarks." + ".".join(path.relative_to(ROOT / "benchmarks").with_suffix("").parts)
