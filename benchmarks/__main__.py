@@ -44,7 +44,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("benchmark.json"))
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), help="run these sections only")
     parser.add_argument("--largest", type=int, default=1_000_000, help="leave out workloads of more Gaussians")
-    parser.add_argument("--scene", type=pathlib.Path, help="a real scene of photographs, to train and to render")
+    parser.add_argument("--scene", type=pathlib.Path, help="a real scene of photographs, to train")
     parser.add_argument("--gsplat", metavar="PYTHON", help="a Python with gsplat, to measure beside it on a GPU")
     parser.add_argument("--other", metavar="NAME=COMMAND", type=named_command, action="append", help=OTHER_HELP)
     parser.set_defaults(other=[])

@@ -27,7 +27,6 @@ def main() -> None:
         "step": stages.measure_step,
         "limit": limit.measure_limit,
         "training": training.measure_training,
-        "trained": training.measure_trained,
     }
     figures = measures[case["case"]](case)
     figures["peak_mb"] = timing.memory_peak() / 1e6

@@ -12,20 +12,10 @@ from benchmarks.workload import random_scene, random_textures
 
 
 def measure_render(case: dict) -> dict:
-    """Measure the random workload."""
+    """Measure the image of the random workload, and the gradient of L1 against a fixed random image."""
     gaussians, camera = random_scene(case["num"], case["width"], case["height"])
     textures = random_textures(case["num"], case.get("textures", "none"))
     settings = a2tg_jax.RenderSettings(compositor=case.get("compositor", "auto"), tile_size=case.get("tile_size", 8))
-    return measure_view(gaussians, camera, textures, settings)
-
-
-def measure_view(
-    gaussians: a2tg_jax.Gaussians,
-    camera: a2tg_jax.Camera,
-    textures: a2tg_jax.Textures | None,
-    settings: a2tg_jax.RenderSettings,
-) -> dict:
-    """Measure the image, and the gradient of L1 against a fixed random image."""
     settings = a2tg_jax.plan_render(gaussians, camera, textures, settings=settings)
     target = jnp.asarray(random_image(camera.width, camera.height))
 

@@ -48,13 +48,13 @@ def run(case: Mapping[str, Any], command: Sequence[str], environment: Mapping[st
 
 
 def line(figures: Mapping[str, Any]) -> str:
-    """Return a case as one line of text, with a line below it for each rendered view."""
+    """Return a case as one line of text."""
     words = []
     for name, value in figures.items():
         if isinstance(value, dict):
             words.append(f"{name} {value['ms']:.1f}")
         elif isinstance(value, float):
             words.append(f"{name} {value:.4g}")
-        elif name != "renders":
+        else:
             words.append(f"{name} {value}")
-    return "\n    ".join(["  ".join(words), *(line(view) for view in figures.get("renders", []))])
+    return "  ".join(words)

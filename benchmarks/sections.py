@@ -94,17 +94,6 @@ def training_section(args: argparse.Namespace) -> list[dict]:
     return found
 
 
-def trained_section(args: argparse.Namespace) -> list[dict]:
-    """Measure a view of a real scene after short training, at three sizes; each a case of its own in the report."""
-    if args.scene is None:
-        return []
-    scene = {"scene": str(args.scene.resolve()), "downscale": 4, "factors": [1, 2, 4]}
-    case = {"case": "trained", **scene, "num": 10_000, "iterations": [500, 200], "threads": ALL}
-    figures = measure(case)
-    views = figures.pop("renders", [{}])
-    return [{**figures, **view} for view in views]
-
-
 def others_section(args: argparse.Namespace) -> list[dict]:
     """Measure other programs on the same workload, one thread, beside this library."""
     if not args.other:
@@ -155,7 +144,6 @@ SECTIONS = {
     "compositors": compositors_section,
     "full_size": full_size_section,
     "training": training_section,
-    "trained": trained_section,
     "others": others_section,
     "gpu": gpu_section,
 }
