@@ -18,14 +18,11 @@ def best_methods(results: Sequence[tables.Result], num_methods: int) -> dict[str
     """Return the method of highest PSNR of each scene, means over its folds; scenes that lack a method are left out."""
     best = {}
     for scene, own in tables.grouped(results, lambda result: result.run.cell.scene.label):
-        psnr = {label: np.mean([each["psnr"] for each in found]) for label, found in tables.grouped(own, _label)}
+        by_label = tables.grouped(own, lambda result: result.label)
+        psnr = {label: np.mean([each["psnr"] for each in found]) for label, found in by_label}
         if len(psnr) == num_methods:
             best[scene] = max(psnr, key=lambda label: psnr[label])
     return best
-
-
-def _label(result: tables.Result) -> str:
-    return result.label
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:

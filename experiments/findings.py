@@ -136,7 +136,7 @@ def table_of(rows: Sequence[Row]) -> str:
         lines.append([
             row.name, with_interval(psnr, "psnr"), "–" if np.isnan(low) else f"{low:+.2f} to {high:+.2f}",
             with_interval(found["ssim"], "ssim"), with_interval(found["lpips"], "lpips"),
-            f"{psnr.num_won()} of {len(psnr.by_scene)}", tables.number(psnr.p_value, 3),
+            f"{psnr.num_won} of {len(psnr.by_scene)}", tables.number(psnr.p_value, 3),
         ])  # fmt: skip
     return tables.markdown(["", "ΔPSNR, dB", "bootstrap", "ΔSSIM", "ΔLPIPS", "scenes won", "p"], lines)
 

@@ -59,9 +59,9 @@ def synthetic_table(args: argparse.Namespace) -> str:
     )
 
 
-def thinned(points: np.ndarray, spacing: float, seed: int = 0) -> np.ndarray:
+def thinned(points: np.ndarray, spacing: float) -> np.ndarray:
     """Return points [P, 3] such that no two lie in one cube of side `spacing`."""
-    order = np.random.default_rng(seed).permutation(len(points))
+    order = np.random.default_rng(0).permutation(len(points))
     cubes = np.floor(points[order] / spacing).astype(np.int64)
     _, first = np.unique(cubes, axis=0, return_index=True)
     kept: np.ndarray = points[order[np.sort(first)]]

@@ -21,7 +21,7 @@ def test_views_seeds_and_scenes_are_averaged_in_this_order():
     results = [at("x", "own", 22.0), at("x", "other", 20.0), at("x", "own", 21.0, 1), at("x", "other", 20.0, 1)]
     results += [at("y", "own", 25.0), at("y", "other", 26.0), at("z", "own", 20.0)]
     found = compare(differences(results, "own", "other", "psnr"))
-    assert found.by_scene == {"x": 1.5, "y": -1.0} and found.over_scenes.mean == 0.25 and found.num_won() == 1
+    assert found.by_scene == {"x": 1.5, "y": -1.0} and found.over_scenes.mean == 0.25 and found.num_won == 1
     assert not found.is_decided and found.p_value == 1.0
     with pytest.raises(ValueError, match="different views of x"):
         differences([at("x", "own", 22.0, views="ac"), at("x", "other", 20.0)], "own", "other", "psnr")

@@ -128,10 +128,11 @@ class Grid:
                 if (method.most is not None and cell.gaussians > method.most) or not method.is_chosen_for(cell.scene):
                     continue
                 yield Run(method, cell, "", self._job(method, cell))
-            reference = self.reference_record(cell, records)
-            for method in self.at_equal_bytes if reference else ():
-                yield Run(method, cell, "bytes", self._job_in(method, cell, reference["mb"]))
-            wanted = seconds_of(self.reference_job(cell), records)
+            reference = self.reference_job(cell)
+            record = records.get(reference.key)
+            for method in self.at_equal_bytes if record else ():
+                yield Run(method, cell, "bytes", self._job_in(method, cell, record["mb"]))
+            wanted = seconds_of(reference, records)
             for method in self.at_equal_time if wanted else ():
                 if not method.is_chosen_for(cell.scene):
                     continue
@@ -139,10 +140,6 @@ class Grid:
                     first, second = (max(1, round(count * wanted / taken)) for count in cell.iterations)
                     longer = dataclasses.replace(cell, iterations=(first, second))
                     yield Run(method, cell, "time", self._job(method, longer))
-
-    def reference_record(self, cell: Cell, records: Mapping[str, Record]) -> Record | None:
-        """Return the record of the reference in a cell, or None before it is finished."""
-        return records.get(self.reference_job(cell).key)
 
     def reference_job(self, cell: Cell) -> Job:
         """Return the last job of the reference in a cell."""

@@ -11,7 +11,15 @@ from lab.tables import Result
 
 
 def _gains(grid: Grid, results: Sequence[Result]) -> str:
-    gains = tables.variants_of_reference(grid, results)
+    """Return a table of gains for the reference and for each method whose label begins with the reference's.
+
+    Each has its own bytes; the other methods have as many Gaussians as fit into the bytes of the reference.
+    """
+    names = [method.label for method in (grid.reference, *grid.methods)]
+    variants = [name for name in names if name.startswith(grid.reference.label)]
+    others = [method.label + tables.EQUAL_BYTES for method in grid.at_equal_bytes]
+    others += [name for name in names if name not in variants]
+    gains = "\n".join(tables.gains_table(results, variant, others) for variant in variants)
     return f"{gains}\n## Figures of every method\n\n{tables.figures_table(results)}"
 
 

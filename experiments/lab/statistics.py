@@ -32,9 +32,10 @@ class Comparison:
         """Whether the t interval excludes 0."""
         return abs(self.over_scenes.mean) > self.over_scenes.half_width
 
-    def num_won(self, is_lower_better: bool = False) -> int:
-        """Return the number of scenes in which the first method is better."""
-        return sum((value < 0) if is_lower_better else (value > 0) for value in self.by_scene.values())
+    @property
+    def num_won(self) -> int:
+        """Number of scenes in which the first method has the higher figure."""
+        return sum(value > 0 for value in self.by_scene.values())
 
 
 def differences(results: Sequence[Result], label: str, other: str, figure: str) -> dict[str, list[np.ndarray]]:
@@ -70,12 +71,12 @@ def sign_flip(values: np.ndarray) -> float:
     return float(np.mean(np.abs(signs @ values) >= abs(values.sum()) * (1 - 1e-12)))
 
 
-def bootstrap(found: Differences, seed: int = 0) -> tuple[float, float]:
+def bootstrap(found: Differences) -> tuple[float, float]:
     """Return the percentile interval of the mean over scenes if scenes, pairs of each scene and views of each pair are
     drawn with replacement; NaN of less than two scenes."""
     if len(found) < 2:
         return float("nan"), float("nan")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     # Each scene's mean is drawn as often as all scenes together need it: draws of one scene are independent.
     draws = np.array([_scene_means(pairs, NUM_DRAWS * len(found), rng) for pairs in found.values()])
     draws = draws.reshape(len(found), NUM_DRAWS, len(found))

@@ -194,18 +194,6 @@ def grouped(results: Iterable[T], key: Callable[[T], Any]) -> list[tuple[Any, li
     return list(groups.items())
 
 
-def variants_of_reference(grid: Grid, results: Sequence[Result]) -> str:
-    """Return a table of gains for the reference and for each method whose label begins with the reference's.
-
-    Each has its own bytes; the other methods have as many Gaussians as fit into the bytes of the reference.
-    """
-    names = [method.label for method in (grid.reference, *grid.methods)]
-    variants = [name for name in names if name.startswith(grid.reference.label)]
-    others = [method.label + EQUAL_BYTES for method in grid.at_equal_bytes]
-    others += [name for name in names if name not in variants]
-    return "\n".join(gains_table(results, variant, others) for variant in variants)
-
-
 def gains_table(results: Sequence[Result], reference: str, others: Sequence[str]) -> str:
     """Return the gain of the reference over other methods in each cell.
 
