@@ -5,12 +5,13 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from lab import plots, tables
+from lab import tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid, read_grid
 from lab.kept import read_kept
 from lab.statistics import Comparison, bootstrap, compare, differences, holm
 from lab.tables import EQUAL_BYTES, Result
+from matplotlib.figure import Figure
 
 from a2tg_jax.results.figures import save_figure
 
@@ -189,7 +190,26 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
         if one.by_scene
     }
     if charted:
-        save_figure(lab.pages / f"{EXPERIMENT.name}.png", plots.forest(charted, "difference of PSNR, dB"))
+        save_figure(lab.pages / f"{EXPERIMENT.name}.png", forest(charted))
+
+
+def forest(found: Mapping[str, tuple[Sequence[float], float, float]]) -> Figure:
+    """Return a row for each comparison: the values of its scenes, and their mean with its interval.
+
+    Args:
+      found: values, mean and half-width of the interval by name; the first is drawn on top.
+    """
+    figure = Figure(figsize=(8.0, 0.8 + 0.26 * len(found)), layout="constrained")
+    axes = figure.add_subplot()
+    for place, (values, mean, half_width) in enumerate(found.values()):
+        axes.plot(values, [place] * len(values), "o", color="#4477aa", alpha=0.35, markersize=4, markeredgewidth=0)
+        axes.errorbar(mean, place, xerr=np.nan_to_num(half_width), fmt="D", color="#000000", markersize=4, capsize=3)
+    axes.axvline(0.0, color="#888888", linewidth=0.8)
+    axes.set_yticks(range(len(found)), list(found), fontsize=8)
+    axes.set_ylim(len(found) - 0.4, -0.6)  # The first on top.
+    axes.set_xlabel("difference of PSNR, dB")
+    axes.grid(alpha=0.25, axis="x")
+    return figure
 
 
 EXPERIMENT = Experiment("findings", ("bytewise", "equal_time", "parts"), present, __doc__)

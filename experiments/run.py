@@ -31,8 +31,7 @@ from a2tg_jax.host import signals
 from a2tg_jax.host.text import did_you_mean
 
 MODULES = (
-    "choose_plain", "findings", "ablation", "texture_resolution", "resolution_shares", "decomposition",
-    "comparison_pictures", "efficiency",
+    "choose_plain", "findings", "ablation", "resolution_shares", "decomposition", "comparison_pictures", "efficiency",
 )  # fmt: skip
 """Modules of this folder that hold an EXPERIMENT; the one that measures time comes last."""
 EVERYTHING, PAGES = "all", "pages"

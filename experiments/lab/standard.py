@@ -51,18 +51,19 @@ def table_experiment(name: str, description: str, grid: str | None = None) -> Ex
     return Experiment(name, (grid or name,), present, description)
 
 
-def paper_experiment(name: str, place: str, description: str) -> Experiment:
+def paper_experiment(name: str, place: str, description: str, everywhere: str = "mean of the data sets") -> Experiment:
     """Return an experiment that also writes the paper's table of its name.
 
     Args:
       name: name of the experiment, its grid, and the paper's table.
       place: key in which the paper's blocks differ (`tables.paper_table`).
       description: one line for the command line.
+      everywhere: heading of the figures if the paper's table names no data sets.
     """
 
     def present(lab: Lab, grids: Sequence[Grid]) -> None:
         (grid,) = grids
-        paper = tables.paper_table(name, place, tables.QUALITY_COLUMNS)
+        paper = tables.paper_table(name, place, tables.QUALITY_COLUMNS, everywhere)
         lab.write(name, f"# {grid.title}\n\n{_as_text(lab, grid)}\n## In the paper\n\n{paper}")
 
     return Experiment(name, (name,), present, description)
@@ -80,6 +81,12 @@ def _as_text(lab: Lab, grid: Grid) -> str:
 STANDARD = (
     paper_experiment("fixed_memory", "budget_mb", "Every method in A²TG's final bytes: Table 1 of the paper."),
     paper_experiment("fixed_number", "gaussians", "Every method with one number of Gaussians: Table 2 of the paper."),
+    paper_experiment(
+        "texture_resolution",
+        "gaussians",
+        "Textures of one size against textures of at most that size: the paper's appendix.",
+        "Deep Blending",
+    ),
     table_experiment("degree_0", "The paper's claim with every method at degree 0 (PROTOCOL.md)."),
     table_experiment("degree_1", "The paper's claim with every method at degree 1 (PROTOCOL.md)."),
     table_experiment("degree_3", "The paper's claim with every method at degree 3 (PROTOCOL.md)."),
