@@ -303,13 +303,6 @@ def plan_places(
     return Places(placed_like(buckets, like), placed_like(row, like), shape.sizes), shape.capacities
 
 
-class Resized(NamedTuple):
-    """Result of `resize`: a table of the given class, and the moments with their tables rebuilt likewise."""
-
-    table: Any
-    moments: Any
-
-
 def resize(
     table: Table,
     sizes: np.ndarray,
@@ -317,9 +310,10 @@ def resize(
     known: Sequence[Shape] = (),
     kept: np.ndarray | None = None,
     room: Shape | None = None,
-) -> Resized:
-    """Rebuild the buckets at new sizes [N, D] (host). Padding, and what grows from an empty block, is `Table.padding`
-    in the table and 0 in moments.
+) -> tuple[Any, Any]:
+    """Return the table with its buckets rebuilt at new sizes [N, D] (host), and the moments likewise.
+
+    Padding, and what grows from an empty block, is `Table.padding` in the table and 0 in moments.
 
     Moments are any pytree, such as the state of Adam: all tables in it of the same class are rebuilt, other leaves
     stay. They become 0 for blocks that are not `kept` [N]. `known` and `room` are as for `plan_places`.
@@ -346,7 +340,7 @@ def resize(
         return rebuilt(leaf, kept_ends, (0.0,) * len(own.padding))
 
     moments = jax.tree.map(rebuilt_moments, moments, is_leaf=lambda leaf: isinstance(leaf, own))
-    return Resized(rebuilt(table, ends, own.padding), moments)
+    return rebuilt(table, ends, own.padding), moments
 
 
 def _moved(
