@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from a2tg_jax.appearance import Appearance, check_is_appearance
+from a2tg_jax.appearance import Appearance
 from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
@@ -137,7 +137,6 @@ def with_capacity(
       ValueError: under jit or vmap without a capacity.
     """
     check_kind("settings", settings, RenderSettings)
-    check_is_appearance(appearance)
     if settings.capacity is not None:
         return settings
     gaussians, camera, appearance, num_live = jax.tree.map(_primal_value, (gaussians, camera, appearance, num_live))
@@ -167,7 +166,6 @@ def pairs_of_view(
     gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: object = None
 ) -> int:
     """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
-    check_is_appearance(appearance)
     if not gaussians.num:
         return 0
     camera = settings.finer(camera)
