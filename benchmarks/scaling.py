@@ -100,7 +100,9 @@ def counted(num: int, devices: int, views: int, has_sky: bool) -> dict[str, floa
     pairs = bands.pairs_of_rows(boxes)
     borders = bands.borders(pairs)
     bands = ImageBands.of(bands.whole, bands.num, BorderRoom(*bands.room_for(borders).tolist()))
-    per_pair, of_even_bands = (rows_between(bands, boxes, own, devices) for own in (borders, bands.even_borders()))
+    height = -(-bands.whole.rows // bands.num)
+    even = jnp.minimum(jnp.arange(bands.num + 1, dtype=jnp.int32) * height, bands.whole.rows)
+    per_pair, of_even_bands = (rows_between(bands, boxes, own, devices) for own in (borders, even))
     least = per_pair.sum() - np.trace(per_pair)
     forward, back = row_bytes()
     row = bands.num * (devices - 1) * (forward + back)
@@ -117,7 +119,7 @@ def counted(num: int, devices: int, views: int, has_sky: bool) -> dict[str, floa
         "pixel_bytes": float(pixel_bytes(bands)),
         "copies_per_splat": float(per_pair.sum() / max(1, (boxes.counts > 0).sum())),
         "fullest_band": fullest(bands, pairs, borders),
-        "fullest_of_even_bands": fullest(bands, pairs, bands.even_borders()),
+        "fullest_of_even_bands": fullest(bands, pairs, even),
     }
 
 

@@ -116,11 +116,6 @@ class ImageBands(NamedTuple):
         ends = jnp.concatenate([jnp.zeros(1, pairs.dtype), jnp.cumsum(pairs)])
         return jnp.diff(ends[borders])
 
-    def even_borders(self) -> Array:
-        """Return the borders of bands that are equally high, as `borders` does."""
-        height = -(-self.whole.rows // self.num)
-        return jnp.minimum(jnp.arange(self.num + 1, dtype=jnp.int32) * height, self.whole.rows)
-
     def reached(self, boxes: Rectangles, borders: Array) -> Array:
         """Return [B, n] whether the box of each splat reaches each band."""
         end = boxes.y0 + boxes.counts // jnp.maximum(boxes.columns, 1)
