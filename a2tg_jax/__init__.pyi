@@ -18,20 +18,14 @@ from .core.optim import adam_init as adam_init, adam_update as adam_update, expo
 from .core.origin import Origin as Origin
 from .core.pytree import combine as combine, partition as partition, pytree as pytree, static as static
 from .core.similarity import Similarity as Similarity, transform_gaussians as transform_gaussians
-from .data import (
-    Mask as Mask,
-    ObservedPoints as ObservedPoints,
-    Picture as Picture,
-    Scene as Scene,
-    View as View,
-    load_scene as load_scene,
-    observed_points as observed_points,
-    run_sfm as run_sfm,
-    scene_from_arrays as scene_from_arrays,
-    synthetic_scene as synthetic_scene,
-    view_image as view_image,
-    with_validation_views as with_validation_views,
-)
+from .data.arrays import scene_from_arrays as scene_from_arrays
+from .data.assembly import with_validation_views as with_validation_views
+from .data.load import load_scene as load_scene
+from .data.observations import ObservedPoints as ObservedPoints, observed_points as observed_points
+from .data.photo_store import Mask as Mask, Picture as Picture
+from .data.scene import Scene as Scene, View as View, view_image as view_image
+from .data.sfm import run_sfm as run_sfm
+from .data.synthetic import synthetic_scene as synthetic_scene
 from .densify.clone_split import (
     CloneSplitPrune as CloneSplitPrune,
     FillingDensity as FillingDensity,

@@ -23,7 +23,7 @@ from a2tg_jax.core.numerics import safe_divide, safe_norm
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.table import Shape, Table, is_table
-from a2tg_jax.data import View
+from a2tg_jax.data.scene import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved, zeros_beside

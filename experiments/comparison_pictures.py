@@ -9,7 +9,7 @@ from lab.grid import Grid
 from skimage.metrics import peak_signal_noise_ratio
 
 import a2tg_jax as a2tg
-from a2tg_jax.data import view_image
+from a2tg_jax.data.scene import view_image
 from a2tg_jax.results.images import largest_gain, save_picture, side_by_side, to_uint8
 
 ZOOM = 4

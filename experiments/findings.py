@@ -19,8 +19,8 @@ DENSE, FEW = "dense", "few views"
 BEST, MCMC = "Best plain method", "2DGS*-MCMC"
 BYTEWISE, SECOND, FIRST = "Bytewise", "Bytewise, second version", "Bytewise, first version"
 VERSIONS = {BYTEWISE: "bytewise", SECOND: "bytewise 2", FIRST: "bytewise 1"}
-"""Names in the table of `bytewise` and of its earlier versions. The second placed no Gaussians by the errors of pictures;
-the first had textures, and no weight on opacities, either."""
+"""Names in the table of `bytewise` and of its earlier versions. The second places no Gaussians by the errors of pictures,
+and the first has textures and no weight on opacities either."""
 EQUAL_TIME = ", equal time"
 PRIMARY = f"{VERSIONS[FIRST]} − best plain method, 0.3 MB"
 SECONDARY = {

@@ -7,8 +7,8 @@ import numpy as np
 from fuzz_commands import run_commands
 
 import a2tg_jax as a2tg
-from a2tg_jax.data import load_scene
 from a2tg_jax.data.decoding import read_pixels
+from a2tg_jax.data.load import load_scene
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.measure import metrics
 from a2tg_jax.results.figures import curves_figure

@@ -9,8 +9,8 @@ from small_values import some_gaussians
 
 from a2tg_jax.cli import main as cli
 from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.data import synthetic_scene
 from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.data.synthetic import synthetic_scene
 from a2tg_jax.finish import compaction
 from a2tg_jax.finish.compaction import (
     Trial,

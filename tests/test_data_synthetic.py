@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from a2tg_jax.data import synthetic_scene, view_image
 from a2tg_jax.data.ray_tracing import Ball, Block, Disc, Tube
-from a2tg_jax.data.synthetic import _lit_surfaces
+from a2tg_jax.data.scene import view_image
+from a2tg_jax.data.synthetic import _lit_surfaces, synthetic_scene
 
 SHAPES = [
     Disc((0.1, 0.2, 0.3), 1.5),

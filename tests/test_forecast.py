@@ -16,7 +16,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.cli import main as cli
 from a2tg_jax.cli.train import ask
 from a2tg_jax.core.cameras import resize_camera
-from a2tg_jax.data import Picture
+from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.host import machine, progress_bars
 from a2tg_jax.mcmc import Mcmc

@@ -11,7 +11,7 @@ from test_view_dependence import banded
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Appearance, Exponents, Texture, TextureOptions, allocate_appearance
-from a2tg_jax.data import View, view_image
+from a2tg_jax.data.scene import View, view_image
 from a2tg_jax.finish.polishing import colors_of, draw_change, polish, with_colors
 from a2tg_jax.renderer import plan_render
 

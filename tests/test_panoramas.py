@@ -9,9 +9,10 @@ from scipy.ndimage import map_coordinates
 from test_data_sfm import cameras_of, staged
 
 from a2tg_jax.core.cameras import looking
-from a2tg_jax.data import load_scene, synthetic
+from a2tg_jax.data import synthetic
 from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.load import load_scene
 from a2tg_jax.data.staging import cut_view, directions, is_panorama, view_size
 
 CENTER = np.array([0.3, -1.2, 1.2])

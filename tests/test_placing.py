@@ -13,7 +13,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import SH_C0, no_rows, rotation_matrices
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.core.pytree import partition
-from a2tg_jax.data import View
+from a2tg_jax.data.scene import View
 from a2tg_jax.densify.placing import OPACITY, PlaceByError, gaussians_at_errors
 from a2tg_jax.events import Due
 

@@ -12,7 +12,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.core.cameras import Camera, crop_camera, resize_camera
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.pytree import num_compiled
-from a2tg_jax.data import View
+from a2tg_jax.data.scene import View
 from a2tg_jax.render import jitted_render
 
 

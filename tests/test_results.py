@@ -22,8 +22,8 @@ from a2tg_jax.appearance import MovableKernels, allocate_appearance
 from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.core.camera_paths import smooth_path
 from a2tg_jax.core.gaussians import init_from_points
-from a2tg_jax.data import View, synthetic_scene, view_image
-from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.data.scene import View, origin_of_scene, view_image
+from a2tg_jax.data.synthetic import synthetic_scene
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.model_file import save_model
 from a2tg_jax.mcmc import Mcmc

@@ -20,7 +20,7 @@ from a2tg_jax.appearance import (
     template_of,
 )
 from a2tg_jax.core.gaussians import SH_C0, init_from_points
-from a2tg_jax.data import View
+from a2tg_jax.data.scene import View
 from a2tg_jax.finish.shrinking import halve_textures, shrink_textures, taken, texel_weights
 from a2tg_jax.model import Model
 from a2tg_jax.results.images import to_uint8

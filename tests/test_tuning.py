@@ -14,8 +14,7 @@ from test_compaction import SCENE, a_model
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import Appearance, Exponents, allocate_appearance, files
 from a2tg_jax.core.cameras import moved_viewmat
-from a2tg_jax.data import Scene
-from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.data.scene import Scene, origin_of_scene
 from a2tg_jax.finish import tuning
 from a2tg_jax.finish.compaction import TooLargeError, Trial, loss_on_views
 from a2tg_jax.finish.tuning import (

@@ -25,8 +25,8 @@ from a2tg_jax.appearance import parts
 from a2tg_jax.cli.main import main
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.data import synthetic_scene
 from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.data.synthetic import synthetic_scene
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.compact import save_compact, unframed
 from a2tg_jax.io.model_file import save_model

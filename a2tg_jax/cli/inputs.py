@@ -8,11 +8,10 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from a2tg_jax.data import run_sfm
 from a2tg_jax.data.download import BENCHMARK_SETS, fetch
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.photo_folder import CAMERA_PICTURE, holds_photos
-from a2tg_jax.data.sfm import CameraModel, Matching
+from a2tg_jax.data.sfm import CameraModel, Matching, run_sfm
 from a2tg_jax.data.staging import Panorama
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.host.text import defaulting_to, did_you_mean

@@ -17,8 +17,8 @@ from tyro.conf import arg
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli.arguments import LpipsWeights, check_path
-from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC, SceneSource
+from a2tg_jax.data.scene import Scene
 from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.host.text import counted, defaulting_to

@@ -24,7 +24,7 @@ from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import BLACK
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import is_table
-from a2tg_jax.data import View, counted_pixels, view_image
+from a2tg_jax.data.scene import View, counted_pixels, view_image
 from a2tg_jax.events import Change, Due, HostEvent, iterations_at
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.exchange import exchange_of

@@ -20,7 +20,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.data import View, counted_pixels, views_by_kind
+from a2tg_jax.data.scene import View, counted_pixels, views_by_kind
 from a2tg_jax.densify.placing import room_for
 from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, iterations_at, keep_rows
 from a2tg_jax.host.text import counted

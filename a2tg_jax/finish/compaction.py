@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Color
-from a2tg_jax.data import View, view_image
-from a2tg_jax.data.scene import check_are_views
+from a2tg_jax.data.scene import View, check_are_views, view_image
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.io.columns import Precision
 from a2tg_jax.io.compact import CompactChoices, decode_model, encode_model

@@ -20,8 +20,7 @@ from a2tg_jax.appearance.base import color_sums
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.optim import solve_cg
-from a2tg_jax.data import View, views_by_kind
-from a2tg_jax.data.scene import check_are_views
+from a2tg_jax.data.scene import View, check_are_views, views_by_kind
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced

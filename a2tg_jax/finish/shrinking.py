@@ -25,8 +25,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.table import Group
-from a2tg_jax.data import View
-from a2tg_jax.data.scene import check_are_views
+from a2tg_jax.data.scene import View, check_are_views
 from a2tg_jax.finish.compaction import loss_on_views
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings

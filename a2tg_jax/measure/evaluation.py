@@ -14,8 +14,7 @@ from jax import Array
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.origin import Color
-from a2tg_jax.data import View, view_image
-from a2tg_jax.data.scene import check_are_views
+from a2tg_jax.data.scene import View, check_are_views, view_image
 from a2tg_jax.host.text import counted
 from a2tg_jax.measure.alignment import color_fit
 from a2tg_jax.measure.metrics import load_lpips, lpips, psnr, ssim

@@ -11,7 +11,7 @@ from typing import Annotated
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.core.numerics import evenly_chosen
-from a2tg_jax.data import Scene
+from a2tg_jax.data.scene import Scene
 from a2tg_jax.finish.compaction import (
     ASSUMED_PSNR,
     LADDER,

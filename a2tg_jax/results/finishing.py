@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from a2tg_jax.core.numerics import evenly_chosen
-from a2tg_jax.data import Scene
+from a2tg_jax.data.scene import Scene
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
 from a2tg_jax.host.atomic import replacing

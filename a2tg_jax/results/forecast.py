@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
-from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
+from a2tg_jax.data.scene import Scene
 from a2tg_jax.host.machine import default_device, default_platform, memory_limit
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.results.record import MEMORY_OF_FILE, RunPlan, RunRecord

@@ -10,7 +10,7 @@ import numpy as np
 
 from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.core.origin import Origin
-from a2tg_jax.data import view_image
+from a2tg_jax.data.scene import view_image
 from a2tg_jax.host.machine import memory_limit
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.host.text import counted, defaulting_to, in_bytes

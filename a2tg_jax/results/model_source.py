@@ -13,9 +13,8 @@ import numpy as np
 
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import transform_gaussians
-from a2tg_jax.data import Scene
 from a2tg_jax.data.load import is_scene
-from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.data.scene import Scene, origin_of_scene
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.edit_file import apply_edit, load_edit

@@ -14,9 +14,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.data import Scene, View, view_image
 from a2tg_jax.data.assembly import every_kth
 from a2tg_jax.data.load import HeldOut, SceneSource
+from a2tg_jax.data.scene import Scene, View, view_image
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.host.text import counted

@@ -19,9 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax.data import Scene
 from a2tg_jax.data.load import SYNTHETIC
-from a2tg_jax.data.scene import views_by_kind
+from a2tg_jax.data.scene import Scene, views_by_kind
 from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text

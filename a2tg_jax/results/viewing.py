@@ -20,8 +20,7 @@ import numpy as np
 from PIL import Image
 
 from a2tg_jax.core.origin import BLACK, Color, Origin
-from a2tg_jax.data import Scene, View, view_image
-from a2tg_jax.data.scene import origin_of_scene
+from a2tg_jax.data.scene import Scene, View, origin_of_scene, view_image
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.compact import decode_model
