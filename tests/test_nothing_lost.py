@@ -23,7 +23,7 @@ from a2tg_jax import Change, StepEvent
 from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host import signals
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import this_machine
 from a2tg_jax.host.regular_files import sha256_of
@@ -112,8 +112,7 @@ def test_files_are_on_the_disk_before_they_are_renamed(tmp_path, monkeypatch):
     fsync, replace = os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda number: (done.append("flush"), fsync(number)))
     monkeypatch.setattr(os, "replace", lambda *paths: (done.append("rename"), replace(*paths)))
-    with replacing(tmp_path / "file") as temporary:
-        temporary.write_text("whole")
+    write_whole(tmp_path / "file", "whole")
     assert done == ["flush", "rename", "flush"] and (tmp_path / "file").read_text() == "whole"
 
 

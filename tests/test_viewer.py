@@ -350,11 +350,11 @@ def test_a_failed_export_leaves_the_photographs_of_the_old_page(tmp_path, monkey
     old.touch()
     (tmp_path / "photographs.json").write_text("[0]")
 
-    def full(path):
+    def full(path, data):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
-        patch.setattr(viewing, "replacing", full)
+        patch.setattr(viewing, "write_whole", full)
         export_web(source, tmp_path, overwrite=True)
     assert old.is_file()
     export_web(source, tmp_path, overwrite=True)

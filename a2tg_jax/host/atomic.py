@@ -47,6 +47,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:
+    """Write a file as `replacing` does; text is written as UTF-8, with line ends as they are."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
 @contextlib.contextmanager
 def named_if_full(path: Path) -> Iterator[None]:
     """Add the name of a file that is written in the block to the error of a full disk."""

@@ -18,7 +18,7 @@ import numpy as np
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import check_gaussians
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.io.columns import (
     MOST_BITS,
@@ -151,8 +151,7 @@ def save_compact(
     check_suffix(path, "save_compact")
     check_is_model(model)
     data = encode_model(model, choices, grids)
-    with replacing(path) as temporary:
-        temporary.write_bytes(data)
+    write_whole(path, data)
 
 
 def load_compact(path: str | os.PathLike[str]) -> Model:

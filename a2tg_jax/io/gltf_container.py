@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, read_regular
 from a2tg_jax.host.text import shortened
@@ -99,8 +99,7 @@ class Builder:
             # The buffer first: a *.gltf never names one that is not there yet.
             with replacing(binary) as temporary, open(temporary, "wb") as file:
                 file.writelines(self._pieces)
-            with replacing(path) as temporary:
-                temporary.write_text(json.dumps(whole, allow_nan=False, indent=1), encoding="utf-8")
+            write_whole(path, json.dumps(whole, allow_nan=False, indent=1))
             return
         text = json.dumps(whole, allow_nan=False, separators=(",", ":")).encode()
         # Chunks of a GLB are aligned to 4 bytes; JSON is padded with spaces.

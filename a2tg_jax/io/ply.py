@@ -29,7 +29,7 @@ from a2tg_jax.core.gaussians import SH_C0, Gaussians, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.ply import OFFSET, ROTATION, PlyFile, largest_color
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.validate import check_model, check_suffix, reading
@@ -87,8 +87,7 @@ def save_ply(
     found = others.world_gaussians(gaussians, transform, world=world)
     third = others.third_log_scales(np.asarray(found.gaussians.log_scales)) if third_scale else None
     means, offset = (found.means, np.zeros(3)) if float64 else (None, found.offset)
-    with replacing(path) as temporary:
-        temporary.write_bytes(encode_ply(found.gaussians, third, place_comments(offset, found.turn), means))
+    write_whole(path, encode_ply(found.gaussians, third, place_comments(offset, found.turn), means))
     others.warn_of_offset("ply", offset, path)
 
 

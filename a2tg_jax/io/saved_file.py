@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
 
@@ -35,5 +35,4 @@ def load_saved(path: Path, kind: str, parse: Callable[[dict[str, Any]], T]) -> T
 def save_saved(path: Path, kind: str, content: Mapping[str, Any]) -> None:
     """Write a file of a kind, as the viewer does."""
     text = json.dumps({"format": f"a2tg-jax {kind}", "version": VERSION, **content}, indent=1)
-    with replacing(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_whole(path, text + "\n")

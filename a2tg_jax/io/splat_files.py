@@ -31,7 +31,7 @@ import numpy as np
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.ply import OFFSET, ROTATION, turn_of
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.operating_system import printing_to_stderr
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.text import shortened
@@ -81,8 +81,7 @@ def save_by_gaussforge(
         gaussians = dataclasses.replace(gaussians, sh=jnp.asarray(np.concatenate([sh[:, :1], rest], axis=1)))
     ply = encode_ply(gaussians, np.repeat(third.clip(LEAST_LOG_SCALE), gaussians.num, axis=0))
     data = _marked(_converted(ply, "ply", kind, Path(path)), kind, offset, turn)
-    with replacing(path) as temporary:
-        temporary.write_bytes(data)
+    write_whole(path, data)
     others.warn_of_offset(kind, offset, path)
 
 
@@ -216,8 +215,7 @@ def save_ksplat(path: str | os.PathLike[str], model: Gaussians | Model, *, world
         HEADER_BYTES, b"\0"
     )
     section = KSPLAT_SECTION.pack(num, num, 0, 0, 0.0, 0, 0, rows.nbytes, 0, 0, degree).ljust(SECTION_BYTES, b"\0")
-    with replacing(path) as temporary:
-        temporary.write_bytes(header + section + rows.tobytes())
+    write_whole(path, header + section + rows.tobytes())
     others.warn_of_offset("ksplat", offset, path)
 
 

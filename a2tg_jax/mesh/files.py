@@ -10,7 +10,7 @@ from PIL import Image
 
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.io.gltf import OWN
 from a2tg_jax.io.gltf_container import Builder
@@ -89,8 +89,7 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
         *(f"property {words[dtype]} {name}" for name, dtype, _ in columns),
         f"element face {mesh.num_faces}", "property list uchar int vertex_indices", "end_header", "",
     ]  # fmt: skip
-    with replacing(path) as temporary:
-        temporary.write_bytes("\n".join(header).encode() + rows.tobytes() + faces.tobytes())
+    write_whole(path, "\n".join(header).encode() + rows.tobytes() + faces.tobytes())
     return [path]
 
 
@@ -109,10 +108,8 @@ def _save_obj(path: Path, mesh: Mesh) -> list[Path]:
         # Picture and material first, so that the mesh never names a missing file.
         with replacing(picture) as temporary:
             Image.fromarray(mesh.texture).save(temporary, "PNG")
-        with replacing(material) as temporary:
-            # Ka and Kd 1, illum 0: colours of the picture, without lights.
-            text = f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {picture.name}\n"
-            temporary.write_text(text, encoding="utf-8")
+        # Ka and Kd 1, illum 0: colours of the picture, without lights.
+        write_whole(material, f"newmtl texture\nKa 1 1 1\nKd 1 1 1\nillum 0\nmap_Kd {picture.name}\n")
     with replacing(path) as temporary, open(temporary, "w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
         rows = mesh.vertices

@@ -37,7 +37,7 @@ from a2tg_jax.finish.tuning import (
     smallest_tuned,
     tune_compact,
 )
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.text import defaulting_to, in_bytes, shortened
 from a2tg_jax.io.compact import GROUPS, CompactChoices, encode_model
 from a2tg_jax.io.formats import FORMATS
@@ -159,8 +159,7 @@ def compress(
     # Only the default path is listed in the marker: any other file is the user's.
     if source.is_dir() and out == default:
         RunFolder(source).own(out)
-    with replacing(out) as temporary:
-        temporary.write_bytes(data)
+    write_whole(out, data)
     share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
     size = f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
     lines = _table(trials, found, chosen, losses) if verbose else []

@@ -21,7 +21,7 @@ from a2tg_jax.core.camera_paths import smooth_path
 from a2tg_jax.core.cameras import Camera, resize_camera
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.colmap import read_cameras_and_points
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
@@ -88,8 +88,7 @@ def write_figures(
         if isinstance(content, Figure):
             save_figure(path, content)
         elif isinstance(content, bytes):
-            with replacing(path) as temporary:
-                temporary.write_bytes(content)
+            write_whole(path, content)
         else:
             save_picture(path, content)
         found[place].append(ReportFigure(path, caption, kind, legend))

@@ -32,7 +32,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from a2tg_jax.host.atomic import left_over, named_if_full, replacing
+from a2tg_jax.host.atomic import left_over, named_if_full, write_whole
 from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.machine import ALONE, Devices
 from a2tg_jax.host.operating_system import flush_folder, try_lock
@@ -402,8 +402,7 @@ def json_text(data: object) -> str:
 
 
 def write_json(path: Path, data: object) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(f"{json_text(data)}\n", encoding="utf-8")
+    write_whole(path, f"{json_text(data)}\n")
 
 
 def read_json(path: Path) -> Any:

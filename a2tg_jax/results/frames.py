@@ -17,7 +17,7 @@ from PIL import Image
 
 from a2tg_jax.core.camera_paths import path_through, smooth_path, turntable
 from a2tg_jax.core.cameras import Camera, crop_camera
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.progress_bars import progress_over
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import did_you_mean, shortened
@@ -78,9 +78,8 @@ class FrameFolder:
             for name in names:
                 if name not in rendered and FRAME.fullmatch(name):
                     (self.path / name).unlink(missing_ok=True)
-        with replacing(self.path / LIST) as temporary:
-            left = [f"{name}\n" for name in names if (self.path / name).is_file()]
-            temporary.write_text("".join(left), encoding="utf-8", errors="surrogateescape")
+        left = "".join(f"{name}\n" for name in names if (self.path / name).is_file())
+        write_whole(self.path / LIST, left.encode(errors="surrogateescape"))
 
 
 def parse_size(text: str) -> tuple[int, int]:

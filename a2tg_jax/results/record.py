@@ -31,7 +31,7 @@ from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 
 from a2tg_jax.core.budget import MEGABYTE, bytes_of, megabytes_of
 from a2tg_jax.data.load import SYNTHETIC, SceneSource
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.remote_files import checked_url, path_here
@@ -249,8 +249,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
     text = f"# Repeats the run: {repeating_command(run)}\n"
     if record.options.memory_budget is not None and (caps := record.options.caps()):
         text += f"# options.memory_budget decides instead of {', '.join(f'options.{name}' for name in caps)}\n"
-    with replacing(run.own(run.record)) as temporary:
-        temporary.write_text(text + tomli_w.dumps(table), encoding="utf-8")
+    write_whole(run.own(run.record), text + tomli_w.dumps(table))
 
 
 def _without_none(table: dict[str, object], start: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import MOST_TOML_BYTES
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.source_commit import source_commit
@@ -378,8 +378,7 @@ def write_report(
         final=training_command(run, f"{run.path}-final", "--test-every", "0") if is_split_by_number else None,
         record=read_regular(run.record, MOST_TOML_BYTES).decode() if is_regular(run.record) else "",
     )
-    with replacing(run.own(run.report)) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_whole(run.own(run.report), page)
 
 
 def _best(row: Sequence[str]) -> list[int]:

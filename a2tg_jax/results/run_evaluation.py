@@ -17,7 +17,7 @@ import numpy as np
 from a2tg_jax.data.assembly import every_kth
 from a2tg_jax.data.load import HeldOut, SceneSource
 from a2tg_jax.data.scene import Scene, View, view_image
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.host.text import counted
 from a2tg_jax.io.model_file import load_model
@@ -91,8 +91,7 @@ def evaluate_run(run: RunFolder, scene: Scene | None = None, *, lpips_weights: P
     # Browsers cannot show subclasses of Appearance.
     if main.appearance.is_portable:
         data = encode_web_scene(main, title=f"{scene.name} · {result.main}")
-        with replacing(run.own(run.viewer)) as temporary:
-            temporary.write_text(viewer_html_with(data), encoding="utf-8")
+        write_whole(run.own(run.viewer), viewer_html_with(data))
     starts = {name: plan.first_iteration(name) for name in models}
     figures = write_figures(run, main, (*scene.test, *scene.train)[0].camera, settings, histories, starts)
     comparisons = _write_sheets(run, result, models, scene)

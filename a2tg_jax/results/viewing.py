@@ -21,7 +21,7 @@ from PIL import Image
 
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.data.scene import Scene, View, origin_of_scene, view_image
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.compact import decode_model
 from a2tg_jax.io.other_programs import matrix_of
@@ -241,8 +241,7 @@ def export_web(
             old = {out / photograph_name(int(index)) for index in read_json(out / PHOTOGRAPHS_NAME)}
     # Nothing is written until all files are checked and all contents made.
     for path, content in files.items():
-        with replacing(path) as temporary:
-            temporary.write_bytes(content)
+        write_whole(path, content)
     for path in old - set(files):
         path.unlink(missing_ok=True)
         remove_if_empty(path.parent, out)
@@ -277,8 +276,7 @@ def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool =
         titles = [str(source.path) for source in sources]
     scenes = [(title, source.encoded) for title, source in zip(titles, sources, strict=True)]
     page = comparison_html(*scenes).encode()
-    with replacing(out) as temporary:
-        temporary.write_bytes(page)
+    write_whole(out, page)
     return f"{out}: {in_bytes(len(page))}, {' against '.join(titles)}"
 
 

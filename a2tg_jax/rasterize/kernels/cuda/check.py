@@ -13,7 +13,7 @@ from jaxlib.version import __version__ as jaxlib_version
 from a2tg_jax.appearance import Appearance, StaticShading, Texture, gaussian_cutoff
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.numerics import MOST_DIFFERENCE, relative_difference
-from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.operating_system import cuda_of_driver
 from a2tg_jax.host.startup import cache_folder
 from a2tg_jax.rasterize.kernels import xla
@@ -55,8 +55,8 @@ def _failure() -> str | None:
     except Exception as error:  # Whatever it is, XLA can draw.
         reason = " ".join(f"CUDA kernels failed: {type(error).__name__}: {error}".split())[:300]
     reason = reason and f"{reason}; please report this, and delete {file} to check them again"
-    with contextlib.suppress(OSError), replacing(file) as partial:
-        partial.write_text(reason, encoding="utf-8")
+    with contextlib.suppress(OSError):
+        write_whole(file, reason)
     return reason or None
 
 
