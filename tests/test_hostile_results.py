@@ -10,9 +10,9 @@ from hostile_files import put
 from run_folders import create_run
 
 from a2tg_jax.cli import main as cli
-from a2tg_jax.host.json_text import DEEPEST, parse_json, parse_toml
+from a2tg_jax.host.json_text import DEEPEST, parse_json, parse_toml, read_json
 from a2tg_jax.results.figures import curves_figure
-from a2tg_jax.results.folder import MOST_NAMES, RunFolder, open_run, read_json
+from a2tg_jax.results.folder import MOST_NAMES, RunFolder, open_run
 from a2tg_jax.results.history import NAMES, read_history, write_history
 from a2tg_jax.results.info import read_psnrs
 from a2tg_jax.results.record import RunRecord, SceneSource, chosen_system, read_record, read_run_file, write_record
@@ -42,7 +42,7 @@ def test_metrics_of_wrong_types(tmp_path, value):
 def test_json_made_to_do_harm(tmp_path, text):
     file = tmp_path / "metrics.json"
     file.write_bytes(text)
-    with pytest.raises(ValueError, match=r"metrics\.json: is not valid JSON") as caught:
+    with pytest.raises(ValueError, match=r"metrics\.json: cannot be read as JSON") as caught:
         read_json(file)
     assert "\n" not in str(caught.value)
 

@@ -23,8 +23,8 @@ from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.photo_reading import Counted, Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
-from a2tg_jax.host.json_text import MOST_BYTES, parse_json
-from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.host.json_text import read_json
+from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
 
 NERFSTUDIO_FILE = "transforms.json"
@@ -55,7 +55,7 @@ def load_transforms(file: Path, options: Options) -> Scene:
     The lists train_filenames, test_filenames and val_filenames decide the split if the file has them (val is the test
     split without a test list); otherwise test_every does. A warning counts frames that the lists leave out.
     """
-    meta = _read_json(file)
+    meta = _read_meta(file)
     (shots,) = _read_shots([(file, meta)], options)
     train, test = every_kth(shots, options.test_every)
     if listed := {key: set(meta[key]) for key in SPLIT_KEYS if key in meta}:
@@ -85,7 +85,7 @@ def load_blender(folder: Path, options: Options) -> Scene:
     """
     train_file, test_file = (folder / name for name in BLENDER_FILES)
     files = [train_file, test_file] if is_regular(test_file) else [train_file]
-    metas = [_read_json(file) for file in files]
+    metas = [_read_meta(file) for file in files]
     groups = _read_shots(list(zip(files, metas, strict=True)), options)
     train, test = groups if len(groups) == 2 else every_kth(groups[0], options.test_every)
     cloud = _points_beside(train_file, *metas)
@@ -94,9 +94,7 @@ def load_blender(folder: Path, options: Options) -> Scene:
 
 def load_frames(made: Frames, options: Options) -> Scene:
     """Make a scene of frames of another program."""
-    meta = {"frames": made.frames}
-    _check_meta(made.file, meta)
-    (shots,) = _read_shots([(made.file, meta)], options, made.counted)
+    (shots,) = _read_shots([(made.file, {"frames": made.frames})], options, made.counted)
     name = scene_name(made.file.resolve().parent)
     return assemble_scene(name, *every_kth(shots, options.test_every), made.cloud, source=str(made.file))
 
@@ -117,21 +115,12 @@ def _points_beside(file: Path, *metas: dict[str, Any]) -> PointCloud | None:
     return next((read_ply_points(file.parent / name) for name in (*named, *usual)), None)
 
 
-def _read_json(file: Path) -> dict[str, Any]:
-    data = read_regular(file, MOST_BYTES)
-    try:
-        meta: dict[str, Any] = parse_json(data, allow_nan=True)  # Numbers are checked where they are used.
-    except ValueError as error:
-        raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
-    _check_meta(file, meta)
-    return meta
+def _read_meta(file: Path) -> dict[str, Any]:
+    """Return the content of a transforms file, with names of files relative to its folder.
 
-
-def _check_meta(file: Path, meta: object) -> None:
-    """Raise ValueError unless there is a non-empty list `frames` of objects, and file names are texts.
-
-    File names become relative to the scene folder.
+    Raise ValueError unless there is a non-empty list `frames` of objects, and file names are texts.
     """
+    meta = read_json(file)  # Numbers are checked where they are used.
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
         raise ValueError(f"{file}: lists no frames; a nerfstudio or Blender transforms file is expected")
     for number, values in enumerate([*meta["frames"], meta]):
@@ -150,6 +139,7 @@ def _check_meta(file: Path, meta: object) -> None:
                 raise ValueError(f"{file}: {key} must be a list of names; got {shortened(names)}")
             if names:
                 values[key] = [inside(file.parent, name) for name in names]
+    return meta
 
 
 def _read_shots(
@@ -157,7 +147,7 @@ def _read_shots(
 ) -> list[list[Shot]]:
     """Return the frames of each transforms file of a scene, downscaled, in the file's order.
 
-    The files come with their contents, which `_check_meta` has checked. Values of a frame override the file's.
+    The files come with their contents, as of `_read_meta`. Values of a frame override the file's.
     """
     photos = []
     for file, frame in ((file, {**meta, **frame}) for file, meta in files for frame in meta["frames"]):

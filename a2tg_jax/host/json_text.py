@@ -58,17 +58,27 @@ def parse_json(text: str | bytes, *, allow_nan: bool = False) -> Any:
     return _parsed(lambda: json.loads(text, parse_constant=number, parse_int=integer, parse_float=number))
 
 
-def read_object(file: Path) -> dict[str, Any]:
-    """Return the object in a JSON file.
+def read_json(file: Path, *, allow_nan: bool = True) -> Any:
+    """Return the value in a JSON file.
+
+    Args:
+      file: the file.
+      allow_nan: as in `parse_json`. Our own files have infinities: the PSNR of equal images.
 
     Raises:
       OSError: if the file cannot be read.
-      ValueError: naming the file, if it is not JSON, or no object.
+      ValueError: naming the file, if it is too large, or not JSON.
     """
+    data = read_regular(file, MOST_BYTES)
     try:
-        values = parse_json(read_regular(file, MOST_BYTES))
+        return parse_json(data, allow_nan=allow_nan)
     except ValueError as error:
         raise ValueError(f"{file}: cannot be read as JSON ({error})") from None
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """Return the object in a JSON file. Raises as `read_json`, and ValueError if it holds another value."""
+    values = read_json(file, allow_nan=False)
     if not isinstance(values, dict):
         raise ValueError(f"{file}: must hold an object; got {shortened(values)}")
     return values

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.json_text import MOST_BYTES, parse_json
-from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.host.json_text import read_json
+from a2tg_jax.host.regular_files import is_regular
 
 T = TypeVar("T")
 VERSION = 1
@@ -22,8 +22,8 @@ def load_saved(path: Path, kind: str, parse: Callable[[dict[str, Any]], T]) -> T
     """
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such {kind}; the viewer's 'Save {kind}' makes one")
+    data = read_json(path, allow_nan=False)
     try:
-        data = parse_json(read_regular(path, MOST_BYTES))
         if not isinstance(data, dict) or (data.get("format"), data.get("version")) != (f"a2tg-jax {kind}", VERSION):
             article = "an" if kind[0] in "aeiou" else "a"
             raise ValueError(f"is not {article} {kind} of version {VERSION} that the viewer saved")

@@ -12,12 +12,13 @@ from a2tg_jax.data.scene import Scene
 from a2tg_jax.finish.polishing import polish
 from a2tg_jax.finish.shrinking import can_shrink, shrink_textures
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.json_text import read_json
 from a2tg_jax.host.progress_bars import counting
 from a2tg_jax.host.regular_files import is_regular, sha256_of
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.measure.evaluation import evaluate
 from a2tg_jax.model import Model
-from a2tg_jax.results.folder import RunFolder, check_free, claimed, read_json, write_json
+from a2tg_jax.results.folder import RunFolder, check_free, claimed, write_json
 from a2tg_jax.results.model_source import finished_stage, settings_of
 from a2tg_jax.results.record import FinishOptions, PlannedStage, write_record
 from a2tg_jax.results.report import aligned

@@ -30,10 +30,8 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from a2tg_jax.host.atomic import left_over, named_if_full, write_whole
-from a2tg_jax.host.json_text import MOST_BYTES, parse_json
 from a2tg_jax.host.machine import ALONE, Devices
 from a2tg_jax.host.operating_system import flush_folder, try_lock
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -403,12 +401,3 @@ def json_text(data: object) -> str:
 
 def write_json(path: Path, data: object) -> None:
     write_whole(path, f"{json_text(data)}\n")
-
-
-def read_json(path: Path) -> Any:
-    """Return the content of a JSON file. Raises ValueError if it is damaged or too large."""
-    data = read_regular(path, MOST_BYTES)
-    try:
-        return parse_json(data, allow_nan=True)  # The PSNR of equal images is infinite.
-    except ValueError as error:
-        raise ValueError(f"{path}: is not valid JSON: {error}") from error

@@ -32,13 +32,13 @@ from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 from a2tg_jax.core.budget import MEGABYTE, bytes_of, megabytes_of
 from a2tg_jax.data.load import SYNTHETIC, SceneSource
 from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml
+from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml, read_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.remote_files import checked_url, path_here
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.config_json import changed_config, config_from_dict, config_to_dict, flatten_config, merged
 from a2tg_jax.io.model_rows import check_encodable
-from a2tg_jax.results.folder import RunFolder, read_json
+from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.systems.bytewise import Bytewise
 from a2tg_jax.training import Stage, System, find_system, like
 from a2tg_jax.training.options import own_options

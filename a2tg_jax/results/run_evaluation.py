@@ -18,6 +18,7 @@ from a2tg_jax.data.assembly import every_kth
 from a2tg_jax.data.load import HeldOut, SceneSource
 from a2tg_jax.data.scene import Scene, View, view_image
 from a2tg_jax.host.atomic import write_whole
+from a2tg_jax.host.json_text import read_json
 from a2tg_jax.host.regular_files import sha256_of
 from a2tg_jax.host.text import counted
 from a2tg_jax.io.model_file import load_model
@@ -29,7 +30,7 @@ from a2tg_jax.measure.metrics import load_lpips
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.results.figures import write_figures
-from a2tg_jax.results.folder import RunFolder, drop_old, read_json, resuming_command, write_json
+from a2tg_jax.results.folder import RunFolder, drop_old, resuming_command, write_json
 from a2tg_jax.results.history import read_history
 from a2tg_jax.results.images import (
     ERROR_GAIN,

@@ -22,13 +22,14 @@ from PIL import Image
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.data.scene import Scene, View, origin_of_scene, view_image
 from a2tg_jax.host.atomic import write_whole
+from a2tg_jax.host.json_text import read_json
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.compact import decode_model
 from a2tg_jax.io.other_programs import matrix_of
 from a2tg_jax.io.web_scene import encode_web_scene
 from a2tg_jax.model import Model
 from a2tg_jax.results.compression import loss_measures
-from a2tg_jax.results.folder import check_new, read_json, remove_if_empty
+from a2tg_jax.results.folder import check_new, remove_if_empty
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
 from a2tg_jax.results.report import loss_text

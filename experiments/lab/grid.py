@@ -14,9 +14,9 @@ from typing import Any
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, MEGABYTE
+from a2tg_jax.host.json_text import read_json
 from a2tg_jax.host.text import did_you_mean
 from a2tg_jax.io.config_json import changed_config, merged
-from a2tg_jax.results.folder import read_json
 from lab.grid_file import (
     GRIDS,
     SIZES,

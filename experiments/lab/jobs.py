@@ -23,9 +23,10 @@ from a2tg_jax.core.origin import WHITE
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.load import SceneSource
+from a2tg_jax.host.json_text import read_json
 from a2tg_jax.host.machine import num_threads, tidy_memory
 from a2tg_jax.host.source_commit import source_commit
-from a2tg_jax.results.folder import read_json, write_json
+from a2tg_jax.results.folder import write_json
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.options import own_options
 from a2tg_jax.training.registry import reference_of
