@@ -53,17 +53,9 @@ class FileFormat:
     """Import of the optional library that writing needs; raises ValueError, with what to install, without it."""
 
 
-def _by_gaussforge(name: str, degree: int = 3) -> FileFormat:
-    return FileFormat(
-        name,
-        load_by_gaussforge,
-        save_by_gaussforge,
-        highest_degree=degree,
-        is_exact=False,
-        import_library=import_gaussforge,
-    )
-
-
+_GAUSSFORGE = FileFormat(
+    "SPZ", load_by_gaussforge, save_by_gaussforge, is_exact=False, import_library=import_gaussforge
+)
 _GLTF = FileFormat("glTF", load_gltf, save_gltf, True, True, is_exact=False, has_extension=True)
 _USD = FileFormat(
     "OpenUSD", load_usd, save_usd, keeps_origin=True, is_exact=False, import_library=lambda path: import_usd()
@@ -73,11 +65,11 @@ FORMATS = {
     ".npz": FileFormat("model", load_model, save_model, True, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
     # Our own reader: reading needs no optional library.
-    ".compressed.ply": dataclasses.replace(_by_gaussforge("compressed PLY"), load=load_ply_model),
+    ".compressed.ply": dataclasses.replace(_GAUSSFORGE, name="compressed PLY", load=load_ply_model),
     ".ply": FileFormat("PLY", load_ply_model, save_ply),
-    ".spz": _by_gaussforge("SPZ"),
-    ".sog": _by_gaussforge("SOG"),
-    ".splat": _by_gaussforge(".splat", degree=0),
+    ".spz": _GAUSSFORGE,
+    ".sog": dataclasses.replace(_GAUSSFORGE, name="SOG"),
+    ".splat": dataclasses.replace(_GAUSSFORGE, name=".splat", highest_degree=0),
     ".ksplat": FileFormat(".ksplat", load_ksplat, save_ksplat, highest_degree=2, is_exact=False),
     **dict.fromkeys((".glb", ".gltf"), _GLTF),
     **dict.fromkeys((".usda", ".usdc", ".usdz", ".usd"), _USD),
