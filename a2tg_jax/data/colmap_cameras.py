@@ -46,6 +46,8 @@ MODELS = {
 }
 """COLMAP's camera models by their number in binary files."""
 BY_NAME = {model.name: model for model in MODELS.values()}
+CUT = ": find cameras again with a2tg sfm, which cuts panoramas into views"
+"""What to do about cameras that look all around."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +82,7 @@ class ColmapCamera:
           ValueError: if the camera has no image plane, like a panorama.
         """
         if not self.model.num_focal:
-            raise ValueError(f"{self.name} has no image plane")
+            raise ValueError(f"{self.name} has no image plane{CUT}")
         focal, (cx, cy) = self.params[: self.model.num_focal], self.params[self.model.num_focal :][:2]
         return np.array([[focal[0], 0.0, cx], [0.0, focal[-1], cy], [0.0, 0.0, 1.0]])
 

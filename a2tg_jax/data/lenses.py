@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from a2tg_jax.core.cameras import check_intrinsics
-from a2tg_jax.data.colmap_cameras import ColmapCamera
+from a2tg_jax.data.colmap_cameras import CUT, ColmapCamera
 from a2tg_jax.data.colmap_library import pycolmap
 from a2tg_jax.data.observations import pinhole_pixels
 
@@ -27,8 +27,6 @@ WIDEST_ANGLE = np.deg2rad(80.0)
 FARTHEST_FROM_RAY = 0.1
 """Largest distance in pixels between a pixel and the projection of its ray; rays farther off are dropped."""
 LEAST_SEEN = 0.05
-CUT = ": find cameras again with a2tg sfm, which cuts panoramas into views"
-"""What to do about cameras that look all around."""
 LensUse = Literal["undistort", "keep"]
 """Whether photographs are undistorted to pinholes, or kept as they are and drawn through the lens."""
 
@@ -105,7 +103,7 @@ class Lens:
 
     def view_of(self, stored: tuple[int, int], downscale: int) -> tuple[tuple[int, int], np.ndarray]:
         """Return (width, height) and K [3, 3] of the view that `view_pixels` makes of a photograph of a size."""
-        K, size = (self._matrix(), self.size) if self.is_kept else self.pinhole
+        K, size = (self.camera.matrix, self.size) if self.is_kept else self.pinhole
         width, height = stored if self.is_kept else self._undistorted_size(stored)
         new_size = max(1, round(width / downscale)), max(1, round(height / downscale))
         return new_size, _scaled_intrinsics(K, size, new_size)
@@ -136,17 +134,11 @@ class Lens:
         if not self.is_kept:
             return None
         # Before is_pinhole, which raises an error without advice if the model has no image plane.
-        K = _scaled_intrinsics(self._matrix(), self.size, (width, height))
+        K = _scaled_intrinsics(self.camera.matrix, self.size, (width, height))
         if self.is_pinhole:
             return None
         with _LOCK:  # Threads that read photographs of one lens share its rays.
             return _rays(self.camera, (width, height), K.tobytes())
-
-    def _matrix(self) -> np.ndarray:
-        try:
-            return self.camera.matrix
-        except ValueError as error:
-            raise ValueError(f"{error}{CUT}") from None
 
     def _sampled(self, planes: np.ndarray) -> np.ndarray:
         """Return float32 planes of the undistorted image, sampled bilinearly from planes [h, w, C] of a photograph."""
