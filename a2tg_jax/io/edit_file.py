@@ -12,7 +12,7 @@ from a2tg_jax.core.origin import Color, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import AxisSteps
-from a2tg_jax.io.saved_file import load_saved, save_saved
+from a2tg_jax.io.saved_file import load_saved, numbers_of, save_saved
 from a2tg_jax.model import Model
 
 # As in web/src/extent.ts.
@@ -110,27 +110,20 @@ def _edit_of(data: dict[str, Any]) -> Edit:
         rows = crop.get("axes", np.eye(3).tolist())
         if not isinstance(rows, list) or len(rows) != 3:
             raise ValueError(f"crop.axes must be 3 directions; got {shortened(rows)}")
-        axes = np.stack([_numbers("crop.axes", row) for row in rows])
+        axes = np.stack([numbers_of(row, 3, "crop.axes") for row in rows])
         check_similarity(Similarity(1.0, axes, np.zeros(3)), "crop.axes")
-        low, high = _numbers("crop.low", crop.get("low"), -math.inf), _numbers("crop.high", crop.get("high"), math.inf)
+        low = numbers_of(crop.get("low"), 3, "crop.low", null=-math.inf)
+        high = numbers_of(crop.get("high"), 3, "crop.high", null=math.inf)
         crop = Box(axes, low, high)
     if up is not None:
-        up = _numbers("up", up)
+        up = numbers_of(up, 3, "up")
         if not np.linalg.norm(up) > 0:
             raise ValueError("up must not be zero")
         up = up / np.linalg.norm(up)
     if background is not None:
-        red, green, blue = _numbers("background", background).tolist()
+        red, green, blue = numbers_of(background, 3, "background").tolist()
         background = (red, green, blue)
     return Edit(crop, float(floaters), up, background)
-
-
-def _numbers(name: str, values: object, instead: float | None = None) -> np.ndarray:
-    """Return three numbers; null becomes `instead`, if it is given."""
-    kinds = (int, float) if instead is None else (int, float, type(None))
-    if not isinstance(values, list) or len(values) != 3 or not all(type(x) in kinds for x in values):
-        raise ValueError(f"{name} must be 3 numbers{'' if instead is None else ' or null'}; got {shortened(values)}")
-    return np.array([instead if x is None else x for x in values], np.float64)
 
 
 def scores_of(model: Model) -> np.ndarray:

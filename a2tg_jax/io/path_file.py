@@ -1,15 +1,13 @@
 """Camera paths as JSON: views saved in the viewer for a flight."""
 
-import math
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 from a2tg_jax.core.cameras import Camera, check_calibration, check_camera
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.saved_file import load_saved
+from a2tg_jax.io.saved_file import load_saved, numbers_of
 
 # A file may come from a stranger: sides decide how much memory a frame takes.
 LARGEST_SIDE, MOST_VIEWS = 16384, 10_000
@@ -31,14 +29,9 @@ def _cameras(data: dict[str, Any]) -> list[Camera]:
 def _camera(view: object, where: str) -> Camera:
     if not isinstance(view, dict):
         raise ValueError(f"{where} must be an object; got {shortened(view)}")
-
-    def numbers(name: str, *shape: int) -> np.ndarray:
-        values, count = view.get(name), math.prod(shape)
-        if not isinstance(values, list) or len(values) != count or not all(type(x) in (int, float) for x in values):
-            raise ValueError(f"{where}.{name} must be {count} numbers; got {shortened(values)}")
-        return np.array(values, np.float64).reshape(shape)
-
-    viewmat, K, (width, height) = numbers("viewmat", 4, 4), numbers("K", 3, 3), numbers("size", 2)
+    viewmat = numbers_of(view.get("viewmat"), 16, f"{where}.viewmat").reshape(4, 4)
+    K = numbers_of(view.get("K"), 9, f"{where}.K").reshape(3, 3)
+    width, height = numbers_of(view.get("size"), 2, f"{where}.size")
     if not all(1 <= side <= LARGEST_SIDE and side == int(side) for side in (width, height)):
         raise ValueError(f"{where}.size must be 1 to {LARGEST_SIDE} pixels; got {width:g} and {height:g}")
     check_calibration(viewmat, K, int(width), int(height), where)

@@ -5,9 +5,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import read_json
 from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.text import shortened
 
 T = TypeVar("T")
 VERSION = 1
@@ -30,6 +33,16 @@ def load_saved(path: Path, kind: str, parse: Callable[[dict[str, Any]], T]) -> T
         return parse(data)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def numbers_of(values: object, count: int, name: str, null: float | None = None) -> np.ndarray:
+    """Return a list of numbers as an array [count]; null becomes `null`, if that is given. Raises ValueError with
+    `name` for anything else."""
+    kinds = (int, float) if null is None else (int, float, type(None))
+    if not isinstance(values, list) or len(values) != count or not all(type(x) in kinds for x in values):
+        wanted = f"{count} numbers{'' if null is None else ' or null'}"
+        raise ValueError(f"{name} must be {wanted}; got {shortened(values)}")
+    return np.array([null if x is None else x for x in values], np.float64)
 
 
 def save_saved(path: Path, kind: str, content: Mapping[str, Any]) -> None:
