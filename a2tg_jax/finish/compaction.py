@@ -188,11 +188,12 @@ def measure_choices(
       model has.
     """
     finest = finest_choices(ladder)
+    most_bytes = len(encode_model(model, finest))
     tried: list[tuple[str, Precision]] = []
     for group, steps in ladder.items():
         coarsest = finest.keeping({group: steps[0]})
         # Groups without numbers, such as texels of a model without textures, do not change the size.
-        if len(encode_model(model, coarsest)) < 0.999 * len(encode_model(model, finest)):
+        if len(encode_model(model, coarsest)) < 0.999 * most_bytes:
             tried += [(group, step) for step in steps]
     shown = progress_over(tried, "rounding", "way", is_shown=progress)
     return [try_choices(model, finest.keeping({group: step}), losses, group) for group, step in shown]
