@@ -32,7 +32,7 @@ from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import Session, fit_stage, loop
 from a2tg_jax.training.batches import PhotoStore
 from a2tg_jax.training.cost import stage_bytes
-from a2tg_jax.training.divergence import jitted_attempt
+from a2tg_jax.training.divergence import spread_attempt
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.losses import normal_consistency
 from a2tg_jax.training.start import initial_model, padded
@@ -297,7 +297,7 @@ def lenses(folder):
 
 
 def attempted(arguments):
-    tried = jitted_attempt()(*arguments)
+    tried = jax.jit(spread_attempt, static_argnums=(0,))(*arguments)
     return tried.views._replace(num_pairs=0, grads=tried.grads), tried.state.model
 
 

@@ -10,7 +10,6 @@ of texels.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -161,7 +160,8 @@ def texel_weights(model: Model, cameras: Sequence[Camera], background: ArrayLike
     assert model.textures is not None
     settings = plan_render(model, cameras)
     background = jnp.asarray(background, model.gaussians.means.dtype)
-    total, jitted = tuple(map(jnp.zeros_like, model.textures.buckets)), _jitted_weights()
+    total = tuple(map(jnp.zeros_like, model.textures.buckets))
+    jitted = jax.jit(_weights_in_view, static_argnums=(4,))
     for index, camera in enumerate(cameras):
         # A key for each view, fixed, so that the same model shrinks in the same way.
         total = jax.tree.map(jnp.add, total, jitted(model, camera, background, jax.random.key(index), settings))
@@ -184,12 +184,6 @@ def _weights_in_view(
     # Hutchinson: for random signs ε, E[(Jᵀε)²] is the sum of J² over the pixels, h.
     (slopes,) = back(jax.random.rademacher(key, color.shape, color.dtype))
     return tuple(map(jnp.square, slopes))
-
-
-@functools.cache
-def _jitted_weights() -> Callable[[Model, Camera, Array, Array, RenderSettings], tuple[Array, ...]]:
-    """Return `_weights_in_view` under jit, with static settings; made at the first call."""
-    return jax.jit(_weights_in_view, static_argnums=(4,))
 
 
 # Textures of few texels in all

@@ -1,10 +1,9 @@
 """Image quality and speed of a trained model on given views."""
 
 import dataclasses
-import functools
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -160,7 +159,7 @@ def evaluate(
         # Not clipped here: the metrics clip both images.
         if fit_colors:
             image = exposed(jnp.asarray(color_fit(image, target, mask), image.dtype), image)
-        decibels, similarity, flat = (float(figure) for figure in _jitted_figures()(image, target, mask))
+        decibels, similarity, flat = (float(figure) for figure in jax.jit(_figures_of)(image, target, mask))
         distance = None if weights is None else float(lpips(image, target, weights, mask))
         per_view.append(ViewMetrics(view.name, decibels, similarity, distance, flat))
         if len(renders) < num_renders:
@@ -172,12 +171,6 @@ def evaluate(
 def _figures_of(image: Array, target: Array, mask: Array | None) -> tuple[Array, Array, Array]:
     """Return PSNR, SSIM and flat PSNR of a render and its photograph."""
     return psnr(image, target, mask), ssim(image, target, mask), flat_psnr(target, mask)
-
-
-@functools.cache
-def _jitted_figures() -> Callable[[Array, Array, Array | None], tuple[Array, Array, Array]]:
-    """Return `_figures_of` under jit, made at the first call."""
-    return jax.jit(_figures_of)
 
 
 def _seconds(renderer: Renderer, camera: Camera) -> float:

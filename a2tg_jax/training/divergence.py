@@ -1,6 +1,5 @@
 """Place where training diverged, found after the fact: views, and rows of parameters (host)."""
 
-import functools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -32,13 +31,8 @@ def largest_loss(history: History) -> float:
     return max(SMALL_LOSS, EXPLOSION * float(history.loss[0])) if len(history.loss) else float("inf")
 
 
-@functools.cache
-def jitted_attempt() -> jax.stages.Wrapped:
-    """Return `attempt`, jitted, with its results spread over the devices of the settings."""
-    return jax.jit(_spread_attempt, static_argnums=(0,))
-
-
-def _spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:
+def spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:
+    """Return the result of `attempt`, spread over the devices of the settings."""
     tried, exchange = attempt(settings, *arguments), settings.render.exchange
     if exchange is None:
         return tried
@@ -55,7 +49,7 @@ def _spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:
 def what_diverged(arguments: tuple[object, ...], names: Sequence[str]) -> str:
     """Return the views and parameters whose numbers are not finite, or the loss if all of them are finite, given the
     arguments of `train_step` before the step that could not be taken, and the names of its views."""
-    tried: Attempt = readable(jitted_attempt()(*arguments))
+    tried: Attempt = readable(jax.jit(spread_attempt, static_argnums=(0,))(*arguments))
     losses = np.asarray(tried.views.loss)
     found = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
     found += [f"the gradient by {place}" for place in _not_finite(tried.grads)]
