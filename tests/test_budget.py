@@ -291,7 +291,7 @@ def test_budgets_that_the_points_of_a_scene_cannot_fill_are_refused(scene, name,
         with pytest.raises(ValueError, match=message):
             start(scene, system)
     check_start(scene, smoke(name, memory_budget="60kB"))
-    check_start(scene, system, num_given=120)
+    system.check_given_number(120)
 
 
 def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene):
@@ -300,9 +300,9 @@ def test_a_budget_of_textures_has_room_for_growth_only_where_there_is_some(scene
     with pytest.raises(ValueError, match=r"0\.03, but \d+ Gaussians .*: raise it, or lower densify\.cap$"):
         check_start(scene, system)
     most = 30_000 // bytes_per_gaussian(system.sh_degree, 4)
-    check_start(scene, system, num_given=most)
+    system.check_given_number(most)
     with pytest.raises(ValueError, match=rf"0\.03, but {most + 1} Gaussians of one texel each .* MB: raise it$"):
-        check_start(scene, system, num_given=most + 1)
+        system.check_given_number(most + 1)
 
 
 @pytest.mark.parametrize("cap", [500_000, 0])
@@ -316,7 +316,7 @@ def test_a_budget_of_textures_is_checked_before_the_first_stage(scene, cap):
         with pytest.raises(ValueError, match=rf"but 120 Gaussians .* take 0\.030 MB: raise it, or lower {option}$"):
             start(scene, system)
     with pytest.raises(ValueError, match=r"but 120 Gaussians .*: raise it$"):
-        check_start(scene, system, num_given=120)
+        system.check_given_number(120)
     check_start(scene, changed_config(system, {"texture": {"budget_mb": 0.0298}}, "test"))
 
 

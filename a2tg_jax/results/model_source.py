@@ -16,7 +16,6 @@ from a2tg_jax.core.similarity import transform_gaussians
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.scene import Scene, origin_of_scene
 from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.text import in_bytes
 from a2tg_jax.io.edit_file import apply_edit, load_edit
 from a2tg_jax.io.formats import FORMATS, format_of, load_splats
 from a2tg_jax.io.model_file import load_model, save_model
@@ -154,7 +153,7 @@ def check_init(file: Path, out: Path, system: System) -> Model:
     """Return a file's splats to replace the first stage of a run, with a warning about what is dropped.
 
     The file is of any format that `load_splats` reads: plain splats in the photographs' original world, or a model.
-    Raises ValueError if there is no such file, the folder holds a run, or the splats exceed the system's memory budget.
+    Raises ValueError if there is no such file, the folder holds a run, or the splats exceed the system's budget.
     """
     if not is_regular(file):
         raise ValueError(f"init: there is no file {file}")
@@ -162,12 +161,10 @@ def check_init(file: Path, out: Path, system: System) -> Model:
     if RunFolder(out).is_begun:
         raise ValueError(f"init begins a new run, and {out} holds one: choose another `out`")
     splats, degree = load_splats(file), system.initial_sh_degree
-    needed, budget = splats.num * system.initial_bytes, system.budget_bytes
-    if budget is not None and needed > budget:
-        raise ValueError(
-            f"init: {file} holds {splats.num:,} Gaussians, {in_bytes(needed)} at degree {degree}, which is more than "
-            f"the memory_budget of {in_bytes(budget)}: raise it, or leave it out"
-        )
+    try:
+        system.check_given_number(splats.num)
+    except ValueError as error:
+        raise ValueError(f"init: {file}: {error}") from error
     shown, lost = splats.appearance, []
     has_shapes = shown.exponents is not None
     if has_shapes and system.stages()[0].appearance.exponents is None:

@@ -128,7 +128,8 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     num_given = None if given is None else given.num
     for system in record.systems.values():
         check_loss_data(scene.train, system.all_stages())
-        check_start(scene, system, num_given if system is record.options else None)
+        if given is None or system is not record.options:
+            check_start(scene, system)
     if doubts := doubts_about(scene, record):
         options.confirm(doubts)
     print_forecast(scene, record, options.max_memory, options.session.num_devices, num_given, out)

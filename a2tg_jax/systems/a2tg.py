@@ -94,8 +94,10 @@ class A2tg(TwoStages):
         self._check_budget(num, f"raise it, or lower {option}")
 
     def check_given_number(self, num: int) -> None:
-        """Check that the memory budget and the texture budget have room for the given Gaussians."""
-        self.check_given_bytes(num)
+        """Check that the memory budget or the texture budget has room for the given Gaussians."""
+        # At most one of them is set, as `stages` checks; given Gaussians do not grow as `check_number` expects.
+        if self.texture.budget_mb is None:
+            super().check_given_number(num)
         self._check_budget(num, "raise it")
 
     def _check_budget(self, num: int, remedy: str) -> None:

@@ -391,17 +391,12 @@ class System:
 
     def check_given_number(self, num: int) -> None:
         """Check the options for Gaussians from a file instead of the first stage; the memory budget must have room for
-        them."""
-        self.check_number(num)
-        self.check_given_bytes(num)
-
-    def check_given_bytes(self, num: int) -> None:
-        """Check that the memory budget has room for the Gaussians of a file, with their appearance at the beginning of
-        each stage.
+        them, with their appearance at the beginning of each stage.
 
         Raises:
-          ValueError: naming the budget.
+          ValueError: naming the option.
         """
+        self.check_number(num)
         if self.budget_bytes is None:
             return
         degree = self.initial_sh_degree

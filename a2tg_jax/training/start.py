@@ -102,26 +102,20 @@ def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarra
     return largest
 
 
-def check_start(scene: Scene, system: System, num_given: int | None = None) -> None:
+def check_start(scene: Scene, system: System) -> None:
     """Raise ValueError, naming the options to change, if no training view sees any point, the events of the first stage
-    cannot work with the initial number of Gaussians, or no view sees a sky for its Gaussians.
-
-    If a file gives Gaussians instead of the first stage, `num_given` is their number.
-    """
-    if num_given is not None:
-        system.check_given_number(num_given)
-    else:
-        points, first = np.asarray(scene.points), system.stages()[0]
-        if np.isfinite(points).all() and not system.sky_gaussians:  # `init_from_points` names others.
-            sights = [Sight.of_camera(view.camera) for view in scene.train]
-            if len(unseeing(points, sights)) == len(sights):
-                raise ValueError(
-                    f"scene.points: no training view sees any of the {len(points):,} points: they must be in the "
-                    "world of the views' cameras; scene.transform.apply leads there from the original world"
-                )
-        num = initial_number(scene, system, first)
-        _rows_needed(first, num, system)
-        system.check_number(num)
+    cannot work with the initial number of Gaussians, or no view sees a sky for its Gaussians."""
+    points, first = np.asarray(scene.points), system.stages()[0]
+    if np.isfinite(points).all() and not system.sky_gaussians:  # `init_from_points` names others.
+        sights = [Sight.of_camera(view.camera) for view in scene.train]
+        if len(unseeing(points, sights)) == len(sights):
+            raise ValueError(
+                f"scene.points: no training view sees any of the {len(points):,} points: they must be in the "
+                "world of the views' cameras; scene.transform.apply leads there from the original world"
+            )
+    num = initial_number(scene, system, first)
+    _rows_needed(first, num, system)
+    system.check_number(num)
     if system.sky_gaussians:
         check_sky(scene, system.sky_gaussians)
 
