@@ -24,7 +24,6 @@ from a2tg_jax.results import forecast
 from a2tg_jax.results.forecast import (
     RunForecast,
     allowed_memory,
-    bytes_allowed,
     doubts_about,
     forecast_run,
     print_forecast,
@@ -296,8 +295,8 @@ def test_on_a_cpu_the_memory_that_is_free_counts(monkeypatch):
     monkeypatch.setattr(forecast, "memory_limit", lambda: 123 * MB)
     assert allowed_memory(None) == 123 * MB and allowed_memory(1.0) == 1
     assert machine.memory_limit() > MB
-    assert room_for_photographs(bytes_allowed("8GB")) == 2 * 10**9  # A quarter of what is allowed.
-    assert room_for_photographs(bytes_allowed(None)) is None
+    assert room_for_photographs(8 * 10**9) == 2 * 10**9  # A quarter of what is allowed.
+    assert room_for_photographs(None) is None
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from tyro.conf import arg
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli.arguments import LpipsWeights, check_path
+from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.data.load import SYNTHETIC, SceneSource
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.host.machine import tidy_memory
@@ -27,7 +28,7 @@ from a2tg_jax.mcmc import Mcmc
 from a2tg_jax.parallel.processes import AUTO, ProcessPlace, joined
 from a2tg_jax.results.compression import command_for_file
 from a2tg_jax.results.folder import RunFolder, open_run, opened, resuming_command
-from a2tg_jax.results.forecast import bytes_allowed, room_for_photographs
+from a2tg_jax.results.forecast import room_for_photographs
 from a2tg_jax.results.history import check_tensorboard
 from a2tg_jax.results.record import (
     RunRecord,
@@ -164,7 +165,7 @@ class Train:
         # Processes must join before anything starts the devices of JAX.
         with joined(self.place) as team:
             session = Session(after_compiling=tidy_memory, devices=devices_named(self.devices))
-            most = bytes_allowed(self.max_memory)
+            most = budget_in_bytes(self.max_memory, "max_memory")
             if team is not None and not team.is_first:  # It trains with the first process and prints nothing.
                 run = RunFolder(self.out)
                 team.advice = lambda: f"continue with: {resuming_command(run, session.devices)}"

@@ -54,6 +54,12 @@ def bytes_of(megabytes: float) -> int:
     return round(megabytes * MEGABYTE)
 
 
+def budget_in_bytes(budget: float | str | None, name: str) -> int | None:
+    """Return the whole bytes of a budget; None stays None. Raises as `megabytes_of`."""
+    megabytes = megabytes_of(budget, name)
+    return None if megabytes is None else bytes_of(megabytes)
+
+
 def bytes_per_gaussian(sh_degree: int, floats: float = 0) -> float:
     """Return the bytes of a Gaussian with `floats` appearance parameters."""
     return BYTES_PER_FLOAT * (floats_per_gaussian(sh_degree) + floats)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from a2tg_jax.core.budget import bytes_of, megabytes_of
+from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.finish.compaction import (
@@ -73,8 +73,7 @@ class CompressOptions:
     @property
     def max_bytes(self) -> int | None:
         """File budget in bytes; None without one. Raises ValueError if it is invalid."""
-        megabytes = megabytes_of(self.file_budget, "file_budget")
-        return None if megabytes is None else bytes_of(megabytes)
+        return budget_in_bytes(self.file_budget, "file_budget")
 
     @property
     def most_loss(self) -> float:

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from a2tg_jax.core.budget import bytes_of, megabytes_of
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.data.scene import Scene
@@ -244,12 +243,6 @@ def quick_flags(longest_side: int, downscale: int = 1) -> str:
     """Return the flags of a quick training with photographs of this longer side, already downscaled by a factor."""
     downscale *= max(1, math.ceil(longest_side / QUICK_SIDE))
     return "--preset quick" + (f" --downscale {downscale}" if downscale > 1 else "")
-
-
-def bytes_allowed(max_memory: float | str | None) -> int | None:
-    """Return the bytes of a memory limit, written like a memory budget. Raises ValueError if it is invalid."""
-    megabytes = megabytes_of(max_memory, "max_memory")
-    return None if megabytes is None else bytes_of(megabytes)
 
 
 def allowed_memory(max_memory: int | None, num_devices: int = 1) -> int:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from a2tg_jax.core.budget import bytes_of, megabytes_of
+from a2tg_jax.core.budget import budget_in_bytes
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.data.scene import view_image
 from a2tg_jax.host.machine import memory_limit
@@ -63,8 +63,8 @@ class MeshOptions:
         check_lengths(self.resolution, self.voxel, self.radius)
         if self.clusters < 1:
             raise ValueError(f"clusters must be at least 1; got {self.clusters}")
-        megabytes, most = megabytes_of(self.max_memory, "max_memory"), memory_limit()
-        if megabytes is not None and bytes_of(megabytes) > most:
+        wanted, most = budget_in_bytes(self.max_memory, "max_memory"), memory_limit()
+        if wanted is not None and wanted > most:
             raise ValueError(f"max_memory must be at most {in_bytes(most)}, the free memory; got {self.max_memory}")
         if self.texture != "none":
             if out.suffix.lower() == ".ply":
@@ -89,7 +89,7 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
         raise ValueError(f"{source.title} has no cameras to fuse depths from; give a run folder, or a model of a run")
     # Photographs are checked here, before minutes of fusion; they are read later.
     pictures = _photographs(source, origin) if options.texture == "photographs" else _renders(source, origin)
-    scale, megabytes = origin.transform.scale, megabytes_of(options.max_memory, "max_memory")
+    scale, max_bytes = origin.transform.scale, budget_in_bytes(options.max_memory, "max_memory")
     result = extract_mesh(
         source.model,
         resolution=options.resolution,
@@ -98,7 +98,7 @@ def write_mesh(source: Source, out: Path, options: MeshOptions) -> str:
         radius=None if options.radius is None else options.radius * scale,
         unbounded=options.unbounded,
         most_clusters=options.clusters,
-        max_bytes=int(GRID_SHARE * memory_limit()) if megabytes is None else bytes_of(megabytes),
+        max_bytes=int(GRID_SHARE * memory_limit()) if max_bytes is None else max_bytes,
         settings=source.settings,
         progress=True,
     )

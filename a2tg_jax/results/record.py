@@ -29,7 +29,7 @@ import numpy as np
 import tomli_w
 from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 
-from a2tg_jax.core.budget import MEGABYTE, bytes_of, megabytes_of
+from a2tg_jax.core.budget import MEGABYTE, budget_in_bytes, megabytes_of
 from a2tg_jax.data.load import SYNTHETIC, SceneSource
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml, read_json
@@ -128,8 +128,7 @@ class RunRecord:
     @property
     def file_bytes(self) -> int | None:
         """File budget in bytes; None without one."""
-        megabytes = megabytes_of(self.file_budget, "file_budget")
-        return None if megabytes is None else bytes_of(megabytes)
+        return budget_in_bytes(self.file_budget, "file_budget")
 
     def budgeted(self) -> "RunRecord":
         """Return the record with the memory budget that goes with its file budget, unless it has another."""

@@ -5,7 +5,7 @@ import math
 import typing
 from typing import Any, ClassVar, Literal, Self
 
-from a2tg_jax.core.budget import bytes_of, bytes_per_gaussian, megabytes_of
+from a2tg_jax.core.budget import budget_in_bytes, bytes_per_gaussian, megabytes_of
 from a2tg_jax.core.checks import check_int, check_number, fields_of
 from a2tg_jax.events import EVERY_ITERATION, Event, StepEvent
 from a2tg_jax.host.text import did_you_mean, in_bytes, shortened
@@ -177,8 +177,7 @@ class System:
     @property
     def budget_bytes(self) -> int | None:
         """Memory budget in bytes; None without one."""
-        megabytes = megabytes_of(self.memory_budget)
-        return None if megabytes is None else bytes_of(megabytes)
+        return budget_in_bytes(self.memory_budget, "memory_budget")
 
     @property
     def small_budget(self) -> str:
