@@ -211,7 +211,7 @@ def unseeing(points: np.ndarray, sights: Sequence[Sight]) -> list[int]:
     return [number for number, sight in enumerate(sights) if not (sight.num_seen(some) or sight.num_seen(points))]
 
 
-def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None, seed: int = 0) -> np.ndarray:
+def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None) -> np.ndarray:
     """Return random points [NUM_CANDIDATES, 3] where cameras look; each view sees some.
 
     They are in the pyramids that the views show; the first half of them in a cube around an object, if all views show
@@ -220,9 +220,8 @@ def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None
     Args:
       sights: what each training view shows. The origin is the point nearest to their optical axes.
       object_axes: [3, 3] axes of the object's cube, as columns; None for other scenes.
-      seed: random seed.
     """
-    rng, cube = np.random.default_rng(seed), np.zeros((0, 3))
+    rng, cube = np.random.default_rng(0), np.zeros((0, 3))
     viewmats = np.stack([sight.viewmat for sight in sights])
     centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
     distances = np.linalg.norm(centers, axis=1)

@@ -23,7 +23,8 @@ OFFSET = "offset"
 """First word of the comment with the origin of positions."""
 ROTATION = "rotation"
 """First word of the comment with the rotation (wxyz) from the original world to the file's."""
-COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+RGB = ("red", "green", "blue")
+COLORS = (RGB, ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Names of colours, in order of preference."""
 SH_DEGREE0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 FLOAT_RANGES, INTEGER_RANGES = (1, 255, 65535), (255, 65535, 2**32 - 1)

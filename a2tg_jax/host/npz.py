@@ -9,12 +9,9 @@ from typing import IO, Any
 
 import numpy as np
 
-from a2tg_jax.host.regular_files import open_regular
+from a2tg_jax.host.regular_files import open_regular, room_of
 from a2tg_jax.host.text import shortened
 
-LARGEST_RATIO = 64
-FREE_ROOM = 1 << 20
-"""A file may unpack to `LARGEST_RATIO` times its own size and these bytes."""
 LONGEST_HEADER = 10_000
 """Largest array header in bytes."""
 CHUNK = 1 << 24
@@ -34,7 +31,7 @@ def read_npz(
     with open_regular(path) as file:
         try:
             with zipfile.ZipFile(file) as archive:
-                room = FREE_ROOM + LARGEST_RATIO * os.fstat(file.fileno()).st_size
+                room = room_of(os.fstat(file.fileno()).st_size)
                 for entry in archive.infolist():
                     name = entry.filename.removesuffix(".npy")
                     if not is_wanted(name):

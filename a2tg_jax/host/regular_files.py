@@ -14,8 +14,15 @@ from a2tg_jax.host.remote_files import fetched, is_remote, listed, remote_entry,
 
 MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
+LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
+"""An untrusted file may unpack to this multiple of its own bytes, plus these bytes."""
 READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """Flags to open a file for reading bytes, without waiting for a pipe's writer or changing newlines."""
+
+
+def room_of(num_bytes: int) -> int:
+    """Return the number of bytes that an untrusted file of this size may unpack to."""
+    return FREE_ROOM + LARGEST_RATIO * num_bytes
 
 
 def is_regular(path: str | os.PathLike[str]) -> bool:

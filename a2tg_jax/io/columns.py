@@ -28,8 +28,6 @@ MOST_BITS = 16
 # Readers return float32.
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 LEAST_OPACITY = 1e-7
-LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
-"""A file may unpack to this multiple of its own bytes, plus these bytes."""
 ZSTD_LEVEL = 19  # Higher levels are zstd's "ultra", whose windows cost readers more memory.
 LZMA_FILTERS = [
     {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 20}
@@ -40,11 +38,6 @@ LONGEST_WEBP_SIDE = 16_383  # 14 bits in WebP's header.
 
 
 # Coders of byte planes
-
-
-def room_of(num_bytes: int) -> int:
-    """Return the number of bytes that a file of this size may unpack to."""
-    return FREE_ROOM + LARGEST_RATIO * num_bytes
 
 
 def encode(coder: str, planes: np.ndarray) -> bytes:

@@ -20,6 +20,7 @@ from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.regular_files import room_of
 from a2tg_jax.io.columns import (
     MOST_BITS,
     AxisSteps,
@@ -32,7 +33,6 @@ from a2tg_jax.io.columns import (
     logits_of,
     morton,
     opacities_of,
-    room_of,
     with_w,
 )
 from a2tg_jax.io.config_json import config_from_dict, config_to_dict

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, read_regular
+from a2tg_jax.host.regular_files import LARGEST_RATIO, MOST_ARRAY_BYTES, is_regular, read_regular, room_of
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.validate import existing_bytes
 
@@ -32,8 +32,6 @@ COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 512
 """Types of numbers, by their code."""
 SIDES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MOST_STRIDE = 252  # glTF 2.0, bufferView.byteStride.
-LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
-"""A file may hold numbers that take this multiple of its own bytes as float32, plus these bytes."""
 LONGEST_NAME = 255
 """Largest number of bytes in a buffer's name."""
 
@@ -135,7 +133,7 @@ class Document:
             raise ValueError(f"is glTF of version {shortened(version)}; this program reads 2.0")
         self._buffers: dict[int, bytes] = {}
         self._files: dict[Path, bytes] = {}
-        self._room = FREE_ROOM + LARGEST_RATIO * len(data)
+        self._room = room_of(len(data))  # For its numbers as float32.
 
     def entry(self, kind: str, index: object) -> dict[str, Any]:
         """Return an object of one of the file's lists, such as "nodes"."""

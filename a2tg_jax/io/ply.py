@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.data.ply import OFFSET, ROTATION, PlyFile, largest_color
+from a2tg_jax.data.ply import OFFSET, RGB, ROTATION, SH_DEGREE0, PlyFile, largest_color
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.io import other_programs as others
@@ -36,11 +36,9 @@ from a2tg_jax.io.validate import check_model, check_suffix, reading
 from a2tg_jax.model import Model
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
-SH_DEGREE0, SH_REST = tuple(f"f_dc_{i}" for i in range(3)), tuple(f"f_rest_{i}" for i in range(45))
+SH_REST = tuple(f"f_rest_{i}" for i in range(45))
 SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
-COLORS = ("red", "green", "blue")
-"""Colours that some programs write instead of f_dc_*."""
 NUM_REST = (0, 9, 24, 45, 72)
 """Number of attributes f_rest_* by degree of the spherical harmonics; some programs write degree 4."""
 THIRD_SCALE = "scale_2"
@@ -221,15 +219,16 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
 def _vertices(ply: PlyFile) -> np.ndarray:
     """Return the vertices, structured, with 2DGS's attributes."""
     fields = ply.fields.get("vertex", {})
-    has_colors = set(COLORS) <= set(fields) and not set(SH_DEGREE0) & set(fields)
-    wanted = (*MEANS, *(COLORS if has_colors else SH_DEGREE0), "opacity", *SCALES, *QUATS)
+    # Some programs write colours instead of f_dc_*.
+    has_colors = set(RGB) <= set(fields) and not set(SH_DEGREE0) & set(fields)
+    wanted = (*MEANS, *(RGB if has_colors else SH_DEGREE0), "opacity", *SCALES, *QUATS)
     ply.require_vertices(wanted, "a PLY of Gaussians")
     vertices = ply.read("vertex")
     if not has_colors:
         return vertices
-    colors = np.stack([vertices[name].astype(np.float64) for name in COLORS], axis=1)
+    colors = np.stack([vertices[name].astype(np.float64) for name in RGB], axis=1)
     if len(colors):
-        colors /= largest_color(np.nan_to_num(colors), is_float=fields[COLORS[0]].startswith("f"))
+        colors /= largest_color(np.nan_to_num(colors), is_float=fields[RGB[0]].startswith("f"))
     return append_fields(vertices, SH_DEGREE0, ((colors - 0.5) / SH_C0).T, usemask=False)
 
 

@@ -34,9 +34,10 @@ from a2tg_jax.data.ply import OFFSET, ROTATION, turn_of
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.operating_system import printing_to_stderr
 from a2tg_jax.host.optional import optional
+from a2tg_jax.host.regular_files import room_of
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io import other_programs as others
-from a2tg_jax.io.columns import morton, room_of
+from a2tg_jax.io.columns import morton
 from a2tg_jax.io.ply import FLAT_MARK, decode_ply, encode_ply, place_comments, place_marks
 from a2tg_jax.io.validate import check_model, existing_bytes, reading
 from a2tg_jax.model import Model
