@@ -174,11 +174,7 @@ def parameter_bytes(gaussians: Gaussians, textures: Textures | None = None) -> i
 
 def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[Array, Array]:
     """Return both images in [0, 1], and black where pixels do not count."""
-    # Other libraries' arrays and nested lists become JAX arrays; the check reports anything else.
-    image, target = (
-        jnp.asarray(value) if hasattr(value, "__array__") or type(value) in (list, tuple) else value
-        for value in (plain_array("image", image), plain_array("target", target))
-    )
+    image, target = plain_array("image", image), plain_array("target", target)
     losses.check_same_shape(image, target)
     image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
     if mask is None:
