@@ -290,8 +290,7 @@ class StageRun:
                     self.learning.observe(iteration, float(info.psnr))
                     bar.update(info, self._rows[-1] if self._rows else None)
                 ahead = self.effects.programs_ahead(iteration)
-                bar.tell_pace(iteration, self.num_compiled, ahead, self.effects.seconds_a_program)
-                self.time_left = bar.left(iteration)
+                self.time_left = bar.tell_pace(iteration, self.num_compiled, ahead, self.effects.seconds_a_program)
                 # Not where a step could not be taken, or training is being stopped.
                 if iteration == stop:
                     self._host_events(iteration)

@@ -120,15 +120,15 @@ class ProgressBar:
     def __exit__(self, *_: object) -> None:
         self._bar.close()
 
-    def tell_pace(self, done: int, num_compiled: int, ahead: int = 0, seconds_a_program: float = 0.0) -> None:
-        """Print a forecast if one is due, after steps that were launched together. Arguments as `Pace.time`."""
+    def tell_pace(
+        self, done: int, num_compiled: int, ahead: int = 0, seconds_a_program: float = 0.0
+    ) -> datetime.timedelta | None:
+        """Print a forecast if one is due, after steps that were launched together, and return the remaining time of the
+        run (`Pace.left`). Arguments as `Pace.time`."""
         self._pace.time(done, num_compiled, ahead, seconds_a_program)
         forecast = self._pace.told(done)
         if forecast is not None and self._is_shown:
             self._bar.write(f"{self._title}: {forecast}")
-
-    def left(self, done: int) -> datetime.timedelta | None:
-        """Return the remaining time of the run (`Pace.left`)."""
         return self._pace.left(done)
 
     def update(self, info: StepInfo, row: Mapping[str, float] | None) -> None:
