@@ -53,8 +53,10 @@ def test_losses_are_differences_of_psnr_and_of_renders():
     pairs = [[np.clip(m.render(camera).color, 0, 1) for m in (model, spoiled)] for camera in cameras]
     wanted = np.mean([10 * np.log10(1 + float(np.mean((a - b) ** 2)) / 0.01) for a, b in pairs])
     assert loss(spoiled) == pytest.approx(wanted, rel=1e-4) and loss(model) == 0
-    with pytest.raises(ValueError, match="there are no views"):
+    with pytest.raises(ValueError, match="views must hold at least one view"):
         loss_on_views(model, [])
+    with pytest.raises(ValueError, match="there are no views"):
+        loss_beside_renders(model, [])
 
 
 def test_the_smallest_file_loses_no_more_than_it_may():

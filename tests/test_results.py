@@ -103,7 +103,7 @@ def test_evaluation_measures_the_render(monkeypatch):
     assert found.psnr == pytest.approx(np.mean([view.psnr for view in found.per_view]))
     assert found[1:].per_view == found.per_view[1:]
     assert found.frames_per_second == 1 / 4, "the median over views, each at its fastest"
-    with pytest.raises(ValueError, match="no views"):
+    with pytest.raises(ValueError, match="at least one view"):
         evaluate((), gaussians)
 
 

@@ -140,10 +140,12 @@ def check_scene(scene: Scene) -> None:
 
 
 def check_are_views(views: Sequence[View], call: str) -> None:
-    """Raise ValueError, which shows the right call, unless the views are a list or a tuple of views."""
+    """Raise ValueError, which shows the right call, unless the views are a list or a tuple of at least one view."""
     others = [item for item in views if not isinstance(item, View)] if isinstance(views, list | tuple) else [views]
     if others:
         raise ValueError(f"views must be views, such as scene.train; got {type(others[0]).__name__}: use {call}")
+    if not views:
+        raise ValueError("views must hold at least one view; got none (scene.test needs a test_every that leaves some)")
 
 
 def origin_of_scene(scene: Scene) -> Origin:

@@ -64,8 +64,6 @@ def polish(
     """
     check_kind("model", model, Model, "use polish(model, scene.train)")
     check_are_views(views, "polish(model, scene.train)")
-    if not views:
-        raise ValueError("views must hold at least one view; got none")
     if not model.appearance.is_linear:
         raise ValueError(
             f"a picture is not linear in the colours of {in_words(model.appearance)}: Gaussians with or without "

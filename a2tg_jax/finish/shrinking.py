@@ -59,8 +59,6 @@ def shrink_textures(
     """
     check_is_model(model)
     check_are_views(views, "shrink_textures(model, scene.train)")
-    if not views:
-        raise ValueError("views must hold at least one view; got none")
     if not max_loss >= 0:
         raise ValueError(f"max_loss must be at least 0 dB; got {max_loss}")
     if not can_shrink(model):

@@ -135,8 +135,6 @@ def evaluate(
       (2, True)
     """
     check_are_views(views, "evaluate(scene.test, model)")
-    if not views:
-        raise ValueError("there are no views to evaluate; load the scene with a test_every that leaves some")
     weights = None if lpips_weights is None else load_lpips(lpips_weights)
     if isinstance(gaussians, Model):
         if textures is not None:
