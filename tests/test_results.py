@@ -688,9 +688,11 @@ def test_tensorboard_gets_each_row_once(tmp_path):
 
 
 def test_without_tensorboard_one_line_says_what_to_do(monkeypatch, tmp_path, capsys, untouched_jax):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
     assert cli.main(["train", "synthetic", "--out", str(tmp_path / "run"), "--tensorboard"]) == 2
-    line = "a2tg: error: --tensorboard needs tensorboardX: pip install 'a2tg-jax[tensorboard]'\n"
+    line = (
+        "a2tg: error: --tensorboard needs tensorboardX, which is not installed: pip install 'a2tg-jax[tensorboard]'\n"
+    )
     assert capsys.readouterr().err == line and not (tmp_path / "run").exists()
 
 

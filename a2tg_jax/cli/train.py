@@ -29,7 +29,7 @@ from a2tg_jax.parallel.processes import AUTO, ProcessPlace, joined
 from a2tg_jax.results.compression import command_for_file
 from a2tg_jax.results.folder import RunFolder, open_run, opened, resuming_command
 from a2tg_jax.results.forecast import room_for_photographs
-from a2tg_jax.results.history import check_tensorboard
+from a2tg_jax.results.history import tensorboard_library
 from a2tg_jax.results.record import (
     RunRecord,
     contradictions,
@@ -173,7 +173,7 @@ class Train:
                 follow_first_process(record, record.scene.load(room_for_photographs(most), is_divided=True), session)
                 return
             if self.tensorboard:
-                check_tensorboard()
+                tensorboard_library()  # Raises before training if it is not installed.
             options = RunOptions(
                 overwrite=self.overwrite,
                 lpips_weights=self.lpips_weights,

@@ -19,6 +19,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Protocol, TypeVar, cast
 
+from a2tg_jax.host.optional import optional
 from a2tg_jax.host.text import shortened
 
 PAUSES = (1.0, 4.0, 15.0)
@@ -139,12 +140,9 @@ def located(path: str | os.PathLike[str] | RemotePath) -> Path:
     if (here := path_here(os.fspath(path))) is not None:
         return here
     url = checked_url(os.fspath(path))
+    library = optional("upath", f"{url}: a URL needs universal_pathlib", "remote")
     try:
-        from upath import UPath
-    except ImportError:
-        raise ValueError(f"{url}: a URL needs universal_pathlib: pip install 'a2tg-jax[remote]'") from None
-    try:
-        found = UPath(url)
+        found = library.UPath(url)
         _ = found.fs, found.path  # The file system is made now, with its errors.
     except ImportError as error:
         package = getattr(error.__cause__ or error, "name", None)  # fsspec's own error has no name.

@@ -1,8 +1,6 @@
 """History of a stage as CSV, one line per logged iteration, and as TensorBoard files (extra [tensorboard])."""
 
 import csv
-import importlib
-import importlib.util
 import io
 import warnings
 from pathlib import Path
@@ -11,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.host.atomic import replacing
+from a2tg_jax.host.optional import optional
 from a2tg_jax.host.regular_files import is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.results.folder import RunFolder
@@ -24,7 +23,6 @@ LARGEST = 1e15
 """Largest number in a history; larger ones would overflow integers and axes."""
 MOST_BYTES = 1 << 26
 """Largest file; about a million rows."""
-LIBRARY = "tensorboardX"
 
 
 def write_history(path: Path, history: History) -> None:
@@ -64,10 +62,9 @@ def read_history(path: Path) -> History:
     return History.of_columns(columns | {name: columns[name].astype(np.int64) for name in INTEGERS})
 
 
-def check_tensorboard() -> None:
-    """Raise ValueError unless the library that writes the files is installed."""
-    if importlib.util.find_spec(LIBRARY) is None:
-        raise ValueError(f"`tensorboard` needs {LIBRARY}: pip install 'a2tg-jax[tensorboard]'")
+def tensorboard_library() -> Any:
+    """Return the library that writes the files. Raises ValueError if it is not installed."""
+    return optional("tensorboardX", "`tensorboard` needs tensorboardX", "tensorboard")
 
 
 class EventWriter:
@@ -91,9 +88,9 @@ class EventWriter:
             folder = self._run.tensorboard
             # tensorboardX chooses the name: what is new afterwards is this writer's.
             before = set(folder.glob("events.*"))
-            library: Any = importlib.import_module(LIBRARY)
             # The suffix keeps files of several stages and processes apart.
-            self._file = library.SummaryWriter(str(folder), filename_suffix=f".{len(before)}.{self._name}")
+            suffix = f".{len(before)}.{self._name}"
+            self._file = tensorboard_library().SummaryWriter(str(folder), filename_suffix=suffix)
             self._run.own_all([f"{folder.name}/{path.name}" for path in sorted(set(folder.glob("events.*")) - before)])
         columns = history.to_dict()
         for row in rows:
