@@ -19,7 +19,7 @@ DENSE, FEW = "dense", "few views"
 BEST, MCMC = "Best plain method", "2DGS*-MCMC"
 BYTEWISE, SECOND, FIRST = "Bytewise", "Bytewise, second version", "Bytewise, first version"
 VERSIONS = {BYTEWISE: "bytewise", SECOND: "bytewise 2", FIRST: "bytewise 1"}
-"""Names in the table of `bytewise` and of its earlier versions. The second places no Gaussians by the errors of pictures,
+"""Names in the table of `bytewise` and of its earlier versions: the second places no Gaussians by errors of pictures,
 and the first has textures and no weight on opacities either."""
 EQUAL_TIME = ", equal time"
 PRIMARY = f"{VERSIONS[FIRST]} − best plain method, 0.3 MB"
