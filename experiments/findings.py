@@ -82,6 +82,8 @@ def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result])
                 if version == label or (version, label) == (FIRST, SECOND):
                     continue
                 is_timed = label.endswith(EQUAL_TIME)
+                if is_timed and version == BYTEWISE:
+                    continue  # Nothing has been trained for its time yet.
                 place = f"{budget:g} MB" + ("" if stratum == DENSE else f", {FEW}") + (EQUAL_TIME if is_timed else "")
                 found = timed if is_timed and version == SECOND else own
                 rows.append(Row(f"{prefix} − {wording}, {place}", found, version, label))
@@ -96,8 +98,10 @@ def stratum_of(result: Result) -> str:
 
 
 def rows_of_parts(results: Sequence[Result]) -> list[Row]:
-    """Return what each part of the first version of `bytewise` brings."""
-    return [Row(f"{VERSIONS[FIRST]}: {part}, 0.3 MB", results, FIRST, label) for label, part in PARTS.items()]
+    """Return what each part of the first version of `bytewise` brings, and shapes of kernels to plain Gaussians."""
+    rows = [Row(f"{VERSIONS[FIRST]}: {part}, 0.3 MB", results, FIRST, label) for label, part in PARTS.items()]
+    pruned = f"{MCMC}, degree 0, pruned"
+    return [*rows, Row("plain, pruned: shapes of kernels, 0.3 MB", results, f"{pruned}, with shapes", pruned)]
 
 
 def rows_of_degrees(results: Mapping[int, Sequence[Result]]) -> list[Row]:

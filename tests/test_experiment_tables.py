@@ -127,7 +127,7 @@ def test_pages_say_which_rows_are_from_before(tmp_path, capsys):
     )
     assert "--renew trains them again" in capsys.readouterr().out
     last = (tmp_path / "fixed_memory.md").read_text(encoding="utf-8").splitlines()[-1]
-    assert last == "*Runs from before: 1 of bytewise (version 1, now 3).*"
+    assert last == f"*Runs from before: 1 of bytewise (version 1, now {a2tg.Bytewise.version}).*"
 
 
 def test_experiments_and_benchmarks_have_one_writer_of_tables():
