@@ -187,14 +187,22 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     dense = [row for row in at_size if FEW not in row.name and UNSEEN not in row.name]
     rows = [*of_bytewise, *rows_of_parts(parts), *rows_of_degrees(degrees)]
     lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(rows)}\n{endpoints(rows)}\n{scenes_table(dense)}")
-    found = {row.name: row.compared("psnr") for row in rows}
-    charted = {
-        name: (list(one.by_scene.values()), one.over_scenes.mean, one.over_scenes.half_width)
-        for name, one in found.items()
-        if one.by_scene
-    }
+    charted: dict[str, tuple[Sequence[float], float, float]] = {}
+    for row in (*newest(of_bytewise), *rows_of_parts(parts), *rows_of_degrees(degrees)):
+        if (one := row.compared("psnr")).by_scene:
+            charted[row.name] = list(one.by_scene.values()), one.over_scenes.mean, one.over_scenes.half_width
     if charted:
         save_figure(lab.pages / f"{EXPERIMENT.name}.png", forest(charted))
+
+
+def newest(rows: Sequence[Row]) -> list[Row]:
+    """Return the comparisons of `bytewise` for the chart, each of the newest version that has runs, without those with
+    3DGS of degree 3, whose differences are several times as large."""
+    found: dict[str, Row] = {}
+    for row in rows:
+        if row.compared("psnr").by_scene and row.other != "3DGS-MCMC, degree 3":
+            found.setdefault(row.name.partition(" − ")[2], row)
+    return list(found.values())
 
 
 def forest(found: Mapping[str, tuple[Sequence[float], float, float]]) -> Figure:
