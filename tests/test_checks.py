@@ -12,7 +12,7 @@ from small_values import some_gaussians, some_world
 import a2tg_jax as a2tg
 from a2tg_jax.core.cameras import check_camera
 from a2tg_jax.core.checks import check_floats, check_number, check_shape, described
-from a2tg_jax.core.numerics import safe_norm
+from a2tg_jax.core.numerics import evenly_chosen, safe_norm
 from a2tg_jax.host.text import shortened
 
 CAMERA = a2tg.Camera(jnp.eye(4).at[2, 3].set(3), jnp.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]]), 16, 12)
@@ -98,3 +98,14 @@ def test_a_moved_model_renders_the_same_with_moved_settings():
     shown = model.render(near, settings=settings).color
     np.testing.assert_allclose(moved.render(camera, settings=settings.transform(world)).color, shown, atol=2e-5)
     assert np.abs(moved.render(camera, settings=settings).color - shown).max() > 0.01
+
+
+@pytest.mark.parametrize("most", [1, 2, 7, 48])
+@pytest.mark.parametrize("num", [0, 1, 7, 48, 49, 1000])
+def test_items_are_chosen_evenly(num, most):
+    found = evenly_chosen(list(range(num)), most)
+    assert len(found) == min(num, most) and found[:1] == [0][:num]
+    np.testing.assert_array_equal(evenly_chosen(np.arange(num), most), found)
+    if len(found) > 1:
+        gaps = np.diff(found)
+        assert found[-1] == num - 1 and gaps.min() > 0 and gaps.max() - gaps.min() <= 1

@@ -96,7 +96,8 @@ def test_pixels_are_drawn_in_proportion_to_their_error_in_all_views():
 def test_what_masks_leave_out_and_what_shows_no_surface_gets_none():
     mask = np.ones(SIZE, bool)
     mask[:, 5:7] = False
-    assert (columns_of(placed([seen(photograph(5, 8, (0, 0, 255)), mask)])) > 7).all()
+    new = placed([seen(photograph(5, 8, (0, 0, 255)), mask)])
+    assert new.num == 20 and (columns_of(new) > 7).all()
     model = wall()
     faint = dataclasses.replace(model.gaussians, logit_opacities=jnp.full(model.gaussians.num, -1.0))
     views = [seen(photograph(5, 8, (0, 0, 255)))]
@@ -121,6 +122,9 @@ def test_the_event_adds_a_share_up_to_the_cap():
         np.testing.assert_array_equal(moments.gaussians.means[:3, 0], [1, 0, 1])
     full = applied(PlaceByError(share=1.0, cap=2), change.model, views)
     assert full.model.num == 2 and full.unused.startswith("share adds no Gaussian")
+    assert applied(PlaceByError(share=0.2), model, views).unused.startswith("share of 1 Gaussians is less than one")
+    hidden = applied(PlaceByError(share=1.0), model, [seen(photograph(5, 8, (0, 0, 255)), np.zeros(SIZE, bool))])
+    assert hidden.model.num == 1 and "views are right" in hidden.unused
     again = applied(PlaceByError(share=1.0, cap=100), model, views)
     assert bits_of(again.model) == bits_of(change.model)
 

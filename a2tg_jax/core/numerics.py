@@ -21,7 +21,8 @@ MOST_DIFFERENCE = 1e-3
 
 
 def evenly_chosen(items: Any, most: int) -> Any:
-    """Return at most `most` items of a list, a tuple or an array, evenly spaced, with the first and the last one."""
+    """Return at most `most` items of a list, a tuple or an array, evenly spaced from the first to the last one; 1: the
+    first."""
     if len(items) <= most:
         return items
     chosen = np.linspace(0, len(items) - 1, most).round().astype(int)

@@ -1,8 +1,9 @@
 """New Gaussians where pictures are wrong, on the surface that is rendered there.
 
 Splitting and MCMC make new Gaussians of old ones, close to these. Here pixels of training views are drawn in proportion
-to their error, and each gets a Gaussian: at the rendered depth, in the plane of the rendered surface, as wide as the
-pixel, and of its colour in the photograph. After ConeGS (Baranowski et al., 2025), whose depths are another model's.
+to their error, and each gets a Gaussian: at the rendered depth, in the plane of the rendered surface, with a standard
+deviation of one pixel, and of its colour in the photograph. After ConeGS (Baranowski et al., 2025), where depths come
+from another model.
 """
 
 import dataclasses
@@ -36,7 +37,7 @@ from a2tg_jax.renderer import plan_render
 
 # Chosen in experiments/NOTEBOOK.md, "New Gaussians where pictures are wrong".
 MOST_VIEWS = 48
-"""Number of training views in which errors are measured each time."""
+"""Largest number of training views in which errors are measured, evenly chosen and the same each time."""
 OPACITY = 0.3
 """Opacity of new Gaussians."""
 LEAST_ALPHA = 0.5
@@ -47,8 +48,8 @@ LEAST_ALPHA = 0.5
 class PlaceByError(HostEvent):
     """Event that adds Gaussians on the rendered surface, at pixels drawn in proportion to their error.
 
-    After ConeGS (Baranowski et al., 2025). It uses the cameras of the scene, not refined ones, and photographs without
-    their exposures.
+    After ConeGS (Baranowski et al., 2025). Errors are measured in up to 48 views, over black where photographs are
+    transparent, with the cameras of the scene, not refined ones, and without exposures.
 
     Examples:
       >>> a2tg.PlaceByError(share=0.1, at=(0.25, 0.5)).iterations(1000)
@@ -71,17 +72,22 @@ class PlaceByError(HostEvent):
         return iterations_at(self.at, num_iterations)
 
     def num_programs(self, num_iterations: int) -> int:
-        return 1  # Only the views that are drawn; rows keep their number.
+        return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
         if any(map(is_table, jax.tree.leaves(model.appearance, is_leaf=is_table))):
             raise ValueError("share must be 0 in a stage whose Gaussians have textures or view dependence of their own")
         num = model.num
-        wanted = min(round(num * float(self.share)), min(self.cap, model.gaussians.num) - num)
-        if wanted <= 0:
+        wanted, room = round(num * float(self.share)), min(self.cap, model.gaussians.num) - num
+        if not wanted:
+            return Change(model, moments, state, unused=f"share of {num:,} Gaussians is less than one: raise it")
+        if room <= 0:
             reason = "share adds no Gaussian, because there are as many as the cap allows; prune some before"
             return Change(model, moments, state, unused=reason)
-        added = gaussians_at_errors(model, due.views, wanted, np.random.default_rng(due.index))
+        added = gaussians_at_errors(model, due.views, min(wanted, room), np.random.default_rng(due.index))
+        if not added.num:
+            reason = "share adds no Gaussian, because views are right wherever a surface is drawn and masks count"
+            return Change(model, moments, state, unused=reason)
         appearance = allocate_appearance(template_of(model.appearance), jax.random.key(due.index), added)
         rows = np.arange(num, num + added.num)
 
@@ -99,12 +105,19 @@ class PlaceByError(HostEvent):
 
 def gaussians_at_errors(model: Model, views: Sequence[View], num: int, rng: np.random.Generator) -> Gaussians:
     """Return `num` Gaussians at pixels of some views, drawn in proportion to the mean difference of their colours;
-    none where masks do not count or no surface is drawn. None at all if no pixel is wrong (host)."""
-    settings, mesh = room_for(model, [view.camera for view in views]), mesh_of(model.gaussians.means)
-    background = everywhere(mesh, jnp.asarray(BLACK, model.gaussians.means.dtype))
+    none where masks do not count or no surface is drawn. None at all if no pixel is wrong (host).
+
+    Raises:
+      ValueError: if there are no views.
+    """
+    if not views:
+        raise ValueError("views must hold at least one view; got none")
+    views, mesh, dtype = evenly_chosen(views, MOST_VIEWS), mesh_of(model.gaussians.means), model.gaussians.means.dtype
+    settings = room_for(model, [view.camera for view in views])
+    background = everywhere(mesh, jnp.asarray(BLACK, dtype))
     totals, drawn = [], []
-    for view in evenly_chosen(views, MOST_VIEWS):
-        camera = everywhere(mesh, view.camera)
+    for view in views:
+        camera = everywhere(mesh, jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), view.camera))
         output, _ = jitted_render()(
             model.gaussians, camera, model.appearance, background, settings, num_live=model.num_live
         )
@@ -125,7 +138,6 @@ def gaussians_at_errors(model: Model, views: Sequence[View], num: int, rng: np.r
         np.full(num, np.log(OPACITY / (1 - OPACITY))),
         sh_of_colors(colors, model.gaussians.sh_degree),
     )
-    dtype = model.gaussians.means.dtype
     return Gaussians(*(jnp.asarray(array, dtype) for array in of_first(mesh, arrays)))
 
 
@@ -136,6 +148,7 @@ def _drawn_pixels(
     normals [P, 3], colours [P, 3] and widths [P]."""
     photograph = view_image(view, BLACK)
     is_usable = counted_pixels([view])[0, ..., 0] & (output.alpha >= LEAST_ALPHA)
+    is_usable &= np.isfinite(output.color).all(axis=2)  # Training says what to do about NaN.
     if view.camera.rays is not None:
         is_usable &= np.isfinite(np.asarray(view.camera.rays)).all(axis=2)
     errors = np.where(is_usable, np.abs(output.color - photograph).mean(axis=2), 0).astype(np.float64)

@@ -71,8 +71,8 @@ class Bytewise(TwoStages):
     """Pruning of the Gaussians that show least, up to 0.8 of the first stage; others grow in their place. The end of
     the stage prunes in any case."""
     place: PlaceByError = PlaceByError()
-    """New Gaussians in the first stage where pictures are wrong, instead of the pruned ones. Its cap is the one of
-    densify, which replaces what else is pruned."""
+    """New Gaussians in the first stage where pictures are wrong, up to the number that densify may reach. By default,
+    each time follows a pruning, which makes room."""
     fading_weight: float = 0.01  # measured in experiments/NOTEBOOK.md, "A weight on opacities"
     """Weight of the mean opacity in the loss of the first stage, so that Gaussians that show little fade and move; 0:
     none. It adds to loss.opacity_weight."""
