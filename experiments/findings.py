@@ -71,21 +71,20 @@ class Row:
 def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result]) -> list[Row]:
     """Return the comparisons of `bytewise`, by stratum and budget. At equal time, plain methods in `results` trained
     for as long as the first version, and in `in_equal_time` for as long as the second."""
-    rows = []
+    rows, order = [], list(VERSIONS)
     for stratum in (DENSE, FEW):
         for budget in (0.3, 1.2):
             own, timed = (
                 [result for result in each if stratum_of(result) == stratum and result.run.cell.budget == budget]
                 for each in (results, in_equal_time)
             )
+            trained_for = {FIRST: own, SECOND: timed}  # None of today's version yet.
             for (version, prefix), (label, wording) in itertools.product(VERSIONS.items(), OTHERS.items()):
-                if version == label or (version, label) == (FIRST, SECOND):
-                    continue
+                if label in VERSIONS and order.index(label) <= order.index(version):
+                    continue  # Versions are compared with earlier ones.
                 is_timed = label.endswith(EQUAL_TIME)
-                if is_timed and version == BYTEWISE:
-                    continue  # Nothing has been trained for its time yet.
                 place = f"{budget:g} MB" + ("" if stratum == DENSE else f", {FEW}") + (EQUAL_TIME if is_timed else "")
-                found = timed if is_timed and version == SECOND else own
+                found = trained_for.get(version, []) if is_timed else own
                 rows.append(Row(f"{prefix} − {wording}, {place}", found, version, label))
                 if version == FIRST and label == BEST and stratum == DENSE:
                     others = [result for result in own if result.run.cell.scene.label not in CHOSEN_ON]
@@ -185,10 +184,11 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     of_bytewise = rows_of_bytewise(bytewise, equal_time)
     at_size = [row for row in of_bytewise if "0.3 MB" in row.name and not row.other.endswith("degree 3")]
     dense = [row for row in at_size if FEW not in row.name and UNSEEN not in row.name]
-    rows = [*of_bytewise, *rows_of_parts(parts), *rows_of_degrees(degrees)]
+    others = [*rows_of_parts(parts), *rows_of_degrees(degrees)]
+    rows = [*of_bytewise, *others]
     lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(rows)}\n{endpoints(rows)}\n{scenes_table(dense)}")
     charted: dict[str, tuple[Sequence[float], float, float]] = {}
-    for row in (*newest(of_bytewise), *rows_of_parts(parts), *rows_of_degrees(degrees)):
+    for row in (*newest(of_bytewise), *others):
         if (one := row.compared("psnr")).by_scene:
             charted[row.name] = list(one.by_scene.values()), one.over_scenes.mean, one.over_scenes.half_width
     if charted:

@@ -47,7 +47,7 @@ MODELS = {
 """COLMAP's camera models by their number in binary files."""
 BY_NAME = {model.name: model for model in MODELS.values()}
 CUT = ": find cameras again with a2tg sfm, which cuts panoramas into views"
-"""What to do about cameras that look all around."""
+"""Advice for panoramas, which have no image plane."""
 
 
 @dataclasses.dataclass(frozen=True)

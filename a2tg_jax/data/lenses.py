@@ -131,12 +131,9 @@ class Lens:
 
         None for a pinhole, or if photographs are undistorted. Raise ValueError if almost no pixel has a ray.
         """
-        if not self.is_kept:
+        if not self.is_kept or self.is_pinhole:
             return None
-        # Before is_pinhole, which raises an error without advice if the model has no image plane.
         K = _scaled_intrinsics(self.camera.matrix, self.size, (width, height))
-        if self.is_pinhole:
-            return None
         with _LOCK:  # Threads that read photographs of one lens share its rays.
             return _rays(self.camera, (width, height), K.tobytes())
 

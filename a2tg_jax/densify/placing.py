@@ -17,23 +17,21 @@ from jax.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.appearance import allocate_appearance, template_of
-from a2tg_jax.core.cameras import Camera, back_project
+from a2tg_jax.core.cameras import back_project
 from a2tg_jax.core.checks import check_number
-from a2tg_jax.core.gaussians import Gaussians, sh_of_colors
+from a2tg_jax.core.gaussians import Gaussians, no_rows, sh_of_colors
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import BLACK
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import is_table
 from a2tg_jax.data.scene import View, counted_pixels, view_image
-from a2tg_jax.events import Change, Due, HostEvent, iterations_at
+from a2tg_jax.events import Change, Due, HostEvent, clear_moments, iterations_at
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.exchange import exchange_of
-from a2tg_jax.parallel.exchange_room import room_of_view
 from a2tg_jax.parallel.sharded_rows import everywhere, mesh_of, of_first, on_host, placed_like, rows_replaced
-from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
+from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.render import jitted_render
-from a2tg_jax.renderer import plan_render
+from a2tg_jax.renderer import room_for
 
 # Chosen in experiments/NOTEBOOK.md, "New Gaussians where pictures are wrong".
 MOST_VIEWS = 48
@@ -76,7 +74,7 @@ class PlaceByError(HostEvent):
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
         if any(map(is_table, jax.tree.leaves(model.appearance, is_leaf=is_table))):
-            raise ValueError("share must be 0 in a stage whose Gaussians have textures or view dependence of their own")
+            raise ValueError("share must be 0 in a stage whose Gaussians have textures or differ in degree")
         num = model.num
         wanted, room = round(num * float(self.share)), min(self.cap, model.gaussians.num) - num
         if not wanted:
@@ -95,9 +93,8 @@ class PlaceByError(HostEvent):
             return rows_replaced(old, rows, new)
 
         gaussians, shown = jax.tree.map(replaced, (model.gaussians, model.appearance), (added, appearance))
-        moments = dataclasses.replace(
-            moments, **{name: jax.tree.map(lambda x: replaced(x, 0), getattr(moments, name)) for name in ("mu", "nu")}
-        )
+        is_new = np.isin(np.arange(model.gaussians.num), rows)
+        moments = clear_moments(model, moments, placed_like(is_new, model.gaussians.means))
         num_live = placed_like(np.asarray(num + added.num, np.int32), model.gaussians.means)
         model = dataclasses.replace(model, gaussians=gaussians, appearance=shown, num_live=num_live)
         return Change(model, moments, state)
@@ -125,15 +122,13 @@ def gaussians_at_errors(model: Model, views: Sequence[View], num: int, rng: np.r
         totals.append(total)
         drawn.append(found)
     if not sum(totals):
-        num, view_of = 0, np.zeros(0, int)
-    else:
-        view_of = rng.choice(len(totals), num, p=np.asarray(totals) / sum(totals))
+        return no_rows(0, model.gaussians.sh.shape[1], dtype)
+    view_of = rng.choice(len(totals), num, p=np.asarray(totals) / sum(totals))
     # Of each view as many as its share of the error, from as many that were drawn in it.
     points, normals, colors, sizes = (np.stack(column)[view_of, np.arange(num)] for column in zip(*drawn, strict=True))
-    quats = Rotation.from_matrix(_axes(normals, rng)).as_quat(scalar_first=True) if num else np.zeros((0, 4))
     arrays = (
         points,
-        quats,
+        Rotation.from_matrix(_axes(normals, rng)).as_quat(scalar_first=True),
         np.log(sizes)[:, None].repeat(2, axis=1),
         np.full(num, np.log(OPACITY / (1 - OPACITY))),
         sh_of_colors(colors, model.gaussians.sh_degree),
@@ -167,21 +162,3 @@ def _axes(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     across = np.cross(normals, rng.normal(size=normals.shape))
     axes = np.stack([across, np.cross(normals, across), normals], axis=-1)
     return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
-
-
-def room_for(model: Model, cameras: Sequence[Camera]) -> RenderSettings:
-    """Return settings with room for a model's tile lists in each view. The devices over which its rows are spread draw
-    each view together (host)."""
-
-    def rounded_up(number: int) -> int:
-        return 1 << number.bit_length()  # Programs are compiled for a room: for few of them.
-
-    settings, appearance = RenderSettings(exchange=exchange_of(model.gaussians.means)), model.appearance
-    if settings.exchange is None:
-        capacity = plan_render(model, cameras, settings=settings).capacity
-        return dataclasses.replace(settings, capacity=rounded_up(capacity or 1))
-    rooms = [room_of_view(model.gaussians, one, appearance, settings, model.num_live) for one in cameras]
-    capacity = rounded_up(max(room.pairs for room in rooms))
-    rows_per_pair = rounded_up(max(room.rows for room in rooms)) / capacity
-    exchange = dataclasses.replace(settings.exchange, rows_per_pair=rows_per_pair)
-    return dataclasses.replace(settings, capacity=capacity, exchange=exchange)

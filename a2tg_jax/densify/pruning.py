@@ -21,13 +21,13 @@ from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.data.scene import View, counted_pixels, views_by_kind
-from a2tg_jax.densify.placing import room_for
 from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, iterations_at, keep_rows
 from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.sharded_rows import everywhere, mesh_of, of_first, on_host, spread
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.renderer import room_for
 
 
 @pytree

@@ -15,7 +15,7 @@ from a2tg_jax.host.remote_files import fetched, is_remote, listed, remote_entry,
 MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
 LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
-"""An untrusted file may unpack to this multiple of its own bytes, plus these bytes."""
+"""Largest growth of an untrusted file that is unpacked: a multiple of its size, and bytes that any file may have."""
 READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """Flags to open a file for reading bytes, without waiting for a pipe's writer or changing newlines."""
 

@@ -67,7 +67,7 @@ def noted(numbers: tuple[int, ...] = ENDING) -> Iterator[Callable[[], bool]]:
 
     default = (signal.default_int_handler, signal.SIG_DFL)
     before = {number: signal.getsignal(number) for number in numbers}
-    # Handlers of this module are those of an outer block.
+    # Handlers of this module belong to an outer block.
     own = tuple(n for n, old in before.items() if old in default or getattr(old, "__module__", None) == __name__)
     with _handled_by(note, own):
         try:
