@@ -21,6 +21,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_floats, check_mask, check_shape
 from a2tg_jax.core.numerics import safe_divide, safe_norm
 from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.origin import BLACK, Color
 from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.core.table import Shape, Table, is_table
 from a2tg_jax.data.scene import View
@@ -109,6 +110,8 @@ class Due:
     """Number of the event's times in the stage."""
     views: Sequence[View] = ()
     """Training views, with the cameras that the scene gives."""
+    background: Color = BLACK
+    """Colour before which the views are drawn; of random ones, black."""
     shapes: set[Shape] = dataclasses.field(default_factory=set)
     """Shapes of textures that steps are compiled for; an event adds the shapes that it makes."""
 

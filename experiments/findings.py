@@ -182,25 +182,27 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     records = read_kept(lab.out.parent / scale / "records.json")
     degrees = {degree: tables.results_of(read_grid(f"degree_{degree}", scale), records) for degree in (3, 1, 0)}
     of_bytewise = rows_of_bytewise(bytewise, equal_time)
-    at_size = [row for row in of_bytewise if "0.3 MB" in row.name and not row.other.endswith("degree 3")]
-    dense = [row for row in at_size if FEW not in row.name and UNSEEN not in row.name]
-    others = [*rows_of_parts(parts), *rows_of_degrees(degrees)]
-    rows = [*of_bytewise, *others]
-    lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(rows)}\n{endpoints(rows)}\n{scenes_table(dense)}")
+    newest = newest_of(of_bytewise)
+    rows = [*newest, *rows_of_parts(parts), *rows_of_degrees(degrees)]
+    at_size = [row for row in newest if "0.3 MB" in row.name and FEW not in row.name]
+    lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(rows)}\n{scenes_table(at_size)}")
+    earlier = [row for row in of_bytewise if row not in newest]
+    lab.write("earlier_versions", f"# Earlier versions of bytewise\n\n{table_of(earlier)}\n{endpoints(of_bytewise)}")
     charted: dict[str, tuple[Sequence[float], float, float]] = {}
-    for row in (*newest(of_bytewise), *others):
-        if (one := row.compared("psnr")).by_scene:
+    for row in rows:
+        # Differences from 3DGS of degree 3 are several times as large as the others.
+        if (one := row.compared("psnr")).by_scene and row.other != "3DGS-MCMC, degree 3":
             charted[row.name] = list(one.by_scene.values()), one.over_scenes.mean, one.over_scenes.half_width
     if charted:
         save_figure(lab.pages / f"{EXPERIMENT.name}.png", forest(charted))
 
 
-def newest(rows: Sequence[Row]) -> list[Row]:
-    """Return the comparisons of `bytewise` for the chart, each of the newest version that has runs, without those with
-    3DGS of degree 3, whose differences are several times as large."""
+def newest_of(rows: Sequence[Row]) -> list[Row]:
+    """Return the comparisons of `bytewise` with other methods and its second version, each of the newest version that
+    has runs."""
     found: dict[str, Row] = {}
     for row in rows:
-        if row.compared("psnr").by_scene and row.other != "3DGS-MCMC, degree 3":
+        if row.compared("psnr").by_scene and row.other != FIRST and UNSEEN not in row.name:
             found.setdefault(row.name.partition(" − ")[2], row)
     return list(found.values())
 

@@ -12,6 +12,7 @@ from kept_checkpoints import fit_keeping_checkpoints
 import a2tg_jax as a2tg
 from a2tg_jax.core.gaussians import SH_C0, no_rows, rotation_matrices
 from a2tg_jax.core.optim import adam_init
+from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.core.pytree import partition
 from a2tg_jax.data.scene import View
 from a2tg_jax.densify.placing import OPACITY, PlaceByError, gaussians_at_errors
@@ -55,8 +56,8 @@ def seen(picture: np.ndarray, mask: np.ndarray | None = None) -> View:
     return View("wall.png", camera(), picture, mask)
 
 
-def placed(views: list[View], num: int = 20) -> a2tg.Gaussians:
-    return gaussians_at_errors(wall(), views, num, np.random.default_rng(0))
+def placed(views: list[View], num: int = 20, background: Color = BLACK) -> a2tg.Gaussians:
+    return gaussians_at_errors(wall(), views, background, num, np.random.default_rng(0))
 
 
 def columns_of(gaussians: a2tg.Gaussians) -> np.ndarray:
@@ -101,8 +102,18 @@ def test_what_masks_leave_out_and_what_shows_no_surface_gets_none():
     model = wall()
     faint = dataclasses.replace(model.gaussians, logit_opacities=jnp.full(model.gaussians.num, -1.0))
     views = [seen(photograph(5, 8, (0, 0, 255)))]
-    found = gaussians_at_errors(dataclasses.replace(model, gaussians=faint), views, 20, np.random.default_rng(0))
+    model = dataclasses.replace(model, gaussians=faint)
+    found = gaussians_at_errors(model, views, BLACK, 20, np.random.default_rng(0))
     assert found.num == 0, "an alpha of 0.27"
+
+
+def test_transparent_pixels_have_the_colour_of_the_background():
+    picture = np.full((*SIZE, 4), (255, 3, 3, 255), np.uint8)  # As an alpha of 0.99 draws red before white.
+    picture[:, 5:8, 3] = 0
+    new = placed([seen(picture)], background=WHITE)
+    columns = columns_of(new)
+    assert new.num == 20 and columns.min() > 5 and columns.max() < 8
+    np.testing.assert_allclose(np.asarray(new.sh[:, 0]) * SH_C0 + 0.5, 1, atol=1e-5)
 
 
 def applied(event: PlaceByError, model: a2tg.Model, views: list[View]):

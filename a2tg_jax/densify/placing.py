@@ -22,7 +22,7 @@ from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.gaussians import Gaussians, no_rows, sh_of_colors
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.origin import BLACK
+from a2tg_jax.core.origin import Color
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import is_table
 from a2tg_jax.data.scene import View, counted_pixels, view_image
@@ -46,8 +46,8 @@ LEAST_ALPHA = 0.5
 class PlaceByError(HostEvent):
     """Event that adds Gaussians on the rendered surface, at pixels drawn in proportion to their error.
 
-    After ConeGS (Baranowski et al., 2025). Errors are measured in up to 48 views, over black where photographs are
-    transparent, with the cameras of the scene, not refined ones, and without exposures.
+    After ConeGS (Baranowski et al., 2025). Errors are measured in up to 48 views, with the cameras of the scene, not
+    refined ones, and without exposures.
 
     Examples:
       >>> a2tg.PlaceByError(share=0.1, at=(0.25, 0.5)).iterations(1000)
@@ -82,7 +82,8 @@ class PlaceByError(HostEvent):
         if room <= 0:
             reason = "share adds no Gaussian, because there are as many as the cap allows; prune some before"
             return Change(model, moments, state, unused=reason)
-        added = gaussians_at_errors(model, due.views, min(wanted, room), np.random.default_rng(due.index))
+        rng = np.random.default_rng(due.index)
+        added = gaussians_at_errors(model, due.views, due.background, min(wanted, room), rng)
         if not added.num:
             reason = "share adds no Gaussian, because views are right wherever a surface is drawn and masks count"
             return Change(model, moments, state, unused=reason)
@@ -100,7 +101,9 @@ class PlaceByError(HostEvent):
         return Change(model, moments, state)
 
 
-def gaussians_at_errors(model: Model, views: Sequence[View], num: int, rng: np.random.Generator) -> Gaussians:
+def gaussians_at_errors(
+    model: Model, views: Sequence[View], background: Color, num: int, rng: np.random.Generator
+) -> Gaussians:
     """Return `num` Gaussians at pixels of some views, drawn in proportion to the mean difference of their colours;
     none where masks do not count or no surface is drawn. None at all if no pixel is wrong (host).
 
@@ -111,14 +114,14 @@ def gaussians_at_errors(model: Model, views: Sequence[View], num: int, rng: np.r
         raise ValueError("views must hold at least one view; got none")
     views, mesh, dtype = evenly_chosen(views, MOST_VIEWS), mesh_of(model.gaussians.means), model.gaussians.means.dtype
     settings = room_for(model, [view.camera for view in views])
-    background = everywhere(mesh, jnp.asarray(BLACK, dtype))
+    behind = everywhere(mesh, jnp.asarray(background, dtype))
     totals, drawn = [], []
     for view in views:
         camera = everywhere(mesh, jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), view.camera))
         output, _ = jitted_render()(
-            model.gaussians, camera, model.appearance, background, settings, num_live=model.num_live
+            model.gaussians, camera, model.appearance, behind, settings, num_live=model.num_live
         )
-        total, found = _drawn_pixels(view, jax.tree.map(on_host, output), num, rng)
+        total, found = _drawn_pixels(view, background, jax.tree.map(on_host, output), num, rng)
         totals.append(total)
         drawn.append(found)
     if not sum(totals):
@@ -137,11 +140,11 @@ def gaussians_at_errors(model: Model, views: Sequence[View], num: int, rng: np.r
 
 
 def _drawn_pixels(
-    view: View, output: RenderOutput, num: int, rng: np.random.Generator
+    view: View, background: Color, output: RenderOutput, num: int, rng: np.random.Generator
 ) -> tuple[float, tuple[np.ndarray, ...]]:
     """Return the sum of the errors of a view, and of `num` pixels that are drawn in proportion to them: points [P, 3],
     normals [P, 3], colours [P, 3] and widths [P]."""
-    photograph = view_image(view, BLACK)
+    photograph = view_image(view, background)
     is_usable = counted_pixels([view])[0, ..., 0] & (output.alpha >= LEAST_ALPHA)
     is_usable &= np.isfinite(output.color).all(axis=2)  # Training says what to do about NaN.
     if view.camera.rays is not None:

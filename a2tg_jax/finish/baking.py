@@ -34,8 +34,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.systems.baselines import Gaussians2d
 from a2tg_jax.training import fit_stage
-from a2tg_jax.training.fitting import BACKGROUNDS
-from a2tg_jax.training.stage import Background
+from a2tg_jax.training.stage import BACKGROUNDS, Background
 
 MOST_GROWTH = 2.0
 """Largest ratio of the bytes after baking to those before."""

@@ -27,7 +27,7 @@ from a2tg_jax.results.folder import RunFolder, open_run, resuming_command, runs_
 from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import PlannedStage, RunRecord, read_record
 from a2tg_jax.training import History, System
-from a2tg_jax.training.fitting import BACKGROUNDS
+from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import new_appearance
 
 SHOWN = f"a run folder, or a file *{', *'.join(FORMATS)}"

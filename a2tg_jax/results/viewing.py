@@ -33,8 +33,8 @@ from a2tg_jax.results.folder import check_new, remove_if_empty
 from a2tg_jax.results.images import to_uint8
 from a2tg_jax.results.model_source import Source
 from a2tg_jax.results.report import loss_text
-from a2tg_jax.training.fitting import BACKGROUNDS
 from a2tg_jax.training.loop import IsStopped, StageRun
+from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.web.page import (
     PHOTOGRAPHS_NAME,
     SCENE_NAME,

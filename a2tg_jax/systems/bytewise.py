@@ -97,7 +97,7 @@ class Bytewise(TwoStages):
     """Options of the texture lookup."""
 
     name: ClassVar[str] = "bytewise"
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     @property
     def initial_sh_degree(self) -> int:

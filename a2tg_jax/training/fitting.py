@@ -7,7 +7,6 @@ import warnings
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind, kind_of
 from a2tg_jax.core.gaussians import check_process
-from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.text import counted, in_bytes, shortened
@@ -17,11 +16,8 @@ from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, Watch, never, unwatched
 from a2tg_jax.training.options import System
 from a2tg_jax.training.reports import RestOfRun
-from a2tg_jax.training.stage import Background
+from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import check_loss_data, check_start, check_views
-
-BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
-"""Background of a finished model for each background of training."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -43,6 +43,7 @@ from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diver
 from a2tg_jax.training.options import System
 from a2tg_jax.training.reports import LearningCheck, ProgressBar, RestOfRun, StageEffects
 from a2tg_jax.training.returned import calling, checked_change
+from a2tg_jax.training.stage import BACKGROUNDS
 from a2tg_jax.training.start import initial_model, padded
 from a2tg_jax.training.step import (
     EXPLODED,
@@ -456,7 +457,8 @@ class StageRun:
             due = event.iterations(self.stage.iterations)
             if iteration not in due:
                 continue
-            now = Due(due.index(iteration) + 1, len(due), self.views, self.session.shapes)
+            background = BACKGROUNDS[self.system.background]
+            now = Due(due.index(iteration) + 1, len(due), self.views, background, self.session.shapes)
             with calling(event, "apply", self.stage.name):
                 change = event.apply(now, self.state.model, self.state.moments, self.state.events[place])
                 change = checked_change(change)

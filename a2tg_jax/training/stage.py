@@ -16,6 +16,7 @@ from jax import Array
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats, in_words
 from a2tg_jax.core.checks import check_kind, check_number, fields_of, kind_of
 from a2tg_jax.core.gaussians import Gaussians, no_rows
+from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.core.pytree import check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.events import EVERY_ITERATION, Event, HostEvent, StepEvent, Times
@@ -71,6 +72,8 @@ T = TypeVar("T")
 COOLED = 0.1
 """Factor of learning rates at the end of a stage that cools down."""
 Background = Literal["black", "white", "random"]
+BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
+"""Background of a model for each background of training."""
 
 
 class LossTerm(Protocol):
