@@ -21,7 +21,6 @@ from .core.similarity import Similarity as Similarity, transform_gaussians as tr
 from .data.arrays import scene_from_arrays as scene_from_arrays
 from .data.assembly import with_validation_views as with_validation_views
 from .data.load import load_scene as load_scene
-from .data.observations import ObservedPoints as ObservedPoints, observed_points as observed_points
 from .data.photo_store import Mask as Mask, Picture as Picture
 from .data.scene import Scene as Scene, View as View, view_image as view_image
 from .data.sfm import run_sfm as run_sfm

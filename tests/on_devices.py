@@ -44,9 +44,7 @@ ROWS = 96
 
 @functools.cache
 def scene():
-    """A scene whose views saw its points, but the first."""
-    found = a2tg.synthetic_scene(num_views=9, width=72, height=54, num_points=ROWS)
-    return dataclasses.replace(found, train=(dataclasses.replace(found.train[0], points=None), *found.train[1:]))
+    return a2tg.synthetic_scene(num_views=9, width=72, height=54, num_points=ROWS)
 
 
 def plain():
@@ -258,7 +256,7 @@ def fit(own, count, **options):
 
 def batches(folder):
     """Views that are drawn at once, each by its share of the devices, have the gradients of one device."""
-    own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True, loss={"points_weight": 0.1})
+    own = system(a2tg.A2tg, densify={"cap": ROWS}, exposure=True)
     with same_attempts(scene(), dataclasses.replace(own, batch_size=6), 1, True) as (run, arguments):
         assert arguments[0].render.exchange.views_at_once == 2
         check_parts(arguments[4].images, [run.views[place].image for place in run.order.indices(1)])

@@ -32,35 +32,27 @@ def given(whole):
 
 
 def test_the_scene_is_that_of_the_arrays(whole, given):
-    scene = a2tg.scene_from_arrays(**given, observed=[np.arange(len(whole.points))] * 6)
+    scene = a2tg.scene_from_arrays(**given)
     for own, view in zip((*scene.train, *scene.test), (*whole.train, *whole.test), strict=True):
         assert own.name == view.name
         np.testing.assert_array_equal(own.image, view.image)
         np.testing.assert_allclose(own.camera.viewmat, view.camera.viewmat, atol=1e-5)
         np.testing.assert_array_equal(own.camera.K, view.camera.K)
-        assert set(view.points.pixels) <= set(own.points.pixels), "hidden points were said to be observed, too"
     np.testing.assert_allclose(scene.points, whole.points, atol=1e-5)
     np.testing.assert_allclose(scene.colors, whole.colors, atol=1e-6)
     assert scene.scale == pytest.approx(whole.scale, rel=1e-5)
     assert scene.transform.scale == pytest.approx(whole.transform.scale, rel=1e-5)
 
 
-def test_what_is_given_beside_images_is_in_the_views(whole, given):
-    """The depths of observed points are in units of the normalised world, however large the given one is."""
+def test_what_is_given_beside_images_is_in_the_views(given):
     masks = [None] * 5 + [np.arange(1200).reshape(30, 40) > 7]
     depths = [None, np.full((30, 40), 2.0, np.float32), *[None] * 4]
-    larger = {"points": 2 * given["points"], "viewmats": given["viewmats"].copy()}
-    larger["viewmats"][:, :3, 3] *= 2
-    observed = [[], [3, 5], *[range(100)] * 4]
-    scene = a2tg.scene_from_arrays(**{**given, **larger}, masks=masks, depths=depths, observed=observed)
+    scene = a2tg.scene_from_arrays(**given, masks=masks, depths=depths)
     views = {view.name: view for view in (*scene.train, *scene.test)}
     first, second, *_, last = (views[name] for name in given["names"])
     assert last.mask.num == 1192 and first.mask is None and second.depth is not None and last.depth is None
-    assert len(first.points.pixels) == 0 and len(second.points.pixels) <= 2
-    own = scene.points[[3, 5]] @ np.asarray(second.camera.viewmat)[:3, :3].T + np.asarray(second.camera.viewmat)[:3, 3]
-    assert all(np.abs(own[:, 2] - z).min() < 1e-5 for z in second.points.depths)
     system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=2, initial_gaussians=None, densify={"cap": 250})
-    changed = a2tg.LossConfig(points_weight=0.1, depth_weight=0.1)
+    changed = a2tg.LossConfig(depth_weight=0.1)
     assert a2tg.fit(scene, dataclasses.replace(system, loss=changed), progress=False).model.num >= 200
 
 
@@ -93,9 +85,6 @@ WRONG = [
     ("names must hold one item for each of 6 images; got 1", "names", ["a"]),
     ("lists a twice", "names", ["a"] * 6),
     ("names[0] must be a str; got NoneType", "names", [None] * 6),
-    ("observed[1] must hold integers [S] from 0 to 199, indices of points; got int64 [1]", "observed",
-     [[0], [200], *[[]] * 4]),
-    ("; got bool [200]: use np.flatnonzero of a mask", "observed", [np.ones(200, bool)] * 6),
     ("masks[0]: a mask must be an array bool", "masks", [np.ones((30, 40))] * 6),
     ("masks[0] must be as large as its image, [30, 40]; got [3, 4]", "masks", [np.ones((3, 4), bool)] * 6),
     ("depths[1] must be as large as its image, [30, 40]; got [3, 4]", "depths", [None, np.ones((3, 4)), *NO_DEPTHS]),
@@ -106,8 +95,6 @@ def test_what_is_wrong_is_named_and_arrays_of_jax_are_fine(given):
     for message, name, wrong in WRONG:
         with pytest.raises(ValueError, match=re.escape(message)):
             a2tg.scene_from_arrays(**{**given, name: wrong})
-    with pytest.raises(ValueError, match="observed needs points"):
-        a2tg.scene_from_arrays(**{**given, "points": None, "colors": None, "observed": [[0]] * 6})
     of_jax = {name: jnp.asarray(given[name]) for name in ("viewmats", "Ks")}
     assert len(a2tg.scene_from_arrays(**{**given, **of_jax}).train) == 4
 

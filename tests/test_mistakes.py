@@ -311,10 +311,6 @@ def staged(**given):
     Own(given=given).stages()[0].check()
 
 
-def without_points():
-    return dataclasses.replace(tiny(), train=tuple(dataclasses.replace(view, points=None) for view in tiny().train))
-
-
 def roughness(model, target, output):
     return jnp.mean(jnp.abs(jnp.diff(output.depth, axis=0)))
 
@@ -575,12 +571,10 @@ CALLS = {
     "trained(corrections=(made(Exposure, camera=lambda self, row, camera: row),))": "Mine.camera … structure",
     "trained(corrections=(made(Exposure, color=lambda self, row, c: c.mean((0, 1))),))": "Mine.color … [16, 16, 3]",
     "trained(corrections=(made(Exposure, project=lambda self, rows: rows[:1]),))": "Mine.project",
-    "trained(losses=(Term(lambda model, target, output: target.points.depths.sum()),))": "target.points … has_points",
     "trained(losses=(Term(lambda model, target, output: target.depth.sum()),))": "target.depth … has_depths=True",
     "trained(losses=(Photometric(), Term(roughness)))": "depth … has_geometry=True",
     "trained(tiny(10), losses=(Photometric(1),))": "10 by 10 pixels … SSIM … 11 by 11",
-    "trained(without_points(), losses=(Term(l1, has_depths=True),))": "needs depth maps",
-    "trained(without_points(), losses=(Term(l1, has_points=True),))": "needs points",
+    "trained(losses=(Term(l1, has_depths=True),))": "needs depth maps",
 }  # fmt: skip
 NAMES: dict[str, Any] = {}
 for module in (appearance, corrections, dataclasses, losses, mcmc, options, a2tg):
@@ -704,10 +698,7 @@ def test_depth_that_was_not_rendered_is_no_zero():
 
 @pytest.mark.long
 def test_a_stage_without_ssim_takes_small_photographs():
-    def points(model, target, output):
-        return target.points.depths.mean() + 0 * output.color.sum()
-
-    assert trained(tiny(10), losses=(a2tg.Term(l1), a2tg.Term(points, has_points=True))).model.num == 50
+    assert trained(tiny(10), losses=(a2tg.Term(l1),)).model.num == 50
 
 
 def test_an_error_in_shade_names_the_appearance():

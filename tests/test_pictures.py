@@ -152,7 +152,7 @@ def test_photographs_that_other_processes_draw_are_not_read(monkeypatch):
     views = tuple(map(counted, built_in().train))
     order = BatchOrder(views, 3, 0)
     monkeypatch.setattr(batches, "are_drawn_here", lambda *_: [False, True, False])
-    store = PhotoStore(views, order, 1, extras=batches.Extras(depths=True), room=0)
+    store = PhotoStore(views, order, 1, has_depths=True, room=0)
     batch, places = store.batch(1)
     store.close()
     assert read == [views[order.indices(1)[1]].name] and places is None

@@ -17,7 +17,7 @@ from a2tg_jax.data.synthetic import exact_depths
 from a2tg_jax.densify.pruning import are_near, shown_in
 from a2tg_jax.events import Due
 from a2tg_jax.rasterize.render_types import Geometry
-from a2tg_jax.training.batches import Extras, stack_views
+from a2tg_jax.training.batches import stack_views
 from a2tg_jax.training.corrections import BilateralGrid, exposed, learned, sliced, total_variation
 from a2tg_jax.training.start import initial_model
 from a2tg_jax.training.terms import DepthPrior, Photometric, RobustPhotometric, depth_loss, inliers, scale_and_shift
@@ -196,7 +196,7 @@ class TestDepthPrior:
         values = RNG.uniform(size=(30, 40))
         values[3, 4] = np.inf
         first = dataclasses.replace(scene.train[0], depth=4 * values)
-        stack = stack_views([first, scene.train[1]], extras=Extras(depths=True))
+        stack = stack_views([first, scene.train[1]], has_depths=True)
         expected = np.where(np.isinf(values), np.nan, values / values[values < 2].max())
         np.testing.assert_allclose(stack.depths[0], expected, rtol=1e-6)
         assert np.isnan(stack.depths[1]).all() and stack_views([first]).depths is None

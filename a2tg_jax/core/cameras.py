@@ -255,6 +255,12 @@ def viewmat_of_axes(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
     return viewmat
 
 
+def pinhole_pixels(points: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Return x and y [P, 2] in pixels of points [P, 3] in front of a pinhole camera, in its frame."""
+    seen = points @ K.T
+    return seen[:, :2] / seen[:, 2:]
+
+
 # Small rigid motions of cameras, so(3) × R³: a twist [6] is a rotation vector ω in radians and a translation. θ is the
 # angle |ω|, W the matrix with W·x = ω × x.
 

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from a2tg_jax.core.camera_paths import nearest_point
+from a2tg_jax.core.cameras import pinhole_pixels
 from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, check_test_every, every_kth, rigid_viewmat
-from a2tg_jax.data.observations import before_camera, observed_points, pinhole_pixels
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture, how_to_convert
 from a2tg_jax.data.scene import Scene
 
@@ -36,7 +36,6 @@ def scene_from_arrays(
     names: Sequence[str] | None = None,
     masks: Sequence[np.ndarray | None] | None = None,
     depths: Sequence[np.ndarray | None] | None = None,
-    observed: Sequence[ArrayLike] | None = None,
     test_every: int = 8,
     name: str = "arrays",
 ) -> Scene:
@@ -53,7 +52,6 @@ def scene_from_arrays(
       masks: [H, W] bool for each image, True at pixels that count, or None.
       depths: [H, W] floats for each image, NaN where unknown, or None: inverse depth up to scale and shift for
         `loss.depth_weight`, or depth up to scale with `loss.depth_kind="depth"`.
-      observed: for each image the indices [S] of the points that it observed, for `loss.points_weight`; may be empty.
       test_every: every k-th view is a test view; 0 keeps none.
       name: name of the scene.
 
@@ -85,30 +83,24 @@ def scene_from_arrays(
     check_unmasked("Ks", Ks)
     Ks = np.asarray(Ks)
     Ks = _matrices("Ks", np.broadcast_to(Ks, (num, 3, 3)) if Ks.shape == (3, 3) else Ks, (num, 3, 3))
-    given = {"names": names, "masks": masks, "depths": depths, "observed": observed}
-    for argument, values in given.items():
+    for argument, values in {"names": names, "masks": masks, "depths": depths}.items():
         if values is not None and len(values) != num:
             raise ValueError(f"{argument} must hold one item for each of {num} images; got {len(values)}")
-    for argument, of_points in (("colors", colors), ("observed", observed)):
-        if of_points is not None and points is None:
-            raise ValueError(f"{argument} needs points")
+    if colors is not None and points is None:
+        raise ValueError("colors needs points")
     cloud = None if points is None else _cloud(points, colors)
 
     def shot(index: int) -> Shot:
         own = f"{index:04d}" if names is None else names[index]
         check_kind(f"names[{index}]", own, str)
         picture = _converted(f"images[{index}]", Picture.of, images[index])
-        viewmat, points = rigid_viewmat(viewmats[index], f"viewmats[{index}]"), None
-        if observed is not None and cloud is not None:
-            chosen = _chosen(cloud.points, observed[index], f"observed[{index}]")
-            ahead = before_camera(chosen, viewmat)
-            points = observed_points(pinhole_pixels(ahead, Ks[index]), ahead[:, 2], picture.size)
+        viewmat = rigid_viewmat(viewmats[index], f"viewmats[{index}]")
         mask, depth = (
             None if values is None or values[index] is None
             else _converted(f"{argument}[{index}]", kind, values[index], picture.size)
             for argument, values, kind in (("masks", masks, Mask.of), ("depths", depths, DepthMap.of))
         )  # fmt: skip
-        return Shot(own, viewmat, Ks[index], picture, mask, depth=depth, points=points)
+        return Shot(own, viewmat, Ks[index], picture, mask, depth=depth)
 
     shots = [shot(index) for index in range(num)]
     for message in _mistakes(images, colors, shots, None if cloud is None else cloud.points):
@@ -179,7 +171,8 @@ def _share_seen(shots: Sequence[Shot], viewmats: np.ndarray, points: np.ndarray)
     """Return the share of all points, averaged over the views, in an image."""
     shares = []
     for shot, viewmat in zip(shots, viewmats, strict=True):
-        xy = pinhole_pixels(before_camera(points, viewmat), shot.K)
+        own = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        xy = pinhole_pixels(own[own[:, 2] > 0], shot.K)
         shares.append(np.count_nonzero(((xy >= 0) & (xy < shot.picture.size[::-1])).all(axis=1)) / len(points))
     return float(np.mean(shares))
 
@@ -221,15 +214,3 @@ def _cloud(points: ArrayLike, colors: ArrayLike | None) -> PointCloud:
     if colors.dtype != np.uint8:
         raise ValueError(f"colors must be uint8; got {colors.dtype}{how_to_convert(colors, 'colors')}")
     return PointCloud(points, colors)
-
-
-def _chosen(points: np.ndarray, indices: ArrayLike, what: str) -> np.ndarray:
-    check_unmasked(what, indices)
-    indices = np.asarray(indices)
-    # NumPy makes float64 of an empty list.
-    is_index = indices.ndim == 1 and (np.issubdtype(indices.dtype, np.integer) or not indices.size)
-    if not is_index or (indices.size and not 0 <= indices.min() <= indices.max() < len(points)):
-        advice = ": use np.flatnonzero of a mask" if indices.dtype == bool else ""
-        wanted = f"{what} must hold integers [S] from 0 to {len(points) - 1}, indices of points"
-        raise ValueError(f"{wanted}; got {indices.dtype} {[*indices.shape]}{advice}")
-    return points[indices.astype(int)]

@@ -15,11 +15,10 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from a2tg_jax.core.camera_paths import LEAST_FACING, nearest_point
-from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration
+from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration, pinhole_pixels
 from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.similarity import Similarity, camera_centers
-from a2tg_jax.data.observations import ObservedPoints, pinhole_pixels
 from a2tg_jax.data.photo_points import MOST_VIEWS, Look, agreeing_points
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
 from a2tg_jax.data.scene import Scene, View
@@ -65,8 +64,6 @@ class Shot:
     """[H, W, 2] rays of the pixels, as in `Camera.rays`, NaN where there is none; None for a pinhole."""
     depth: DepthMap | None = None
     panorama: int | None = None
-    points: ObservedPoints | None = None
-    """Points that it observed, their depths in units of the original world; None if unknown."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -135,7 +132,7 @@ def assemble_scene(
         if unseen_by:
             message = f"{source}: {len(unseen_by)} of {len(sights)} training views see none of its points, such as "
             warnings.warn(f"{message}{train[unseen_by[0]].name}: nothing to start from there", stacklevel=3)
-    views = {shot.name: _view(shot, viewmats[shot.name], transform.scale) for shot in shots}
+    views = {shot.name: _view(shot, viewmats[shot.name]) for shot in shots}
     return Scene(
         name=name,
         train=tuple(views[key] for key in sorted(shot.name for shot in train)),
@@ -295,8 +292,8 @@ def _are_somewhere(points: np.ndarray) -> np.ndarray:
     return (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
 
 
-def _view(shot: Shot, viewmat: np.ndarray, scale: float) -> View:
-    """Return the shot with its camera in the normalised world, which is `scale` times as large as the original."""
+def _view(shot: Shot, viewmat: np.ndarray) -> View:
+    """Return the shot with its camera in the normalised world."""
     height, width = shot.picture.size
     check_calibration(viewmat, shot.K, width, height, shot.name)
     rays: Any = shot.rays  # Views of one lens share the array.
@@ -307,8 +304,7 @@ def _view(shot: Shot, viewmat: np.ndarray, scale: float) -> View:
         mask = Mask.of(has_ray if mask is None else has_ray & mask.read())
     # Batches of views without masks carry one bool per view (scene.counted_pixels).
     mask = None if mask is None or mask.is_full else mask
-    points = None if shot.points is None else shot.points.scaled(scale)
-    return View(shot.name, camera, shot.picture, mask, shot.depth, shot.panorama, points)
+    return View(shot.name, camera, shot.picture, mask, shot.depth, shot.panorama)
 
 
 def normalizing_similarity(viewmats: np.ndarray) -> Similarity:

@@ -1,6 +1,5 @@
 """COLMAP scenes: a sparse model (.bin or .txt) next to a folder of images."""
 
-import dataclasses
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +15,6 @@ from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.colmap_files import KINDS, POINT, FrameRecord, ImageRecord, RigRecord, num_images, read_file
 from a2tg_jax.data.image_files import inside, on_disk, warn_of_unposed
 from a2tg_jax.data.lenses import checked_lens
-from a2tg_jax.data.observations import before_camera, observed_points
 from a2tg_jax.data.photo_reading import Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
@@ -120,15 +118,6 @@ def load_colmap(path: Path, options: Options) -> Scene:
         )
 
     shots = read_photos(photos, options, path, scene, how_to_remove)
-    for index, (shot, image) in enumerate(zip(shots, images, strict=True)):
-        # Features without a point (NO_POINT), and points deleted from the model, drop out.
-        own = image.point_ids[np.isin(image.point_ids, contents.points["id"])]
-        if len(own):
-            positions = contents.points["position"][np.searchsorted(contents.points["id"], own)]
-            # Features are places in the stored photograph; views may be undistorted and smaller, so project the points.
-            places, (height, width) = before_camera(positions, shot.viewmat), shot.picture.size
-            xy = lenses[image.camera_id].projected(places, shot.K, (width, height))
-            shots[index] = dataclasses.replace(shot, points=observed_points(xy, places[:, 2], (height, width)))
     train, test = every_kth(shots, options.test_every)
     return assemble_scene(scene_name(scene), train, test, _start_cloud(model, contents), source=str(path))
 
@@ -209,7 +198,7 @@ def _read_model(model: Path) -> SparseModel:
                 f"{files['cameras'].name}; export the model again"
             )
     points = found.get("points3D", np.empty(0, POINT))
-    # load_colmap finds points by searchsorted.
+    # COLMAP's binary files have points in any order, which would decide the order of the initial Gaussians.
     points = points[np.argsort(points["id"], kind="stable")]
     return SparseModel(cameras, found["images"], points, found.get("rigs", []), found.get("frames", []))
 

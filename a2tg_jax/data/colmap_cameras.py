@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from a2tg_jax.core.cameras import pinhole_pixels
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.observations import pinhole_pixels
 
 
 class CameraModel(NamedTuple):

@@ -34,9 +34,8 @@ from a2tg_jax.host.text import shortened
 KINDS = ("cameras", "images", "points3D", "rigs", "frames")
 """Names of a model's files without suffix. A model has cameras and images, and the others if it needs them."""
 POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8")])
-FEATURE = np.dtype([("place", "<f8", 2), ("id", "<u8")])
-NO_POINT = (1 << 64) - 1
-"""Id of the point of a feature that observed none."""
+LARGEST_WHOLE = (1 << 64) - 1
+"""Largest whole number in a binary file."""
 LONGEST_NAME = 4096
 CAMERA_SENSOR = 0
 """Kind of the sensors that take images."""
@@ -55,8 +54,6 @@ class ImageRecord(NamedTuple):
     """Quaternion and translation from world to camera."""
     camera_id: int
     name: str
-    point_ids: np.ndarray
-    """[N] uint64 ids of the points that its features observed, or `NO_POINT`."""
 
 
 class RigRecord(NamedTuple):
@@ -163,11 +160,8 @@ class _Binary:
         if end < 0:
             raise self.error("has a name that does not end")
         name = _decoded_name(self.path, self.data[self.skip(end + 1 - self.at) : end])
-        (count,) = self.take("Q")
-        start = self.skip(FEATURE.itemsize * count)
-        features = np.frombuffer(self.data, FEATURE, count, start) if count else np.empty(0, FEATURE)
-        # A view of the mapping would keep it from being closed (BufferError).
-        return ImageRecord(number, pose, camera, name, features["id"].copy())
+        self.skip(24 * self.take("Q")[0])  # The features, which are not needed.
+        return ImageRecord(number, pose, camera, name)
 
     def points3D(self) -> bytes:
         start = self.skip(POINT.itemsize)
@@ -193,7 +187,7 @@ class _Binary:
 def _whole(word: bytes) -> int:
     """Return a whole number of at least 0, which may be written like 96.0."""
     number = int(word) if word.isdigit() else float(word)  # A float would round ids above 2^53.
-    if not 0 <= number <= NO_POINT or number != int(number):  # NaN fails as well.
+    if not 0 <= number <= LARGEST_WHOLE or number != int(number):  # NaN fails as well.
         raise ValueError(f"{shortened(word.decode(errors='replace'))} is not a whole number of at least 0")
     return int(number)
 
@@ -222,12 +216,14 @@ def _text_record(kind: str, path: Path, line: bytes, features: bytes) -> Any:
         name = _decoded_name(path, line.split(None, 9)[9].strip())  # The rest of the line, which may have spaces.
         words = iter(())  # The name took the rest of the line.
         try:
-            # Each feature has x, y and the id of its point; -1 stands for none.
-            triples = zip(*[iter(features.split())] * 3, strict=True)
-            ids = [NO_POINT if word == b"-1" else _whole(word) for _, _, word in triples]
+            # Each feature has x, y and the id of its point; -1 stands for none. If the line is missing, this is the
+            # next image's, whose words are no such triples.
+            for _, _, word in zip(*[iter(features.split())] * 3, strict=True):
+                if word != b"-1":
+                    _whole(word)
         except ValueError:
             raise ValueError("the line of its points is missing or cut off") from None
-        record = ImageRecord(number, pose, camera, name, np.array(ids, np.uint64))
+        record = ImageRecord(number, pose, camera, name)
     elif kind == "points3D":
         number, position, color, error = whole(), floats(3), floats(3), floats(1)[0]
         if len(list(words)) % 2:

@@ -13,7 +13,6 @@ from scipy.ndimage import map_coordinates
 from a2tg_jax.core.cameras import check_intrinsics
 from a2tg_jax.data.colmap_cameras import CUT, ColmapCamera
 from a2tg_jax.data.colmap_library import pycolmap
-from a2tg_jax.data.observations import pinhole_pixels
 
 PINHOLE_TOLERANCE = 1e-3
 """Largest deviation in pixels of a camera that still counts as a pinhole."""
@@ -118,13 +117,6 @@ class Lens:
     def view_plane(self, plane: np.ndarray) -> np.ndarray:
         """Return numbers [h, w] float32 of a photograph's pixels, undistorted like its view, not downscaled."""
         return plane if self.is_kept or self.is_pinhole else self._sampled(plane[..., None])[..., 0]
-
-    def projected(self, points: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Return x and y [P, 2] in pixels of points [P, 3] in front of the camera, in a view of a K and (width,
-        height)."""
-        if not self.is_kept:
-            return pinhole_pixels(points, K)
-        return self.camera.pixels(points) * np.divide(size, self.size)
 
     def rays(self, width: int, height: int) -> np.ndarray | None:
         """Return the rays [height, width, 2] of views of a size, as in `Camera.rays`; NaN where there is none.

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
+from a2tg_jax.core.cameras import pinhole_pixels
 from a2tg_jax.core.geometry import NEAR_PLANE
-from a2tg_jax.data.observations import pinhole_pixels
 from a2tg_jax.data.photo_store import Mask, Picture
 
 # Chosen in experiments/NOTEBOOK.md, "A start from photographs".

@@ -16,7 +16,6 @@ from a2tg_jax.core.notebook_display import THUMBNAIL, enlarged, html_image, png
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import BLACK, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
-from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
 from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import counted, in_bytes
@@ -49,8 +48,6 @@ class View:
     """Depth map for `loss.depth_weight`, or an array [H, W] of floats; None if there is none."""
     panorama: int | None = None
     """Number of the panorama that it was cut from; None for a photograph. Its views are held out together."""
-    points: ObservedPoints | None = None
-    """Points of the reconstruction that it observed, for `loss.points_weight`; None if unknown."""
 
     def __post_init__(self) -> None:
         """Convert arrays to pictures, masks and depth maps.

@@ -3,7 +3,6 @@
 Its patterns have details of about 4 to 10 pixels, finer than one or two thousand Gaussians can show without textures.
 """
 
-import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -14,7 +13,6 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from a2tg_jax.core.cameras import intrinsics, looking
 from a2tg_jax.data import patterns
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, check_test_every, every_kth
-from a2tg_jax.data.observations import before_camera, observed_points, pinhole_pixels
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.data.ray_tracing import (
     Ball,
@@ -36,8 +34,6 @@ DISTANCE = 2.4
 """Distance of the cameras from the target."""
 FIELD_OF_VIEW = np.deg2rad(58.0)
 """Field of view across the longer side of the image."""
-SAME_SURFACE = 1e-3
-"""Largest relative difference of depth between a point and its surface."""
 SAMPLE_OFFSETS = np.array([[-0.375, -0.125, 0.125, 0.375], [0.125, -0.375, 0.375, -0.125]])
 """Places [2, S] of a pixel's rays around its centre: a turned square, all different along x and along y."""
 
@@ -90,15 +86,6 @@ def synthetic_scene(
         for index, viewmat in enumerate(viewmats)
     ]
     cloud = sample_points(surfaces, shots, num_points, rng)
-    for index, shot in enumerate(shots):  # They observed the points that no shape hides from them.
-        own = before_camera(cloud.points, shot.viewmat)
-        xy, depths = pinhole_pixels(own, K), own[:, 2]
-        rays = _directions(shot.viewmat, K, *xy.T)
-        hits, _ = nearest_hits([surface.shape for surface in surfaces], _center(shot.viewmat), rays)
-        # Rays have z = 1 in the camera, so hits are depths.
-        is_seen = depths <= (1 + SAME_SURFACE) * hits
-        points = observed_points(xy[is_seen], depths[is_seen], shot.picture.size)
-        shots[index] = dataclasses.replace(shot, points=points)
     return assemble_scene("synthetic", *every_kth(shots, test_every), cloud, source="the synthetic scene")
 
 

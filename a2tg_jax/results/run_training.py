@@ -390,7 +390,7 @@ def digests_of(record: RunRecord, scene: Scene, session: Session) -> list[bytes]
     views = []
     for view in scene.train:
         has = view.has_alpha, view.mask is not None, view.depth is not None
-        arrays = view.camera.viewmat, view.camera.K, *(() if view.points is None else view.points)
+        arrays = view.camera.viewmat, view.camera.K
         views.append((view.name, view.picture.size, has, *map(checksum, arrays)))
     lenses = [own[0].camera.rays for own in views_by_kind(scene.train)]
     rays = [None if lens is None else checksum(lens) for lens in lenses]

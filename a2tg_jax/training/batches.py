@@ -10,7 +10,6 @@ import numpy as np
 from jax import Array
 from numpy.typing import DTypeLike
 
-from a2tg_jax.data.observations import ObservedPoints, stacked_points
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.machine import default_device, num_threads
 from a2tg_jax.parallel.exchange import Exchange, are_drawn_here, on_devices
@@ -33,18 +32,6 @@ Kind = tuple[int, int, int]
 """Image size and lens of a view (`data.scene.kinds_of`)."""
 
 
-class Extras(NamedTuple):
-    """Data of views that are loaded with their photographs."""
-
-    depths: bool = False
-    """Whether depth maps are."""
-    points: bool = False
-    """Whether the observed points are."""
-
-
-NO_EXTRAS = Extras()
-
-
 class Photographs(NamedTuple):
     """V views of one image size and lens."""
 
@@ -62,8 +49,6 @@ class Photographs(NamedTuple):
     """[V, H, W] float32 depth maps, NaN where unknown; None unless a loss term reads them."""
     rays: Array | None = None
     """[H, W, 2] rays of the lens (`Camera.rays`); None of a pinhole."""
-    points: ObservedPoints | None = None
-    """Observed points [V, S]; None unless a loss term reads them."""
 
     def of(self, views: Array | np.ndarray | None, dtype: np.dtype | None = None) -> "Photographs":
         """Return the views of some indices, or all; with a dtype, cameras and depths are of it."""
@@ -76,8 +61,6 @@ class Photographs(NamedTuple):
         batch = batch._replace(viewmats=batch.viewmats.astype(dtype), Ks=batch.Ks.astype(dtype))
         if batch.depths is not None:
             batch = batch._replace(depths=batch.depths.astype(dtype))
-        if batch.points is not None:
-            batch = batch._replace(points=batch.points._replace(depths=batch.points.depths.astype(dtype)))
         return batch
 
 
@@ -137,10 +120,10 @@ class BatchPlan(NamedTuple):
 
 
 def plan_batches(
-    views: tuple[View, ...], batch_size: int, room: float | None = None, extras: Extras = NO_EXTRAS
+    views: tuple[View, ...], batch_size: int, room: float | None = None, has_depths: bool = False
 ) -> BatchPlan:
     """Return where photographs are during training. Arguments as of `PhotoStore`."""
-    sizes, of_rays = [view_bytes(view, extras) for view in views], ray_bytes(views)
+    sizes, of_rays = [view_bytes(view, has_depths) for view in views], ray_bytes(views)
     room = device_room() if room is None else room
     batch_bytes = batch_size * max(sizes)
     num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(batch_bytes, 1))))
@@ -148,11 +131,9 @@ def plan_batches(
     return BatchPlan(is_resident, of_rays <= room, batch_bytes, num_ahead)
 
 
-def view_bytes(view: View, extras: Extras = NO_EXTRAS) -> int:
-    """Return the bytes of a photograph and of the extras."""
-    of_points = 0 if view.points is None else view.points.nbytes
-    of_depths = BYTES_PER_DEPTH * math.prod(view.picture.size)
-    return view.picture.nbytes + extras.depths * of_depths + extras.points * of_points
+def view_bytes(view: View, has_depths: bool = False) -> int:
+    """Return the bytes of a photograph, and of its depth map if that is loaded with it."""
+    return view.picture.nbytes + has_depths * BYTES_PER_DEPTH * math.prod(view.picture.size)
 
 
 class PhotoStore:
@@ -165,7 +146,7 @@ class PhotoStore:
         order: BatchOrder,
         last: int,
         exchange: Exchange | None = None,
-        extras: Extras = NO_EXTRAS,
+        has_depths: bool = False,
         room: float | None = None,
     ):
         """Args:
@@ -174,12 +155,12 @@ class PhotoStore:
         last: the stage's last iteration.
         exchange: devices that draw the views of an iteration, and over which photographs that stay there are spread
           by rows of pixels; None: one.
-        extras: data to load with the photographs.
+        has_depths: whether depth maps are loaded with the photographs.
         room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
         self._views, self._order, self._last, self._exchange = views, order, last, exchange
-        self._extras = extras
-        plan = plan_batches(views, len(order.indices(1)), room, extras)
+        self._has_depths = has_depths
+        plan = plan_batches(views, len(order.indices(1)), room, has_depths)
         self._mesh = None if exchange is None else exchange.mesh
         self._keeps_rays, self.num_ahead = plan.keeps_rays, plan.num_ahead
         self._rays: dict[Kind, Array] = {}
@@ -208,7 +189,7 @@ class PhotoStore:
             return self._placed(kind, self._ahead.first({key: self._order.indices(key) for key in following})), None
         if kind not in self._stacks:
             views = [self._views[index] for index in self._of_kind[kind]]
-            self._stacks[kind] = self._placed(kind, stack_views(views, self._views, extras=self._extras))
+            self._stacks[kind] = self._placed(kind, stack_views(views, self._views, has_depths=self._has_depths))
         return self._stacks[kind], np.asarray([self._places[index] for index in indices], np.int32)
 
     def _placed(self, kind: Kind, batch: Photographs) -> Photographs:
@@ -228,7 +209,7 @@ class PhotoStore:
         """Return the photographs of an iteration, without those that other processes' devices draw."""
         height = self._views[indices[0]].picture.size[0]
         views, are_read = [self._views[i] for i in indices], are_drawn_here(self._exchange, len(indices), height)
-        return stack_views(views, self._views, extras=self._extras, are_read=are_read)
+        return stack_views(views, self._views, has_depths=self._has_depths, are_read=are_read)
 
     def close(self) -> None:
         """End the threads."""
@@ -267,7 +248,7 @@ def device_room() -> float:
 
 
 def stack_views(
-    views: list[View], among: tuple[View, ...] | None = None, *, extras: Extras = NO_EXTRAS,
+    views: list[View], among: tuple[View, ...] | None = None, *, has_depths: bool = False,
     are_read: Sequence[bool] | None = None,
 ) -> Photographs:  # fmt: skip
     """Return views of one image size and lens, stacked in numpy arrays.
@@ -275,8 +256,8 @@ def stack_views(
     Args:
       views: the views to stack.
       among: views that decide the structure: if one of that size has opacities or a mask, every stack of that size has
-        them, and each has room for as many points as the view with the most. None: `views`.
-      extras: data to load with the photographs. Depths are NaN where a view has no map.
+        them. None: `views`.
+      has_depths: whether depth maps are loaded with the photographs; NaN where a view has none.
       are_read: whether the pictures of each view are read; other pictures are zeros. None: all.
     """
     size = views[0].picture.size
@@ -295,7 +276,7 @@ def stack_views(
             stack[place] = own
         return stack
 
-    alphas = masks = depths = points = None
+    alphas = masks = depths = None
     if any(view.has_alpha for view in alike):
         opaque = np.full(size, 255, np.uint8)
         alphas = stacked({place: own[..., 3] if own.shape[2] == 4 else opaque for place, own in pixels.items()})
@@ -303,14 +284,11 @@ def stack_views(
         whole = np.ones(size, bool)
         of_views = {place: whole if view.mask is None else view.mask.read() for place, view in read.items()}
         masks = stacked(of_views, bool)
-    if extras.points:  # Of all views, because every device has them.
-        length = max(0 if view.points is None else len(view.points.pixels) for view in alike)
-        points = stacked_points([view.points for view in views], size, length)
-    if extras.depths:
+    if has_depths:
         unknown = np.full(size, np.nan, np.float32)
         found = {place: unknown if view.depth is None else view.depth.read() for place, view in read.items()}
         depths = stacked(found, np.float32)
     viewmats, Ks = (np.stack([np.asarray(getattr(view.camera, name)) for view in views]) for name in ("viewmat", "K"))
     images = stacked({place: own[..., :3] for place, own in pixels.items()}, channels=(3,))
     rays: Any = views[0].camera.rays
-    return Photographs(viewmats, Ks, images, alphas, masks, depths, rays, points)  # type: ignore[arg-type]
+    return Photographs(viewmats, Ks, images, alphas, masks, depths, rays)  # type: ignore[arg-type]

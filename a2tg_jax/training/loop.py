@@ -200,7 +200,9 @@ class StageRun:
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
-        self.photographs = PhotoStore(self.views, self.order, self.stage.iterations, self._exchange, self.stage.extras)
+        self.photographs = PhotoStore(
+            self.views, self.order, self.stage.iterations, self._exchange, self.stage.has_depths
+        )
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.learning = LearningCheck(
             self.views, self.order, self.stage.iterations, system.background, is_first=index == 0,

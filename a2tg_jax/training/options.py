@@ -17,7 +17,6 @@ from a2tg_jax.training.terms import (
     DepthKind,
     DepthPrior,
     Photometric,
-    PointDepths,
     RobustPhotometric,
     Term,
     distortion,
@@ -52,8 +51,6 @@ class LossConfig:
     """Rendered inverse depth against the scene's depth maps, after a least-squares scale and shift per view."""
     depth_kind: DepthKind = "inverse"
     """Meaning of depth maps: inverse depth up to scale and shift (monocular networks), or depth up to scale."""
-    points_weight: float = 0.0
-    """Rendered inverse depth against the inverse depth of the points that COLMAP observed in each photograph."""
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a number is out of range."""
@@ -73,13 +70,12 @@ class LossConfig:
         if self.robust_share:
             start, has_ssim = RobustPhotometric.start if is_first else 0.0, self.ssim_weight != 0
             first = RobustPhotometric(self.ssim_weight, self.robust_share, self.robust_factor, start, has_ssim)
-        optional: tuple[Term | DepthPrior | PointDepths, ...] = (
+        optional: tuple[Term | DepthPrior, ...] = (
             Term(normals, self.normal_weight, has_geometry=True),
             Term(distortion, self.distortion_weight, has_geometry=True),
             Term(opacity, self.opacity_weight),
             Term(scale, self.scale_weight),
             DepthPrior(self.depth_weight, self.depth_kind),
-            PointDepths(self.points_weight),
         )
         return (first, *(term for term in optional if term.weight))
 

@@ -24,7 +24,6 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput
-from a2tg_jax.training.batches import Extras
 from a2tg_jax.training.corrections import Correction
 from a2tg_jax.training.returned import calling
 from a2tg_jax.training.terms import Target
@@ -80,9 +79,8 @@ class LossTerm(Protocol):
     """A part of the loss, a pytree of its numbers.
 
     One that reads the render's depth, normal or distortion has `has_geometry = True`; one that reads the depth maps of
-    the photographs has `has_depths = True`, and one that reads the reconstruction's points has `has_points = True`.
-    The history records it by its `name`, or its class's. A term of several summands may have a method `parts` with
-    the same arguments, which returns them by name.
+    the photographs has `has_depths = True`. The history records it by its `name`, or its class's. A term of several
+    summands may have a method `parts` with the same arguments, which returns them by name.
     """
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
@@ -133,9 +131,9 @@ class Stage:
         return any(getattr(term, "has_ssim", False) for term in self.losses)
 
     @property
-    def extras(self) -> Extras:
-        """Data that loss terms read besides the photographs, as `Target.depth` and `Target.points`."""
-        return Extras(*(any(getattr(term, f"has_{name}", False) for term in self.losses) for name in Extras._fields))
+    def has_depths(self) -> bool:
+        """Whether a loss term reads the depth maps of the photographs (`Target.depth`)."""
+        return any(getattr(term, "has_depths", False) for term in self.losses)
 
     def floats_shown(self, sh_degree: int) -> float:
         """Return the floats of appearance that a Gaussian of a degree has when the stage begins (host)."""

@@ -15,11 +15,9 @@ from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.data.assembly import Sight, unseeing
-from a2tg_jax.data.observations import check_observed_points
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.training.batches import Extras
 from a2tg_jax.training.losses import SSIM_WINDOW
 from a2tg_jax.training.options import System
 from a2tg_jax.training.sky import check_sky, sky_of
@@ -121,9 +119,7 @@ def check_start(scene: Scene, system: System) -> None:
 
 
 def check_loss_data(views: tuple[View, ...], stages: Sequence[Stage]) -> None:
-    """Raise ValueError unless at least one view has each of the data that losses read, and all are large enough for
-    SSIM."""
-    extras = Extras(*map(any, zip(*(stage.extras for stage in stages), strict=True)))
+    """Raise ValueError if losses read depth maps and no view has one, or if a view is too small for their SSIM."""
     for view in views if any(stage.has_ssim for stage in stages) else ():
         if min(view.picture.size) < SSIM_WINDOW:
             height, width = view.picture.size
@@ -131,16 +127,10 @@ def check_loss_data(views: tuple[View, ...], stages: Sequence[Stage]) -> None:
                 f"view {view.name} has {width} by {height} pixels, but the loss has SSIM, which needs {SSIM_WINDOW} by "
                 f"{SSIM_WINDOW}: take larger photographs, or set loss.ssim_weight to 0"
             )
-    if extras.depths and all(view.depth is None for view in views):
+    if any(stage.has_depths for stage in stages) and all(view.depth is None for view in views):
         raise ValueError(
             "loss.depth_weight, or a custom term, needs depth maps, but no training view has one: put them as "
             "NAME.npy or NAME.png into the folder depths next to images, or leave it out"
-        )
-    if extras.points and all(view.points is None for view in views):
-        raise ValueError(
-            "loss.points_weight, or a custom term, needs points that photographs observed, but no training view "
-            "has any: load a COLMAP model whose images list them (in Python, use scene_from_arrays(…, observed=…)), or "
-            "leave it out"
         )
 
 
@@ -167,8 +157,6 @@ def check_views(views: tuple[View, ...]) -> None:
                 )
         if view.mask is not None and not view.mask.num:
             raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or fix its mask")
-        if view.points is not None:
-            check_observed_points(view.points, (height, width), f"points of view {view.name}")
 
 
 def _rows_needed(stage: Stage, num: int, system: System) -> int:

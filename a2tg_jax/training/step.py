@@ -262,12 +262,12 @@ def batch_gradients(
     def loss(
         shown: Model, seen: TracedView, output: RenderOutput
     ) -> tuple[Array, tuple[Array, Array, dict[str, Array]]]:
-        image, alpha, mask, depth, points = seen.target
+        image, alpha, mask, depth = seen.target
         photograph = over_background(image, alpha, seen.background)
         color = corrected_color(seen.corrections, seen.rows, output.color)
         if mask is not None:  # Excluded pixels of both are black, so that they add to no loss term.
             photograph, color = (jnp.where(mask[..., None], x, jnp.zeros_like(x)) for x in (photograph, color))
-        target = Target(seen.camera, photograph, seen.background, mask, clock.progress(iteration - 1), depth, points)
+        target = Target(seen.camera, photograph, seen.background, mask, clock.progress(iteration - 1), depth)
         output = dataclasses.replace(output, color=color)
         parts_by_name: dict[str, Array] = {}
         values: list[Array] = []
@@ -299,7 +299,7 @@ def batch_gradients(
         own = BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe, terms)
         return own, found.appearance
 
-    pictures = batch.images, batch.alphas, batch.masks, batch.depths, batch.points
+    pictures = batch.images, batch.alphas, batch.masks, batch.depths
     arrays = batch.viewmats, batch.Ks, backgrounds, own, pictures
     exchange = settings.exchange
     if exchange is None or exchange.views_at_once == 1:

@@ -15,13 +15,10 @@ from jax import Array
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.numerics import safe_divide
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.data.observations import ObservedPoints
 from a2tg_jax.model import Model
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.training.losses import live_mean, normal_consistency, photometric_loss, photometric_parts
 from a2tg_jax.training.returned import check_scalar
-
-NOT_LOADED = "target.{name} was not loaded: use {flag}=True, as in Term(function, {flag}=True) for a custom loss term"
 
 
 @pytree
@@ -40,22 +37,16 @@ class Target:
     """Share of the stage that is done."""
     depth_map: Array | None = None
     """`depth`, or None unless a term of the stage has `has_depths`."""
-    observed: ObservedPoints | None = None
-    """`points`, or None unless a term of the stage has `has_points`."""
 
     @property
     def depth(self) -> Array:
         """[H, W] depth map, divided by its largest magnitude, NaN where unknown. Raises ValueError if not loaded."""
         if self.depth_map is None:
-            raise ValueError(NOT_LOADED.format(name="depth", flag="has_depths"))
+            raise ValueError(
+                "target.depth was not loaded: use has_depths=True, as in Term(function, has_depths=True) for a custom "
+                "loss term"
+            )
         return self.depth_map
-
-    @property
-    def points(self) -> ObservedPoints:
-        """Points [S] that the photograph observed. Raises ValueError if they were not loaded."""
-        if self.observed is None:
-            raise ValueError(NOT_LOADED.format(name="points", flag="has_points"))
-        return self.observed
 
 
 LossFunction = Callable[[Model, Target, RenderOutput], Array]
@@ -81,8 +72,6 @@ class Term:
     term of the stage needs them, reading them raises ValueError."""
     has_depths: bool = static(default=False)
     """Whether the function reads `target.depth`, the depth map of the photograph."""
-    has_points: bool = static(default=False)
-    """Whether the function reads `target.points`, the points that the photograph observed."""
 
     def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
         value = self.function(model, target, output)
@@ -229,20 +218,6 @@ class DepthPrior:
         return self.weight * depth_loss(output.depth, output.alpha, prior, counts, has_shift=self.kind == "inverse")
 
 
-@pytree
-class PointDepths:
-    """Mean absolute difference of inverse depths at the points that the photograph observed (`points_loss`)."""
-
-    weight: float
-
-    name = "points"
-    has_geometry = True
-    has_points = True
-
-    def __call__(self, model: Model, target: Target, output: RenderOutput) -> Array:
-        return self.weight * points_loss(output.depth, output.alpha, target.points, target.mask)
-
-
 def depth_loss(depth: Array, alpha: Array, prior: Array, counts: Array, *, has_shift: bool = True) -> Array:
     """Mean |s·prior + t − alpha/depth| over the pixels that count and are covered.
 
@@ -261,33 +236,7 @@ def depth_loss(depth: Array, alpha: Array, prior: Array, counts: Array, *, has_s
     inverse = jnp.where(counts, safe_divide(alpha, depth), 0.0)
     prior = jnp.where(counts, prior, 0.0)
     scale, shift = jax.lax.stop_gradient(scale_and_shift(prior, inverse, counts, has_shift=has_shift))
-    return _mean_error(scale * prior + shift, inverse, counts)
-
-
-def points_loss(depth: Array, alpha: Array, points: ObservedPoints, mask: Array | None = None) -> Array:
-    """Mean |1/z − alpha/depth| over the pixels of points [S] of depth z that count and are covered; 0 without any.
-
-    Depth and alpha [H, W] are as in `depth_loss`; the mask [H, W] is True at pixels that count, and None if all do.
-    """
-
-    def at_points(image: Array) -> Array:
-        # 0 at pixels beyond the end of the image, which fill up the points of a view with few.
-        values = image.reshape(-1).at[points.pixels]
-        # Padding ascends beyond the image (`stacked_points`), so that indices are unique and sorted.
-        return values.get(mode="fill", fill_value=0, unique_indices=True, indices_are_sorted=True)
-
-    depth, alpha = at_points(depth), at_points(alpha)
-    # The depth of padding is 0.
-    counts = (points.depths > 0) & (alpha > LEAST_ALPHA) & (depth > 0)
-    if mask is not None:
-        counts = counts & at_points(mask)
-    known = safe_divide(jnp.ones_like(points.depths), points.depths)
-    inverse, known = (jnp.where(counts, x, 0.0) for x in (safe_divide(alpha, depth), known))
-    return _mean_error(known, inverse, counts)
-
-
-def _mean_error(one: Array, other: Array, counts: Array) -> Array:
-    error = jnp.where(counts, jnp.abs(one - other), 0.0)
+    error = jnp.where(counts, jnp.abs(scale * prior + shift - inverse), 0.0)
     return jnp.sum(error) / jnp.maximum(jnp.sum(counts), 1).astype(error.dtype)
 
 
