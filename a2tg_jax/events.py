@@ -152,8 +152,6 @@ class Event:
     `placed_like`, which never puts all rows on one device (`parallel.sharded_rows`).
     """
 
-    prunes_large: ClassVar[bool] = False
-    """Whether it prunes Gaussians for their size, so that no sky can be trained."""
     limited_by: ClassVar[str] = ""
     """Field that bounds the number of Gaussians, such as "cap"; advice names it."""
 

@@ -21,10 +21,10 @@ FLAGS = {
         "memory-budget more noise-in-stage2 num-processes on-nan opacity-reset.most out overwrite place.at place.cap "
         "place.share preset process-id prune.at prune.keep prune.share quiet rates.log-scales rates.logit-opacities "
         "rates.means rates.means-final-factor rates.quats rates.sh-degree0 rates.sh-rest refine-poses resume seed "
-        "sh-degree single-texel-rate sky-gaussians stage1-iterations stage2-iterations system tensorboard test-every "
-        "texel-rate texture-share texture-side texture.anisotropic texture.at texture.axes texture.budget-mb "
-        "texture.cap texture.fraction texture.gradient texture.k-a texture.k-s texture.moments texture.select "
-        "texture.threshold tile-size validation view view-dependence-rate view-dependence-share view-dependence.at "
+        "sh-degree single-texel-rate stage1-iterations stage2-iterations system tensorboard test-every texel-rate "
+        "texture-share texture-side texture.anisotropic texture.at texture.axes texture.budget-mb texture.cap "
+        "texture.fraction texture.gradient texture.k-a texture.k-s texture.moments texture.select texture.threshold "
+        "tile-size validation view view-dependence-rate view-dependence-share view-dependence.at "
         "view-dependence.budget-mb view-dependence.highest view-dependence.idle yes "
     ),
     "eval": "json lpips-weights",

@@ -73,7 +73,6 @@ class CloneSplitPrune(StepEvent):
     largest_share: float = 0.1
     """Largest size as a share of scene_scale; larger Gaussians are pruned after the first reset of opacities."""
 
-    prunes_large = True
     limited_by = "cap"
     impossible: ClassVar[str] = "adaptive density control would prune every Gaussian; a lower least_opacity keeps some"
 

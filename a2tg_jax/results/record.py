@@ -122,8 +122,6 @@ class RunRecord:
             check_encodable(self.options.stages()[-1].appearance, "the file of file_budget", "leave it out")
         if self.init is not None and len(self.plan.main) < 2:
             raise ValueError(f"init replaces a first stage, and {self.system} has no second one")
-        if self.init is not None and self.options.sky_gaussians:
-            raise ValueError("init replaces a first stage, and sky_gaussians start in one: leave one out")
 
     @property
     def file_bytes(self) -> int | None:

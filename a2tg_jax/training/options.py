@@ -117,10 +117,6 @@ class System:
     """Views per iteration."""
     initial_gaussians: int | None = None
     """Number of Gaussians to start from; None: one per point, at most the cap."""
-    sky_gaussians: int = 0
-    """Number of the initial Gaussians that start as the sky of an outdoor capture, on a sphere around the cameras,
-    where training views see no points; 0: none. Its radius is 10 times the distance of the farthest points, 1 % of them
-    left out. Not for systems that prune splats of that size."""
     initial_opacity: float = 0.1
     """Opacity of the Gaussians that training starts from; billboards with alpha textures always start half opaque in
     the middle."""
@@ -307,7 +303,6 @@ class System:
         check_number("batch_size", self.batch_size, least=1)
         if self.initial_gaussians is not None:
             check_number("initial_gaussians", self.initial_gaussians, least=2)
-        check_number("sky_gaussians", self.sky_gaussians, least=0)
         check_number("initial_opacity", self.initial_opacity, above=0, below=1)
         check_number("sh_degree", self.sh_degree, least=0, most=3)
         check_int("seed", self.seed, 0, 2**31 - 1)
@@ -326,21 +321,6 @@ class System:
             raise ValueError(f"the stages of {type(self).__name__} must have different names; got {', '.join(names)}")
         for stage in self.all_stages():
             stage.check()
-        # A sky would be pruned for its size, or leave no room for the Gaussians at points.
-        pruning = next((event for stage in stages for event in stage.events if event.prunes_large), None)
-        if self.sky_gaussians and pruning is not None:
-            raise ValueError(
-                f"sky_gaussians are as large as what {type(pruning).__name__} prunes: leave out sky_gaussians, or take "
-                "a system without this event"
-            )
-        caps = [most for event in stages[0].events if (most := event.most_gaussians) is not None]
-        room = min([*caps, self.initial_gaussians or math.inf])
-        if self.sky_gaussians and self.sky_gaussians > room - 2:
-            limits = " and ".join(self.limits()) if room in caps else "initial_gaussians"
-            raise ValueError(
-                f"sky_gaussians must leave room for 2 others among the {room:,} that training starts from at most; got "
-                f"{self.sky_gaussians:,}: lower sky_gaussians, or raise {limits}"
-            )
         # Corrections that would do nothing.
         if self.corrections.exposure_kind != "affine" and not self.exposure:
             raise ValueError(

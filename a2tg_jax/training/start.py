@@ -20,7 +20,6 @@ from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.training.losses import SSIM_WINDOW
 from a2tg_jax.training.options import System
-from a2tg_jax.training.sky import check_sky, sky_of
 from a2tg_jax.training.stage import Stage
 
 KEY_OF_APPEARANCE = 0x7E8E1  # no stage's number, which is folded into the same key
@@ -32,15 +31,10 @@ GREY, GREY_SLACK = 0.5, 0.01
 
 
 def initial_model(scene: Scene, system: System) -> Model:
-    """Return Gaussians at the scene's points and of its sky, as many as the first stage has room for."""
+    """Return Gaussians at the scene's points, as many as the first stage has room for."""
     first = system.stages()[0]
     num, degree, opacity = initial_number(scene, system, first), system.initial_sh_degree, system.initial_opacity
-    num_sky = system.sky_gaussians
-    sky = sky_of(scene, num_sky, opacity=opacity, sh_degree=degree) if num_sky else None
-    gaussians = init_from_points(
-        scene.points, start_colors(scene), num - num_sky, system.seed, opacity=opacity, sh_degree=degree
-    )
-    gaussians = gaussians if sky is None else _followed_by(gaussians, sky)
+    gaussians = init_from_points(scene.points, start_colors(scene), num, system.seed, opacity=opacity, sh_degree=degree)
     adapted = fainter_where_dense if first.appearance.has_low_pass else wider_where_dense
     return Model(adapted(gaussians, [view.camera for view in scene.train]))
 
@@ -101,10 +95,10 @@ def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarra
 
 
 def check_start(scene: Scene, system: System) -> None:
-    """Raise ValueError, naming the options to change, if no training view sees any point, the events of the first stage
-    cannot work with the initial number of Gaussians, or no view sees a sky for its Gaussians."""
+    """Raise ValueError, naming the options to change, if no training view sees any point, or the events of the first
+    stage cannot work with the initial number of Gaussians."""
     points, first = np.asarray(scene.points), system.stages()[0]
-    if np.isfinite(points).all() and not system.sky_gaussians:  # `init_from_points` names others.
+    if np.isfinite(points).all():  # `init_from_points` names others.
         sights = [Sight.of_camera(view.camera) for view in scene.train]
         if len(unseeing(points, sights)) == len(sights):
             raise ValueError(
@@ -114,8 +108,6 @@ def check_start(scene: Scene, system: System) -> None:
     num = initial_number(scene, system, first)
     _rows_needed(first, num, system)
     system.check_number(num)
-    if system.sky_gaussians:
-        check_sky(scene, system.sky_gaussians)
 
 
 def check_loss_data(views: tuple[View, ...], stages: Sequence[Stage]) -> None:
@@ -177,10 +169,9 @@ def _rows_needed(stage: Stage, num: int, system: System) -> int:
 
 
 def initial_number(scene: Scene, system: System, first: Stage) -> int:
-    """Return the number of initial Gaussians: as requested, at most one for each point plus the sky's, and at most what
-    the first stage has room for."""
-    room = len(scene.points) + system.sky_gaussians
-    num = min(system.initial_gaussians or room, room)
+    """Return the number of initial Gaussians: as requested, at most one for each point, and at most what the first
+    stage has room for."""
+    num = min(system.initial_gaussians or len(scene.points), len(scene.points))
     caps = [most for event in first.events if (most := event.most_gaussians) is not None]
     return min(num, *caps) if caps else num
 
