@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lab.ellipsoids import Ellipsoids, Gaussians3dMcmc
+from oracle import rotation_matrix
 
 import a2tg_jax as a2tg
 
@@ -34,12 +35,7 @@ def published(gaussians, appearance, camera):
     colors = np.asarray(a2tg.Appearance().own_colors(gaussians, camera, 1))
     splats = []
     for i in range(gaussians.num):
-        w, x, y, z = np.asarray(gaussians.quats[i]) / np.linalg.norm(gaussians.quats[i])
-        R = np.array([
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ])  # fmt: skip
+        R = rotation_matrix(np.asarray(gaussians.quats[i]))
         S = np.diag(np.exp([*np.asarray(gaussians.log_scales[i]), float(appearance.log_thickness[i])]))
         a, b, c = W @ np.asarray(gaussians.means[i]) + t
         limits = 1.3 * 0.5 * camera.width / K[0, 0], 1.3 * 0.5 * camera.height / K[1, 1]
