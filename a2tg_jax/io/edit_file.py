@@ -1,6 +1,7 @@
 """Edits as JSON: what the viewer hides, turns and colours, applied to a model for all other files."""
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,10 @@ import numpy as np
 from a2tg_jax.core.floaters import floater_scores
 from a2tg_jax.core.origin import Color, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import AxisSteps
-from a2tg_jax.io.saved_file import load_saved, numbers_of, save_saved
+from a2tg_jax.io.saved_file import VERSION, load_saved, numbers_of
 from a2tg_jax.model import Model
 
 # As in web/src/extent.ts.
@@ -74,7 +76,7 @@ def save_edit(path: Path, edit: Edit) -> None:
     changes |= {"floaters": edit.floaters} if edit.floaters else {}
     changes |= {} if edit.up is None else {"up": edit.up.tolist()}
     changes |= {} if edit.background is None else {"background": list(edit.background)}
-    save_saved(path, "edit", changes)
+    write_whole(path, json.dumps({"format": "a2tg-jax edit", "version": VERSION, **changes}, indent=1) + "\n")
 
 
 def crop_box(model: Model, up: np.ndarray, low: np.ndarray, high: np.ndarray) -> Box:

@@ -1,13 +1,11 @@
 """JSON files that the viewer saves: paths and edits."""
 
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import read_json
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import shortened
@@ -43,9 +41,3 @@ def numbers_of(values: object, count: int, name: str, null: float | None = None)
         wanted = f"{count} numbers{'' if null is None else ' or null'}"
         raise ValueError(f"{name} must be {wanted}; got {shortened(values)}")
     return np.array([null if x is None else x for x in values], np.float64)
-
-
-def save_saved(path: Path, kind: str, content: Mapping[str, Any]) -> None:
-    """Write a file of a kind, as the viewer does."""
-    text = json.dumps({"format": f"a2tg-jax {kind}", "version": VERSION, **content}, indent=1)
-    write_whole(path, text + "\n")

@@ -63,18 +63,17 @@ class ServedPhotographs:
     def __init__(self, origin: Origin | None, load_scene: Callable[[], Scene | None], background: Color = BLACK):
         self._names, self._background = () if origin is None else origin.names, background
         self._load_scene, self._lock = load_scene, threading.Lock()
+        self._found: dict[int, View] | None = None
 
     @property
     def views(self) -> dict[int, View]:
         """Views by the index of their cameras."""
         with self._lock:  # The server has several threads; the scene is read once.
+            if self._found is None:
+                scene = self._load_scene() if self._names else None
+                by_name = {} if scene is None else {view.name: view for view in (*scene.train, *scene.test)}
+                self._found = {index: by_name[name] for index, name in enumerate(self._names) if name in by_name}
             return self._found
-
-    @functools.cached_property
-    def _found(self) -> dict[int, View]:
-        scene = self._load_scene() if self._names else None
-        by_name = {} if scene is None else {view.name: view for view in (*scene.train, *scene.test)}
-        return {index: by_name[name] for index, name in enumerate(self._names) if name in by_name}
 
     def jpeg(self, index: int) -> bytes | None:
         """Return a photograph over the model's background, in its camera's size."""

@@ -16,7 +16,7 @@ from jax import Array
 from a2tg_jax.core.geometry import Outline
 from a2tg_jax.rasterize.kernels.jaxprs import refusal_of
 from a2tg_jax.rasterize.kernels.native import ffi
-from a2tg_jax.rasterize.kernels.native.lists import ListFunctions, list_functions
+from a2tg_jax.rasterize.kernels.native.lists import list_functions
 from a2tg_jax.rasterize.kernels.native.llvm_code import CompiledFunction
 from a2tg_jax.rasterize.kernels.native.passes import BACKWARD_BYTES, FORWARD_BYTES, compiled_passes, packed_pixels
 from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats, pack_inputs, unpack_gradients
@@ -62,11 +62,7 @@ def _packed(settings: PassSettings, inputs: PassInputs, vector_bytes: int) -> tu
 def _registered(
     kernel: PassSettings, which: Literal["forward", "backward"], make_handler: Callable[[CompiledFunction], ffi.Handler]
 ) -> str:
-
-    def handler() -> ffi.Handler:
-        return make_handler(getattr(compiled_passes(kernel), which))
-
-    return ffi.registered(f"{which} {kernel!r}", (which, kernel), handler)
+    return ffi.registered(f"{which} {kernel!r}", (which, kernel), lambda: make_handler(compiled_passes(kernel)[which]))
 
 
 def _forward_handler(run: CompiledFunction) -> ffi.Handler:
@@ -225,7 +221,8 @@ def tile_lists(
     return TileLists(ids, starts, num_pairs, overflow, height=height)
 
 
-def _list_handler(functions: ListFunctions, arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+def _list_handler(functions: list[CompiledFunction], arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
+    run_bound, run_find, run_place = functions
     M, cutoff, size = arguments
     ids, starts, total, overflow = results
     columns, width, height = map(int, size)
@@ -233,7 +230,7 @@ def _list_handler(functions: ListFunctions, arguments: list[np.ndarray], results
     outlines, rectangles = np.empty((num, len(Outline._fields)), M.dtype), np.empty((num, 4), np.int32)
 
     def bound(first: int, last: int, _: int) -> None:
-        functions.bound(*_addresses(M, cutoff, outlines, rectangles), first, last, width, height)
+        run_bound(*_addresses(M, cutoff, outlines, rectangles), first, last, width, height)
 
     ffi.run_spans(bound, ffi.even_spans(num, SPLATS_PER_THREAD))
     room = int(rectangles[:, 3].sum(dtype=np.int64))
@@ -253,7 +250,7 @@ def _list_handler(functions: ListFunctions, arguments: list[np.ndarray], results
     def find(first: int, last: int, index: int) -> None:
         found = tiles[begins[first] :], splats[begins[first] :]
         buffers = order[first:], rectangles, outlines, counts[index], *found
-        functions.find(*_addresses(*buffers), last - first, columns)
+        run_find(*_addresses(*buffers), last - first, columns)
 
     ffi.run_spans(find, spans)
     np.cumsum(counts.sum(axis=0), out=starts[1:])
@@ -262,7 +259,7 @@ def _list_handler(functions: ListFunctions, arguments: list[np.ndarray], results
 
     def place(first: int, _: int, index: int) -> None:
         found = tiles[begins[first] :], splats[begins[first] :]
-        functions.place(*_addresses(*found, cursors[index], ids), int(counts[index].sum()))
+        run_place(*_addresses(*found, cursors[index], ids), int(counts[index].sum()))
 
     ffi.run_spans(place, spans)
 

@@ -14,7 +14,6 @@ its end afterwards.
 """
 
 import functools
-from typing import NamedTuple
 
 import jax.numpy as jnp
 from llvmlite import ir
@@ -117,19 +116,13 @@ def _write_place(module: ir.Module, name: str) -> None:
     b.ret_void()
 
 
-class ListFunctions(NamedTuple):
-    bound: CompiledFunction
-    find: CompiledFunction
-    place: CompiledFunction
-
-
 @functools.cache
-def list_functions(dtype: str, tile_size: int, near_plane: float) -> ListFunctions:
-    """Return the functions for homographies of a dtype and tiles of a size, compiled at the first call."""
+def list_functions(dtype: str, tile_size: int, near_plane: float) -> list[CompiledFunction]:
+    """Return `bound`, `find` and `place` for a dtype and tiles of a size, compiled at the first call."""
     module = ir.Module("lists")
     bound, find, place = (llvm_code.unique(name) for name in ("bound", "find", "place"))
     _write_bound(module, bound, dtype, tile_size, near_plane)
     _write_find(module, find, dtype, tile_size)
     _write_place(module, place)
     signatures = {bound: (len(BOUND), 4), find: (len(FIND), 2), place: (len(PLACE), 1)}
-    return ListFunctions(*llvm_code.compiled(module, signatures))
+    return llvm_code.compiled(module, signatures)

@@ -376,17 +376,12 @@ class _Backward(_Pass):
                 self.store(self.b.fadd(self.load(row, k, self.real), value), row, k)
 
 
-class Passes(NamedTuple):
-    forward: CompiledFunction
-    backward: CompiledFunction
-
-
 @functools.cache
-def compiled_passes(kernel: PassSettings) -> Passes:
-    """Return the passes of a kernel, compiled at the first call."""
+def compiled_passes(kernel: PassSettings) -> dict[str, CompiledFunction]:
+    """Return the passes `forward` and `backward` of a kernel, compiled at the first call."""
     functions, module = PixelFunctions(kernel), ir.Module("passes")
     forward, backward = (llvm_code.unique(name) for name in ("forward", "backward"))
     _Forward(functions, module, forward, FORWARD).write()
     _Backward(functions, module, backward, BACKWARD).write()
     signatures = {forward: (len(FORWARD), len(INTEGERS)), backward: (len(BACKWARD), len(INTEGERS))}
-    return Passes(*llvm_code.compiled(module, signatures))
+    return dict(zip(("forward", "backward"), llvm_code.compiled(module, signatures), strict=True))
