@@ -248,7 +248,14 @@ def encode_model(
                 writer.means(axes, keys[places], bits)
             else:
                 writer.numbers("means", part.means.T, choices.means)
-            _write(writer, part, choices, header)
+            writer.indices("degrees", np.searchsorted(header["degrees"], part.degrees), len(header["degrees"]))
+            if part.sizes is not None:
+                # A pair of sides as one number, which orders pairs as np.unique does.
+                pairs = np.reshape(header["sizes"], (-1, 2)), part.sizes
+                table, found = (sizes @ [MAX_SIDE + 1, 1] for sizes in pairs)
+                writer.indices("sizes", np.searchsorted(table, found), len(table))
+            for name, values, precision, is_color in _columns(part, choices):
+                writer.numbers(name, values, precision, is_color=is_color)
             if floaters is not None:
                 writer.planes(FLOATERS, floaters[order[places]][None])
         return framed(header | {"parts": writer.parts, "ends": writer.ends}, writer.body), writer.num_unpacked
@@ -256,17 +263,6 @@ def encode_model(
     data, num_unpacked = encoded(choices.coder)
     # Very repetitive numbers are not coded: readers would take the file for a decompression bomb.
     return data if num_unpacked <= room_of(len(data)) else encoded("none")[0]
-
-
-def _write(writer: ColumnWriter, rows: Rows, choices: CompactChoices, header: Mapping[str, Any]) -> None:
-    """Write everything in a chunk except its means."""
-    writer.indices("degrees", np.searchsorted(header["degrees"], rows.degrees), len(header["degrees"]))
-    if rows.sizes is not None:
-        # A pair of sides as one number, which orders pairs as np.unique does.
-        table, found = (np.asarray(sizes).reshape(-1, 2) @ [MAX_SIDE + 1, 1] for sizes in (header["sizes"], rows.sizes))
-        writer.indices("sizes", np.searchsorted(table, found), len(table))
-    for name, values, precision, is_color in _columns(rows, choices):
-        writer.numbers(name, values, precision, is_color=is_color)
 
 
 def _columns(rows: Rows, choices: CompactChoices) -> Iterator[tuple[str, np.ndarray, Precision, bool]]:

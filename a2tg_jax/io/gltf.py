@@ -221,7 +221,7 @@ def _splats(document: Document, attributes: Mapping[str, object]) -> others.Elli
     # xyzw to wxyz.
     means, quats = numbers(MEANS, "VEC3"), numbers(ROTATION, "VEC4")[:, [3, 0, 1, 2]]
     scales, opacities = numbers(SCALE, "VEC3"), numbers(OPACITY, "SCALAR")[:, 0]
-    tried = range(others.HIGHEST_DEGREE + 2)  # One more than is read, for the warning.
+    tried = range(MAX_DEGREE + 2)  # One more than is read, for the warning.
     found = max((degree for degree in tried if coefficient(degree, 0) in attributes), default=0)
     degree = others.degree_to_read(found, str(document.path))
     names = [coefficient(band, order) for band in range(degree + 1) for order in range(2 * band + 1)]

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.appearance.parts import nearest_gaussians
+from a2tg_jax.appearance.parts import MAX_DEGREE, nearest_gaussians
 from a2tg_jax.core.camera_paths import upright_rotation
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gaussians, logit
 from a2tg_jax.core.origin import Origin
@@ -42,7 +42,6 @@ UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
 LEVEL = math.cos(math.radians(3))
 """Cosine of the largest angle between the estimated vertical and an axis that counts as the vertical itself."""
 LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-6
-HIGHEST_DEGREE = len(NUM_BASES) - 1
 THICKNESS = 1e-3
 """Ratio of a flat Gaussian's third scale in a file to its shorter one."""
 # Turns by 120° and −120° about (1, 1, 1), and none.
@@ -294,10 +293,10 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
 
 def degree_to_read(degree: int, name: str) -> int:
     """Return the SH degree to read from a file, at most 3. Warn if the file's is higher."""
-    if degree > HIGHEST_DEGREE:
-        message = f"{name}: has SH of degree {degree}; degree {HIGHEST_DEGREE} is read, and what is above it left out"
+    if degree > MAX_DEGREE:
+        message = f"{name}: has SH of degree {degree}; degree {MAX_DEGREE} is read, and what is above it left out"
         warnings.warn(message, stacklevel=4)
-    return min(degree, HIGHEST_DEGREE)
+    return min(degree, MAX_DEGREE)
 
 
 # Worlds

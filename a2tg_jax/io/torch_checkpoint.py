@@ -68,7 +68,19 @@ def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
             reason = shortened(str(error) or type(error).__name__, 200)
             raise ValueError(f"{path}: is not a PyTorch checkpoint (1.6 or newer), or is damaged ({reason})") from error
     with reading(path):
-        return _gaussians_of(arrays, path)
+        means = arrays["means"]
+        num = len(means)
+        bands = [arrays[name].reshape(num, -1, 3) for name in ("sh0", "shN") if name in arrays]
+        sh, log_scales = np.concatenate(bands, axis=1), arrays["scales"]
+        if sh.shape[1] not in COEFFICIENTS or bands[0].shape[1] != 1 or log_scales.shape[1:] not in ((2,), (3,)):
+            found = f"{sh.shape[1]} coefficients and {log_scales.shape[-1]} scales of each Gaussian"
+            raise ValueError(f"has {found}; SH of degree 0 to 4 have 1, 4, 9, 16 or 25, and Gaussians 2 or 3 scales")
+        sh = sh[:, : COEFFICIENTS[degree_to_read(COEFFICIENTS.index(sh.shape[1]), str(path))]]
+        quats, logits = arrays["quats"].reshape(num, 4), arrays["opacities"].reshape(num)
+        columns = flat_rows(str(path), means.reshape(num, 3), quats, log_scales, logits, sh)
+        gaussians = Gaussians(*map(jnp.asarray, columns))
+        check_model(Model(gaussians))
+        return gaussians
 
 
 class _Refused(Exception):
@@ -222,20 +234,3 @@ def _array(tensor: _Tensor, archive: zipfile.ZipFile, folder: str) -> np.ndarray
     strides = [stride * dtype.itemsize for stride in tensor.stride]
     # A copy, for strides may overlap.
     return np.array(np.lib.stride_tricks.as_strided(flat[tensor.offset :], size, strides), np.float32)
-
-
-def _gaussians_of(arrays: Mapping[str, np.ndarray], path: Path) -> Gaussians:
-    """Return the Gaussians of arrays by gsplat's names. Raises ValueError if the shapes disagree."""
-    means = arrays["means"]
-    num = len(means)
-    bands = [arrays[name].reshape(num, -1, 3) for name in ("sh0", "shN") if name in arrays]
-    sh, log_scales = np.concatenate(bands, axis=1), arrays["scales"]
-    if sh.shape[1] not in COEFFICIENTS or bands[0].shape[1] != 1 or log_scales.shape[1:] not in ((2,), (3,)):
-        found = f"{sh.shape[1]} coefficients and {log_scales.shape[-1]} scales of each Gaussian"
-        raise ValueError(f"has {found}; SH of degree 0 to 4 have 1, 4, 9, 16 or 25, and Gaussians 2 or 3 scales")
-    sh = sh[:, : COEFFICIENTS[degree_to_read(COEFFICIENTS.index(sh.shape[1]), str(path))]]
-    quats, logits = arrays["quats"].reshape(num, 4), arrays["opacities"].reshape(num)
-    columns = flat_rows(str(path), means.reshape(num, 3), quats, log_scales, logits, sh)
-    gaussians = Gaussians(*map(jnp.asarray, columns))
-    check_model(Model(gaussians))
-    return gaussians

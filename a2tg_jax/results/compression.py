@@ -162,7 +162,12 @@ def compress(
     share = f"1/{model.num_bytes / chosen.num_bytes:.1f} of the model's numbers"
     size = f"{out}: {in_bytes(chosen.num_bytes)} on disk, {share}, {loss_text(chosen.losses[0])}"
     lines = _table(trials, found, chosen, losses) if verbose else []
-    return "\n".join([*lines, *_notes(found, max_bytes), size])
+    if found.diverged:
+        lines.append(f"tuning ended early, what was found before is kept: {found.diverged}")
+    if max_bytes is not None and found.tried and found.chosen is None:
+        best = f"the best of {len(found.tried)} has {in_bytes(min(trial.num_bytes for trial in found.tried))}"
+        lines.append(f"no tuned file is small enough, {best}: the untuned one is kept")
+    return "\n".join([*lines, size])
 
 
 def command_for_file(run: RunFolder, size: str) -> str:
@@ -202,16 +207,6 @@ def _table(trials: Sequence[Trial], found: TunedFiles, chosen: Trial, measures: 
         kept = ", ".join(f"{group} {getattr(trial.choices, group)}" for group in GROUPS if group in groups)
         bits.append(f"{name}: {kept}")
     return [*aligned(list(zip(*rows, strict=True))), *bits]
-
-
-def _notes(found: TunedFiles, max_bytes: int | None) -> list[str]:
-    """Return lines about a tuning that ended early, and about tuned files that are all too large."""
-    notes = [f"tuning ended early, what was found before is kept: {found.diverged}"] if found.diverged else []
-    if max_bytes is not None and found.tried and found.chosen is None:
-        least = in_bytes(min(trial.num_bytes for trial in found.tried))
-        best = f"the best of {len(found.tried)} has {least}"
-        notes.append(f"no tuned file is small enough, {best}: the untuned one is kept")
-    return notes
 
 
 def _better(

@@ -26,7 +26,8 @@ from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.images import file_uri, jpeg_uri
 from a2tg_jax.results.record import RunPlan, RunRecord, repeating_command, training_command
 
-QUALITIES = ("PSNR (dB)", "SSIM", "LPIPS")
+QUALITIES = (("PSNR (dB)", "psnr", 2), ("SSIM", "ssim", 4), ("LPIPS", "lpips", 4))
+"""Rows of the summary: name, metric, and decimals."""
 WAYS = {
     "color_fit": "colours fitted",
     "aligned": "poses aligned",
@@ -166,8 +167,9 @@ def summary_table(result: RunResult, names: Sequence[str]) -> tuple[list[str], l
     for split in dict.fromkeys(split for measured in models for split in measured.splits):
         views, _, way = split.partition("_")
         title = f"{views}, {WAYS[way]}:" if way else views
-        cells = zip(*(_qualities(measured.splits.get(split)) for measured in models), strict=True)
-        rows += [[f"{title} {name}", *row] for name, row in zip(QUALITIES, cells, strict=True)]
+        for name, figure, digits in QUALITIES:
+            values = [getattr(measured.splits.get(split), figure, None) for measured in models]
+            rows.append([f"{title} {name}", *("" if value is None else f"{value:.{digits}f}" for value in values)])
     figures = [
         {
             "Gaussians": f"{found.num_gaussians:,}",
@@ -279,13 +281,6 @@ def minutes(seconds: float) -> str:
     if whole >= 3600:
         return f"{whole // 3600} h {whole % 3600 // 60} min"
     return f"{whole // 60} min {whole % 60} s" if whole >= 60 else f"{whole} s"
-
-
-def _qualities(found: Evaluation | None) -> list[str]:
-    """Return PSNR, SSIM and LPIPS; empty for a missing metric."""
-    if found is None:
-        return ["", "", ""]
-    return [f"{found.psnr:.2f}", f"{found.ssim:.4f}", "" if found.lpips is None else f"{found.lpips:.4f}"]
 
 
 # The page
