@@ -11,8 +11,6 @@ import a2tg_jax as a2tg
 from a2tg_jax.results.record import common_options, is_equal
 
 PACKAGE = "a2tg_jax"
-FORMER_FIELDS = {f"{PACKAGE}.Term": (("has_points", False),)}
-"""Fields that classes had, with their values, when the committed records were made: their keys are still found."""
 
 
 def is_same_so_far(made: a2tg.System, wanted: a2tg.System, index: int) -> bool:
@@ -39,9 +37,8 @@ def _described(value: Any) -> Any:
     if value is None or isinstance(value, str | bool | int | float):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        name = _name_of(type(value))
         wording = tuple((field.name, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
-        return name, wording + FORMER_FIELDS.get(name, ())
+        return _name_of(type(value)), wording
     if isinstance(value, tuple | list):
         return _name_of(type(value)), *map(_described, value)
     if isinstance(value, Mapping):
