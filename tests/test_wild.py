@@ -13,7 +13,6 @@ from test_data_colmap import HEIGHT, WIDTH, write_scene
 import a2tg_jax as a2tg
 from a2tg_jax.core.optim import adam_init
 from a2tg_jax.data.photo_reading import find_depths, read_depths
-from a2tg_jax.data.synthetic import exact_depths
 from a2tg_jax.densify.pruning import are_near, shown_in
 from a2tg_jax.events import Due
 from a2tg_jax.rasterize.render_types import Geometry
@@ -49,7 +48,7 @@ def trained(scene):
     camera = scene.train[0].camera
     near = np.asarray(camera.center + 0.1 * camera.viewmat[2, :3])[None] + 0.01 * RNG.normal(size=(20, 3))
     points, colors = np.concatenate([near, scene.points]), np.concatenate([np.ones((20, 3)), scene.colors])
-    first = dataclasses.replace(scene.train[0], depth=1 / exact_depths(scene)[0])
+    first = dataclasses.replace(scene.train[0], depth=RNG.uniform(0.5, 1, (30, 40)).astype(np.float32))
     found = dataclasses.replace(
         scene, train=(first, *scene.train[1:]), points=points.astype(np.float32), colors=colors.astype(np.float32)
     )

@@ -4,7 +4,7 @@ Its patterns have details of about 4 to 10 pixels, finer than one or two thousan
 """
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -166,27 +166,15 @@ def exact_points(scene: Scene) -> np.ndarray:
     """Return the points [P, 3] on the exact surfaces that the training views of a synthetic scene see, in the original
     world.
     """
-    return np.concatenate([(center + t * rays).T[np.isfinite(t)] for center, rays, t in _exact_hits(scene)])
-
-
-def exact_depths(scene: Scene) -> list[np.ndarray]:
-    """Return the depths [H, W] float32 of the exact surfaces that each training view of a synthetic scene sees, along
-    the camera's z axis in the normalised world.
-    """
-    hits = zip(scene.train, _exact_hits(scene), strict=True)
-    return [(scene.transform.scale * t).astype(np.float32).reshape(view.picture.size) for view, (_, _, t) in hits]
-
-
-def _exact_hits(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield centre [3, 1], rays [3, P] with z = 1, and depths t [P] of the pixels of each training view, in the
-    original world."""
     shapes = [shape for shape, _ in still_life(np.random.default_rng(0))]  # Only patterns depend on the seed.
-    inverse = scene.transform.inverse()
+    inverse, points = scene.transform.inverse(), []
     for camera in (view.camera for view in scene.train):
         viewmat = inverse.apply_to_viewmat(np.asarray(camera.viewmat, np.float64))
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         rays = _directions(viewmat, np.asarray(camera.K, np.float64), x, y)
-        yield _center(viewmat), rays, nearest_hits(shapes, _center(viewmat), rays)[0]
+        depths = nearest_hits(shapes, _center(viewmat), rays)[0]
+        points.append((_center(viewmat) + depths * rays).T[np.isfinite(depths)])
+    return np.concatenate(points)
 
 
 def _center(viewmat: np.ndarray) -> np.ndarray:
