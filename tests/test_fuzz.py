@@ -12,7 +12,7 @@ from fuzz_mutate import of_bytes, of_json, of_text
 from fuzz_readers import READERS
 from fuzz_worker import outcome
 
-NUM_CASES = 180
+NUM_CASES = 96
 MOST_MEGABYTES = 300
 
 
@@ -33,7 +33,7 @@ def test_changed_files_are_read_or_refused(tmp_path):
     assert {answer["reader"] for answer in found} == {reader.name for reader in READERS}
     assert max(answer["megabytes"] for answer in found) < MOST_MEGABYTES
     kinds = Counter(answer["kind"] for answer in found)
-    assert kinds["read"] > 8 and kinds["refused"] > 90
+    assert kinds["read"] > 4 and kinds["refused"] > 45
 
 
 def raising(error):

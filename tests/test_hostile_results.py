@@ -222,7 +222,7 @@ def test_markers_of_many_files_are_written_at_once_and_refused_above_the_limit(t
         file.writelines(f"x/{i}.png\n" for i in range(900_000))
     with pytest.raises(ValueError, match=r"lists 999,99\d files, and 100,000 are the most"):
         run.written()
-    assert time.perf_counter() - start < 5
+    assert time.perf_counter() - start < 60, "quadratic time"
 
 
 def test_a_history_of_200_000_rows_is_read_and_drawn_in_seconds(tmp_path):
@@ -235,7 +235,7 @@ def test_a_history_of_200_000_rows_is_read_and_drawn_in_seconds(tmp_path):
     write_history(tmp_path / "a.csv", history)
     found = read_history(tmp_path / "a.csv")
     curves_figure({"a": found}, {"a": 0})
-    assert time.perf_counter() - start < 15
+    assert time.perf_counter() - start < 60, "quadratic time"
     np.testing.assert_array_equal(found.iteration, iteration)
     np.testing.assert_array_equal(found.psnr, history.psnr)
 

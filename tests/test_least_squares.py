@@ -82,14 +82,14 @@ def test_many_steps_are_at_the_least_error():
         [np.ravel(view_image(v, model.background) - np.asarray(model.render(v.camera).color)) for v in views]
     )
     expected = np.linalg.solve(J.T @ J + ridge * np.eye(len(flat)), J.T @ residual)
-    found, _ = jax.flatten_util.ravel_pytree(colors_of(polish(model, views, num_steps=200, ridge=ridge)))
+    found, _ = jax.flatten_util.ravel_pytree(colors_of(polish(model, views, num_steps=60, ridge=ridge)))
     np.testing.assert_allclose(found - flat, expected, atol=1e-4)
     # The rays of the same pinhole: the centres of its pixels.
     rays = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
     views = [
         dataclasses.replace(view, camera=dataclasses.replace(view.camera, rays=jnp.asarray(rays))) for view in views
     ]
-    by_rays, _ = jax.flatten_util.ravel_pytree(colors_of(polish(model, views, num_steps=200, ridge=ridge)))
+    by_rays, _ = jax.flatten_util.ravel_pytree(colors_of(polish(model, views, num_steps=60, ridge=ridge)))
     np.testing.assert_allclose(by_rays, found, atol=1e-4)
 
 
