@@ -111,7 +111,7 @@ class Due:
     views: Sequence[View] = ()
     """Training views, with the cameras that the scene gives."""
     background: Color = BLACK
-    """Colour before which the views are drawn; of random ones, black."""
+    """Background of the views, RGB in [0, 1]; black where training takes random ones."""
     shapes: set[Shape] = dataclasses.field(default_factory=set)
     """Shapes of textures that steps are compiled for; an event adds the shapes that it makes."""
 

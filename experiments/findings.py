@@ -1,4 +1,4 @@
-"""The table and the chart of docs/results.md: every comparison of PROTOCOL.md, from the committed records."""
+"""The tables and the chart of docs/results.md, and the table of earlier versions of `bytewise` in NOTEBOOK.md."""
 
 import dataclasses
 import itertools
@@ -203,6 +203,7 @@ def newest_of(rows: Sequence[Row]) -> list[Row]:
     found: dict[str, Row] = {}
     for row in rows:
         if row.compared("psnr").by_scene and row.other != FIRST and UNSEEN not in row.name:
+            # The rest of the name is the same for all versions, and the newest comes first.
             found.setdefault(row.name.partition(" − ")[2], row)
     return list(found.values())
 

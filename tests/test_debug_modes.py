@@ -18,18 +18,20 @@ WITHOUT_JIT, CHECKS_FOR_NAN = jax.disable_jit, functools.partial(jax.debug_nans,
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*changed nothing")
 @pytest.mark.parametrize(
-    ("mode", "name", "cap"),
+    ("mode", "name", "cap", "iterations"),
     [
-        (WITHOUT_JIT, "gaussians-2d-mcmc", 21),
-        (CHECKS_FOR_NAN, "bytewise", 21),
-        (CHECKS_FOR_NAN, "supergaussians", 200),
+        (WITHOUT_JIT, "gaussians-2d-mcmc", 21, 12),
+        (CHECKS_FOR_NAN, "bytewise", 21, 12),
+        (CHECKS_FOR_NAN, "supergaussians", 200, 24),
     ],
 )
-def test_a_system_trains(mode, name, cap):
-    """A few steps of each stage, and an event that moves and adds Gaussians, for which clones and halves need room."""
+def test_a_system_trains(mode, name, cap, iterations):
+    """A few steps of each stage, and events that add Gaussians, of which clones and halves need room."""
     scene = a2tg.synthetic_scene(num_views=4, width=16, height=12, num_points=30)
-    changes = {"stage1_iterations": 12, "stage2_iterations": 3, "initial_gaussians": 20, "densify": {"cap": cap}}
+    changes = {"stage1_iterations": iterations, "stage2_iterations": 1, "initial_gaussians": 20}
+    changes["densify"] = {"cap": cap}
     system = changed_config(a2tg.find_system(name), changes, "test")
     with mode():
         model = a2tg.fit(scene, system, progress=False).model
+    assert model.num != 20
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model.gaussians))

@@ -3,7 +3,7 @@
 import dataclasses
 import re
 import warnings
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,20 @@ class PruneFaint(a2tg.HostEvent):
             return a2tg.Change(fewer, moments, state)
         chosen = jax.tree.map(lambda x: x[: model.num][is_kept] if x.ndim else x, moments)
         return a2tg.Change(fewer, chosen, state)
+
+
+@a2tg.pytree
+class SeesBackground(a2tg.HostEvent):
+    """Notes the background that it is given."""
+
+    seen: ClassVar[list] = []
+
+    def iterations(self, num_iterations):
+        return (1,)
+
+    def apply(self, due, model, moments, state):
+        self.seen.append(due.background)
+        return a2tg.Change(model, moments, state)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -188,6 +202,13 @@ def test_choices_about_anisotropy_that_act_are_used():
     thin, square = a2tg.Upscale(k_a=3.0), np.ones((2, 2), int)
     assert thin._unused(square, np.array([[0.02, 0.005], [0.02, 0.02]])) is None
     assert re.match(r"k_a made no difference", thin._unused(square, np.array([[0.02, 0.01], [0.02, 0.02]])))
+
+
+@pytest.mark.filterwarnings("ignore:.*changed nothing")
+def test_an_event_is_given_the_background_of_training(scene):
+    for background in ("white", "black", "random"):
+        fitted(scene, SeesBackground(), iterations=2, background=background)
+    assert SeesBackground.seen == [(1, 1, 1), (0, 0, 0), (0, 0, 0)]
 
 
 def test_parameters_learn_by_the_rate_that_is_given(scene):

@@ -252,7 +252,7 @@ def test_rays_that_come_with_batches_count_twice(kept, monkeypatch):
     of_rays, counted = ray_bytes(kept.train), []
     for room in (of_rays, of_rays - 1):
         monkeypatch.setattr(batches, "device_room", lambda room=room: room)
-        counted.append(fed_bytes(kept.train, 1))
+        counted.append(fed_bytes(kept.train, 1, has_depths=False))
     assert counted[1] - counted[0] == of_rays > 0
 
 

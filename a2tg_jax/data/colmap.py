@@ -198,7 +198,7 @@ def _read_model(model: Path) -> SparseModel:
                 f"{files['cameras'].name}; export the model again"
             )
     points = found.get("points3D", np.empty(0, POINT))
-    # COLMAP's binary files have points in any order, which would decide the order of the initial Gaussians.
+    # Files have points in any order; by id, a model starts alike from its binary and its text files.
     points = points[np.argsort(points["id"], kind="stable")]
     return SparseModel(cameras, found["images"], points, found.get("rigs", []), found.get("frames", []))
 

@@ -34,8 +34,6 @@ from a2tg_jax.host.text import shortened
 KINDS = ("cameras", "images", "points3D", "rigs", "frames")
 """Names of a model's files without suffix. A model has cameras and images, and the others if it needs them."""
 POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8")])
-LARGEST_WHOLE = (1 << 64) - 1
-"""Largest whole number in a binary file."""
 LONGEST_NAME = 4096
 CAMERA_SENSOR = 0
 """Kind of the sensors that take images."""
@@ -187,7 +185,7 @@ class _Binary:
 def _whole(word: bytes) -> int:
     """Return a whole number of at least 0, which may be written like 96.0."""
     number = int(word) if word.isdigit() else float(word)  # A float would round ids above 2^53.
-    if not 0 <= number <= LARGEST_WHOLE or number != int(number):  # NaN fails as well.
+    if not 0 <= number < 1 << 64 or number != int(number):  # NaN fails as well.
         raise ValueError(f"{shortened(word.decode(errors='replace'))} is not a whole number of at least 0")
     return int(number)
 
@@ -215,14 +213,11 @@ def _text_record(kind: str, path: Path, line: bytes, features: bytes) -> Any:
         number, pose, camera, _ = whole(), floats(7), whole(), next(words)
         name = _decoded_name(path, line.split(None, 9)[9].strip())  # The rest of the line, which may have spaces.
         words = iter(())  # The name took the rest of the line.
-        try:
-            # Each feature has x, y and the id of its point; -1 stands for none. If the line is missing, this is the
-            # next image's, whose words are no such triples.
-            for _, _, word in zip(*[iter(features.split())] * 3, strict=True):
-                if word != b"-1":
-                    _whole(word)
-        except ValueError:
-            raise ValueError("the line of its points is missing or cut off") from None
+        # Each feature has x, y and the id of its point, or -1. If the line is missing, this is the next image's, whose
+        # third word is a fraction.
+        triples = features.split()
+        if len(triples) % 3 or (triples and not re.fullmatch(rb"-?\d+(\.0*)?", triples[2])):
+            raise ValueError("the line of its points is missing or cut off")
         record = ImageRecord(number, pose, camera, name)
     elif kind == "points3D":
         number, position, color, error = whole(), floats(3), floats(3), floats(1)[0]

@@ -46,8 +46,8 @@ LEAST_ALPHA = 0.5
 class PlaceByError(HostEvent):
     """Event that adds Gaussians on the rendered surface, at pixels drawn in proportion to their error.
 
-    After ConeGS (Baranowski et al., 2025). Errors are measured in up to 48 views, with the cameras of the scene, not
-    refined ones, and without exposures.
+    After ConeGS (Baranowski et al., 2025). Errors are measured in up to 48 views over the background of training (black
+    where that is random), with the cameras of the scene, not refined ones, and without exposures.
 
     Examples:
       >>> a2tg.PlaceByError(share=0.1, at=(0.25, 0.5)).iterations(1000)

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import in_words
 from a2tg_jax.appearance.base import color_sums
+from a2tg_jax.appearance.parts import MAX_DEGREE
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.optim import solve_cg
@@ -26,8 +27,6 @@ from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import plan_render
 from a2tg_jax.training.batches import Photographs, over_background, stack_views
-
-HIGHEST_DEGREE = 3
 
 
 class Colors(NamedTuple):
@@ -119,9 +118,9 @@ def _solve(
 
 def draw_change(model: Model, change: Colors, camera: Camera, settings: RenderSettings) -> Array:
     """Return the change [H, W, 3] of a picture by a change of the colours, a linear function."""
-    is_shown = color_sums(model.appearance, model.gaussians, camera, HIGHEST_DEGREE) + 0.5 > 0
+    is_shown = color_sums(model.appearance, model.gaussians, camera, MAX_DEGREE) + 0.5 > 0
     changed = with_colors(model, change)
-    sums = color_sums(changed.appearance, changed.gaussians, camera, HIGHEST_DEGREE)
+    sums = color_sums(changed.appearance, changed.gaussians, camera, MAX_DEGREE)
     # Where max(·, 0) cuts a colour off, its derivative is 0.
     appearance = dataclasses.replace(changed.appearance, given_colors=jnp.where(is_shown, sums, 0.0))
     # Over black: the background is the constant of an affine picture, not part of J.

@@ -119,11 +119,9 @@ class BatchPlan(NamedTuple):
     """Number of batches prepared ahead, if the photographs do not all stay on the device."""
 
 
-def plan_batches(
-    views: tuple[View, ...], batch_size: int, room: float | None = None, has_depths: bool = False
-) -> BatchPlan:
+def plan_batches(views: tuple[View, ...], batch_size: int, room: float | None = None, *, has_depths: bool) -> BatchPlan:
     """Return where photographs are during training. Arguments as of `PhotoStore`."""
-    sizes, of_rays = [view_bytes(view, has_depths) for view in views], ray_bytes(views)
+    sizes, of_rays = [view_bytes(view, has_depths=has_depths) for view in views], ray_bytes(views)
     room = device_room() if room is None else room
     batch_bytes = batch_size * max(sizes)
     num_ahead = max(1, min(MOST_AHEAD, int(ROOM_AHEAD // max(batch_bytes, 1))))
@@ -131,9 +129,10 @@ def plan_batches(
     return BatchPlan(is_resident, of_rays <= room, batch_bytes, num_ahead)
 
 
-def view_bytes(view: View, has_depths: bool = False) -> int:
+def view_bytes(view: View, *, has_depths: bool) -> int:
     """Return the bytes of a photograph, and of its depth map if that is loaded with it."""
-    return view.picture.nbytes + has_depths * BYTES_PER_DEPTH * math.prod(view.picture.size)
+    depths = BYTES_PER_DEPTH * math.prod(view.picture.size) if has_depths else 0
+    return view.picture.nbytes + depths
 
 
 class PhotoStore:
@@ -160,7 +159,7 @@ class PhotoStore:
         """
         self._views, self._order, self._last, self._exchange = views, order, last, exchange
         self._has_depths = has_depths
-        plan = plan_batches(views, len(order.indices(1)), room, has_depths)
+        plan = plan_batches(views, len(order.indices(1)), room, has_depths=has_depths)
         self._mesh = None if exchange is None else exchange.mesh
         self._keeps_rays, self.num_ahead = plan.keeps_rays, plan.num_ahead
         self._rays: dict[Kind, Array] = {}

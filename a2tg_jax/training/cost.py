@@ -150,7 +150,7 @@ def stage_bytes(
     if any(isinstance(event, StepEvent) and event.most_gaussians is not None for event in stage.events):
         of_step += (num_devices - 1) * model_bytes  # Rows that move inside a step are gathered on each device.
     return Bytes(
-        photographs=held_bytes(scene) + fed_bytes(scene.train, batch, stage.has_depths),
+        photographs=held_bytes(scene) + fed_bytes(scene.train, batch, has_depths=stage.has_depths),
         model=(STATES + 1) * model_bytes,  # what the stage began with stays
         gradients=max(of_step, STATES * model_bytes * is_changed),  # An event holds the old state and the new one.
         pixels=largest * (images * per_pixel + VIEW_PER_PIXEL * (batch - 1)) + at_once * STEP_PER_PAIR * pairs,
@@ -165,11 +165,11 @@ def held_bytes(scene: Scene) -> int:
     return sum(view.picture.nbytes for view in views if view.picture.is_held) + ray_bytes(views)
 
 
-def fed_bytes(views: Sequence[View], batch_size: int, has_depths: bool = False) -> float:
+def fed_bytes(views: Sequence[View], batch_size: int, *, has_depths: bool) -> float:
     """Return the bytes of the photographs that are ready for the step, all or the next batches, and of reading them."""
     plan = plan_batches(tuple(views), batch_size, has_depths=has_depths)
     if plan.is_resident:
-        return sum(view_bytes(view, has_depths) for view in views) + ray_bytes(views)
+        return sum(view_bytes(view, has_depths=has_depths) for view in views) + ray_bytes(views)
     is_read = any(not view.picture.is_held for view in views)
     # Rays that do not stay on the device come with each batch: with the step's own and with the next.
     of_rays = ray_bytes(views) if plan.keeps_rays else 2 * max(ray_bytes([view]) for view in views)

@@ -460,7 +460,7 @@ class StageRun:
             if iteration not in due:
                 continue
             background = BACKGROUNDS[self.system.background]
-            now = Due(due.index(iteration) + 1, len(due), self.views, background, self.session.shapes)
+            now = Due(due.index(iteration) + 1, len(due), self.views, background=background, shapes=self.session.shapes)
             with calling(event, "apply", self.stage.name):
                 change = event.apply(now, self.state.model, self.state.moments, self.state.events[place])
                 change = checked_change(change)

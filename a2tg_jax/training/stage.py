@@ -72,7 +72,7 @@ COOLED = 0.1
 """Factor of learning rates at the end of a stage that cools down."""
 Background = Literal["black", "white", "random"]
 BACKGROUNDS: dict[Background, Color] = {"black": BLACK, "white": WHITE, "random": BLACK}
-"""Background of a model for each background of training."""
+"""Background of models, and of what events on the host render, for each background of training."""
 
 
 class LossTerm(Protocol):

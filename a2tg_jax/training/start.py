@@ -171,9 +171,9 @@ def _rows_needed(stage: Stage, num: int, system: System) -> int:
 def initial_number(scene: Scene, system: System, first: Stage) -> int:
     """Return the number of initial Gaussians: as requested, at most one for each point, and at most what the first
     stage has room for."""
-    num = min(system.initial_gaussians or len(scene.points), len(scene.points))
+    num = len(scene.points)
     caps = [most for event in first.events if (most := event.most_gaussians) is not None]
-    return min(num, *caps) if caps else num
+    return min([num, system.initial_gaussians or num, *caps])
 
 
 def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> Model:
@@ -193,7 +193,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
         gaussians = nearest_gaussians(gaussians, np.asarray(shapes))
     if room > num:
         spare = no_rows(room - num, gaussians.sh.shape[1], gaussians.means.dtype)
-        gaussians = _followed_by(gaussians, spare)
+        gaussians = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, spare)
     appearance = model.appearance
     is_same = template_of(appearance) == stage.appearance
     if not is_same or room > num:
@@ -217,7 +217,3 @@ def new_appearance(template: Appearance, gaussians: Gaussians, system: System) -
     """Return the appearance that a stage of a system begins with, of the options of a template."""
     key = jax.random.fold_in(jax.random.key(system.seed), KEY_OF_APPEARANCE)
     return allocate_appearance(template, key, gaussians)
-
-
-def _followed_by(gaussians: Gaussians, others: Gaussians) -> Gaussians:
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), gaussians, others)
