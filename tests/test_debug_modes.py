@@ -29,7 +29,7 @@ def test_a_system_trains(mode, name, cap, iterations):
     """A few steps of each stage, and events that add Gaussians, of which clones and halves need room."""
     scene = a2tg.synthetic_scene(num_views=4, width=16, height=12, num_points=30)
     changes = {"stage1_iterations": iterations, "stage2_iterations": 1, "initial_gaussians": 20}
-    changes["densify"] = {"cap": cap}
+    changes |= {"densify": {"cap": cap}, "tile_size": 16}
     system = changed_config(a2tg.find_system(name), changes, "test")
     with mode():
         model = a2tg.fit(scene, system, progress=False).model

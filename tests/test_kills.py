@@ -4,8 +4,8 @@ import pytest
 from kills import kill_runs
 
 TINY = (
-    *("--system", "a2tg", "--downscale", "6", "--stage1-iterations", "60", "--stage2-iterations", "40"),
-    *("--initial-gaussians", "60", "--densify.cap", "60", "--texture.cap", "2", "--texture.at", "0.5"),
+    *("--system", "gaussians-2d-mcmc", "--downscale", "6", "--stage1-iterations", "60", "--initial-gaussians", "60"),
+    *("--densify.cap", "60"),
 )
 
 
