@@ -213,10 +213,10 @@ def _text_record(kind: str, path: Path, line: bytes, features: bytes) -> Any:
         number, pose, camera, _ = whole(), floats(7), whole(), next(words)
         name = _decoded_name(path, line.split(None, 9)[9].strip())  # The rest of the line, which may have spaces.
         words = iter(())  # The name took the rest of the line.
-        # Each feature has x, y and the id of its point, or -1. If the line is missing, this is the next image's, whose
-        # third word is a fraction.
+        # Each feature has x, y and the id of its point, or -1. If the line is missing, this is the next image's, which
+        # ends with a name.
         triples = features.split()
-        if len(triples) % 3 or (triples and not re.fullmatch(rb"-?\d+(\.0*)?", triples[2])):
+        if len(triples) % 3 or not all(re.fullmatch(rb"-?\d+(\.0*)?", word) for word in triples[2:3] + triples[-1:]):
             raise ValueError("the line of its points is missing or cut off")
         record = ImageRecord(number, pose, camera, name)
     elif kind == "points3D":
