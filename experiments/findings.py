@@ -186,7 +186,8 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     rows = [*newest, *rows_of_parts(parts), *rows_of_degrees(degrees)]
     at_size = [row for row in newest if "0.3 MB" in row.name and FEW not in row.name]
     lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(rows)}\n{scenes_table(at_size)}")
-    earlier = [row for row in of_bytewise if row not in newest]
+    shown = {row.name for row in newest}
+    earlier = [row for row in of_bytewise if row.name not in shown]
     lab.write("earlier_versions", f"# Earlier versions of bytewise\n\n{table_of(earlier)}\n{endpoints(of_bytewise)}")
     charted: dict[str, tuple[Sequence[float], float, float]] = {}
     for row in rows:

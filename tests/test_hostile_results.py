@@ -214,7 +214,7 @@ def test_brackets_in_strings_do_not_count():
 
 def test_markers_of_many_files_are_written_at_once_and_refused_above_the_limit(tmp_path):
     run, names = create_run(tmp_path / "run"), [f"test/{i}.png" for i in range(MOST_NAMES - 10)]
-    start = time.perf_counter()
+    start = time.process_time()
     run.own_all([*names, *names])
     run.own_all(names)
     assert run.written().count(names[7]) == 1 and set(names) <= set(run.written())
@@ -222,7 +222,7 @@ def test_markers_of_many_files_are_written_at_once_and_refused_above_the_limit(t
         file.writelines(f"x/{i}.png\n" for i in range(900_000))
     with pytest.raises(ValueError, match=r"lists 999,99\d files, and 100,000 are the most"):
         run.written()
-    assert time.perf_counter() - start < 60, "quadratic time"
+    assert time.process_time() - start < 5
 
 
 def test_a_history_of_200_000_rows_is_read_and_drawn_in_seconds(tmp_path):
@@ -231,11 +231,11 @@ def test_a_history_of_200_000_rows_is_read_and_drawn_in_seconds(tmp_path):
     history = History(
         np.ones(num, int), iteration, values, np.where(iteration == 5, np.inf, 20.0), iteration, values, values
     )
-    start = time.perf_counter()
+    start = time.process_time()
     write_history(tmp_path / "a.csv", history)
     found = read_history(tmp_path / "a.csv")
     curves_figure({"a": found}, {"a": 0})
-    assert time.perf_counter() - start < 60, "quadratic time"
+    assert time.process_time() - start < 15
     np.testing.assert_array_equal(found.iteration, iteration)
     np.testing.assert_array_equal(found.psnr, history.psnr)
 

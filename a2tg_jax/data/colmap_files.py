@@ -216,7 +216,7 @@ def _text_record(kind: str, path: Path, line: bytes, features: bytes) -> Any:
         # Each feature has x, y and the id of its point, or -1. If the line is missing, this is the next image's, which
         # ends with a name.
         triples = features.split()
-        if len(triples) % 3 or not all(re.fullmatch(rb"-?\d+(\.0*)?", word) for word in triples[2:3] + triples[-1:]):
+        if len(triples) % 3 or not all(re.fullmatch(rb"-1|\d+(\.0*)?", word) for word in triples[2:3] + triples[-1:]):
             raise ValueError("the line of its points is missing or cut off")
         record = ImageRecord(number, pose, camera, name)
     elif kind == "points3D":
