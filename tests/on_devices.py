@@ -135,9 +135,9 @@ def borders_without_room_overflow(exchange, camera):
     """The lists of a band whose borders moved too far stay within its tiles, and the overflow is told."""
     heights, listed = [], exchanges.list_tiles
 
-    def watched(settings, M, cutoff, capacity, pixels, height):
-        jax.debug.callback(lambda own: heights.append((int(own), settings.grid.height)), height)
-        return listed(settings, M, cutoff, capacity, pixels, height)
+    def watched(compositor, M, cutoff, near_plane, grid, capacity, pixels, height):
+        jax.debug.callback(lambda own: heights.append((int(own), grid.height)), height)
+        return listed(compositor, M, cutoff, near_plane, grid, capacity, pixels, height)
 
     own = dataclasses.replace(exchange, border_room=BorderRoom(0, 0))
     settings = dataclasses.replace(a2tg.plan_render(plain(), [camera]), compositor="native", exchange=own)

@@ -44,6 +44,7 @@ from a2tg_jax.core.numerics import Integer, at_least
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
 from a2tg_jax.core.table import Table, check_places, check_table, is_table
+from a2tg_jax.parallel.sharded_rows import rows_moved
 from a2tg_jax.texture import Textures
 
 T = TypeVar("T")
@@ -450,7 +451,9 @@ def clear_rows(tree: T, is_cleared: Array) -> T:
 
 def take_rows(tree: T, rows: np.ndarray) -> T:
     """Return the rows of some Gaussians, which may repeat; tables in buckets as small as they need (host)."""
-    return jax.tree.map(lambda leaf: leaf.take(rows) if is_table(leaf) else leaf[rows], tree, is_leaf=is_table)
+    return jax.tree.map(
+        lambda leaf: leaf.take(rows) if is_table(leaf) else rows_moved(leaf, rows), tree, is_leaf=is_table
+    )
 
 
 def join_rows(trees: Sequence[T]) -> T:

@@ -321,7 +321,7 @@ class Coefficients(Table):
             own = np.full(len(blocks), num, np.int32)
             own[row[bucket == index]] = np.flatnonzero(bucket == index)
             owners.append(placed_like(own, places.bucket))
-        return cls(tuple(map(jnp.asarray, buckets)), *places, tuple(owners))
+        return cls(tuple(map(jax.device_put, buckets)), *places, tuple(owners))
 
     @staticmethod
     def resized(blocks: np.ndarray, size: Size) -> np.ndarray:
@@ -364,7 +364,8 @@ class Bands(Part):
             if not blocks.size:
                 continue
             # Padding reads the last Gaussian here, and is dropped below.
-            bases = sh_basis(normalize(means[jnp.minimum(owners, table.num - 1)] - center[None, :]))
+            directions = normalize(means[jnp.minimum(owners, table.num - 1)] - center[None, :])
+            bases = sh_basis(directions, blocks.shape[1] + NUM_BASES[base])
             colors = jnp.zeros((len(blocks), 3), total.dtype)
             for band in range(base + 1, MAX_DEGREE + 1):
                 first, last = NUM_BASES[band - 1], NUM_BASES[band]

@@ -258,7 +258,7 @@ def init_from_points(
         np.full(count, np.log(opacity / (1 - opacity))),
         sh_of_colors(colors, sh_degree),
     )
-    return Gaussians(*(jnp.asarray(array, jnp.float32) for array in arrays))
+    return Gaussians(*jax.device_put([array.astype(np.float32) for array in arrays]))
 
 
 def sh_of_colors(colors: np.ndarray, sh_degree: int) -> np.ndarray:
@@ -271,13 +271,14 @@ def sh_of_colors(colors: np.ndarray, sh_degree: int) -> np.ndarray:
 
 def no_rows(num: int, num_coefficients: int, dtype: DTypeLike = jnp.float32) -> Gaussians:
     """Return rows that do not exist yet."""
-    return Gaussians(
-        means=jnp.zeros((num, 3), dtype),
-        quats=jnp.tile(jnp.asarray([[1.0, 0.0, 0.0, 0.0]], dtype), (num, 1)),
-        log_scales=jnp.full((num, 2), NO_ROW_LOG_SCALE, dtype),
-        logit_opacities=jnp.full(num, NO_ROW_LOG_SCALE, dtype),
-        sh=jnp.zeros((num, num_coefficients, 3), dtype),
+    arrays = (
+        np.zeros((num, 3), dtype),
+        np.tile(np.asarray([1.0, 0.0, 0.0, 0.0], dtype), (num, 1)),
+        np.full((num, 2), NO_ROW_LOG_SCALE, dtype),
+        np.full(num, NO_ROW_LOG_SCALE, dtype),
+        np.zeros((num, num_coefficients, 3), dtype),
     )
+    return Gaussians(*jax.device_put(arrays))
 
 
 # Coincident copies that together look like one Gaussian (3DGS-MCMC, Kheradmand et al., 2024, relocation)

@@ -4,6 +4,7 @@ L = 16 bases, degree 0 first; (x, y, z) is a unit vector from the camera to the 
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
@@ -13,22 +14,24 @@ NUM_BASES = (1, 4, 9, 16)
 """Number of bases of degrees 0 to the index."""
 
 
-def sh_basis(directions: Array) -> Array:
-    """Return the 16 basis functions [..., 16] at unit directions [..., 3]."""
+def sh_basis(directions: Array, num: int = 16) -> Array:
+    """Return the first basis functions [..., num] at unit directions [..., 3]; `num` is one of `NUM_BASES`."""
     # Factors and signs of 3DGS's program, whose files hold coefficients of this basis.
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
-    xx, yy, zz = x * x, y * y, z * z
-    return jnp.stack(
-        [
-            jnp.full_like(x, 0.28209479177387814),
-            -0.4886025119029199 * y,
-            0.4886025119029199 * z,
-            -0.4886025119029199 * x,
+    bases = [jnp.full_like(x, 0.28209479177387814)]
+    if num > 1:
+        bases += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if num > 4:
+        xx, yy, zz = x * x, y * y, z * z
+        bases += [
             1.0925484305920792 * x * y,
             -1.0925484305920792 * y * z,
             0.31539156525252005 * (2 * zz - xx - yy),
             -1.0925484305920792 * x * z,
             0.5462742152960396 * (xx - yy),
+        ]
+    if num > 9:
+        bases += [
             -0.5900435899266435 * y * (3 * xx - yy),
             2.890611442640554 * x * y * z,
             -0.4570457994644658 * y * (4 * zz - xx - yy),
@@ -36,9 +39,8 @@ def sh_basis(directions: Array) -> Array:
             -0.4570457994644658 * x * (4 * zz - xx - yy),
             1.445305721320277 * z * (xx - yy),
             -0.5900435899266435 * x * (xx - 3 * yy),
-        ],
-        axis=-1,
-    )
+        ]
+    return jnp.stack(bases, axis=-1)
 
 
 def sh_sum(sh: Array, means: Array, center: Array, degree: ArrayLike) -> Array:
@@ -46,10 +48,10 @@ def sh_sum(sh: Array, means: Array, center: Array, degree: ArrayLike) -> Array:
 
     Coefficients are [N, K, 3], K being 1, 4, 9 or 16, the camera's centre [3]. The highest degree used may be traced.
     """
-    directions = normalize(means - center[None, :])
-    degrees = jnp.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3], jnp.int32)
+    num = sh.shape[1]
+    basis = sh_basis(normalize(means - center[None, :]), num)
+    degrees = np.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3], np.int32)[:num]
     # A mask, not a slice: the degree may be traced.
-    is_used = degrees <= jnp.asarray(degree, jnp.int32)
-    basis = jnp.where(is_used[None, :], sh_basis(directions), 0.0)[:, : sh.shape[1]]
+    basis = jnp.where((degrees <= jnp.asarray(degree, jnp.int32))[None, :], basis, 0.0)
     # A sum, which CPUs do several times faster than many small matrix products.
     return jnp.sum(basis[:, :, None] * sh, axis=1)

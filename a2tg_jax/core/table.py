@@ -83,14 +83,13 @@ class Table:
         """Return blocks of the given sizes [N, D] that hold the C `values` everywhere (host); one with sides of 0
         takes no bytes."""
         places, capacities = plan_places(np.asarray(sizes))
-        value, shapes = jnp.asarray(values, dtype), zip(capacities, places.bucket_sizes, strict=True)
-        buckets = [jnp.broadcast_to(value, (capacity, *size, len(values))) for capacity, size in shapes]
-        return cls.placed(buckets, places)
+        shapes = zip(capacities, places.bucket_sizes, strict=True)
+        return cls.placed([cls._padded(capacity, size, dtype, values) for capacity, size in shapes], places)
 
     @classmethod
     def placed(cls, buckets: Sequence[Any], places: "Places") -> Self:
         """Return the table of buckets and of the places that were planned for them (host)."""
-        return cls(tuple(map(jnp.asarray, buckets)), *places)
+        return cls(tuple(map(jax.device_put, buckets)), *places)
 
     @classmethod
     def _padded(cls, capacity: int, size: Size, dtype: DTypeLike, padding: Sequence[float] | None = None) -> np.ndarray:

@@ -95,7 +95,7 @@ class PlaceByError(HostEvent):
 
         gaussians, shown = jax.tree.map(replaced, (model.gaussians, model.appearance), (added, appearance))
         is_new = np.isin(np.arange(model.gaussians.num), rows)
-        moments = clear_moments(model, moments, placed_like(is_new, model.gaussians.means))
+        moments = jax.jit(clear_moments)(model, moments, placed_like(is_new, model.gaussians.means))
         num_live = placed_like(np.asarray(num + added.num, np.int32), model.gaussians.means)
         model = dataclasses.replace(model, gaussians=gaussians, appearance=shown, num_live=num_live)
         return Change(model, moments, state)
@@ -136,7 +136,7 @@ def gaussians_at_errors(
         np.full(num, np.log(OPACITY / (1 - OPACITY))),
         sh_of_colors(colors, model.gaussians.sh_degree),
     )
-    return Gaussians(*(jnp.asarray(array, dtype) for array in of_first(mesh, arrays)))
+    return Gaussians(*jax.device_put([array.astype(dtype) for array in of_first(mesh, arrays)]))
 
 
 def _drawn_pixels(
@@ -152,8 +152,8 @@ def _drawn_pixels(
     errors = np.where(is_usable, np.abs(output.color - photograph).mean(axis=2), 0).astype(np.float64)
     sums = np.cumsum(errors)
     pixels = np.searchsorted(sums, rng.random(num) * sums[-1], side="right").clip(0, errors.size - 1)
-    depth = jnp.asarray(output.depth / np.maximum(output.alpha, LEAST_ALPHA))
-    points = np.asarray(back_project(depth, view.camera)).reshape(-1, 3)[pixels]
+    depth = output.depth / np.maximum(output.alpha, LEAST_ALPHA)
+    points = np.asarray(jax.jit(back_project)(depth, view.camera)).reshape(-1, 3)[pixels]
     K = np.asarray(view.camera.K, np.float64)
     sizes = np.asarray(depth, np.float64).ravel()[pixels] / np.sqrt(K[0, 0] * K[1, 1])
     normals = np.asarray(output.normal, np.float64).reshape(-1, 3)[pixels]

@@ -308,7 +308,8 @@ def _composite_band(
     # A band that moved too far overflows; until then it must not reach beyond the memory of its grid.
     height = jnp.minimum(end - top, bands.own.height)
     own = settings._replace(grid=bands.own)
-    lists = list_tiles(own, jax.lax.stop_gradient(splats.M), cutoff, most_pairs, pixels, height)
+    M = jax.lax.stop_gradient(splats.M)
+    lists = list_tiles(own.compositor, M, cutoff, own.near_plane, own.grid, most_pairs, pixels, height)
     channels, transmittance = composite(own, splats, texels, regions, cutoff, lists, jacobian, probe)
     if bands.num > 1:
         image = jnp.concatenate([channels, transmittance[None]])

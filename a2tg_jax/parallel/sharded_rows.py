@@ -115,35 +115,34 @@ def _is_own(x: object) -> bool:
 
 
 def placed_like(new: Any, old: object) -> Array:
-    """Return values of the host, their rows spread over the devices of another array, whose shape may differ.
-    ValueError: several processes have different values."""
-    mesh = mesh_of(old)
-    if mesh is None:
-        return jnp.asarray(new)
-    new = np.asarray(new)
-    return spread(mesh, new.astype(jax.dtypes.canonicalize_dtype(new.dtype), copy=False))
+    """Return values of the host, their rows spread over the devices of another array, whose shape may differ, or on its
+    device. ValueError: several processes have different values."""
+    mesh, new = mesh_of(old), np.asarray(new)
+    new = new.astype(jax.dtypes.canonicalize_dtype(new.dtype), copy=False)
+    if mesh is not None:
+        return spread(mesh, new)
+    # Compiles nothing, unlike `jnp.asarray`. An array that may be on any device stays such a one.
+    is_fixed = isinstance(old, jax.Array) and not isinstance(old, jax.core.Tracer) and old.committed
+    return jax.device_put(new, old.sharding if is_fixed else None)
 
 
 def zeros_beside(old: object, shape: Sequence[int], dtype: DTypeLike) -> Array:
     """Return zeros, their rows spread over the devices of another array."""
-    mesh = mesh_of(old)
-    return jnp.zeros(shape, dtype, device=None if mesh is None else sharding_of_rows(mesh, tuple(shape)))
+    return placed_like(np.zeros(shape, dtype), old)
 
 
 def rows_moved(x: Array, rows: Array | np.ndarray) -> Array:
     """Return the array whose row i is the former row rows[i].
 
-    It is traceable. Outside jit, rows that are spread over devices move on the host.
+    It is traceable. Outside jit, rows move on the host, where nothing is compiled for their number.
     """
-    if mesh_of(x) is None:
+    if isinstance(x, jax.core.Tracer) or isinstance(rows, jax.core.Tracer):
         return x[rows]
     return placed_like(on_host(x)[np.asarray(rows)], x)
 
 
 def rows_replaced(x: Array, rows: np.ndarray, new: ArrayLike) -> Array:
     """Return the array with other values at some rows (host)."""
-    if mesh_of(x) is None:
-        return x.at[rows].set(new)
     found = np.array(on_host(x))
     found[rows] = new
     return placed_like(found, x)

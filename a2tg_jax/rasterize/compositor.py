@@ -22,7 +22,7 @@ from a2tg_jax.parallel.sharded_rows import cotangent_of
 from a2tg_jax.rasterize import tiles
 from a2tg_jax.rasterize.kernels import xla
 from a2tg_jax.rasterize.kernels.platforms import by_platform, choose, instead_of
-from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats
+from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats, Wanted
 from a2tg_jax.rasterize.tile_pixels import TilePixels
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
@@ -88,27 +88,28 @@ def _assemble(tiles: Array, grid: TileGrid) -> Array:
 
 
 def list_tiles(
-    settings: PassSettings, M: Array, cutoff: Array, capacity: int, pixels: TilePixels | None = None,
-    height: Array | None = None,
+    compositor: Wanted, M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int,
+    pixels: TilePixels | None = None, height: Array | None = None,
 ) -> TileLists:  # fmt: skip
     """List the splats that touch each tile of a pass, as `tiles.tile_lists` does, by native loops where they run.
 
     If the tiles have pixels with rays, XLA lists the splats, and the height is not used.
     """
-    grid = settings.grid
     if pixels is not None:
-        return tiles.tile_lists(M, cutoff, settings.near_plane, grid, capacity, pixels)
+        return tiles.tile_lists(M, cutoff, near_plane, grid, capacity, pixels)
     integers = [jax.ShapeDtypeStruct((num,), jnp.int32) for num in (capacity, grid.num + 1)]
     results = (*integers, jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_))
-    ids, starts, num_pairs, overflow = by_platform(_lists_on, (settings, capacity), results, M, cutoff, height)
+    ids, starts, num_pairs, overflow = by_platform(
+        _lists_on, (compositor, near_plane, grid, capacity), results, M, cutoff, height
+    )
     return TileLists(ids, starts, num_pairs, overflow, height=height)
 
 
-def _lists_on(platform: str, settings: PassSettings, capacity: int) -> Any:
+def _lists_on(platform: str, compositor: Wanted, near_plane: float, grid: TileGrid, capacity: int) -> Any:
     def lists(M: Array, cutoff: Array, height: Array | None) -> tuple[Array, ...]:
         # `cuda` has no function of this name.
-        tile_lists = getattr(_kernels(settings, platform), "tile_lists", tiles.tile_lists)
-        return tuple(tile_lists(M, cutoff, settings.near_plane, settings.grid, capacity, height=height)[:4])
+        tile_lists = getattr(_kernels(compositor, platform), "tile_lists", tiles.tile_lists)
+        return tuple(tile_lists(M, cutoff, near_plane, grid, capacity, height=height)[:4])
 
     return lists
 
@@ -153,15 +154,15 @@ def _by_platform(which: str, settings: PassSettings, results: Any, *arrays: obje
 
 
 def _pass_on(platform: str, which: str, settings: PassSettings) -> Any:
-    kernels = _kernels(settings, platform)
+    kernels = _kernels(settings.compositor, platform)
     if kernels is not xla and (reason := kernels.refusal(settings.kernel)):
         instead_of(settings.compositor, type(settings.static.appearance), reason)
         kernels = xla
     return functools.partial(getattr(kernels, which), _batched_on(platform, settings))
 
 
-def _kernels(settings: PassSettings, platform: str) -> Any:
-    chosen = choose(settings.compositor, platform)
+def _kernels(compositor: Wanted, platform: str) -> Any:
+    chosen = choose(compositor, platform)
     # Imported here: `native` needs llvmlite, which may be missing, and programs on CPUs do not use `cuda`.
     return xla if chosen in ("xla", "autodiff") else importlib.import_module(f"{xla.__package__}.{chosen}.composite")
 

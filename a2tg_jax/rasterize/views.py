@@ -14,7 +14,6 @@ from a2tg_jax.appearance.base import num_colors_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.geometry import screen_bounds
 from a2tg_jax.core.numerics import Integer
 from a2tg_jax.parallel.exchange import composite_on_devices
 from a2tg_jax.parallel.exchange_room import room_of_view
@@ -22,9 +21,9 @@ from a2tg_jax.rasterize.compositor import Composited, composite, list_tiles
 from a2tg_jax.rasterize.kernels.platforms import check_compositor
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import Geometry, RenderOutput, RenderSettings
-from a2tg_jax.rasterize.splats import drawn_splats, project_gaussians, settings_of_pass
+from a2tg_jax.rasterize.splats import Wanted, drawn_splats, project_gaussians, settings_of_pass
 from a2tg_jax.rasterize.tile_pixels import tile_pixels
-from a2tg_jax.rasterize.tiles import TileGrid, tile_rectangles, total_pairs
+from a2tg_jax.rasterize.tiles import TileGrid
 
 
 def render_traced(
@@ -94,7 +93,8 @@ def render_traced(
     if settings.exchange is None:
         # Which tiles a splat touches is piecewise constant.
         pixels = None if camera.rays is None else tile_pixels(camera.rays, settings.tile_size)
-        lists = list_tiles(compositing, jax.lax.stop_gradient(splats.M), cutoff, capacity, pixels)
+        M = jax.lax.stop_gradient(splats.M)
+        lists = list_tiles(settings.compositor, M, cutoff, settings.near_plane, grid, capacity, pixels)
         image = composite(compositing, splats, texels, regions, cutoff, lists, jacobian, probe)
         shown = Composited(*image, lists.num_pairs, lists.overflow)
     else:
@@ -168,9 +168,11 @@ def pairs_of_view(
     """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
     if not gaussians.num:
         return 0
+    check_compositor(settings.compositor)
     camera = settings.finer(camera)
     try:
-        return int(_jitted_count()(gaussians, camera, appearance, settings.tile_size, settings.near_plane, num_live))
+        known = settings.compositor, settings.tile_size, settings.near_plane
+        return int(_jitted_count()(gaussians, camera, appearance, *known, num_live))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 
@@ -188,10 +190,12 @@ def pairs_to_draw(
 @functools.cache
 def _jitted_count() -> jax.stages.Wrapped:
     def count(
-        gaussians: Gaussians, camera: Camera, appearance: Appearance, tile_size: int, near_plane: float, num_live: Any
-    ) -> Array:
-        bounds = screen_bounds(*drawn_splats(gaussians, camera, appearance, num_live), near_plane)
+        gaussians: Gaussians, camera: Camera, appearance: Appearance, compositor: Wanted, tile_size: int,
+        near_plane: float, num_live: Any,
+    ) -> Array:  # fmt: skip
+        M, cutoff = drawn_splats(gaussians, camera, appearance, num_live)
+        grid = TileGrid(camera.width, camera.height, tile_size)
         pixels = None if camera.rays is None else tile_pixels(camera.rays, tile_size)
-        return total_pairs(tile_rectangles(bounds, TileGrid(camera.width, camera.height, tile_size), pixels).counts)
+        return list_tiles(compositor, M, cutoff, near_plane, grid, 0, pixels).num_pairs
 
-    return jax.jit(count, static_argnums=(3, 4))
+    return jax.jit(count, static_argnums=(3, 4, 5))

@@ -7,6 +7,7 @@ after it stay idle (`step.TrainState.status`); the loop removes the cause and la
 import contextlib
 import dataclasses
 import datetime
+import functools
 import time
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -184,16 +185,17 @@ class StageRun:
         """Rows of the history since then."""
 
         # Steps take over the buffers that they are given: copies on the device, or in numpy to be spread.
-        copied = jnp.array if self.mesh is None else np.array
+        copied: Any = functools.partial(jax.tree.map, jnp.copy if self.mesh is None else np.array)
+        copied = jax.jit(copied) if self.mesh is None else copied
         if resume is None:
             start = initial_model(scene, system) if start is None else start
-            model = padded(jax.tree.map(copied, start.live), self.stage, system, self.session.num_devices)
+            model = padded(copied(start.live), self.stage, system, self.session.num_devices)
             names = [view.name for view in self.views]
             state = initial_state(self.stage, spread(self.mesh, model), names, start.origin)
         else:
             check_corrections(resume.state.corrections, len(self.views))
             warn_of_uneven_rows(resume.state.model.gaussians.num, self.session.num_devices)
-            state = jax.tree.map(copied, resume.state)
+            state = copied(resume.state)
         self.state = self._with_room(spread(self.mesh, state))
 
         self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))

@@ -199,8 +199,8 @@ class LearningCheck:
         # Flat colours of the same views, because some are easier than others.
         for iteration, _ in self._seen:
             for view in (self._views[index] for index in self._order.indices(iteration)):
-                mask = None if view.mask is None else jnp.asarray(view.mask.read())
-                flat.append(float(flat_psnr(jnp.asarray(view_image(view, (self._level,) * 3)), mask)))
+                mask = None if view.mask is None else view.mask.read()
+                flat.append(float(jax.jit(flat_psnr)(view_image(view, (self._level,) * 3), mask)))
         if not has_learned(reached, float(np.mean(flat))):
             warnings.warn(
                 f"training does not learn: {reached:.1f} dB on the training views after {self._at:,} iterations, where "
