@@ -290,8 +290,8 @@ def test_flags_of_xla(monkeypatch):
     assert os.environ["XLA_FLAGS"] == "--xla_cpu_prefer_vector_width=256 --xla_dump_to=x --xla_other=1"
     avx512 = frozenset({"avx512f"})
     assert startup.cpu_flags(avx512, (0, 12)) == (startup.WHOLE_LOOPS_FLAG, startup.WIDE_VECTORS_FLAG)
-    assert startup.cpu_flags(frozenset(), (0, 12)) == (startup.WHOLE_LOOPS_FLAG,)
-    assert startup.cpu_flags(frozenset(), (0, 10)) == (startup.WHOLE_LOOPS_FLAG, startup.OLD_FUSIONS_FLAG)
+    assert startup.cpu_flags(frozenset(), (0, 11)) == (startup.WHOLE_LOOPS_FLAG,)
+    assert startup.cpu_flags(avx512, (0, 10)) == (*startup.cpu_flags(avx512, (0, 12)), startup.OLD_FUSIONS_FLAG)
     assert startup.cpu_flags(avx512, (9, 9)) == ()
 
 

@@ -139,3 +139,16 @@ def test_a_cropped_view_keeps_its_centre_and_proportions():
         assert (cropped.width, cropped.height) == (width, height)
         expected = factor * K[:2] + [[0, 0, (width - factor * 48) / 2], [0, 0, (height - factor * 32) / 2]]
         np.testing.assert_allclose(cropped.K[:2], expected, rtol=1e-6)
+
+
+def test_room_is_planned_within_a_gradient():
+    gaussians, (camera, *_) = cloud(40), flight(2)
+    planned = a2tg.plan_render(gaussians, camera).capacity
+
+    def loss(means, viewmat):
+        moved = dataclasses.replace(gaussians, means=means), dataclasses.replace(camera, viewmat=viewmat)
+        assert a2tg.plan_render(*moved).capacity == planned
+        return jnp.sum(means)
+
+    np.testing.assert_array_equal(jax.grad(loss)(gaussians.means, camera.viewmat), np.ones((40, 3)))
+    jax.grad(loss, argnums=1)(gaussians.means, camera.viewmat)

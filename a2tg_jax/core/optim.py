@@ -3,7 +3,6 @@
 jaxopt has no Adam. No other module imports jaxopt.
 """
 
-import functools
 import math
 import warnings
 from typing import Any
@@ -105,17 +104,16 @@ def adam_update(
     mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
     nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
 
-    @functools.cache
-    def correction(decay: float, dtype: DTypeLike) -> Array:
-        # 1 - decay^count; the plain formula loses four digits in float32 at the first steps. A decay of 0 needs no
-        # correction, and has no logarithm.
-        return -jnp.expm1(count.astype(dtype) * math.log(decay)) if decay else jnp.ones((), dtype)
+    # For each dtype once. In this order, so that the same program is compiled each time.
+    dtypes = dict.fromkeys(leaf.dtype for leaf in jax.tree.leaves(params))
+    corrections = {dtype: [_bias_correction(decay, count, dtype) for decay in (b1, b2)] for dtype in dtypes}
 
     def step(rate: Array, param: Array, m: Array, v: Array) -> Array:
         # Rates have JAX's default dtype, which under x64 would promote float32 parameters.
         rate = jnp.asarray(rate, param.dtype)
-        root = jnp.sqrt(v) / jnp.sqrt(correction(b2, param.dtype))
-        change: Array = rate / correction(b1, param.dtype) * (m / (root + eps))
+        first, second = corrections[param.dtype]
+        root = jnp.sqrt(v) / jnp.sqrt(second)
+        change: Array = rate / first * (m / (root + eps))
         return param - change
 
     params = jax.tree.map(step, _one_each(rates, params), params, mu, nu)
@@ -169,3 +167,9 @@ def _check_floats(params: object) -> None:
         name = f"params{jax.tree_util.keystr(path)}"
         check_array(name, leaf)
         check_floats(name, leaf, leaf.shape)
+
+
+def _bias_correction(decay: float, count: Array, dtype: DTypeLike) -> Array:
+    """Return 1 - decay^count; the plain formula loses four digits in float32 at the first steps."""
+    # A decay of 0 needs no correction, and has no logarithm.
+    return -jnp.expm1(count.astype(dtype) * math.log(decay)) if decay else jnp.ones((), dtype)

@@ -191,8 +191,9 @@ class Table:
             raise ValueError(f"{name} of {num} sizes cannot change rows: densify and prune before they grow")
         # With one bucket, row i is Gaussian i's (`plan_places`); padding follows and stays.
         (bucket,) = self.buckets
-        spare = jnp.arange(len(rows), len(bucket), dtype=jnp.int32)
-        moved = rows_moved(bucket, jnp.concatenate([jnp.asarray(rows, jnp.int32), spare]))
+        spare = np.arange(len(rows), len(bucket), dtype=np.int32)
+        concatenate = jnp.concatenate if isinstance(rows, jax.core.Tracer) else np.concatenate
+        moved = rows_moved(bucket, concatenate([rows, spare]))
         return dataclasses.replace(self, buckets=(moved,))
 
     def clear(self, is_cleared: Array) -> Self:

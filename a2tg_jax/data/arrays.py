@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from a2tg_jax.core.camera_paths import nearest_point
-from a2tg_jax.core.cameras import pinhole_pixels
 from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.similarity import camera_centers
-from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, check_test_every, every_kth, rigid_viewmat
+from a2tg_jax.data.assembly import PointCloud, Shot, Sight, assemble_scene, check_test_every, every_kth, rigid_viewmat
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture, how_to_convert
 from a2tg_jax.data.scene import Scene
 
@@ -169,12 +168,9 @@ def _likelier_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
 
 def _share_seen(shots: Sequence[Shot], viewmats: np.ndarray, points: np.ndarray) -> float:
     """Return the share of all points, averaged over the views, in an image."""
-    shares = []
-    for shot, viewmat in zip(shots, viewmats, strict=True):
-        own = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-        xy = pinhole_pixels(own[own[:, 2] > 0], shot.K)
-        shares.append(np.count_nonzero(((xy >= 0) & (xy < shot.picture.size[::-1])).all(axis=1)) / len(points))
-    return float(np.mean(shares))
+    pairs = zip(shots, viewmats, strict=True)
+    sights = [Sight.of(viewmat, shot.K, shot.picture.size, None) for shot, viewmat in pairs]
+    return float(np.mean([sight.num_seen(points, 0.0) for sight in sights])) / len(points)
 
 
 def _share_that_meet(viewmats: np.ndarray, precision: float) -> float:

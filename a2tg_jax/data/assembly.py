@@ -194,10 +194,10 @@ class Sight(NamedTuple):
         viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
         return Sight.of(viewmat, K, (camera.height, camera.width), camera.rays)
 
-    def num_seen(self, points: np.ndarray) -> int:
+    def num_seen(self, points: np.ndarray, near_plane: float = NEAR_PLANE) -> int:
         """Return the number of points [P, 3] in the picture and beyond the near plane."""
         own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        places = pinhole_pixels(own[own[:, 2] > NEAR_PLANE], self.K)
+        places = pinhole_pixels(own[own[:, 2] > near_plane], self.K)
         return int(((places >= self.low) & (places <= self.high)).all(axis=1).sum())
 
 

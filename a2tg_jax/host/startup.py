@@ -9,21 +9,22 @@ from a2tg_jax.host import machine
 from a2tg_jax.host.machine import processor_features, processor_key
 
 CHECKED_JAX_VERSIONS = ((0, 10), (0, 11), (0, 12))
-"""Versions that have the flags below; an unknown flag would end the process."""
+"""Versions that have the first two flags below; an unknown flag would end the process."""
 QUIET_CACHE_VERSION = (0, 12)
 """First version that reads programs from a cache without alarming log lines."""
 WHOLE_LOOPS_FLAG = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
 WIDE_VECTORS_FLAG = "--xla_cpu_prefer_vector_width=512"
 OLD_FUSIONS_FLAG = "--xla_cpu_use_fusion_emitters=false"
-"""XLA's code generator before MLIR, which 0.10 still has: it compiles in half the time, and the code is as fast."""
+"""XLA's code generator without MLIR, which jax 0.10 still has (experiments/NOTEBOOK.md, "Speed on CPUs")."""
 
 
 def configure_cpu(*, use_cache: bool = True, num_threads: int | None = None) -> None:
     """Make JAX faster at this library's work on CPUs; call it once, before JAX computes anything.
 
-    Keeps XLA's compiled programs on disk, and adds flags to XLA_FLAGS unless you have set them: while-loops are
-    compiled whole, which speeds up compositing by XLA, vectors are 512 bits wide on processors with AVX-512, and jax
-    0.10 compiles in half the time. GPUs are not affected. The command line calls this function.
+    Keeps XLA's compiled programs on disk, and adds flags to XLA_FLAGS unless you have set them. While-loops are
+    compiled whole, which speeds up compositing by XLA; vectors are 512 bits wide on processors with AVX-512; and jax
+    0.10 takes its older code generator, which compiles in half the time. GPUs are not affected. The command line calls
+    this function.
 
     Args:
       use_cache: whether to keep compiled programs in the user's cache folder, so that the next process starts in

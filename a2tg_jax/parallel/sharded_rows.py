@@ -114,29 +114,35 @@ def _is_own(x: object) -> bool:
     return mesh_of(x) is None and getattr(x, "is_fully_addressable", True)
 
 
-def placed_like(new: Any, old: object) -> Array:
+def placed_like(new: Any, old: Any) -> Array:
     """Return values of the host, their rows spread over the devices of another array, whose shape may differ, or on its
-    device. ValueError: several processes have different values."""
+    device if it is committed to one. ValueError: several processes have different values."""
     mesh, new = mesh_of(old), np.asarray(new)
     new = new.astype(jax.dtypes.canonicalize_dtype(new.dtype), copy=False)
     if mesh is not None:
         return spread(mesh, new)
-    # Compiles nothing, unlike `jnp.asarray`. An array that may be on any device stays such a one.
-    is_fixed = isinstance(old, jax.Array) and not isinstance(old, jax.core.Tracer) and old.committed
-    return jax.device_put(new, old.sharding if is_fixed else None)
+    is_fixed = _is_held(old) and old.committed and len(old.devices()) == 1
+    # Compiles nothing, unlike `jnp.asarray`.
+    return jax.device_put(new, next(iter(old.devices())) if is_fixed else None)
+
+
+def _is_held(x: object) -> bool:
+    """Return whether a value is an array of JAX with numbers, not traced."""
+    return isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer)
 
 
 def zeros_beside(old: object, shape: Sequence[int], dtype: DTypeLike) -> Array:
     """Return zeros, their rows spread over the devices of another array."""
-    return placed_like(np.zeros(shape, dtype), old)
+    mesh = mesh_of(old)
+    return jnp.zeros(shape, dtype, device=None if mesh is None else sharding_of_rows(mesh, tuple(shape)))
 
 
 def rows_moved(x: Array, rows: Array | np.ndarray) -> Array:
     """Return the array whose row i is the former row rows[i].
 
-    It is traceable. Outside jit, rows move on the host, where nothing is compiled for their number.
+    It is traceable. Outside jit, rows of JAX's arrays move on the host, where nothing is compiled for their number.
     """
-    if isinstance(x, jax.core.Tracer) or isinstance(rows, jax.core.Tracer):
+    if not _is_held(x) or isinstance(rows, jax.core.Tracer):
         return x[rows]
     return placed_like(on_host(x)[np.asarray(rows)], x)
 

@@ -91,7 +91,7 @@ def list_tiles(
     compositor: Wanted, M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int,
     pixels: TilePixels | None = None, height: Array | None = None,
 ) -> TileLists:  # fmt: skip
-    """List the splats that touch each tile of a pass, as `tiles.tile_lists` does, by native loops where they run.
+    """List the splats that touch each tile, as `tiles.tile_lists` does, by native loops where they run.
 
     If the tiles have pixels with rays, XLA lists the splats, and the height is not used.
     """

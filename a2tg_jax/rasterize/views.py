@@ -21,7 +21,7 @@ from a2tg_jax.rasterize.compositor import Composited, composite, list_tiles
 from a2tg_jax.rasterize.kernels.platforms import check_compositor
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import Geometry, RenderOutput, RenderSettings
-from a2tg_jax.rasterize.splats import Wanted, drawn_splats, project_gaussians, settings_of_pass
+from a2tg_jax.rasterize.splats import drawn_splats, project_gaussians, settings_of_pass
 from a2tg_jax.rasterize.tile_pixels import tile_pixels
 from a2tg_jax.rasterize.tiles import TileGrid
 
@@ -168,11 +168,9 @@ def pairs_of_view(
     """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
     if not gaussians.num:
         return 0
-    check_compositor(settings.compositor)
-    camera = settings.finer(camera)
+    camera, static = settings.finer(camera), (settings.tile_size, settings.near_plane)
     try:
-        known = settings.compositor, settings.tile_size, settings.near_plane
-        return int(_jitted_count()(gaussians, camera, appearance, *known, num_live))
+        return int(_jitted_count()(gaussians, camera, appearance, *static, num_live))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 
@@ -190,12 +188,12 @@ def pairs_to_draw(
 @functools.cache
 def _jitted_count() -> jax.stages.Wrapped:
     def count(
-        gaussians: Gaussians, camera: Camera, appearance: Appearance, compositor: Wanted, tile_size: int,
-        near_plane: float, num_live: Any,
-    ) -> Array:  # fmt: skip
-        M, cutoff = drawn_splats(gaussians, camera, appearance, num_live)
+        gaussians: Gaussians, camera: Camera, appearance: Appearance, tile_size: int, near_plane: float, num_live: Any
+    ) -> Array:
+        M, cutoff = jax.lax.stop_gradient(drawn_splats(gaussians, camera, appearance, num_live))
         grid = TileGrid(camera.width, camera.height, tile_size)
         pixels = None if camera.rays is None else tile_pixels(camera.rays, tile_size)
-        return list_tiles(compositor, M, cutoff, near_plane, grid, 0, pixels).num_pairs
+        # Whatever composites later, and wherever: the number is the same.
+        return list_tiles("auto", M, cutoff, near_plane, grid, 0, pixels).num_pairs
 
-    return jax.jit(count, static_argnums=(3, 4, 5))
+    return jax.jit(count, static_argnums=(3, 4))

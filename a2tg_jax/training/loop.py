@@ -7,7 +7,6 @@ after it stay idle (`step.TrainState.status`); the loop removes the cause and la
 import contextlib
 import dataclasses
 import datetime
-import functools
 import time
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -184,9 +183,10 @@ class StageRun:
         self._rows: list[dict[str, float]] = []
         """Rows of the history since then."""
 
-        # Steps take over the buffers that they are given: copies on the device, or in numpy to be spread.
-        copied: Any = functools.partial(jax.tree.map, jnp.copy if self.mesh is None else np.array)
-        copied = jax.jit(copied) if self.mesh is None else copied
+        def copied(tree: Any) -> Any:
+            # Steps take over the buffers that they are given: copies on the device, or in numpy to be spread.
+            return jax.device_put(tree, may_alias=False) if self.mesh is None else jax.tree.map(np.array, tree)
+
         if resume is None:
             start = initial_model(scene, system) if start is None else start
             model = padded(copied(start.live), self.stage, system, self.session.num_devices)
