@@ -69,8 +69,9 @@ class Row:
 
 
 def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result]) -> list[Row]:
-    """Return the comparisons of `bytewise`, by stratum and budget. At equal time, plain methods in `results` trained
-    for as long as the first version, and in `in_equal_time` for as long as the second."""
+    """Return the comparisons of `bytewise`, by stratum and budget. At equal iterations, all runs count. At equal time,
+    plain methods in `results` trained for as long as the first version, and in `in_equal_time` for as long as the
+    present one."""
     rows, order = [], list(VERSIONS)
     for stratum in (DENSE, FEW):
         for budget in (0.3, 1.2):
@@ -78,13 +79,13 @@ def rows_of_bytewise(results: Sequence[Result], in_equal_time: Sequence[Result])
                 [result for result in each if stratum_of(result) == stratum and result.run.cell.budget == budget]
                 for each in (results, in_equal_time)
             )
-            trained_for = {FIRST: own, SECOND: timed}  # None of today's version yet.
+            trained_for = {FIRST: own, BYTEWISE: timed}
             for (version, prefix), (label, wording) in itertools.product(VERSIONS.items(), OTHERS.items()):
                 if label in VERSIONS and order.index(label) <= order.index(version):
                     continue  # Versions are compared with earlier ones.
                 is_timed = label.endswith(EQUAL_TIME)
                 place = f"{budget:g} MB" + ("" if stratum == DENSE else f", {FEW}") + (EQUAL_TIME if is_timed else "")
-                found = trained_for.get(version, []) if is_timed else own
+                found = trained_for.get(version, []) if is_timed else own + timed
                 rows.append(Row(f"{prefix} − {wording}, {place}", found, version, label))
                 if version == FIRST and label == BEST and stratum == DENSE:
                     others = [result for result in own if result.run.cell.scene.label not in CHOSEN_ON]
