@@ -492,7 +492,7 @@ def rows_are_read_and_moved(exchange):
                     np.testing.assert_array_equal(on_host(moved), values[places])
                     np.testing.assert_array_equal(rows_moved(jnp.asarray(values), places), values[places])
                     assert moved.sharding == sharding_of_rows(exchange.mesh, (len(places), *shape[1:]))
-        values, last = rng.normal(size=(num, 2)), jax.devices()[-1]
+        values, last = rng.normal(size=(num, 2)), jax.local_devices()[-1]
         assert rows_moved(jax.device_put(values, last), np.arange(3)).devices() == {last}
         np.testing.assert_array_equal(rows_moved(values, np.arange(3)), values[:3], strict=True)
         columns = spread(exchange.mesh, values_of := rng.normal(size=(3, num)).astype(np.float32), axis=1)

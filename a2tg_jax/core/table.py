@@ -20,7 +20,7 @@ from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_mask, check_shape, plain_array, short_repr
 from a2tg_jax.core.pytree import partition, pytree, static
-from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved
+from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved, to_jax
 
 Size = tuple[int, ...]
 Group = tuple[np.ndarray, np.ndarray]
@@ -89,7 +89,7 @@ class Table:
     @classmethod
     def placed(cls, buckets: Sequence[Any], places: "Places") -> Self:
         """Return the table of buckets and of the places that were planned for them (host)."""
-        return cls(tuple(map(jax.device_put, buckets)), *places)
+        return cls(tuple(map(to_jax, buckets)), *places)
 
     @classmethod
     def _padded(cls, capacity: int, size: Size, dtype: DTypeLike, padding: Sequence[float] | None = None) -> np.ndarray:

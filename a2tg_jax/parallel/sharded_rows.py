@@ -126,6 +126,11 @@ def placed_like(new: Any, old: Any) -> Array:
     return jax.device_put(new, next(iter(old.devices())) if is_fixed else None)
 
 
+def to_jax(x: Any) -> Array:
+    """Return an array of JAX: one of NumPy on the default device, any other as it is. Compiles nothing."""
+    return x if isinstance(x, jax.Array) else jax.device_put(x)
+
+
 def _is_held(x: object) -> bool:
     """Return whether a value is an array of JAX with numbers, not traced."""
     return isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer)
