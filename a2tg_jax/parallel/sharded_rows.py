@@ -127,7 +127,7 @@ def placed_like(new: Any, old: Any) -> Array:
 
 
 def to_jax(x: Any) -> Array:
-    """Return an array of JAX: one of NumPy on the default device, any other as it is. Compiles nothing."""
+    """Return an array of JAX: one of NumPy on the default device, any other unchanged. Compiles nothing."""
     return x if isinstance(x, jax.Array) else jax.device_put(x)
 
 
