@@ -31,9 +31,7 @@ def measure_stages(case: dict) -> dict:
     compositing, texels, regions = settings_of_pass(
         appearance, splats, grid, settings.near_plane, has_geometry=False, compositor="auto", tile_batch=None
     )
-    find_lists = jax.jit(
-        lambda M, cutoff: list_tiles("auto", M, cutoff, compositing.near_plane, compositing.grid, capacity)
-    )
+    find_lists = jax.jit(lambda M, cutoff: list_tiles("auto", M, cutoff, settings.near_plane, grid, capacity))
     lists = find_lists(splats.M, cutoff)
     jacobian, probe = camera.K @ camera.viewmat[:3, :3], jnp.zeros((num, 4))
 

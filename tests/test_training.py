@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bits import bits_of
 from kept_checkpoints import fit_keeping_checkpoints
-from own_fusions import passes_in_its_own_process
+from own_process import passes_in_its_own_process
 
 from a2tg_jax import (
     A2tg,

@@ -44,7 +44,7 @@ from a2tg_jax.core.numerics import Integer, at_least
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
 from a2tg_jax.core.table import Table, check_places, check_table, is_table
-from a2tg_jax.parallel.sharded_rows import rows_moved
+from a2tg_jax.parallel.sharded_rows import rows_joined, rows_moved
 from a2tg_jax.texture import Textures
 
 T = TypeVar("T")
@@ -460,6 +460,6 @@ def join_rows(trees: Sequence[T]) -> T:
     """Concatenate the rows of several trees, which have the same structure except for their tables (host)."""
 
     def joined(*leaves: Any) -> Any:
-        return type(leaves[0]).joined(leaves) if is_table(leaves[0]) else jnp.concatenate(leaves)
+        return type(leaves[0]).joined(leaves) if is_table(leaves[0]) else rows_joined(leaves)
 
     return jax.tree.map(joined, *trees, is_leaf=is_table)

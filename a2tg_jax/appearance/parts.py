@@ -22,7 +22,7 @@ from a2tg_jax.core.numerics import Integer, normalize, within
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, sh_basis
 from a2tg_jax.core.table import Places, Size, Table, check_places, check_table
-from a2tg_jax.parallel.sharded_rows import on_host, placed_like, to_jax
+from a2tg_jax.parallel.sharded_rows import on_host, placed_like
 from a2tg_jax.texture import NEUTRAL_TEXEL, Textures, allocate_textures, check_textures
 
 
@@ -321,7 +321,7 @@ class Coefficients(Table):
             own = np.full(len(blocks), num, np.int32)
             own[row[bucket == index]] = np.flatnonzero(bucket == index)
             owners.append(placed_like(own, places.bucket))
-        return cls(tuple(map(to_jax, buckets)), *places, tuple(owners))
+        return dataclasses.replace(super().placed(buckets, places), owners=tuple(owners))
 
     @staticmethod
     def resized(blocks: np.ndarray, size: Size) -> np.ndarray:

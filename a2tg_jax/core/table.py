@@ -20,7 +20,7 @@ from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_mask, check_shape, plain_array, short_repr
 from a2tg_jax.core.pytree import partition, pytree, static
-from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved, to_jax
+from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved
 
 Size = tuple[int, ...]
 Group = tuple[np.ndarray, np.ndarray]
@@ -89,7 +89,9 @@ class Table:
     @classmethod
     def placed(cls, buckets: Sequence[Any], places: "Places") -> Self:
         """Return the table of buckets and of the places that were planned for them (host)."""
-        return cls(tuple(map(to_jax, buckets)), *places)
+        # `device_put` compiles nothing, but would move arrays that several processes share.
+        held = (bucket if isinstance(bucket, jax.Array) else jax.device_put(bucket) for bucket in buckets)
+        return cls(tuple(held), *places)
 
     @classmethod
     def _padded(cls, capacity: int, size: Size, dtype: DTypeLike, padding: Sequence[float] | None = None) -> np.ndarray:
@@ -191,9 +193,8 @@ class Table:
             raise ValueError(f"{name} of {num} sizes cannot change rows: densify and prune before they grow")
         # With one bucket, row i is Gaussian i's (`plan_places`); padding follows and stays.
         (bucket,) = self.buckets
-        spare = np.arange(len(rows), len(bucket), dtype=np.int32)
-        concatenate = jnp.concatenate if isinstance(rows, jax.core.Tracer) else np.concatenate
-        moved = rows_moved(bucket, concatenate([rows, spare]))
+        spare = jnp.arange(len(rows), len(bucket), dtype=jnp.int32)
+        moved = rows_moved(bucket, jnp.concatenate([jnp.asarray(rows, jnp.int32), spare]))
         return dataclasses.replace(self, buckets=(moved,))
 
     def clear(self, is_cleared: Array) -> Self:

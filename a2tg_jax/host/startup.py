@@ -53,8 +53,12 @@ def cpu_flags(features: frozenset[str], jax_version: tuple[int, ...]) -> tuple[s
     """Return the XLA flags that help on a processor with these features; none for an unknown version of JAX."""
     if jax_version not in CHECKED_JAX_VERSIONS:
         return ()
-    wide = (WIDE_VECTORS_FLAG,) if "avx512f" in features else ()
-    return (WHOLE_LOOPS_FLAG, *wide, *((OLD_FUSIONS_FLAG,) if jax_version == (0, 10) else ()))
+    flags = {
+        WHOLE_LOOPS_FLAG: True,
+        WIDE_VECTORS_FLAG: "avx512f" in features,
+        OLD_FUSIONS_FLAG: jax_version == (0, 10),
+    }
+    return tuple(flag for flag, is_wanted in flags.items() if is_wanted)
 
 
 def silence_xla() -> None:

@@ -126,11 +126,6 @@ def placed_like(new: Any, old: Any) -> Array:
     return jax.device_put(new, next(iter(old.devices())) if is_fixed else None)
 
 
-def to_jax(x: Any) -> Array:
-    """Return an array of JAX: one of NumPy on the default device, any other unchanged. Compiles nothing."""
-    return x if isinstance(x, jax.Array) else jax.device_put(x)
-
-
 def _is_held(x: object) -> bool:
     """Return whether a value is an array of JAX with numbers, not traced."""
     return isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer)
@@ -150,6 +145,13 @@ def rows_moved(x: Array, rows: Array | np.ndarray) -> Array:
     if not _is_held(x) or isinstance(rows, jax.core.Tracer):
         return x[rows]
     return placed_like(on_host(x)[np.asarray(rows)], x)
+
+
+def rows_joined(parts: Sequence[Array]) -> Array:
+    """Return the rows of several arrays, one after the other, on the devices of the first, as in `rows_moved`."""
+    if not all(map(_is_held, parts)):
+        return jnp.concatenate(parts)
+    return placed_like(np.concatenate([on_host(part) for part in parts]), parts[0])
 
 
 def rows_replaced(x: Array, rows: np.ndarray, new: ArrayLike) -> Array:

@@ -168,9 +168,9 @@ def pairs_of_view(
     """Return the (splat, tile) pairs of the first `num_live` rows in a view, before the outline test (host)."""
     if not gaussians.num:
         return 0
-    camera, static = settings.finer(camera), (settings.tile_size, settings.near_plane)
+    camera = settings.finer(camera)
     try:
-        return int(_jitted_count()(gaussians, camera, appearance, *static, num_live))
+        return int(_jitted_count()(gaussians, camera, appearance, settings.tile_size, settings.near_plane, num_live))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
 

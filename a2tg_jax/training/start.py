@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
+from a2tg_jax.appearance.base import join_rows
 from a2tg_jax.appearance.parts import nearest_gaussians
 from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
@@ -18,7 +19,6 @@ from a2tg_jax.data.assembly import Sight, unseeing
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.sharded_rows import on_host, placed_like
 from a2tg_jax.training.losses import SSIM_WINDOW
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
@@ -194,7 +194,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
         gaussians = nearest_gaussians(gaussians, np.asarray(shapes))
     if room > num:
         spare = no_rows(room - num, gaussians.sh.shape[1], gaussians.means.dtype)
-        gaussians = jax.tree.map(lambda a, b: placed_like(np.concatenate([on_host(a), b]), a), gaussians, spare)
+        gaussians = join_rows([gaussians, spare])
     appearance = model.appearance
     is_same = template_of(appearance) == stage.appearance
     if not is_same or room > num:
