@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import os
 import types
 import typing
 from collections.abc import Sequence
@@ -70,6 +71,12 @@ def parse(kind: type[Parsed], program: str, arguments: Sequence[str], default: P
         if text != scene:
             check_path(text)
     return command
+
+
+def at_home(word: str) -> str:
+    """Return an argument with the home folder for a leading ~, also in --out=~/x, where shells leave it."""
+    flag, equals, text = word.partition("=") if word.startswith("--") else ("", "", word)
+    return flag + equals + os.path.expanduser(text)
 
 
 def check_path(text: str) -> None:

@@ -158,8 +158,9 @@ def parsed(name: str, arguments: Sequence[str]) -> Any:
       SystemExit: after help or an error of an argument, which are printed.
       ValueError, FileNotFoundError: if there is no such system, preset or file, or it is invalid.
     """
-    from a2tg_jax.cli.arguments import parse
+    from a2tg_jax.cli.arguments import at_home, parse
 
+    arguments = [at_home(word) for word in arguments]
     kind, default = command_class(name), None
     if name == "train":
         from a2tg_jax.cli.train import train_defaults

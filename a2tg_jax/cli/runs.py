@@ -207,10 +207,10 @@ class MeshCommand:
         check_output(out)
         for file in files:
             check_export(file, default, "--out", overwrite=self.overwrite)
-        print(write_mesh(source, out, self.options))
         if is_run and out.resolve() == default.resolve():
             # Listed, so that the next a2tg mesh may replace it (check_export).
             RunFolder(self.source).own(default)
+        print(write_mesh(source, out, self.options))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,6 +30,7 @@ from a2tg_jax.data.staging import HALF, Panorama, Staged, directions, stage
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.host.machine import num_threads
 from a2tg_jax.host.progress_bars import counting, has_terminal
+from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import counted, first_names
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -116,8 +117,9 @@ def run_sfm(
     check_literal("camera_model", camera_model, CameraModel)
     if frames < LEAST_PHOTOS:
         raise ValueError(f"frames must be at least {LEAST_PHOTOS}; got {frames}")
-    sources = [Path(photos)] if isinstance(photos, str | os.PathLike) else [Path(source) for source in photos]
-    out, masks = Path(out), None if masks is None else Path(masks)
+    sources = [expanded(source) for source in ([photos] if isinstance(photos, str | os.PathLike) else photos)]
+    out = expanded(out)
+    masks = None if masks is None else expanded(masks)
     if masks is not None and not masks.is_dir():
         raise FileNotFoundError(f"{masks}: no such folder of masks")
     for existing in (out / "images", out / "sparse", out / MASKS):

@@ -24,12 +24,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path next to `path` to write to, and rename it to `path` if the block succeeds.
 
     If the process is killed or the machine loses power, the old file or none is left, never half of one. Missing parent
-    folders are made. Partial files of the same file that killed processes left over are deleted after an hour.
+    folders are made. A link stays, and the file that it leads to is written. Partial files of the same file that killed
+    processes left over are deleted after an hour.
 
     Raises:
-      OSError: from the block. The error of a full disk names the file.
+      OSError: from the block, or if a link leads nowhere. The error of a full disk names the file.
     """
-    path = Path(path)
+    path = file_to_write(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(OSError):  # Another process may delete them; another user's cannot be deleted.
         for partial, whole in _left_over_once(path.absolute().parent).items():
@@ -45,6 +46,24 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             flush_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def file_to_write(path: str | os.PathLike[str]) -> Path:
+    """Return the path itself or, if it is a link, the file that it leads to, which need not exist.
+
+    Raises:
+      OSError: if links lead in a circle, or to a folder that does not exist, such as on a disk that is not mounted.
+    """
+    path = Path(path)
+    if not path.is_symlink():
+        return path
+    # Unlike Path.resolve, realpath accepts circular links, and returns one of them.
+    target = Path(os.path.realpath(path))
+    if target.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), os.fspath(path))
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"{path} is a link to {target}, but there is no folder {target.parent}: make it first")
+    return target
 
 
 def write_whole(path: str | os.PathLike[str], data: bytes | str) -> None:

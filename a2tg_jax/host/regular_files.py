@@ -20,6 +20,15 @@ READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0
 """Flags to open a file for reading bytes, without waiting for a pipe's writer or changing newlines."""
 
 
+def expanded(path: str | os.PathLike[str]) -> Path:
+    """Return a path of the user, with the home folder for a leading ~, as a shell expands it.
+
+    Not for names in files: a scene in the current folder might name a photograph ~/private.png.
+    """
+    # Unlike Path.expanduser, it leaves the name of an unknown user as it is.
+    return Path(os.path.expanduser(path))
+
+
 def room_of(num_bytes: int) -> int:
     """Return the number of bytes that an untrusted file of this size may unpack to."""
     return FREE_ROOM + LARGEST_RATIO * num_bytes

@@ -81,13 +81,14 @@ def is_url(text: str) -> bool:
 
 
 def path_here(text: str) -> Path | None:
-    """Return the path on this machine for a path or a file:// URL; None for the URL of a store.
+    """Return the path on this machine for a path, perhaps with a leading ~, or a file:// URL; None for the URL of a
+    store.
 
     Raises:
       ValueError: if file:// has a host, or no path.
     """
     if not is_url(text):
-        return Path(text)
+        return Path(os.path.expanduser(text))
     scheme, _, place = text.partition("://")
     if scheme.lower() != "file":
         return None

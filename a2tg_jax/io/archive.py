@@ -6,7 +6,6 @@ The entry "header" is JSON text as bytes; its "format" and "version" identify th
 import json
 import os
 from collections.abc import Collection, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.npz import read_npz
-from a2tg_jax.host.regular_files import is_folder, is_regular
+from a2tg_jax.host.regular_files import expanded, is_folder, is_regular
 from a2tg_jax.host.text import shortened
 
 FORMAT = "a2tg-jax checkpoint"
@@ -42,7 +41,7 @@ def write_archive(
     # The header is bytes, not a NumPy string: `read_npz` accepts numbers only.
     entries = {HEADER: np.frombuffer(text.encode(), np.uint8), **{name: np.asarray(a) for name, a in arrays.items()}}
     # An open file, because NumPy appends .npz to paths without it, and `replacing` would not find the result.
-    with replacing(path) as temporary, open(temporary, "wb") as file:
+    with replacing(expanded(path)) as temporary, open(temporary, "wb") as file:
         np.savez(file, **entries)  # type: ignore[arg-type]
 
 
@@ -51,7 +50,7 @@ def read_archive(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the header and the arrays of `write_archive`; `names` selects arrays. FileNotFoundError: there is no such
     file. ValueError: it is not such an archive, is damaged, lacks one of the names, or has another version."""
-    path = Path(path)
+    path = expanded(path)
     # Naming a run folder instead of its model is a likely mistake.
     if is_folder(path):
         found = sorted(path.glob("models/*.npz"))

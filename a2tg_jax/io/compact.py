@@ -20,7 +20,7 @@ from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.regular_files import room_of
+from a2tg_jax.host.regular_files import expanded, room_of
 from a2tg_jax.io.columns import (
     MOST_BITS,
     AxisSteps,
@@ -151,7 +151,7 @@ def save_compact(
     check_suffix(path, "save_compact")
     check_is_model(model)
     data = encode_model(model, choices, grids)
-    write_whole(path, data)
+    write_whole(expanded(path), data)
 
 
 def load_compact(path: str | os.PathLike[str]) -> Model:
@@ -173,6 +173,7 @@ def load_compact(path: str | os.PathLike[str]) -> Model:
       200
     """
     check_suffix(path, "load_compact")
+    path = expanded(path)
     return decode_model(existing_bytes(path, "compact scene"), os.fspath(path))
 
 

@@ -12,6 +12,7 @@ from a2tg_jax.core.floaters import floater_scores
 from a2tg_jax.core.origin import Color, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.host.atomic import write_whole
+from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.columns import AxisSteps
 from a2tg_jax.io.saved_file import VERSION, load_saved, numbers_of
@@ -63,7 +64,7 @@ def load_edit(path: Path) -> Edit:
       FileNotFoundError: if there is no such file.
       ValueError: if it is invalid, naming the file.
     """
-    return load_saved(Path(path), "edit", _edit_of)
+    return load_saved(expanded(path), "edit", _edit_of)
 
 
 def save_edit(path: Path, edit: Edit) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK
+from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gltf import load_gltf, save_gltf
@@ -116,7 +117,7 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
       FileNotFoundError: if there is no such file.
       ValueError: if the suffix is unknown, an optional library is missing, or the file is damaged.
     """
-    loaded = format_of(path).load(Path(path))
+    loaded = format_of(path).load(expanded(path))
     return Model(loaded) if isinstance(loaded, Gaussians) else loaded
 
 
@@ -139,7 +140,7 @@ def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "o
       200
     """
     save = writer_of(path)
-    save(Path(path), model, **({} if format_of(path).keeps_origin else {"world": world}))
+    save(expanded(path), model, **({} if format_of(path).keeps_origin else {"world": world}))
 
 
 def files_written(path: Path) -> list[Path]:

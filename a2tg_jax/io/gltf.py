@@ -8,7 +8,6 @@ the extension A2TG_splat_textures; programs without it show plain splats. docs/f
 import os
 import warnings
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -18,6 +17,7 @@ from a2tg_jax.appearance.base import PARTS
 from a2tg_jax.appearance.parts import EXTENT, MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import PROGRAM, shortened
 from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.columns import LARGEST_FLOAT, Ends, dequantised, ends_of, quantised
@@ -126,7 +126,7 @@ def save_gltf(
         "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
     }
-    builder.save(Path(path), whole)
+    builder.save(expanded(path), whole)
 
 
 def _extension_of(builder: Builder, model: Model, kind: TexelKind) -> dict[str, Any]:
@@ -176,6 +176,7 @@ def load_gltf(path: str | os.PathLike[str]) -> Model:
       ValueError: if it is not glTF 2.0, is damaged, holds no splats, or needs an unsupported extension.
     """
     check_suffix(path, "load_gltf")
+    path = expanded(path)
     with reading(path):
         document = Document(path)
         if unknown := [name for name in document.json.get("extensionsRequired", []) if name not in READ]:

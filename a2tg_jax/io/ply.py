@@ -30,7 +30,7 @@ from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.ply import OFFSET, RGB, ROTATION, SH_DEGREE0, PlyFile, largest_color
 from a2tg_jax.host.atomic import write_whole
-from a2tg_jax.host.regular_files import is_regular, open_regular
+from a2tg_jax.host.regular_files import expanded, is_regular, open_regular
 from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.validate import check_model, check_suffix, reading
 from a2tg_jax.model import Model
@@ -82,6 +82,7 @@ def save_ply(
       200
     """
     check_suffix(path, "save_ply")
+    path = expanded(path)
     found = others.world_gaussians(gaussians, transform, world=world)
     third = others.third_log_scales(np.asarray(found.gaussians.log_scales)) if third_scale else None
     means, offset = (found.means, np.zeros(3)) if float64 else (None, found.offset)
@@ -181,7 +182,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
 def load_ply_model(path: str | os.PathLike[str]) -> Model:
     """Return the Gaussians of `load_ply` as a model, with the offset of the positions, if any, in its origin."""
-    path = Path(path)
+    path = expanded(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such PLY file")
     with open_regular(path) as file:

@@ -16,14 +16,13 @@ import pickle
 import pickletools
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.host.regular_files import is_regular, open_regular
+from a2tg_jax.host.regular_files import expanded, is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.other_programs import degree_to_read, flat_rows
 from a2tg_jax.io.validate import check_model, reading
@@ -55,7 +54,7 @@ def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
     """Read Gaussians from a checkpoint of gsplat, Nerfstudio, 3DGS or 2DGS. Ellipsoids become flat, with a warning.
     FileNotFoundError: there is no such file. ValueError: it is not such a checkpoint, is damaged, pickles anything but
     tensors, or a number is not finite."""
-    path = Path(path)
+    path = expanded(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such checkpoint")
     with open_regular(path) as file:

@@ -17,7 +17,7 @@ from a2tg_jax.core.origin import BLACK
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
-from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, is_regular, open_regular
+from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, expanded, is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.model_file import background_of, origin_of
@@ -42,7 +42,7 @@ def save_usd(path: str | os.PathLike[str], model: Model, *, ellipsoids: bool = F
       ValueError: if usd-core is missing, or the model has a number that is not finite or too large.
     """
     stage = _stage_of(live_model(path, model, "save_usd"), ellipsoids)
-    path = Path(path)
+    path = expanded(path)
     # usd-core chooses the format by the suffix, which the temporary path lacks.
     with replacing(path) as temporary, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         suffix = path.suffix.lower() if path.suffix.lower() in (".usda", ".usdz") else ".usdc"
@@ -132,7 +132,7 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
       ValueError: if usd-core is missing, or the file is not USD, is damaged, or holds no splats.
     """
     check_suffix(path, "load_usd")
-    usd, path = import_usd(), Path(path)
+    usd, path = import_usd(), expanded(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such USD file")
     # usd-core opens the path itself: this checks the size and the permission first.

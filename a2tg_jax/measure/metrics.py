@@ -20,7 +20,7 @@ from a2tg_jax.core.checks import check_kind, check_shape, plain_array
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.host.npz import read_npz
-from a2tg_jax.host.regular_files import is_regular
+from a2tg_jax.host.regular_files import expanded, is_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.texture import BYTES_PER_TEXEL, Textures
 from a2tg_jax.training import losses
@@ -107,7 +107,7 @@ def load_lpips(path: str | os.PathLike[str]) -> LpipsWeights:
       FileNotFoundError: if there is no such file.
       ValueError: if it does not hold LPIPS weights of AlexNet or SqueezeNet.
     """
-    return _load_lpips(Path(path).resolve())
+    return _load_lpips(expanded(path).resolve())
 
 
 def lpips(

@@ -11,6 +11,7 @@ from PIL import Image
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.atomic import replacing, write_whole
+from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import PROGRAM
 from a2tg_jax.io.gltf import OWN
 from a2tg_jax.io.gltf_container import Builder
@@ -63,7 +64,7 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, transform: Similarity | 
       1
     """
     check_mesh_suffix(path)
-    path = Path(path)
+    path = expanded(path)
     suffix = path.suffix.lower()
     if suffix == ".glb":
         _save_glb(path, mesh, transform)

@@ -28,10 +28,11 @@ import os
 import shlex
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from a2tg_jax.host.atomic import left_over, named_if_full, write_whole
+from a2tg_jax.host.atomic import file_to_write, left_over, named_if_full, write_whole
 from a2tg_jax.host.machine import ALONE, Devices
 from a2tg_jax.host.operating_system import flush_folder, try_lock
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -70,8 +71,15 @@ class RunFolder:
         self.test = path / "test"
 
     def own(self, path: Path) -> Path:
-        """Return the path after listing it in the marker. Only listed paths are ever replaced or deleted."""
+        """Return the path after listing it in the marker. Only listed paths are ever replaced or deleted.
+
+        A link to a file outside is removed, with a warning: a run folder may come from a stranger.
+        """
         self.own_all([path.relative_to(self.path).as_posix()])
+        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(self.path.resolve()):
+            target = os.readlink(path)
+            warnings.warn(f"{path} was a link to {target}, which stays: runs write into their own folder", stacklevel=2)
+            path.unlink()
         return path
 
     def own_all(self, names: Sequence[str]) -> None:
@@ -331,11 +339,11 @@ def _move(source: RunFolder, target: RunFolder, *, is_record_first: bool) -> Non
 
 
 def check_output(path: Path) -> None:
-    """Raise ValueError if a file or folder cannot be made, naming the obstacle.
+    """Raise ValueError, or OSError of a link, if a file or folder cannot be made, naming the obstacle.
 
     Several levels of new folders outside the current one, such as on a misspelt drive, are reported on stderr.
     """
-    place = Path(os.path.abspath(path))
+    place = Path(os.path.abspath(file_to_write(path)))
     missing = [folder for folder in (place, *place.parents) if not folder.exists()]
     existing = missing[-1].parent if missing else place if place.is_dir() else place.parent
     if not existing.exists():

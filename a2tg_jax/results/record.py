@@ -144,7 +144,7 @@ class RunRecord:
         """Return the record with full paths; relative ones start from a folder. Raises as `scene_place`."""
         path = self.scene.path
         path = path if path in ("", SYNTHETIC) else scene_place(path, folder)
-        init = None if self.init is None else os.path.realpath(folder / self.init)
+        init = None if self.init is None else os.path.realpath(folder / os.path.expanduser(self.init))
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, path=path), init=init)
 
     def with_system(self, name: str, preset: str | None) -> "RunRecord":
