@@ -145,6 +145,52 @@ def test_rows_of_nan_are_left_out_and_counted(tmp_path, name):
     assert_same(found, load_ply(tmp_path / "whole.ply"))
 
 
+def filtered(log_scales, logit, width):
+    """Scales and opacity of Mip-Splatting (`get_scaling_with_3D_filter`, `get_opacity_with_3D_filter`), by products."""
+    squares = np.exp(log_scales) ** 2
+    share = np.sqrt(np.prod(squares) / np.prod(squares + width**2))
+    return np.sqrt(squares + width**2), share / (1 + np.exp(-logit))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_big_endian"])
+@pytest.mark.parametrize("is_flat", [False, True])
+def test_the_filter_of_mip_splatting_is_applied(tmp_path, encoding, is_flat):
+    names, rng = [*ATTRIBUTES, "scale_2", "filter_3D"], np.random.default_rng(0)
+    rows = rng.normal(size=(6, len(names)))
+    rows[:, names.index("scale_2")] = -6
+    rows[:, names.index("filter_3D")] = [0.3, 0.05, 0.0, 2.0, np.nan, -0.3]
+    write_ply(tmp_path / "g.ply", names, rows, encoding)
+    if is_flat:
+        data = (tmp_path / "g.ply").read_bytes()
+        (tmp_path / "g.ply").write_bytes(data.replace(b"made by hand", b"SplatRenderMode: 2dgs"))
+    with pytest.warns(UserWarning) as told:
+        found = load_ply(tmp_path / "g.ply")
+    wanted = ["g.ply: 1 Gaussian of 6 left out", "g.ply: holds 3D Gaussians (scale_2), 4 of them not flat"]
+    for one, beginning in zip(told, wanted[: 1 if is_flat else 2], strict=True):
+        assert str(one.message).startswith(str(tmp_path / beginning))
+    assert found.num == 5
+    columns = [names.index(name) for name in ("scale_0", "scale_1", *(() if is_flat else ("scale_2",)))]
+    for row, scales, opacity in zip(rows[[0, 1, 2, 3, 5]], found.scales, found.opacities, strict=True):
+        by_axis, drawn = filtered(row[columns], row[names.index("opacity")], row[names.index("filter_3D")])
+        np.testing.assert_allclose(np.sort(scales), np.sort(by_axis)[-2:], rtol=1e-5)
+        np.testing.assert_allclose(opacity, drawn, rtol=1e-5)
+
+
+def test_attributes_that_are_not_read_are_named(tmp_path):
+    more = ["beta", "f_offset_0", "f_offset_1", "filter_3D", "red", "green", "blue"]
+    names = [*ATTRIBUTES, "scale_2", *more]
+    rows = np.ones((2, len(names)))
+    rows[:, [names.index("scale_2"), names.index("filter_3D")]] = -20, 0
+    write_ply(tmp_path / "g.ply", names, rows)
+    with pytest.warns(UserWarning, match=r"g\.ply: does not read beta, f_offset_\*; if the program") as told:
+        load_ply(tmp_path / "g.ply")
+    assert "filter" not in str(told[0].message) and "red" not in str(told[0].message)
+    names = ["x", "y", "z", "f_anchor_feat_0", "opacity", "scale_0", "scale_1"]
+    write_ply(tmp_path / "g.ply", names, np.zeros((2, len(names))))
+    with pytest.raises(ValueError, match=r"no attribute f_dc_0.*networks make splats of these anchors"):
+        load_ply(tmp_path / "g.ply")
+
+
 def test_a_third_scale_of_0_is_flat(tmp_path):
     """Its logarithm is −inf; in other places that is no number."""
     names, rows = (*ATTRIBUTES, "scale_2"), np.random.default_rng(0).normal(size=(3, len(ATTRIBUTES) + 1))

@@ -123,12 +123,52 @@ def test_coefficients_above_degree_3_are_left_out_with_a_warning(tmp_path):
         assert_same(load_splats(tmp_path / "a.pt").gaussians, some_gaussians())
 
 
-def test_gaussians_of_nan_are_left_out_and_counted(tmp_path):
+@pytest.mark.parametrize("value", [np.nan, 1e13])
+def test_gaussians_that_cannot_be_drawn_are_left_out_and_counted(tmp_path, value):
     means = np.array(some_gaussians().means)
-    means[3, 1] = np.nan
+    means[3, 1] = value
     write_checkpoint(tmp_path / "a.pt", {"splats": {**tensors(), "means": Tensor(means)}})
     with pytest.warns(UserWarning, match=r"a\.pt: 1 Gaussian of 7 left out.*first is row 3"):
         assert_same(load_splats(tmp_path / "a.pt").gaussians, some_gaussians()[np.array([0, 1, 2, 4, 5, 6])])
+
+
+@pytest.mark.parametrize("kind", ["gsplat", "nerfstudio"])
+def test_the_filter_of_mip_splatting_is_applied_and_other_tensors_are_named(tmp_path, kind):
+    width, folder = np.linspace(0, 0.3, 7)[:, None], "" if kind == "gsplat" else "_model.gauss_params."
+    value = {"splats": tensors()} if kind == "gsplat" else as_nerfstudio()
+    own = value["splats" if kind == "gsplat" else "pipeline"]
+    own |= {f"{folder}filter_3D": Tensor(width), f"{folder}beta": Tensor(width)}
+    write_checkpoint(tmp_path / "a.pt", {**value, "camera_opt": {"embeds.weight": Tensor(width)}})
+    with pytest.warns(UserWarning) as told:
+        found = load_splats(tmp_path / "a.pt").gaussians
+    assert [str(one.message).rpartition("a.pt: ")[2][:20] for one in told] == [
+        "does not read beta; ",
+        "holds 3D Gaussians (",
+    ]
+    g = some_gaussians()
+    scales = np.concatenate([g.scales, np.exp(g.log_scales.min(1, keepdims=True) - 7)], axis=1).astype(float)
+    drawn = np.sqrt(scales**2 + width**2)
+    np.testing.assert_allclose(found.scales, drawn[:, :2], rtol=1e-5)
+    np.testing.assert_allclose(found.opacities, g.opacities * np.prod(scales / drawn, axis=1), rtol=1e-4)
+
+
+def test_entries_beyond_those_of_3dgs_are_named(tmp_path):
+    """RaDe-GS appends a network and embeddings for the appearance of photographs."""
+    parts, iteration = as_2dgs()
+    write_checkpoint(
+        tmp_path / "a.pt", ((*parts, {"weight": Tensor(np.zeros(3))}, Tensor(np.zeros((5, 64)))), iteration)
+    )
+    with pytest.warns(UserWarning, match="does not read entry 12 of its tuple, entry 13 of its tuple; if"):
+        assert_same(load_splats(tmp_path / "a.pt").gaussians, some_gaussians())
+
+
+def test_counts_that_differ_are_named_and_none_are_an_empty_model(tmp_path):
+    write_checkpoint(tmp_path / "a.pt", {"splats": {**tensors(), "quats": Tensor(np.zeros((6, 4)))}})
+    with pytest.raises(ValueError, match=r"a\.pt: has 7 means, but 6 quats"):
+        load_splats(tmp_path / "a.pt")
+    none = {name: Tensor(np.asarray(tensor.array)[:0]) for name, tensor in tensors().items()}
+    write_checkpoint(tmp_path / "a.pt", {"splats": none})
+    assert load_splats(tmp_path / "a.pt").num == 0
 
 
 class Harm:

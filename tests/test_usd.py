@@ -120,11 +120,12 @@ def test_fields_that_lie_are_refused(tmp_path, change, message):
     refused(path, message)
 
 
-def test_particles_of_nan_are_left_out_and_counted(tmp_path):
+@pytest.mark.parametrize("value", [np.nan, 1e13])
+def test_particles_that_cannot_be_drawn_are_left_out_and_counted(tmp_path, value):
     gaussians = some_gaussians()
     stage, field = stage_of(gaussians)
     positions = np.array(gaussians.means)
-    positions[2, 1] = np.nan
+    positions[2, 1] = value
     field.GetPrim().GetAttribute("positions").Set(Vt.Vec3fArray.FromNumpy(positions))
     stage.GetRootLayer().Export(str(tmp_path / "m.usda"))
     with pytest.warns(UserWarning, match=rf"m\.usda: 1 Gaussian of {gaussians.num} left out.*first is row 2"):

@@ -108,7 +108,10 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
     check_similarity(similarity, "similarity")
     rotation = np.asarray(similarity.rotation, np.float64)
     means = similarity.apply(np.asarray(gaussians.means, np.float64))
-    turned = Rotation.from_matrix(rotation) * Rotation.from_quat(np.asarray(gaussians.quats), scalar_first=True)
+    quats = np.asarray(gaussians.quats, np.float64)
+    # The renderer draws quaternions of zeros as unrotated.
+    quats = np.where(quats.any(axis=1, keepdims=True), quats, [1.0, 0.0, 0.0, 0.0])
+    turned = Rotation.from_matrix(rotation) * Rotation.from_quat(quats, scalar_first=True)
     log_scales = np.asarray(gaussians.log_scales, np.float64) + np.log(similarity.scale)
     # D is block diagonal: lower degrees need its upper left part only.
     turned_sh = sh_rotation(rotation)[: gaussians.sh.shape[1], : gaussians.sh.shape[1]]

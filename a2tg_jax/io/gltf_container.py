@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from a2tg_jax.data.ply import turn_of
 from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import LARGEST_RATIO, MOST_ARRAY_BYTES, is_regular, read_regular, room_of
@@ -321,8 +321,8 @@ def _local_matrix(node: Mapping[str, Any]) -> np.ndarray:
     if "matrix" in node:
         # Column by column in the file.
         return vector("matrix", [0.0] * 16).reshape(4, 4).T
-    rotation = vector("rotation", [0.0, 0.0, 0.0, 1.0])
+    xyzw = vector("rotation", [0.0, 0.0, 0.0, 1.0])
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(rotation).as_matrix() * vector("scale", [1.0, 1.0, 1.0])
+    matrix[:3, :3] = turn_of(xyzw[[3, 0, 1, 2]]) * vector("scale", [1.0, 1.0, 1.0])
     matrix[:3, 3] = vector("translation", [0.0, 0.0, 0.0])
     return matrix

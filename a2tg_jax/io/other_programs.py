@@ -8,6 +8,7 @@ are relative to an offset.
 import dataclasses
 import math
 import os
+import re
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, NamedTuple
@@ -18,13 +19,14 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.appearance.parts import MAX_DEGREE, nearest_gaussians
 from a2tg_jax.core.camera_paths import upright_rotation
+from a2tg_jax.core.checks import LARGEST_NUMBER
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gaussians, logit
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity, transform_gaussians
-from a2tg_jax.host.text import counted
+from a2tg_jax.host.text import counted, first_names, shortened
 from a2tg_jax.io.model_file import origin_arrays, origin_header
-from a2tg_jax.io.validate import check_origin
+from a2tg_jax.io.validate import LARGEST_LOG_SCALE, check_origin
 from a2tg_jax.model import Model, concatenate
 
 Up = Literal["y", "z"]
@@ -42,6 +44,8 @@ UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
 LEVEL = math.cos(math.radians(3))
 """Cosine of the largest angle between the estimated vertical and an axis that counts as the vertical itself."""
 LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-6
+LEAST_LENGTH = 1e-9
+"""Length of a quaternion below which, and above whose inverse, it is made a unit quaternion."""
 THICKNESS = 1e-3
 """Ratio of a flat Gaussian's third scale in a file to its shorter one."""
 # Turns by 120° and −120° about (1, 1, 1), and none.
@@ -210,54 +214,106 @@ def gaussians_of(
 ) -> Gaussians:
     """Return the Gaussians of a file's splats, whose third axis is the normal if the file `is_flat`.
 
-    Otherwise the thinnest axis becomes the normal. Splats with numbers that are not finite are dropped with a warning,
-    unless `keeps_all`.
+    Otherwise the thinnest axis becomes the normal. Splats that cannot be drawn are left out with a warning, unless
+    `keeps_all`.
     """
-    # A textured file has tables by row: none can be dropped.
-    if not keeps_all:
-        kept = whole_rows(os.fspath(path), splats.scales, splats.means, splats.quats, splats.opacities, splats.sh)
-        splats = Ellipsoids(*(values[kept] for values in splats))
-    with np.errstate(invalid="ignore"):
-        log_scales = np.log(np.maximum(splats.scales, LEAST_SCALE))
-    quats, log_scales = (
-        (splats.quats, log_scales[:, :2]) if is_flat else flattened(splats.quats, log_scales, os.fspath(path))
-    )
+    # A covariance has the squares of the scales, whatever their signs.
+    log_scales = np.log(np.maximum(np.abs(splats.scales), LEAST_SCALE))
     opacities = np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, LARGEST_OPACITY)
+    numbers = (splats.means, splats.quats, log_scales[:, :2] if is_flat else log_scales)
     logits = np.log(opacities) - np.log1p(-opacities)
-    numbers = (splats.means, quats, log_scales, logits, splats.sh)
-    return Gaussians(*(jnp.asarray(values, jnp.float32) for values in numbers))
-
-
-def whole_rows(name: str, scales: np.ndarray, *columns: np.ndarray) -> np.ndarray:
-    """Return which rows [N] have finite numbers only. The others are counted in a warning that names the file.
-
-    If no row is finite, all are returned, and the checks of a model fail. Of three scales, or their logarithms,
-    the smallest may be −inf: `flattened` drops it.
-    """
-    seen = np.sort(scales, axis=1)[:, -2:]  # NaN is sorted to the end.
-    finite = [np.isfinite(column).all(axis=tuple(range(1, column.ndim))) for column in (seen, *columns)]
-    is_whole: np.ndarray = np.logical_and.reduce(finite)
-    bad = np.flatnonzero(~is_whole)
-    if len(bad) == len(is_whole):
-        return np.ones(len(bad), bool)
-    if len(bad):
-        message = (
-            f"{name}: {counted(len(bad), 'Gaussian')} of {len(is_whole):,} left out, with NaN or infinite numbers; the "
-            f"first is row {bad[0]:,} (from 0)"
-        )
-        warnings.warn(message, stacklevel=4)
-    return is_whole
+    columns = flat_rows(os.fspath(path), *numbers, logits, splats.sh, keeps_all=keeps_all)
+    return Gaussians(*(jnp.asarray(values, jnp.float32) for values in columns))
 
 
 def flat_rows(
-    name: str, means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, logits: np.ndarray, sh: np.ndarray
+    name: str,
+    means: np.ndarray,
+    quats: np.ndarray,
+    log_scales: np.ndarray,
+    logits: np.ndarray,
+    sh: np.ndarray,
+    *,
+    keeps_all: bool = False,
 ) -> tuple[np.ndarray, ...]:
-    """Return the columns of `whole_rows` only, with two log-scales: three are `flattened`."""
-    kept = whole_rows(name, log_scales, means, quats, logits, sh)
-    means, quats, log_scales, logits, sh = (values[kept] for values in (means, quats, log_scales, logits, sh))
+    """Return the columns with rows that can be drawn only, unless it `keeps_all`, and two log-scales.
+
+    Three log-scales are `flattened`. Quaternions of zeros become unrotated, as the renderer draws them, with a warning;
+    infinite logits become finite.
+    """
+    quats = np.array(quats)
+    lengths = np.linalg.norm(quats.astype(np.float64), axis=1)
+    unrotated = np.flatnonzero(lengths == 0)
+    if len(unrotated):
+        message = (
+            f"{name}: {counted(len(unrotated), 'Gaussian')} of {len(lengths):,} with the rotation 0 0 0 0, read as "
+            f"unrotated; the first is row {unrotated[0]:,} (from 0)"
+        )
+        warnings.warn(message, stacklevel=4)
+        quats[unrotated] = 1, 0, 0, 0
+    # The squares of these leave the range of float32.
+    is_extreme = ((lengths > 0) & (lengths < LEAST_LENGTH)) | (np.isfinite(lengths) & (lengths > 1 / LEAST_LENGTH))
+    quats[is_extreme] /= lengths[is_extreme, None]
+    # Some programs write infinite logits for opacities 0 and 1.
+    most = np.where(logits > 0, -np.log(LEAST_OPACITY), np.log(LEAST_OPACITY)).astype(logits.dtype)
+    logits = np.where(np.isinf(logits), most, logits)
+    if not keeps_all:
+        columns = {"means": means, "quats": quats, "log-scales": log_scales, "logits": logits, "SH": sh}
+        kept = drawable_rows(name, columns)
+        means, quats, log_scales, logits, sh = (values[kept] for values in columns.values())
     if log_scales.shape[1] == 3:
         quats, log_scales = flattened(quats, log_scales, name)
     return means, quats, log_scales, logits, sh
+
+
+def drawable_rows(name: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return which rows [N] have finite numbers that float32 can draw. The others are counted in a warning that names
+    the file and the first of them.
+
+    If there are none, all are returned, and the checks of a model fail. Of three log-scales the smallest may be −inf:
+    `flattened` drops it.
+    """
+    seen, is_good = {}, {}
+    for field, values in columns.items():
+        is_scale = field == "log-scales"
+        # NaN is sorted to the end.
+        seen[field] = np.sort(values, axis=1)[:, -2:] if is_scale else values
+        # False for NaN.
+        is_good[field] = (seen[field] <= (LARGEST_LOG_SCALE if is_scale else LARGEST_NUMBER)) & (
+            seen[field] >= -LARGEST_NUMBER
+        )
+    in_rows = [good.all(axis=tuple(range(1, good.ndim))) for good in is_good.values()]
+    is_drawable: np.ndarray = np.logical_and.reduce(in_rows)
+    bad = np.flatnonzero(~is_drawable)
+    if len(bad) == len(is_drawable):
+        return np.ones(len(bad), bool)
+    if len(bad):
+        row = bad[0]
+        field = next(field for field, good in is_good.items() if not good[row].all())
+        number = np.atleast_1d(seen[field][row])[~np.atleast_1d(is_good[field][row])][0]
+        message = (
+            f"{name}: {counted(len(bad), 'Gaussian')} of {len(is_drawable):,} left out, with numbers that are NaN, "
+            f"infinite or too large to draw (beyond ±{LARGEST_NUMBER:g}); the first is row {row:,} (from 0), with "
+            f"{field} of {number:g}"
+        )
+        warnings.warn(message, stacklevel=5)
+    return is_drawable
+
+
+def filtered(log_scales: np.ndarray, logits: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return log-scales [N, 2 or 3] and logits [N] as drawn through the 3D filter of Mip-Splatting (Yu et al., 2024).
+
+    A Gaussian of scales s and opacity o is drawn with s' = √(s² + f²) and o·Π s/s', f being its width of the filter.
+    """
+    log_scales, logits, widths = (values.astype(np.float64) for values in (log_scales, logits, widths))
+    with np.errstate(divide="ignore", invalid="ignore"):  # Widths and scales of 0; their rows are replaced below.
+        wider = np.logaddexp(2 * log_scales, 2 * np.log(np.abs(widths))[:, None]) / 2
+        log_opacities = (log_scales - wider).sum(axis=1) - np.logaddexp(0, -logits)
+        log_opacities = np.minimum(log_opacities, np.log(LARGEST_OPACITY))
+        fainter = log_opacities - np.log(-np.expm1(log_opacities))
+    is_filtered = widths != 0
+    found = np.where(is_filtered[:, None], wider, log_scales), np.where(is_filtered, fainter, logits)
+    return found[0].astype(np.float32), found[1].astype(np.float32)
 
 
 def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -289,6 +345,18 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
         w * d + x * c - y * b + z * a,
     )
     return np.stack(product, axis=-1), kept
+
+
+def warn_of_unread(names: Iterable[str], path: str | os.PathLike[str]) -> None:
+    """Warn of the attributes of a file's Gaussians that are not read, unless there are none; f_rest_* is read."""
+    # Many names differ in a number only.
+    kinds = sorted({re.sub(r"_\d+$", "_*", name) for name in names} - {"f_rest_*"})
+    if kinds:
+        message = (
+            f"{os.fspath(path)}: does not read {first_names([shortened(kind) for kind in kinds])}; if the program that "
+            "wrote the file draws by these attributes, its Gaussians look different here"
+        )
+        warnings.warn(message, stacklevel=5)
 
 
 def degree_to_read(degree: int, name: str) -> int:

@@ -41,7 +41,11 @@ SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
 NUM_REST = (0, 9, 24, 45, 72)
 """Number of attributes f_rest_* by degree of the spherical harmonics; some programs write degree 4."""
-THIRD_SCALE = "scale_2"
+THIRD_SCALE, FILTER = "scale_2", "filter_3D"
+UNSEEN = {*NORMALS, *RGB, "alpha"}
+"""Attributes that change nothing that Gaussians show."""
+ANCHORS = "f_anchor_feat_0"
+"""Attribute of files of Scaffold-GS, whose networks make the splats."""
 FLAT_MARK = "SplatRenderMode: 2dgs"
 """Comment in the header that marks flat splats."""
 
@@ -152,7 +156,8 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
     Text and binary files of either byte order are read, and colours red, green, blue where f_dc_* are missing. SH
     keep the file's degree. Degrees above 3 are dropped with a warning, and so are Gaussians with numbers that are not
-    finite; other attributes are ignored.
+    finite or too large to draw. filter_3D of Mip-Splatting widens the scales and lowers the opacities, as that program
+    draws them; a warning names other attributes, but for normals and further colours.
     The third scale (scale_2) of a file that marks its splats as flat is dropped. Other files have ellipsoids: the
     thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more than a thousandth
     of the others.
@@ -202,10 +207,9 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     log_scales = _columns(vertices, (*SCALES, THIRD_SCALE) if has_third else SCALES)
     # float64 until the offset is subtracted: float32 would round map coordinates.
     means, quats = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1), _columns(vertices, QUATS)
-    # Some programs write infinite logits for opacities 0 and 1.
-    logits = vertices["opacity"]
-    most = np.where(logits > 0, -np.log(others.LEAST_OPACITY), np.log(others.LEAST_OPACITY))
-    logits = np.where(np.isinf(logits), most, logits).astype(np.float32)
+    logits = _columns(vertices, ("opacity",))[:, 0]
+    if FILTER in (vertices.dtype.names or ()):
+        log_scales, logits = others.filtered(log_scales, logits, vertices[FILTER])
     sh = _sh_of(vertices, path)
     means, quats, log_scales, logits, sh = others.flat_rows(str(path), means, quats, log_scales, logits, sh)
     inside = others.offset_for("ply", means, log_scales)  # Zeros where the file has float32.
@@ -223,8 +227,10 @@ def _vertices(ply: PlyFile) -> np.ndarray:
     # Some programs write colours instead of f_dc_*.
     has_colors = set(RGB) <= set(fields) and not set(SH_DEGREE0) & set(fields)
     wanted = (*MEANS, *(RGB if has_colors else SH_DEGREE0), "opacity", *SCALES, *QUATS)
-    ply.require_vertices(wanted, "a PLY of Gaussians")
+    of_networks = "; its networks make splats of these anchors: export them" if ANCHORS in fields else ""
+    ply.require_vertices(wanted, f"a PLY of Gaussians{of_networks}")
     vertices = ply.read("vertex")
+    others.warn_of_unread({*fields} - {*wanted, THIRD_SCALE, FILTER, *UNSEEN}, ply.path)
     if not has_colors:
         return vertices
     colors = np.stack([vertices[name].astype(np.float64) for name in RGB], axis=1)

@@ -24,7 +24,7 @@ import numpy as np
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.host.regular_files import expanded, is_regular, open_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io.other_programs import degree_to_read, flat_rows
+from a2tg_jax.io.other_programs import degree_to_read, filtered, flat_rows, warn_of_unread
 from a2tg_jax.io.validate import check_model, reading
 from a2tg_jax.model import Model
 
@@ -42,6 +42,8 @@ MOST_SIDES = 4
 BYTE_ORDER = b"little"
 GSPLAT = ("means", "quats", "scales", "opacities", "sh0", "shN")
 NERFSTUDIO = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
+FILTER = "filter_3D"
+"""Name of the widths of Mip-Splatting's filter."""
 TUPLE_2DGS = {"means": 1, "sh0": 2, "shN": 3, "scales": 4, "quats": 5, "opacities": 6}
 """Places of the parameters in the tuple that 3DGS and 2DGS save."""
 # 3DGS has active_sh_degree at place 0, then the parameters, then statistics and the optimiser.
@@ -60,23 +62,30 @@ def load_checkpoint_gaussians(path: str | os.PathLike[str]) -> Gaussians:
     with open_regular(path) as file:
         try:
             with zipfile.ZipFile(file) as archive:
-                arrays = _unpickled(archive)
+                arrays, unread = _unpickled(archive)
         except _Refused as error:
             raise ValueError(f"{path}: {error}") from None
         except Exception as error:  # A damaged pickle may raise anything.
             reason = shortened(str(error) or type(error).__name__, 200)
             raise ValueError(f"{path}: is not a PyTorch checkpoint (1.6 or newer), or is damaged ({reason})") from error
+    warn_of_unread(unread, path)
     with reading(path):
-        means = arrays["means"]
-        num = len(means)
-        bands = [arrays[name].reshape(num, -1, 3) for name in ("sh0", "shN") if name in arrays]
+        num = len(arrays["means"])
+        for name, array in arrays.items():
+            if len(array) != num:
+                raise ValueError(f"has {num} means, but {len(array)} {name}")
+        bands = [arrays[name] for name in ("sh0", "shN") if name in arrays]
+        # No -1, which NumPy cannot find for no rows.
+        bands = [band.reshape(num, math.prod(band.shape[1:]) // 3, 3) for band in bands]
         sh, log_scales = np.concatenate(bands, axis=1), arrays["scales"]
         if sh.shape[1] not in COEFFICIENTS or bands[0].shape[1] != 1 or log_scales.shape[1:] not in ((2,), (3,)):
             found = f"{sh.shape[1]} coefficients and {log_scales.shape[-1]} scales of each Gaussian"
             raise ValueError(f"has {found}; SH of degree 0 to 4 have 1, 4, 9, 16 or 25, and Gaussians 2 or 3 scales")
         sh = sh[:, : COEFFICIENTS[degree_to_read(COEFFICIENTS.index(sh.shape[1]), str(path))]]
         quats, logits = arrays["quats"].reshape(num, 4), arrays["opacities"].reshape(num)
-        columns = flat_rows(str(path), means.reshape(num, 3), quats, log_scales, logits, sh)
+        if FILTER in arrays:
+            log_scales, logits = filtered(log_scales, logits, arrays[FILTER].reshape(num))
+        columns = flat_rows(str(path), arrays["means"].reshape(num, 3), quats, log_scales, logits, sh)
         gaussians = Gaussians(*map(jnp.asarray, columns))
         check_model(Model(gaussians))
         return gaussians
@@ -153,8 +162,8 @@ class _Unpickler(pickle.Unpickler):
         return _Storage(dtype, str(key), num)
 
 
-def _unpickled(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
-    """Return the arrays of a checkpoint's Gaussians by gsplat's names."""
+def _unpickled(archive: zipfile.ZipFile) -> tuple[dict[str, np.ndarray], set[str]]:
+    """Return the arrays of a checkpoint's Gaussians by gsplat's names, and the names of those that are not read."""
     names = archive.namelist()
     # The folder in the zip has the name of the file when it was saved.
     pickled = next((name for name in names if name.count("/") == 1 and name.endswith("/data.pkl")), None)
@@ -177,14 +186,18 @@ def _unpickled(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
         if opcode.name.endswith("PUT") and isinstance(argument, int) and argument > len(data):
             raise _Refused("has a damaged pickle: its memo is longer than the pickle")
     value = _Unpickler(io.BytesIO(data)).load()
-    return {name: _array(tensor, archive, folder) for name, tensor in _tensors_of(value).items()}
+    tensors, unread = _tensors_of(value)
+    return {name: _array(tensor, archive, folder) for name, tensor in tensors.items()}, unread
 
 
-def _tensors_of(value: object) -> dict[str, _Tensor]:
-    """Return the tensors of Gaussians in a checkpoint by gsplat's names."""
+def _tensors_of(value: object) -> tuple[dict[str, _Tensor], set[str]]:
+    """Return the tensors of Gaussians in a checkpoint by gsplat's names, and the names of their other tensors."""
+    unread = set[str]()
     if isinstance(value, tuple | list) and len(value) == 2 and isinstance(value[0], tuple | list):
         parts = value[0]
         found = {name: parts[place] for name, place in TUPLE_2DGS.items()} if len(parts) >= TUPLE_LENGTH - 1 else {}
+        # RaDe-GS, for one, adds a network and embeddings for the appearance of photographs.
+        unread |= {f"entry {place} of its tuple" for place in range(TUPLE_LENGTH, len(parts)) if _shows(parts[place])}
     else:
         own = dict[str, _Tensor]()
         # A dictionary with many references would make the walk take forever.
@@ -193,15 +206,30 @@ def _tensors_of(value: object) -> dict[str, _Tensor]:
                 raise _Refused(f"has dictionaries of more than {MOST_NODES:,} values")
             if isinstance(node, _Tensor):
                 own[name] = node
+            elif isinstance(node, Mapping):
+                unread |= _beside_means(node)
         # Nerfstudio's names differ in the SH only.
         wanted = GSPLAT if any(name.endswith("sh0") for name in own) else NERFSTUDIO
-        found = {name: own[key] for name, key in zip(GSPLAT, wanted, strict=True) if key in own}
+        found = {name: own[key] for name, key in zip((*GSPLAT, FILTER), (*wanted, FILTER), strict=True) if key in own}
+        unread -= {*wanted, FILTER}
     tensors = {name: tensor for name, tensor in found.items() if isinstance(tensor, _Tensor)}
     # Degree 0 needs no shN.
     missing = [name for name in GSPLAT[:-1] if name not in tensors]
     if missing:
         raise _Refused(f"holds no Gaussians as gsplat, Nerfstudio, 3DGS or 2DGS save them: no {', '.join(missing)}")
-    return tensors
+    return tensors, unread
+
+
+def _shows(part: object) -> bool:
+    """Return whether an entry of a tuple may change what its program shows: tensors and networks, no optimiser."""
+    return isinstance(part, _Tensor) or (isinstance(part, Mapping) and "param_groups" not in part)
+
+
+def _beside_means(node: Mapping[Any, object]) -> set[str]:
+    """Return the names of the tensors that a dictionary has beside "means", such as "gauss_params.means"."""
+    names = {key for key, own in node.items() if isinstance(key, str) and isinstance(own, _Tensor)}
+    folders = [name.removesuffix("means") for name in names if name.rpartition(".")[2] == "means"]
+    return {name.removeprefix(folder) for folder in folders for name in names if name.startswith(folder)}
 
 
 def _nodes(value: Any, name: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:

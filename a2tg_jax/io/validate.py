@@ -141,9 +141,16 @@ def check_bounded(name: str, tree: object) -> None:
     check_finite(name, tree)
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         values = np.asarray(leaf)
-        if np.issubdtype(values.dtype, np.floating) and (large := values[np.abs(values) > LARGEST_NUMBER]).size:
-            label = f"{name}{jax.tree_util.keystr(path)}"
-            raise ValueError(f"{label} must be within ±{LARGEST_NUMBER:g}; got {large[0]:g}")
+        if not np.issubdtype(values.dtype, np.floating):
+            continue
+        # Scalars count as one row.
+        is_large = np.atleast_1d(np.abs(values) > LARGEST_NUMBER)
+        if is_large.any():
+            row = np.flatnonzero(is_large.any(axis=tuple(range(1, is_large.ndim))))[0]
+            raise ValueError(
+                f"{name}{jax.tree_util.keystr(path)} must be within ±{LARGEST_NUMBER:g}; got "
+                f"{np.atleast_1d(values)[is_large][0]:g} in row {row:,} (from 0)"
+            )
 
 
 def check_count(name: str, value: object, most: int) -> None:
