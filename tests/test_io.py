@@ -157,7 +157,7 @@ def filtered(log_scales, logit, width):
 def test_the_filter_of_mip_splatting_is_applied(tmp_path, encoding, is_flat):
     names, rng = [*ATTRIBUTES, "scale_2", "filter_3D"], np.random.default_rng(0)
     rows = rng.normal(size=(6, len(names)))
-    rows[:, names.index("scale_2")] = -6
+    rows[:, names.index("scale_2")] = -9
     rows[:, names.index("filter_3D")] = [0.3, 0.05, 0.0, 2.0, np.nan, -0.3]
     write_ply(tmp_path / "g.ply", names, rows, encoding)
     if is_flat:
