@@ -195,6 +195,44 @@ def test_numbers_at_the_limit_are_drawn_and_have_gradients(tmp_path):
     assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.parametrize("compositor", ["native", "xla", "autodiff"])
+def test_numbers_beyond_the_limit_spoil_no_other_gradient(compositor):
+    camera = a2tg.Camera(jnp.eye(4), jnp.asarray([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]]), 40, 30)
+    settings = a2tg.RenderSettings(compositor=compositor, capacity=4096)
+    near = a2tg.Gaussians(
+        means=jnp.asarray([[0.0, 0, 2], [0.3, 0.1, 2.5], [0, 0, 3]]),
+        quats=jnp.tile(jnp.asarray([1.0, 0.1, 0.2, 0]), (3, 1)),
+        log_scales=jnp.full((3, 2), -1.5),
+        logit_opacities=jnp.zeros(3),
+        sh=jnp.ones((3, 4, 3)),
+    )
+
+    @jax.jit
+    def gradients(gaussians):
+        def loss(gaussians, camera):
+            return jnp.mean(a2tg.render_image(gaussians, camera, settings=settings).color ** 2)
+
+        return jax.grad(loss, argnums=(0, 1))(gaussians, camera)
+
+    def at(distance):
+        return dataclasses.replace(near, means=near.means.at[2].set(distance * jnp.asarray([0.1, -0.1, 1])))
+
+    def sized(log_scale):
+        return dataclasses.replace(near, log_scales=near.log_scales.at[2].set(log_scale))
+
+    # What is large enough looks the same at any size: a dot at infinity, and a plane.
+    for large, larger in [
+        (at(1e6), at(1e22)),
+        (at(1e6), at(1e36)),
+        (sized(20.0), sized(50.0)),
+        (sized(20.0), sized(80.0)),
+    ]:
+        (wanted, _), (found, of_camera) = gradients(large), gradients(larger)
+        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+            np.testing.assert_allclose(one[:2], other[:2], rtol=1e-4, atol=1e-8)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((found, of_camera)))
+
+
 def test_files_with_numbers_that_are_too_large(tmp_path, monkeypatch):
     gaussians = some_gaussians()
     gaussians = dataclasses.replace(gaussians, means=gaussians.means.at[0, 0].set(-1e13))

@@ -18,9 +18,9 @@ from jax.typing import ArrayLike, DTypeLike
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, Gaussians, logit
-from a2tg_jax.core.numerics import Integer, normalize, within
+from a2tg_jax.core.numerics import Integer, within
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.core.sh import NUM_BASES, sh_basis
+from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis
 from a2tg_jax.core.table import Places, Size, Table, check_places, check_table
 from a2tg_jax.parallel.sharded_rows import on_host, placed_like
 from a2tg_jax.texture import NEUTRAL_TEXEL, Textures, allocate_textures, check_textures
@@ -364,7 +364,7 @@ class Bands(Part):
             if not blocks.size:
                 continue
             # Padding reads the last Gaussian here, and is dropped below.
-            directions = normalize(means[jnp.minimum(owners, table.num - 1)] - center[None, :])
+            directions = directions_from(center, means[jnp.minimum(owners, table.num - 1)])
             bases = sh_basis(directions, blocks.shape[1] + NUM_BASES[base])
             colors = jnp.zeros((len(blocks), 3), total.dtype)
             for band in range(base + 1, MAX_DEGREE + 1):

@@ -36,6 +36,13 @@ def relative_difference(found: Sequence[ArrayLike], wanted: Sequence[ArrayLike])
     return float(np.max([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs if b.size]))
 
 
+def factor_to(most: float, columns: Sequence[Array]) -> Array:
+    """Return the factor [N] by which the largest magnitude of a row of columns [N] becomes `most`, or 1 if it is less.
+    It has no gradient."""
+    largest = functools.reduce(jnp.maximum, (jnp.abs(jax.lax.stop_gradient(column)) for column in columns))
+    return jnp.where(largest > most, most / largest, 1.0)
+
+
 def safe_divide(numerator: Array, denominator: Array, fallback: float = 0.0) -> Array:
     """Return numerator / denominator, or `fallback` with zero gradient where the denominator is 0."""
     is_zero = denominator == 0

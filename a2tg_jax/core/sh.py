@@ -8,7 +8,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from a2tg_jax.core.numerics import normalize
+from a2tg_jax.core.checks import LARGEST_NUMBER
+from a2tg_jax.core.numerics import factor_to, normalize
 
 NUM_BASES = (1, 4, 9, 16)
 """Number of bases of degrees 0 to the index."""
@@ -43,13 +44,20 @@ def sh_basis(directions: Array, num: int = 16) -> Array:
     return jnp.stack(bases, axis=-1)
 
 
+def directions_from(center: Array, means: Array) -> Array:
+    """Return the unit vectors [N, 3] from a camera's centre [3] to means [N, 3] at any distance."""
+    offsets = means - center[None, :]
+    # Otherwise squares would overflow far away, and gradients be NaN.
+    return normalize(offsets * factor_to(LARGEST_NUMBER, [*offsets.T])[:, None])
+
+
 def sh_sum(sh: Array, means: Array, center: Array, degree: ArrayLike) -> Array:
     """Return the view-dependent sums [N, 3], Σ Y_l·sh_l; colours are max(sum + 0.5, 0).
 
     Coefficients are [N, K, 3], K being 1, 4, 9 or 16, the camera's centre [3]. The highest degree used may be traced.
     """
     num = sh.shape[1]
-    basis = sh_basis(normalize(means - center[None, :]), num)
+    basis = sh_basis(directions_from(center, means), num)
     degrees = np.asarray([0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3], np.int32)[:num]
     # A mask, not a slice: the degree may be traced.
     basis = jnp.where((degrees <= jnp.asarray(degree, jnp.int32))[None, :], basis, 0.0)

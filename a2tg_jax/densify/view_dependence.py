@@ -17,10 +17,9 @@ from a2tg_jax.appearance import in_words
 from a2tg_jax.appearance.parts import MAX_DEGREE, Coefficients, degrees_of_sizes, floats_of_band, sizes_of_degrees
 from a2tg_jax.core.budget import BYTES_PER_FLOAT, MOST_ROOM, bytes_of, event_budget, within_budget
 from a2tg_jax.core.checks import check_number
-from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.core.sh import NUM_BASES, sh_basis
+from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
 from a2tg_jax.events import Change, Due, HostEvent, Seen, iterations_at
 from a2tg_jax.model import Model
@@ -46,7 +45,7 @@ class ViewDependence:
         total = self.total
         # One view at a time: all at once would take [V, N, 16, 3].
         for center, color in zip(centers, colors, strict=True):
-            basis = sh_basis(normalize(means - center[None, :]))
+            basis = sh_basis(directions_from(center, means))
             total = total + basis[:, :, None] * color[:, None, :]
         return ViewDependence(total, self.views + len(colors))
 

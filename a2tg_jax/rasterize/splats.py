@@ -17,7 +17,7 @@ from a2tg_jax.appearance.base import colors_in_view, cutoff_of, num_colors_of, n
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians
-from a2tg_jax.core.numerics import Integer
+from a2tg_jax.core.numerics import Integer, factor_to
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
 
@@ -25,6 +25,10 @@ Compositor = Literal["cuda", "native", "xla", "autodiff"]
 """CUDA kernels (NVIDIA GPUs), native loops (CPUs), XLA (everywhere), or XLA without a gradient of its own."""
 Wanted = Literal["auto", "cuda", "native", "xla", "autodiff"]
 """A compositor, or the first of native loops, CUDA kernels and XLA that runs on the platform that JAX compiles for."""
+
+
+LARGEST_DEPTH, LARGEST_AXIS = 1e18, 1e12
+"""Magnitudes up to which homographies are exact: beyond, products and their gradients would overflow float32."""
 
 
 class Splats(NamedTuple):
@@ -128,6 +132,10 @@ def project_gaussians(
     is_drawn = ~(M[:, 2, 2] < near_plane)
     if num_live is not None:
         is_drawn &= jnp.arange(num, dtype=jnp.int32) < num_live
+    # A factor on a whole homography moves a splat nearer and changes nothing else; one on two columns makes it smaller.
+    nearer = factor_to(LARGEST_DEPTH, [M[:, 2, 2]])
+    smaller = nearer * factor_to(LARGEST_AXIS, [M[:, i, k] for i in range(3) for k in range(2)])
+    M = M * jnp.stack([smaller, smaller, nearer], axis=1)[:, None, :]
     # A bound, not part of the image: what lies beyond is invisible anyway.
     cutoff = jnp.where(is_drawn, jax.lax.stop_gradient(cutoff_of(appearance, opacities)), -1.0)
     # Not finite and not invisible: NaN marks it, which `views.render_traced` carries into the image. Column by column,
