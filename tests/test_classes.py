@@ -1,9 +1,11 @@
 """Programs are told apart by the classes of what they are given, where JAX may mistake one for another."""
 
+import copy
 import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from lab.fingerprint import fingerprint
 
@@ -46,6 +48,41 @@ def test_fields_are_arrays_static_or_beside():
     made = jax.jit(lambda parts: parts)(one)
     assert made.note is None and made.choice == "a" and one.note == "kept here"
     assert [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(one)] == [".array"]
+
+
+def test_arrays_are_compared_as_a_whole():
+    scene = a2tg.synthetic_scene(num_views=4, width=24, height=18)
+    cameras = [view.camera for view in scene.train]
+    gaussians = a2tg.init_from_points(scene.points, scene.colors, num=20, sh_degree=0)
+    textures = a2tg.allocate_textures([(2, 2)] * 20)
+    model = a2tg.Model(gaussians, a2tg.Appearance(texture=a2tg.Texture(textures)))
+    for value in (cameras[0], gaussians, textures, model):
+        assert value == copy.deepcopy(value) and value == jax.tree.map(np.asarray, value)
+        assert value != jax.tree.map(lambda leaf: leaf + 1, value) and value != "another kind"
+        with pytest.raises(TypeError, match="unhashable"):
+            hash(value)
+    assert copy.deepcopy(cameras[1]) in cameras and cameras.index(copy.deepcopy(cameras[1])) == 1
+    assert cameras[0] != dataclasses.replace(cameras[0], width=25) and gaussians != gaussians[:10]
+    assert model != dataclasses.replace(model, background=(1.0, 1.0, 1.0))
+    with pytest.raises(jax.errors.TracerArrayConversionError):
+        jax.jit(lambda one, other: one == other)(gaussians, copy.deepcopy(gaussians))
+    assert {a2tg.Mcmc(cap=2): "found"}[a2tg.Mcmc(cap=2)] == "found"
+
+
+def test_an_assignment_says_how_to_make_a_changed_copy():
+    scene = a2tg.synthetic_scene(num_views=4, width=24, height=18)
+    own = [scene, scene.train[0].camera, scene.train[0], a2tg.RenderSettings(), a2tg.A2tg(), a2tg.Mcmc(), NoArrays()]
+    for value in own:
+        name = dataclasses.fields(value)[0].name
+        with pytest.raises(dataclasses.FrozenInstanceError, match=rf"dataclasses.replace\(old, {name}=...\)"):
+            setattr(value, name, 1)
+        with pytest.raises(AttributeError, match=f"no field widht, only .*{name}"):
+            value.widht = 1
+
+
+@a2tg.pytree
+class NoArrays:
+    number: int = 1
 
 
 def test_transformations_do_not_check_fields():

@@ -11,6 +11,9 @@ from typing import Any, TypeVar, dataclass_transform, overload
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from a2tg_jax.host.text import name_replace
 
 T = TypeVar("T")
 MARK = "_registered_pytree"
@@ -44,7 +47,8 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     """Decorate a class: make it a frozen dataclass and a pytree of its fields, except static ones.
 
     Transformations of JAX build instances without calling `__init__` and `__post_init__`, so that these may check and
-    convert what a caller gives.
+    convert what a caller gives. Two instances are equal if their fields are, arrays by shape and values. Only instances
+    without arrays can be hashed.
 
     Args:
       cls: the class, whose bases may be decorated as well.
@@ -55,7 +59,10 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     """
     if cls is None:
         return lambda own: pytree(own, **options)
+    own_equality = vars(cls).get("__eq__", _are_equal)
     made = dataclasses.dataclass(frozen=True, **options)(cls)
+    made.__eq__ = own_equality
+    name_replace(made)
     kinds: dict[str, list[str]] = {"static": [], "beside": [], "dynamic": []}
     for field in dataclasses.fields(made):
         kind = next((kind for kind in ("static", "beside") if field.metadata.get(kind)), "dynamic")
@@ -84,6 +91,25 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
     setattr(made, MARK, made)
     return made
+
+
+def _are_equal(one: Any, other: Any) -> Any:
+    """Compare two instances field by field, as dataclasses do, but arrays as a whole."""
+    if type(other) is not type(one):
+        return NotImplemented
+    names = [field.name for field in dataclasses.fields(one)]
+    own, others = ([getattr(instance, name) for name in names] for instance in (one, other))
+    structure: Any = jax.tree.structure(own)
+    if structure != jax.tree.structure(others):
+        return False
+    return all(map(_are_equal_leaves, jax.tree.leaves(own), jax.tree.leaves(others)))
+
+
+def _are_equal_leaves(one: object, other: object) -> bool:
+    if isinstance(one, np.ndarray | jax.Array) or isinstance(other, np.ndarray | jax.Array):
+        # Outside of `array_equal`, which takes two tracers for unequal without a word.
+        return one is other or np.array_equal(np.asarray(one), np.asarray(other))
+    return one is other or bool(one == other)
 
 
 def check_pytree(name: str, value: object) -> None:

@@ -1,14 +1,19 @@
-"""Docstrings under the fields of a class, added to the docstring of the class for `help` and notebooks."""
+"""Docstrings under the fields of a class, added to the docstring of the class for `help` and notebooks; and errors of
+assignments to frozen dataclasses."""
 
+import dataclasses
 import inspect
 import sys
 import textwrap
+
+from a2tg_jax.host.text import name_replace
 
 _known: set[str] = set()
 
 
 def list_fields() -> None:
-    """Add the docstrings of fields to each class of this package imported so far."""
+    """Add the docstrings of fields to each class of this package imported so far, and name `dataclasses.replace` in the
+    errors of its frozen dataclasses."""
     for name in {name for name in sys.modules if name.startswith("a2tg_jax.")} - _known:
         _known.add(name)
         if name.startswith("a2tg_jax.cli."):
@@ -17,6 +22,8 @@ def list_fields() -> None:
             own = vars(found).get("__doc__") if isinstance(found, type) and found.__module__ == name else None
             if isinstance(own, str):
                 found.__doc__ = _WithFields(own)
+                if dataclasses.is_dataclass(found) and "__setattr__" in vars(found):
+                    name_replace(found)
 
 
 class _WithFields:

@@ -1,5 +1,6 @@
 """Short texts for messages."""
 
+import dataclasses
 import difflib
 import shlex
 from collections.abc import Iterable, Sequence
@@ -58,3 +59,20 @@ def in_bytes(num: float) -> str:
         # Numbers are rounded up to 10.0 from 9.995 on, and to 100 from 99.95 on: three digits in any case.
         text = f"{size:,.{2 if size < 9.995 else 1 if size < 99.95 else 0}f} {unit}"
     return text
+
+
+def name_replace(cls: Any) -> None:
+    """Let the error of an assignment to a field of a frozen dataclass say how to make a changed copy."""
+    refuse = cls.__setattr__
+
+    def __setattr__(self: Any, name: str, value: object) -> None:
+        try:
+            refuse(self, name, value)
+        except dataclasses.FrozenInstanceError:
+            names = [field.name for field in dataclasses.fields(self)]
+            hint = f"make a changed copy: dataclasses.replace(old, {name}=...)"
+            if name not in names:
+                hint = f"it has no field {name}, only {', '.join(names)}"
+            raise dataclasses.FrozenInstanceError(f"{type(self).__name__} cannot be changed; {hint}") from None
+
+    cls.__setattr__ = __setattr__
