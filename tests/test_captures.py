@@ -433,6 +433,8 @@ def test_a_world_of_a_map_stays_there(tmp_path):
     [
         ("scan.psx", "Export Cameras"),
         ("scan.r3d", "unpack it"),
+        ("IMG_0001.INSP", "equirectangular JPEG"),
+        ("clip.osv", "equirectangular MP4"),
         ("poses_bounds.npy", "a2tg sfm"),
         ("opensfm/reconstruction.json", "export_colmap"),
         ("database.db", "colmap mapper"),

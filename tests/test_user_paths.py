@@ -1,4 +1,4 @@
-"""Paths that a user gives: ~ for the home folder, and outputs that are links."""
+"""Paths that a user gives: ~ for the home folder, outputs that are links, and pointers of git-lfs instead of files."""
 
 import os
 import pathlib
@@ -11,7 +11,14 @@ from small_models import some_checkpoint, some_model, write_random_squeeze
 
 import a2tg_jax as a2tg
 from a2tg_jax.cli.main import COMMANDS, main, parsed
+from a2tg_jax.data.colmap_files import read_file
+from a2tg_jax.data.decoding import picture_facts, read_pixels
+from a2tg_jax.data.photo_reading import read_depths
+from a2tg_jax.data.ply import read_ply_points
+from a2tg_jax.data.video import extract_frames
 from a2tg_jax.host.atomic import write_whole
+from a2tg_jax.host.json_text import read_json
+from a2tg_jax.io.formats import FORMATS, format_of
 from a2tg_jax.results.folder import write_json
 from a2tg_jax.results.record import read_run_file
 
@@ -149,3 +156,35 @@ def test_a_run_writes_into_its_own_folder(tmp_path):
     write_whole(run.own(run.viewer), "page")
     assert (tmp_path / "outside").read_text() == "mine" and not run.report.is_symlink()
     assert run.viewer.is_symlink() and (run.path / "elsewhere.html").read_text() == "page"
+
+
+# Pointers of git-lfs
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 123456\n"
+
+
+@pytest.mark.parametrize("suffix", sorted(FORMATS))
+def test_models_that_git_lfs_did_not_fetch(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(POINTER)
+    if format_of(path).import_library is not None:
+        pytest.importorskip("pxr" if suffix.startswith(".usd") else "gaussforge")
+    with pytest.raises(ValueError, match=r"pointer of git-lfs.* run `git lfs pull`"):
+        a2tg.load_splats(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("a.jpg", read_pixels), ("a.jpg", picture_facts), ("a.npy", read_depths), ("a.png", read_depths),
+        ("a.json", read_json), ("a.npz", a2tg.load_lpips), ("a.ply", read_ply_points),
+        ("cameras.bin", lambda path: read_file(path, "cameras")), ("run.toml", read_run_file),
+        ("a.mp4", lambda path: extract_frames(path, path.parent / "frames", 3)),
+    ],
+)  # fmt: skip
+def test_files_that_git_lfs_did_not_fetch(tmp_path, name, read):
+    if name.endswith("mp4"):
+        pytest.importorskip("av", reason="the extra [video] is not installed")
+    (tmp_path / name).write_bytes(POINTER)
+    with pytest.raises(ValueError, match=r"pointer of git-lfs, .* run `git lfs pull`"):
+        read(tmp_path / name)

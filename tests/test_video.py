@@ -1,10 +1,15 @@
 """Frames of a video: sharp ones, apart from each other, turned as players show them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+import a2tg_jax as a2tg
+from a2tg_jax.data.decoding import picture_size
+from a2tg_jax.data.photo_folder import is_video
 from a2tg_jax.data.video import LEAST_MOTION, _as_shown, _display_matrix, choose_frames, extract_frames, motion
 
 
@@ -31,12 +36,19 @@ def test_motion_is_measured_in_widths(shift):
 WIDTH, HEIGHT = 96, 64
 
 
-def encode(path, frames):
-    """Writes grey frames [HEIGHT, WIDTH] as a video."""
+def encode(path, frames, *, codec="mpeg4", still=None):
+    """Writes grey frames [HEIGHT, WIDTH] as a video; `still` is the disposition of a larger picture in a stream before
+    it."""
     av = pytest.importorskip("av", reason="the extra [video] is not installed")
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=10)
+    with av.open(f"file:{path}", "w") as container:
+        if still is not None:
+            cover = container.add_stream("mjpeg", rate=1)
+            cover.width, cover.height, cover.pix_fmt, cover.disposition = 640, 480, "yuvj420p", still
+        stream = container.add_stream(codec, rate=25)
         stream.width, stream.height, stream.pix_fmt, stream.bit_rate = WIDTH, HEIGHT, "yuv420p", 4_000_000
+        if still is not None:
+            black = av.VideoFrame.from_ndarray(np.zeros((480, 640, 3), np.uint8), format="rgb24")
+            container.mux([*cover.encode(black), *cover.encode()])
         for grey in frames:
             frame = av.VideoFrame.from_ndarray(np.repeat(grey.astype(np.uint8)[..., None], 3, -1), format="rgb24")
             container.mux(stream.encode(frame))
@@ -103,6 +115,72 @@ def test_frames_with_unknown_side_data_are_turned():
     """By 90 degrees counterclockwise the right edge comes to the top."""
     shown = _as_shown(np.array([[[1], [2], [3]], [[4], [5], [6]]]), _display_matrix(FrameOfNewerKind()))
     np.testing.assert_array_equal(shown[..., 0], [[3, 6], [2, 5], [1, 4]])
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+@pytest.mark.parametrize("still", [0, 1 << 10])
+def test_a_picture_beside_the_video_is_not_taken_for_it(tmp_path, suffix, still):
+    """A cover, or a stream of one frame, which Matroska does not mark."""
+    frames = np.random.default_rng(0).integers(0, 255, (30, HEIGHT, WIDTH))
+    encode(tmp_path / f"clip.{suffix}", frames, still=still)
+    assert extract_frames(tmp_path / f"clip.{suffix}", tmp_path / "frames", 9, progress=False)[1] == 30
+    assert {picture_size(file) for file in (tmp_path / "frames").iterdir()} == {(WIDTH, HEIGHT)}
+
+
+def test_of_several_videos_the_largest_is_read_with_a_warning(tmp_path):
+    av = pytest.importorskip("av", reason="the extra [video] is not installed")
+    with av.open(str(tmp_path / "clip.mp4"), "w") as container:
+        streams = [container.add_stream("mpeg4", rate=25) for _ in range(3)]
+        for stream, side in zip(streams, (32, 64, 48), strict=True):
+            stream.width, stream.height, stream.pix_fmt = side, side, "yuv420p"
+        for stream in streams * 12:
+            pixels = np.zeros((stream.height, stream.width, 3), np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        for stream in streams:
+            container.mux(stream.encode())
+    with pytest.warns(UserWarning, match=r"video streams 0 \(32x32\), 1 \(64x64\), 2 \(48x48\); 1 is read.* -map 0:"):
+        extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 3, progress=False)
+    assert {picture_size(file) for file in (tmp_path / "frames").iterdir()} == {(64, 64)}
+
+
+def test_an_interlaced_video_is_read_with_advice(tmp_path):
+    av = pytest.importorskip("av", reason="the extra [video] is not installed")
+    with av.open(str(tmp_path / "0001.mts"), "w", format="mpegts") as container:
+        stream = container.add_stream("mpeg2video", rate=25, options={"flags": "+ildct+ilme"})
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for grey in np.random.default_rng(0).integers(0, 255, (5, HEIGHT, WIDTH, 1)):
+            frame = av.VideoFrame.from_ndarray(np.repeat(grey.astype(np.uint8), 3, -1), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with pytest.warns(UserWarning, match=r"0001\.mts: is interlaced.* -vf bwdif converted\.mp4"):
+        extract_frames(tmp_path / "0001.mts", tmp_path / "frames", 3, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"),
+    [
+        ("2026-05-01T12:30:00.mp4", "mpeg4"), ("100%.mp4", "mpeg4"), ("0001.mts", "mpeg4"), ("0001.M2TS", "mpeg4"),
+        ("a.ts", "mpeg4"), ("a.mpg", "mpeg2video"), ("a.vob", "mpeg2video"), ("a.3gp", "mpeg4"), ("a.wmv", "wmv2"),
+        ("a.flv", "flv"),
+    ],
+)  # fmt: skip
+def test_videos_of_other_names_are_read(tmp_path, monkeypatch, name, codec):
+    encode(tmp_path / name, np.random.default_rng(0).integers(0, 255, (12, HEIGHT, WIDTH)), codec=codec)
+    monkeypatch.chdir(tmp_path)
+    assert is_video(Path(name))
+    assert extract_frames(Path(name), Path("frames"), 3, progress=False)[1] == 12
+
+
+@pytest.mark.parametrize("data", [b"", bytes(4000)])
+@pytest.mark.parametrize("suffix", ["mts", "mpg", "3gp"])
+def test_a_damaged_video_of_any_name_comes_with_advice(tmp_path, suffix, data):
+    pytest.importorskip("av", reason="the extra [video] is not installed")
+    (tmp_path / f"clip.{suffix}").write_bytes(data)
+    reason = "" if data else "it is empty: 0 bytes"
+    with pytest.raises(
+        ValueError, match=rf"cannot be read as a video \({reason}.*\); convert it: ffmpeg -i .* converted"
+    ):
+        a2tg.run_sfm(tmp_path / f"clip.{suffix}", tmp_path / "scene", progress=False)
 
 
 def test_what_is_no_video_is_named(tmp_path):

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from a2tg_jax.host.regular_files import open_regular
+from a2tg_jax.host.remote_files import is_remote
 from a2tg_jax.host.text import shortened
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "BMP", "GIF", "PPM")
@@ -184,6 +185,9 @@ def _opened(path: str | os.PathLike[str], most_bits: int = 8, is_decoded: bool =
         if str(error).startswith(f"{path}: "):  # Raised above, or by a store that does not answer.
             raise
         reason = shortened(str(error) or type(error).__name__, LONGEST_REASON)
+        if isinstance(error, UnidentifiedImageError):  # Its text names an object of Python instead of the file.
+            is_empty = not is_remote(path) and not os.path.getsize(path)
+            reason = "it is empty: 0 bytes" if is_empty else f"it is none of {', '.join(FORMATS)}"
         raise ValueError(f"{path}: cannot be read as an image ({reason}); replace or remove it") from error
 
 

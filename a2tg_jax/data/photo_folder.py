@@ -11,13 +11,14 @@ import re
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from a2tg_jax.data.decoding import software_of, upright_thumbnail
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, map_in_threads
-from a2tg_jax.host.regular_files import is_regular, read_regular
+from a2tg_jax.host.regular_files import is_regular, names_in, read_regular
 from a2tg_jax.host.text import PROGRAM, as_argument, counted, first_names
 
 FOREIGN_SUFFIXES = (
@@ -25,7 +26,12 @@ FOREIGN_SUFFIXES = (
     ".ppm", ".tga", ".psd", ".exr", ".hdr",
 )  # fmt: skip
 """Suffixes of pictures that are not read."""
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+VIDEO_SUFFIXES = (
+    ".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".vob", ".3gp", ".3g2",
+    ".wmv", ".asf", ".flv", ".ogv",
+)  # fmt: skip
+SPHERICAL_SUFFIXES = (".insp", ".insv", ".osv", ".360")
+"""Suffixes of photographs and videos of 360° cameras that are two fisheyes, and in `FOUND_BY`."""
 LEAST_PHOTOS = 3
 MOST_TOLD = 5
 """Largest number of suffixes that a message counts."""
@@ -53,7 +59,9 @@ FOUND_BY: tuple[tuple[str, str], ...] = (
     ("*.rcproj", "is a project of RealityCapture: export the registration as COLMAP, or as XMP beside the photographs"),
     ("*.rsproj", "is a project of RealityScan: export the registration as COLMAP, or as XMP beside the photographs"),
     ("*.r3d", "is a recording of Record3D: rename it to .zip, unpack it, and give the folder with metadata and rgbd"),
+    ("*.insp", "is a photograph of Insta360: export an equirectangular JPEG with Insta360 Studio, then a2tg sfm"),
     ("*.insv", "is a recording of Insta360: export an equirectangular MP4 with Insta360 Studio, then a2tg sfm"),
+    ("*.osv", "is a recording of DJI Osmo 360: export an equirectangular MP4 with DJI Studio, then a2tg sfm"),
     ("*.360", "is a recording of GoPro MAX: export an equirectangular MP4 with GoPro Player, then a2tg sfm"),
     ("*.usdz", "is a finished model, without photographs: export the raw data of the capture"),
     ("*.zip", "is packed: unpack it, and give the folder in it"),
@@ -124,7 +132,7 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
         raise ValueError(". ".join([needed, *([others_text] if others else []), *skipped]))
     if others:
         warnings.warn(f"{folder}: {others_text}", stacklevel=3)
-    foreign = [file for file in unread if file.suffix.lower() in FOREIGN_SUFFIXES + VIDEO_SUFFIXES]
+    foreign = [file for file in unread if file.suffix.lower() in FOREIGN_SUFFIXES + VIDEO_SUFFIXES + SPHERICAL_SUFFIXES]
     if foreign:
         warnings.warn(f"{folder}: {_skipped(folder, foreign)}", stacklevel=3)
     return photos
@@ -136,14 +144,18 @@ def _files_below(folder: Path) -> Iterator[Path]:
 
 
 def _skipped(folder: Path, files: list[Path]) -> str:
-    """Return the number of skipped files by suffix, the formats that are read, and how to convert."""
+    """Return the number of skipped files by suffix, the formats that are read, and how to convert others."""
     counts = Counter(file.suffix.lower() or "without suffix" for file in files)
     parts = [f"{number} {suffix}" for suffix, number in counts.most_common(MOST_TOLD)]
     message = (
-        f"Skipped: {', '.join(parts)}{', …' if len(counts) > MOST_TOLD else ''}; read: {', '.join(PHOTO_SUFFIXES)}"
+        f"Skipped: {', '.join(parts)}{', …' if len(counts) > MOST_TOLD else ''}; read: {', '.join(PHOTO_SUFFIXES)}; "
+        f"videos: {', '.join(VIDEO_SUFFIXES[:MOST_TOLD])}, …"
     )
     foreign = next((file for file in files if file.suffix.lower() in FOREIGN_SUFFIXES), None)
     video = next((file for file in files if file.suffix.lower() in VIDEO_SUFFIXES), None)
+    spherical = next((file for file in files if file.suffix.lower() in SPHERICAL_SUFFIXES), None)
+    if spherical is not None:
+        message += f". {spherical} {capture_hint(spherical)}"
     if foreign is not None:
         pattern = as_argument(folder / foreign.parent / f"*{foreign.suffix}")  # ImageMagick itself expands the star.
         message += f". To make JPEG files of them: magick mogrify -format jpg {pattern}"
@@ -155,10 +167,17 @@ def _skipped(folder: Path, files: list[Path]) -> str:
 def capture_hint(path: Path) -> str | None:
     """Return what a file or folder of another program is and what to do with it, or None if it is unknown."""
     if not path.is_dir():
-        return next((text for pattern, text in FOUND_BY if "/" not in pattern and path.match(pattern)), None)
-    # min, because glob has no fixed order.
-    found = ((min(path.glob(pattern), default=None), text) for pattern, text in FOUND_BY)
-    return next((f"{first.relative_to(path).as_posix()} {text}" for first, text in found if first is not None), None)
+        name = path.name.lower()
+        return next((text for pattern, text in FOUND_BY if fnmatchcase(name, pattern)), None)
+    names = names_in(path)
+    for pattern, text in FOUND_BY:
+        # Cameras write suffixes in capitals, but Python's glob tells these apart before 3.12.
+        found = [name for name in names if fnmatchcase(name.lower(), pattern)]
+        if "/" in pattern:
+            found = sorted(file.relative_to(path).as_posix() for file in path.glob(pattern))
+        if found:
+            return f"{found[0]} {text}"
+    return None
 
 
 def _written(folder: Path, names: Sequence[str]) -> set[str]:

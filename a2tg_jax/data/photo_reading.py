@@ -414,6 +414,8 @@ def read_depths(file: str | os.PathLike[str]) -> np.ndarray:
         except Unreachable:
             raise
         except Exception as error:  # Damaged files raise anything from SyntaxError to struct.error.
+            if str(error).startswith(f"{file}: "):  # It says already which file and what to do.
+                raise
             reason = shortened(str(error) or type(error).__name__)
             raise ValueError(f"{file}: cannot be read as a depth map ({reason}); replace or remove it") from error
         # With the axis of a batch or a channel, such as [1, H, W].

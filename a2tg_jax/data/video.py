@@ -3,7 +3,10 @@
 A first pass scores small greyscale frames, a second one writes the chosen ones.
 """
 
+import sys
+import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +17,30 @@ from scipy.ndimage import laplace
 from a2tg_jax.data.decoding import MAX_PIXELS
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import counting
+from a2tg_jax.host.regular_files import open_regular
+from a2tg_jax.host.text import as_argument
 
 DEFAULT_FRAMES = 150
 SHARPNESS_WIDTH, MOTION_WIDTH = 640, 128
 """Widths in pixels of the greyscale frames on which sharpness and motion are measured."""
 LEAST_MOTION = 0.005
 """Motion between two frames, as a share of the width, below which the camera counts as still."""
-ONLY_VIDEOS = {"format_whitelist": "mov,matroska,webm,avi", "protocol_whitelist": "file"}
+ONLY_VIDEOS = {"format_whitelist": "mov,matroska,webm,avi,mpegts,mpeg,asf,flv,ogg", "protocol_whitelist": "file"}
 """Options that keep FFmpeg from playlists, which name further files and addresses."""
+STILLS = 1 << 10 | 1 << 11 | 1 << 20
+"""FFmpeg's dispositions of streams that are pictures beside a video: attached_pic, timed_thumbnails, still_image."""
+ENOUGH_FRAMES = 10
+"""Number of frames of one stream by which another one has its second, or is a picture."""
 QUALITY = 95
 
 
 def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = True) -> tuple[int, int]:
     """Write the frames of a video that suit structure from motion as JPEG files, named by their number.
 
+    Of several videos in a file, the largest picture is read, with a warning. Another warning names interlaced frames.
+
     Args:
-      video: file of any format that FFmpeg decodes.
+      video: file in a usual format of videos.
       folder: new folder for the frames.
       count: largest number of frames to write.
       progress: show progress bars.
@@ -37,9 +48,12 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
     Returns:
       (number written, number of frames of the video).
     """
+    stream = _chosen_stream(video)
     sharpness, places = [], []
     seen, path = None, 0.0
-    for frame in _frames(video, "scoring frames", progress):
+    is_interlaced = False
+    for frame in _frames(video, stream, "scoring frames", progress):
+        is_interlaced |= bool(frame.interlaced_frame)
         # Sharpness is the variance of the Laplacian.
         sharpness.append(float(laplace(_grey(frame, SHARPNESS_WIDTH).astype(np.float32)).var()))
         small = _grey(frame, MOTION_WIDTH)
@@ -49,11 +63,14 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
             seen, path = small, path + moved
         places.append(path)
     if not places:
-        raise ValueError(f"{video}: has no frames that can be decoded; convert it with ffmpeg to MP4 first")
+        raise ValueError(f"{video}: has no frames that can be decoded; {_conversion(video)}")
+    if is_interlaced:
+        advice = _conversion(video, "-vf bwdif")
+        warnings.warn(f"{video}: is interlaced, so that moving edges look like combs; {advice}", stacklevel=2)
     chosen = set(choose_frames(np.array(sharpness), np.array(places), count).tolist())
     folder.mkdir(parents=True)
     # Decoded again, because all frames would not fit into memory.
-    for number, frame in enumerate(_frames(video, "writing frames", progress)):
+    for number, frame in enumerate(_frames(video, stream, "writing frames", progress)):
         if number in chosen:
             pixels = _as_shown(frame.to_ndarray(format="rgb24"), _display_matrix(frame))
             Image.fromarray(np.ascontiguousarray(pixels)).save(folder / f"{number:06d}.jpg", quality=QUALITY)
@@ -90,22 +107,59 @@ def motion(before: np.ndarray, after: np.ndarray) -> float:
     return float(np.abs(after - before).mean() / max(slope, 1.0) / before.shape[1])
 
 
-def _frames(video: Path, phase: str, progress: bool) -> Iterator[Any]:
+@contextmanager
+def _opened(video: Path) -> Iterator[Any]:
+    """Open a video within the block, in which errors of FFmpeg become one ValueError."""
     av = optional("av", "a video needs PyAV", "video")
+    open_regular(video, sys.maxsize).close()
     try:
-        with av.open(str(video), options=ONLY_VIDEOS) as container:
-            if not container.streams.video:
-                raise ValueError(f"{video}: has no video stream")
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            if stream.width * stream.height > MAX_PIXELS:
-                raise ValueError(f"{video}: has frames of more than {MAX_PIXELS // 10**6} megapixels")
-            with counting(phase, stream.frames or None, "frame", is_shown=progress) as bar:
-                for frame in container.decode(stream):
-                    bar.update()
-                    yield frame
+        # Without file: FFmpeg would take what is before a colon, as in 12:30.mp4, for a protocol.
+        with av.open(f"file:{video}", options=ONLY_VIDEOS) as container:
+            yield container
     except av.FFmpegError as error:
-        raise ValueError(f"{video}: cannot be read as a video ({error.strerror}); convert it with ffmpeg") from None
+        reason = error.strerror if video.stat().st_size else "it is empty: 0 bytes"
+        raise ValueError(f"{video}: cannot be read as a video ({reason}); {_conversion(video)}") from None
+
+
+def _conversion(video: Path, options: str = "") -> str:
+    """Return the advice to convert a video with ffmpeg."""
+    return f"convert it: ffmpeg -i {as_argument(video)} {options and options + ' '}converted.mp4"
+
+
+def _chosen_stream(video: Path) -> int:
+    """Return the index of the largest stream that is no single picture, such as a cover."""
+    with _opened(video) as container:
+        streams = [stream for stream in container.streams.video if not stream.disposition & STILLS]
+        if len(streams) > 1:
+            counts = {stream.index: 0 for stream in streams}
+            for packet in container.demux(streams):
+                counts[packet.stream.index] += packet.size > 0  # The last ones are empty.
+                if max(counts.values()) == ENOUGH_FRAMES:
+                    break
+            streams = [stream for stream in streams if counts[stream.index] > 1] or streams
+        if not streams:
+            raise ValueError(f"{video}: has no video stream")
+        chosen = max(streams, key=lambda stream: int(stream.width * stream.height))
+        if len(streams) > 1:
+            found = ", ".join(f"{stream.index} ({stream.width}x{stream.height})" for stream in streams)
+            warnings.warn(
+                f"{video}: has the video streams {found}; {chosen.index} is read. To write another: "
+                f"ffmpeg -i {as_argument(video)} -map 0:NUMBER -c copy other.mp4",
+                stacklevel=3,
+            )
+        if chosen.width * chosen.height > MAX_PIXELS:
+            raise ValueError(f"{video}: has frames of more than {MAX_PIXELS // 10**6} megapixels")
+        return int(chosen.index)
+
+
+def _frames(video: Path, stream_index: int, phase: str, progress: bool) -> Iterator[Any]:
+    with _opened(video) as container:
+        stream = container.streams[stream_index]
+        stream.thread_type = "AUTO"
+        with counting(phase, stream.frames or None, "frame", is_shown=progress) as bar:
+            for frame in container.decode(stream):
+                bar.update()
+                yield frame
 
 
 def _grey(frame: Any, width: int) -> np.ndarray:

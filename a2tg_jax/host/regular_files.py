@@ -16,6 +16,8 @@ MOST_ARRAY_BYTES = 1 << 34
 """Largest file of arrays: models, checkpoints, weights, point clouds and COLMAP's models."""
 LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
 """Largest growth of an untrusted file that is unpacked: a multiple of its size, and bytes that any file may have."""
+LFS_POINTER, MOST_POINTER_BYTES = b"version https://git-lfs.github.com/spec/", 1024
+"""Beginning and size limit of the text that stands for a file of git-lfs (https://github.com/git-lfs/git-lfs, spec)."""
 READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """Flags to open a file for reading bytes, without waiting for a pipe's writer or changing newlines."""
 
@@ -66,10 +68,18 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTE
 
     Raises:
       OSError: if it cannot be opened.
-      ValueError: naming the path, if it is not a regular file, or is larger.
+      ValueError: naming the path, if it is not a regular file, is larger, or is a pointer of git-lfs.
     """
-    if is_remote(path):
-        return fetched(path, most_bytes)
+    file = fetched(path, most_bytes) if is_remote(path) else _opened_here(path, most_bytes)
+    if os.fstat(file.fileno()).st_size < MOST_POINTER_BYTES and file.peek().startswith(LFS_POINTER):
+        file.close()
+        raise ValueError(
+            f"{path}: is a pointer of git-lfs, a text that stands for the file; run `git lfs pull` in its repository"
+        )
+    return file
+
+
+def _opened_here(path: str | os.PathLike[str], most_bytes: int) -> BufferedReader:
     # Opening alone can have effects on a device.
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise ValueError(_refusal(path))
