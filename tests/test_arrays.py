@@ -70,13 +70,23 @@ NO_DEPTHS = [None] * 4
 WRONG = [
     (f"images[0]: a picture {PICTURE}float32 [30, 40, 3]: use", "images", [np.zeros((30, 40, 3), np.float32)] * 6),
     (f"{PICTURE}uint8 [3, 30, 40]", "images", [np.zeros((3, 30, 40), np.uint8)] * 6),
+    (f"{PICTURE}float64 [30, 40]: use np.rint(255 * image)", "images", [np.zeros((30, 40))] * 6),
+    ("images must hold at least two images, with a pose each; got 0", "images", []),
+    ("images must be an Iterable; got NoneType: use a list", "images", None),
     ("use np.clip(np.rint(image), 0, 255).astype(np.uint8) of [0, 255]", "images", [np.full((30, 40, 3), 255.0)] * 6),
     ("got int64 [30, 40, 3]: use np.clip(np.rint(image), 0, 255)", "images", [np.full((30, 40, 3), 200)] * 6),
     ("use (image // 257).astype", "images", [np.full((30, 40, 3), 65535, np.uint16)] * 6),
     ("viewmats must be [6, 4, 4]; got [6, 3, 4]", "viewmats", np.zeros((6, 3, 4))),
     ("viewmats[0]: its pose is not a rigid motion", "viewmats", np.stack([np.diag([2.0, 2, 2, 1])] * 6)),
     ("end with the row 0, 0, 0, 1: transpose", "viewmats", np.stack([np.eye(4) + np.eye(4, k=-1)] * 6)),
+    ("viewmats[0]: its pose is not finite", "viewmats", np.full((6, 4, 4), np.nan)),
+    ("viewmats[0]: its pose exceeds ±1e+12, at 1e+200", "viewmats", np.stack([np.eye(4) + 1e200 * np.eye(4, k=3)] * 6)),
+    ("viewmats must be an array of real numbers; got NoneType", "viewmats", None),
     ("Ks must be [6, 3, 3]; got [2, 3, 3]", "Ks", np.zeros((2, 3, 3))),
+    ("Ks must be an array of real numbers; got list", "Ks", [[1, 2], [3]]),
+    ("Ks[0]: its focal lengths must be in 0.04..4e+06 pixels", "Ks", np.full((3, 3), np.inf)),
+    ("Ks[0]: its focal lengths must be in 0.04..4e+06 pixels", "Ks", np.zeros((6, 3, 3))),
+    ("points must be an array of real numbers; got complex128[5, 3]", "points", np.full((5, 3), 1j)),
     ("points must be [P, 3]; got [5, 2]", "points", np.zeros((5, 2))),
     ("colors needs points", "points", None),
     ("colors must be uint8; got float64: use np.rint(255", "colors", np.zeros((200, 3))),
@@ -86,6 +96,7 @@ WRONG = [
     ("lists a twice", "names", ["a"] * 6),
     ("names[0] must be a str; got NoneType", "names", [None] * 6),
     ("masks[0]: a mask must be an array bool", "masks", [np.ones((30, 40))] * 6),
+    ("the mask of view_001.png excludes every pixel", "masks", [None, np.zeros((30, 40), bool), *NO_DEPTHS]),
     ("masks[0] must be as large as its image, [30, 40]; got [3, 4]", "masks", [np.ones((3, 4), bool)] * 6),
     ("depths[1] must be as large as its image, [30, 40]; got [3, 4]", "depths", [None, np.ones((3, 4)), *NO_DEPTHS]),
 ]  # fmt: skip
@@ -115,9 +126,7 @@ CONVENTIONS = {
 @pytest.mark.parametrize("advice", CONVENTIONS)
 @pytest.mark.filterwarnings("ignore:.*sparse points")
 def test_poses_of_another_convention_are_named(given, advice, has_points):
-    """The advice is right. Flipped axes alone are noticed by points only, for cameras may look outwards."""
-    if not has_points and CONVENTIONS[advice] is of_opengl:
-        pytest.skip("needs points")
+    """The advice is right."""
     changed = {} if has_points else {"points": None, "colors": None}
     wrong = CONVENTIONS[advice](given["viewmats"])
     with pytest.warns(UserWarning, match=re.escape(f"with {advice}, if these")):
@@ -126,13 +135,111 @@ def test_poses_of_another_convention_are_named(given, advice, has_points):
     a2tg.scene_from_arrays(**{**given, **changed})
 
 
-def test_cameras_that_look_outwards_are_fine(given):
-    """On a circle, as in a room; without points."""
-    outwards = [a2tg.look_at([x, y, 0], [2 * x, 2 * y, 0], width=40, height=30).viewmat
-                for x, y in zip(np.cos(range(6)), np.sin(range(6)), strict=True)]  # fmt: skip
+def room(camera, radius=3.0):
+    """What a camera in a sphere sees: smooth waves on its wall, whose rays are intersected here."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    viewmat, K = np.asarray(camera.viewmat, float), np.asarray(camera.K, float)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(K).T @ viewmat[:3, :3]
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    center = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    along = rays @ center
+    wall = center + (np.sqrt(along**2 - center @ center + radius**2) - along)[..., None] * rays
+    waves = np.random.default_rng(0).normal(size=(3, 40))
+    return np.clip(128 + 25 * np.sin(4 / radius * wall @ waves + waves[0]) @ waves.T, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("is_real", [False, True], ids=["photographs of elsewhere", "a room"])
+def test_cameras_that_look_outwards_are_fine(given, is_real):
+    """On a circle, without points. Their axes meet behind them, as flipped axes around a subject do."""
+    cameras = [a2tg.look_at([x, y, 0], [2 * x, 2 * y, 0], width=40, height=30)
+               for x, y in zip(np.cos(range(6)), np.sin(range(6)), strict=True)]  # fmt: skip
+    images = [room(camera) for camera in cameras] if is_real else given["images"]
     with pytest.warns(UserWarning) as warned:
-        a2tg.scene_from_arrays(given["images"], outwards, given["Ks"])
+        a2tg.scene_from_arrays(images, [camera.viewmat for camera in cameras], cameras[0].K)
     assert len(warned) == 1 and "has no sparse points" in str(warned[0].message)
+
+
+def test_grey_images_are_those_of_three_equal_channels(given):
+    planes = [image[..., 1] for image in given["images"]]
+    wanted = a2tg.scene_from_arrays(**{**given, "images": [np.stack([plane] * 3, -1) for plane in planes]})
+    for images in (planes, [plane[..., None] for plane in planes], (plane for plane in planes)):
+        found = a2tg.scene_from_arrays(**{**given, "images": images})
+        for own, view in zip(found.train, wanted.train, strict=True):
+            np.testing.assert_array_equal(own.image, view.image)
+            np.testing.assert_array_equal(a2tg.view_image(own), a2tg.view_image(view))
+
+
+def test_points_that_are_nowhere_are_left_out_with_one_warning(given):
+    """NumPy says nothing of its own."""
+    nowhere = [[np.nan] * 3, [0, np.inf, 0], [1e300, 0, 0]]
+    changed = {"points": np.concatenate([given["points"], nowhere]), "colors": None}
+    with pytest.warns(UserWarning) as warned:
+        scene = a2tg.scene_from_arrays(**{**given, **changed})
+    assert [str(each.message) for each in warned] == [
+        "the scene arrays: 3 points left out, not finite or beyond ±1e+12"
+    ] and len(scene.points) == 200  # fmt: skip
+
+
+MAP = np.array([4e5, 5e6, 100.0])
+"""An offset of map coordinates, at which float32 has steps of half a metre."""
+
+
+def on_map(given, dtype=np.float64):
+    """Camera-to-world matrices on a map, whose rotations have been rounded."""
+    poses = np.linalg.inv(given["viewmats"])
+    poses[:, :3, :3] = poses[:, :3, :3].astype(np.float32)
+    poses[:, :3, 3] += MAP
+    return poses.astype(dtype).astype(np.float64)
+
+
+def test_cameras_on_a_map_stay_where_rounded_rotations_have_them(given):
+    """They are orthonormal to 1e-8 only, which t = -R·c would multiply by 5e6."""
+    here, there = (
+        a2tg.scene_from_arrays(**{**given, "viewmats": np.linalg.inv(poses), "points": points})
+        for poses, points in (
+            (np.linalg.inv(given["viewmats"]), given["points"]),
+            (on_map(given), given["points"] + MAP),
+        )
+    )
+    for own, view in zip(there.train, here.train, strict=True):
+        np.testing.assert_allclose(own.camera.center, view.camera.center, atol=1e-6)
+
+
+ROUNDED = {
+    "viewmats": lambda given: {"viewmats": np.linalg.inv(on_map(given)).astype(np.float32)},
+    "camera positions": lambda given: {"viewmats": np.linalg.inv(on_map(given, np.float32))},
+    "points": lambda given: {"points": (given["points"] + MAP).astype(np.float32)},
+}
+
+
+@pytest.mark.parametrize("what", ROUNDED)
+def test_map_coordinates_in_float32_are_noticed(given, what):
+    on_a_map = {"viewmats": np.linalg.inv(on_map(given)), "points": given["points"] + MAP}
+    with pytest.warns(
+        UserWarning, match=rf"arrays: {what} were rounded to float32, in steps of 0\.5, which is 0\.\d+ of"
+    ):
+        a2tg.scene_from_arrays(**{**given, **on_a_map, **ROUNDED[what](given)})
+    a2tg.scene_from_arrays(**{**given, **on_a_map})
+    near = {name: np.asarray(given[name], np.float32) for name in ("viewmats", "points")}
+    a2tg.scene_from_arrays(**{**given, **near})
+
+
+def test_it_is_said_why_photographs_are_not_compared(given):
+    few = {name: given[name] for name in ("viewmats", "Ks")}
+    plain = [np.where(np.arange(30)[:, None, None] < 8, image, 90).astype(np.uint8) for image in given["images"]]
+    with pytest.warns(UserWarning, match=r"random points, since [67]\d% of the photographs is plain, such as a wall"):
+        a2tg.scene_from_arrays(plain, **few)
+    clear = [np.zeros((30, 40, 4), np.uint8)] * 6
+    with pytest.warns(UserWarning, match="random points, since the photographs agree nowhere"):
+        a2tg.scene_from_arrays(clear, **few)
+
+
+def test_a_view_that_does_not_fit_its_camera_is_named(whole):
+    view = whole.train[0]
+    other = dataclasses.replace(view, name="b.png", camera=a2tg.resize_camera(view.camera, 20, 15))
+    model = a2tg.Model(a2tg.init_from_points(whole.points, whole.colors, num=20))
+    with pytest.raises(ValueError, match=r"picture of view b\.png must be uint8 \[15, 20, 3\], as large as its camera"):
+        a2tg.evaluate([view, other], model)
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,29 @@
 """Scenes from arrays: images and cameras that are already in memory."""
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from a2tg_jax.core.camera_paths import nearest_point
-from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked
+from a2tg_jax.core.cameras import check_intrinsics
+from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked, described, kind_of
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.similarity import camera_centers
-from a2tg_jax.data.assembly import PointCloud, Shot, Sight, assemble_scene, check_test_every, every_kth, rigid_viewmat
+from a2tg_jax.data.assembly import (
+    PointCloud,
+    Shot,
+    Sight,
+    are_somewhere,
+    assemble_scene,
+    check_test_every,
+    every_kth,
+    rigid_viewmat,
+    warn_of_rounding,
+)
+from a2tg_jax.data.photo_points import MOST_VIEWS, Look, agreement
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture, how_to_convert
 from a2tg_jax.data.scene import Scene
 
@@ -23,6 +35,11 @@ LEAST_SEEN, CLEARLY = 0.05, 1.5
 """Smallest share of points in view by another convention, and its smallest ratio to the share by the given one."""
 PRECISIONS = 0.2, 0.01
 """Largest offset of an axis from the common point, relative to its distance, for photographs and for renders."""
+SUBJECT, NUM_TRIED = 0.6, 20_000
+"""Half the side of the cube around the common point, in units of the cameras' distance, in which photographs are
+compared at random points, and their number."""
+MOST_DIFFERENCE = 0.9
+"""Largest ratio of the difference of photographs to the one of photographs exchanged among the cameras (`BEST`)."""
 
 
 def scene_from_arrays(
@@ -41,8 +58,10 @@ def scene_from_arrays(
     """Make a scene of images and cameras in any world, which is normalised as `load_scene` does.
 
     Args:
-      images: V images [H, W, 3] or, with straight alpha, [H, W, 4], uint8; sizes may differ. They are not copied.
-      viewmats: [V, 4, 4] world-to-camera matrices, rigid; x is right, y down, z forward (OpenCV).
+      images: V images uint8, V ≥ 2: [H, W, 3], with straight alpha [H, W, 4], or grey [H, W] or [H, W, 1]; sizes may
+        differ. They are not copied.
+      viewmats: [V, 4, 4] world-to-camera matrices, rigid; x is right, y down, z forward (OpenCV). Rounded rotations
+        are made orthonormal around the camera centre.
       Ks: [V, 3, 3] intrinsics in pixels, or [3, 3] for all.
       points: [P, 3] points to start from, in the same world; None: some where the images agree, with a
         warning.
@@ -54,8 +73,9 @@ def scene_from_arrays(
       test_every: every k-th view is a test view; 0 keeps none.
       name: name of the scene.
 
-    Warns of likely mistakes: camera-to-world matrices, OpenGL axes, intrinsics for another image size, and colours in
-    [0, 1] that were converted without a factor of 255.
+    Warns of likely mistakes: camera-to-world matrices, OpenGL axes (without points, only if the cameras surround a
+    subject), intrinsics for another image size, colours in [0, 1] that were converted without a factor of 255, and map
+    coordinates in float32.
 
     Returns:
       The scene in its normalised world; `Scene.transform` leads there from the given one.
@@ -75,13 +95,18 @@ def scene_from_arrays(
       10
     """
     check_test_every(test_every)
+    check_kind("images", images, Iterable, "use a list of arrays uint8 [H, W, 3]")
+    images = list(images)
     num = len(images)
-    viewmats = _matrices("viewmats", viewmats, (num, 4, 4))
-    if not np.allclose(viewmats[:, 3], [0, 0, 0, 1]):
+    if num < 2:
+        raise ValueError(f"images must hold at least two images, with a pose each; got {num}")
+    viewmats = _numbers("viewmats", viewmats)
+    check_shape("viewmats", viewmats, (num, 4, 4))
+    if np.abs(viewmats[:, 3] - [0, 0, 0, 1]).max() > 1e-5:  # False for NaN, which rigid_viewmat reports.
         raise ValueError("viewmats must end with the row 0, 0, 0, 1: transpose matrices that multiply row vectors")
-    check_unmasked("Ks", Ks)
-    Ks = np.asarray(Ks)
-    Ks = _matrices("Ks", np.broadcast_to(Ks, (num, 3, 3)) if Ks.shape == (3, 3) else Ks, (num, 3, 3))
+    Ks = _numbers("Ks", Ks)
+    Ks = np.broadcast_to(Ks, (num, 3, 3)) if Ks.shape == (3, 3) else Ks
+    check_shape("Ks", Ks, (num, 3, 3))
     for argument, values in {"names": names, "masks": masks, "depths": depths}.items():
         if values is not None and len(values) != num:
             raise ValueError(f"{argument} must hold one item for each of {num} images; got {len(values)}")
@@ -94,6 +119,8 @@ def scene_from_arrays(
         check_kind(f"names[{index}]", own, str)
         picture = _converted(f"images[{index}]", Picture.of, images[index])
         viewmat = rigid_viewmat(viewmats[index], f"viewmats[{index}]")
+        height, width = picture.size
+        check_intrinsics(Ks[index], width, height, f"Ks[{index}]")
         mask, depth = (
             None if values is None or values[index] is None
             else _converted(f"{argument}[{index}]", kind, values[index], picture.size)
@@ -104,18 +131,22 @@ def scene_from_arrays(
     shots = [shot(index) for index in range(num)]
     for message in _mistakes(images, colors, shots, None if cloud is None else cloud.points):
         warnings.warn(f"the scene {name}: {message}", stacklevel=2)
-    return assemble_scene(name, *every_kth(shots, test_every), cloud, source=f"the scene {name}")
+    scene = assemble_scene(name, *every_kth(shots, test_every), cloud, source=f"the scene {name}")
+    # Those of the shots are made orthonormal.
+    warn_of_rounding("viewmats", viewmats[:, :3, 3], scene.transform, f"the scene {name}")
+    return scene
 
 
 def _mistakes(
     images: Sequence[object], colors: ArrayLike | None, shots: Sequence[Shot], points: np.ndarray | None
 ) -> Iterator[str]:
     # Colours in [0, 1] cast to uint8 are only 0 and 1. The first image usually settles it.
-    arrays = {"images": [image for image in images if not isinstance(image, Picture)]}
-    for name, own in (arrays | ({} if colors is None else {"colors": [colors]})).items():
+    pairs = zip(images, shots, strict=True)
+    arrays = {"images": [shot.picture.read() for image, shot in pairs if not isinstance(image, Picture)]}
+    for name, own in (arrays | ({} if colors is None else {"colors": [np.asarray(colors)]})).items():
         largest = 0
         for array in own:
-            largest = max(largest, int(np.max(np.asarray(array)[..., :3], initial=0)))
+            largest = max(largest, int(np.max(array[..., :3], initial=0)))
             if largest > 1:
                 break
         if largest == 1:
@@ -133,14 +164,15 @@ def _mistakes(
             f"{height:g}. Multiply the first row of K by the ratio of the widths, the second by the ratio of the "
             "heights"
         )
-    if message := _likelier_poses(shots, points):
+    if message := _likelier_poses(shots, None if points is None else points[are_somewhere(points)]):
         yield f"viewmats must be world to camera, x right, y down, z forward: {message}"
 
 
 def _likelier_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
     """Return a message if the poses only make sense by another convention.
 
-    With points, the test is how many of them are in the images; without, whether all cameras look at one place.
+    With points, the test is how many of them are in the images; without, whether all cameras look at one place. Axes of
+    cameras that look outwards meet behind them, so for flipped axes the photographs must also agree there.
     """
     chosen = evenly_chosen(shots, MOST_COMPARED)
     given = np.stack([shot.viewmat for shot in chosen])
@@ -160,10 +192,30 @@ def _likelier_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
         return f"the views see {own:.0%} of the points, and would see {found[best]:.0%} with {[*others][best]}"
     for precision in PRECISIONS:
         own, *found = (_share_that_meet(viewmats, precision) for viewmats in (given, *others.values()))
-        best = int(np.argmax(found[:2]))  # Not the flip: axes of cameras that look outwards meet behind.
+        best = int(np.argmax(found[:2]))
+        if found[2] >= 0.9 and own <= 0.5 and _agree_on_subject(chosen, flip @ given):
+            best = 2
         if own <= 0.5 and found[best] >= 0.9:
             return f"{own:.0%} of the cameras look at one place, and {found[best]:.0%} would with {[*others][best]}"
     return ""
+
+
+def _agree_on_subject(shots: Sequence[Shot], viewmats: np.ndarray) -> bool:
+    """Return whether photographs agree around the point nearest to all optical axes, better than if they are exchanged
+    among the cameras."""
+    shots, viewmats = evenly_chosen(shots, MOST_VIEWS), evenly_chosen(viewmats, MOST_VIEWS)
+    looks = [Look(shot.picture, shot.mask, viewmat, shot.K) for shot, viewmat in zip(shots, viewmats, strict=True)]
+    centers = camera_centers(viewmats)
+    subject = nearest_point(centers, viewmats[:, 2, :3])
+    half_side = SUBJECT * np.median(np.linalg.norm(centers - subject, axis=1))
+    points = subject + half_side * np.random.default_rng(0).uniform(-1, 1, (NUM_TRIED, 3))
+    own = agreement(looks, points)
+    exchanged = []
+    for shift in {1, len(looks) // 3, len(looks) // 2, len(looks) - 1} - {0}:
+        for look, viewmat in zip(looks, np.roll(viewmats, shift, axis=0), strict=True):
+            look.viewmat = viewmat
+        exchanged.append(agreement(looks, points))
+    return own < MOST_DIFFERENCE * min(exchanged)
 
 
 def _share_seen(shots: Sequence[Shot], viewmats: np.ndarray, points: np.ndarray) -> float:
@@ -182,10 +234,16 @@ def _share_that_meet(viewmats: np.ndarray, precision: float) -> float:
     return float(np.mean((depths > 0) & (np.linalg.norm(np.cross(offsets, axes), axis=1) < precision * depths)))
 
 
-def _matrices(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    check_shape(name, values, shape)
+def _numbers(name: str, values: ArrayLike) -> np.ndarray:
+    """Return an array or nested lists as float64, or raise a ValueError that names them."""
     check_unmasked(name, values)
-    return np.asarray(values, np.float64)
+    try:
+        if values is not None and not np.iscomplexobj(values):
+            return np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        pass
+    found = described(values) if hasattr(values, "dtype") else kind_of(values)
+    raise ValueError(f"{name} must be an array of real numbers; got {found}")
 
 
 def _converted(name: str, kind: Callable[[Any], Any], values: object, size: tuple[int, int] | None = None) -> Any:
@@ -201,10 +259,9 @@ def _converted(name: str, kind: Callable[[Any], Any], values: object, size: tupl
 
 
 def _cloud(points: ArrayLike, colors: ArrayLike | None) -> PointCloud:
-    check_unmasked("points", points)
-    check_unmasked("colors", colors)
-    points = np.asarray(points, np.float64)
+    points = _numbers("points", points)
     check_shape("points", points, ("P", 3))
+    check_unmasked("colors", colors)
     colors = np.full(points.shape, 128, np.uint8) if colors is None else np.asarray(colors)
     check_shape("colors", colors, points.shape)
     if colors.dtype != np.uint8:

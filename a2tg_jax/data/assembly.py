@@ -19,7 +19,7 @@ from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_ca
 from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.similarity import Similarity, camera_centers
-from a2tg_jax.data.photo_points import MOST_VIEWS, Look, agreeing_points
+from a2tg_jax.data.photo_points import MOST_PLAIN, MOST_VIEWS, Look, agreeing_points, plain_share
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
 from a2tg_jax.data.scene import Scene, View
 from a2tg_jax.host.text import counted
@@ -43,6 +43,9 @@ FARTHEST = 1e5
 """Largest distance of a camera from the median centre, in units of the median distance."""
 MIN_UP_LENGTH = 1e-3
 """Shortest mean of the cameras' unit up vectors that still defines up."""
+COARSEST = 1e-4
+"""Largest rounding of coordinates without a warning, in units of the distance of the cameras: 0.1 pixels at a focal
+length of 1,000."""
 ZERO_SPREAD = 1e-9
 """Distance below which cameras count as one place, relative to their distance from the origin."""
 VALIDATION_EVERY = 8
@@ -103,29 +106,28 @@ def assemble_scene(
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
+    warn_of_rounding("camera positions", camera_centers(np.stack([shot.viewmat for shot in shots])), transform, source)
     sights = [Sight.of(viewmats[shot.name], shot.K, shot.picture.size, shot.rays) for shot in train]
     if cloud is not None:
-        is_usable = _are_somewhere(cloud.points)
+        is_usable = are_somewhere(cloud.points)
         # Again in the normalised world: its unit is small if the cameras are close together.
-        is_usable[is_usable] = _are_somewhere(transform.apply(cloud.points[is_usable]))
+        is_usable[is_usable] = are_somewhere(transform.apply(cloud.points[is_usable]))
         if not is_usable.all():
             left_out = counted(int(np.count_nonzero(~is_usable)), "point")
             message = f"{source}: {left_out} left out, not finite or beyond ±{LARGEST_COORDINATE:g}"
             warnings.warn(message, stacklevel=3)
             cloud = PointCloud(cloud.points[is_usable], cloud.colors[is_usable])
+        warn_of_rounding("points", cloud.points, transform, source)
     # Initial Gaussians are as large as the distances to their neighbours, so one point is not enough.
     points = None if cloud is None or len(cloud.points) < 2 else transform.apply(cloud.points)
     unseen_by = [] if points is None else unseeing(points, sights)
     if cloud is None or points is None or len(unseen_by) == len(sights):
         lacks = "has no" if points is None else "no training view sees any of its"
-        points, colors, agrees = _start_without_points(
+        points, colors, obstacle = _start_without_points(
             train, viewmats, sights, transform.rotation if is_object else None
         )
-        if cloud is not None or not (is_object and agrees):
-            kind = (
-                "points where photographs agree" if agrees
-                else "random points, since photographs agree nowhere or are plain"
-            )  # fmt: skip
+        if cloud is not None or obstacle or not is_object:
+            kind = f"random points, since {obstacle}" if obstacle else "points where photographs agree"
             warnings.warn(f"{source}: {lacks} sparse points; starts from {len(points):,} {kind}", stacklevel=3)
     else:
         colors = cloud.colors
@@ -146,19 +148,27 @@ def assemble_scene(
 
 def _start_without_points(
     train: Sequence[Shot], viewmats: Mapping[str, np.ndarray], sights: "Sequence[Sight]", object_axes: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return points [P, 3] where photographs agree, their colours [P, 3] uint8, and True; or random grey ones, and
-    False. Each view sees some."""
-    random = random_points(sights, object_axes)
-    points, colors = agreeing_points(_compared_photographs(train, viewmats), random, NUM_POINTS)
-    agrees = len(points) >= 2
-    if not agrees:
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return points [P, 3] where photographs agree, their colours [P, 3] uint8, and ""; or random grey ones, and why
+    there are no others. Each view sees some."""
+    random, obstacle = random_points(sights, object_axes), ""
+    looks = _compared_photographs(train, viewmats)
+    points, colors = agreeing_points(looks, random, NUM_POINTS)
+    if len(points) < 2:
         points, colors = random[:NUM_POINTS], np.full((NUM_POINTS, 3), GREY)
+        obstacle = "the photographs agree nowhere"
+        if not looks:
+            obstacle = "photographs that keep a lens's distortion are not compared"
+        elif (share := plain_share(looks)) > MOST_PLAIN:
+            obstacle = (
+                f"{share:.0%} of the photographs is plain, such as a wall or the sky, where they would agree anywhere: "
+                "give points of a reconstruction, such as a2tg sfm finds"
+            )
     elif lost := unseeing(points, sights):
         # As many for each of them as for the others, at random.
         more = random_points([sights[index] for index in lost])[: NUM_POINTS * len(lost) // len(sights)]
         points, colors = np.concatenate([points, more]), np.concatenate([colors, np.full(more.shape, GREY)])
-    return points, np.rint(255 * colors).astype(np.uint8), agrees
+    return points, np.rint(255 * colors).astype(np.uint8), obstacle
 
 
 def _compared_photographs(train: Sequence[Shot], viewmats: Mapping[str, np.ndarray]) -> list[Look]:
@@ -250,10 +260,20 @@ def random_points(sights: Sequence[Sight], object_axes: np.ndarray | None = None
 
 
 def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
-    """Return the rigid motion nearest to a nearly rigid matrix [4, 4], such as a rounded pose. `what` is its name."""
-    rotation = viewmat[:3, :3]
-    if not (np.abs(viewmat) <= LARGEST_COORDINATE).all():  # False for NaN.
-        largest = np.abs(viewmat).max()
+    """Return the rigid motion nearest to a nearly rigid world-to-camera matrix [4, 4], such as a rounded pose, with the
+    same camera centre -R⁻¹·t. `what` is its name."""
+    rigid = rigid_motion(viewmat, what)
+    # In map coordinates t is millions of metres long: with another R, the same t would be another place.
+    rigid[:3, 3] = rigid[:3, :3] @ np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3])
+    return rigid
+
+
+def rigid_motion(motion: np.ndarray, what: str) -> np.ndarray:
+    """Return the rigid motion nearest to a nearly rigid matrix [4, 4], with the same translation, such as the position
+    in a camera-to-world matrix. `what` is its name."""
+    rotation = motion[:3, :3]
+    if not (np.abs(motion) <= LARGEST_COORDINATE).all():  # False for NaN.
+        largest = np.abs(motion).max()
         found = f"exceeds ±{LARGEST_COORDINATE:g}, at {largest:g}" if np.isfinite(largest) else "is not finite"
         raise ValueError(f"{what}: its pose {found}; remove it from the scene or correct the pose")
     # The nearest orthogonal matrix to R = U·S·Vᵀ is U·Vᵀ; it is a reflection if its determinant is -1.
@@ -261,7 +281,7 @@ def rigid_viewmat(viewmat: np.ndarray, what: str) -> np.ndarray:
     if np.abs(singular_values - 1).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
         raise ValueError(f"{what}: its pose is not a rigid motion; rotations must be orthonormal and right-handed")
     rigid = np.eye(4)
-    rigid[:3, :3], rigid[:3, 3] = left @ right, viewmat[:3, 3]
+    rigid[:3, :3], rigid[:3, 3] = left @ right, motion[:3, 3]
     return rigid
 
 
@@ -276,6 +296,11 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
     for shot, following in itertools.pairwise(shots):
         if shot.name == following.name:
             raise ValueError(f"{source}: lists {shot.name} twice; remove one")
+    for shot in shots:
+        if shot.mask is not None and shot.mask.num == 0:
+            raise ValueError(
+                f"{source}: the mask of {shot.name} excludes every pixel; remove the photograph or correct the mask"
+            )
     centers = camera_centers(np.stack([shot.viewmat for shot in shots]))
     # Medians, because one camera far away would move a mean towards itself.
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
@@ -288,8 +313,30 @@ def _check_shots(shots: Sequence[Shot], num_train: int, source: str) -> None:
         )
 
 
-def _are_somewhere(points: np.ndarray) -> np.ndarray:
-    return (np.abs(points) <= LARGEST_COORDINATE).all(axis=1)  # False for NaN.
+def are_somewhere(points: np.ndarray) -> np.ndarray:
+    """Return [P] bool, whether the coordinates of points [P, 3] are finite and not too large."""
+    return np.asarray((np.abs(points) <= LARGEST_COORDINATE).all(axis=1))  # False for NaN.
+
+
+def warn_of_rounding(what: str, positions: np.ndarray, transform: Similarity, source: str) -> None:
+    """Warn if positions [..., 3] in the original world are numbers of float32, whose steps are large there.
+
+    `transform` leads to the normalised world, in which the cameras' distance is 1.
+    """
+    steps = np.spacing(np.abs(positions).astype(np.float32)).astype(np.float64)
+    is_coarse = steps * transform.scale > COARSEST
+    coarse, steps = positions[is_coarse], steps[is_coarse]
+    # Positions that come from inverting a matrix differ from float32 by rounding of float64.
+    is_float32 = np.abs(coarse - coarse.astype(np.float32)) <= 1e-3 * steps
+    is_whole = np.abs(coarse - np.rint(coarse)) <= 1e-3  # Such as a grid in metres, which lost nothing.
+    if not len(coarse) or not is_float32.all() or (is_whole.all() and steps.max() < 1):
+        return
+    warnings.warn(
+        f"{source}: {what} were rounded to float32, in steps of {steps.max():g}, which is "
+        f"{steps.max() * transform.scale:.2g} of the cameras' distance from the subject: give them in float64, or "
+        "subtract an offset before they become float32",
+        stacklevel=4,
+    )
 
 
 def _view(shot: Shot, viewmat: np.ndarray) -> View:

@@ -165,11 +165,6 @@ def read_photos(
     elif lacking:
         message = f"{place}: {len(lacking)} of {len(shots)} photographs have no mask, such as {lacking[0]}"
         warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
-    for shot in shots:
-        if shot.mask is not None and shot.mask.num == 0:
-            raise ValueError(
-                f"{place}: the mask of {shot.name} excludes every pixel; remove the photograph or correct the mask"
-            )
     return shots
 
 

@@ -63,17 +63,20 @@ class Picture:
         """Return a picture of pixels held in memory; a picture is returned unchanged.
 
         Raises:
-          ValueError: unless they are uint8, [H, W, 3] or [H, W, 4].
+          ValueError: unless they are uint8, [H, W, 3], [H, W, 4], or grey [H, W] or [H, W, 1].
         """
         if isinstance(pixels, Picture):
             return pixels
         wanted = "a picture must be an array uint8 [H, W, 3], or [H, W, 4] with alpha"
         if isinstance(pixels, str | os.PathLike) or not hasattr(pixels, "dtype"):
             raise ValueError(f"{wanted}; got {type(pixels).__name__}")
-        is_image = len(pixels.shape) == 3 and pixels.shape[2] in (3, 4) and min(pixels.shape) > 0
+        is_grey = len(pixels.shape) == 2 or pixels.shape[2:] == (1,)
+        is_image = (is_grey or (len(pixels.shape) == 3 and pixels.shape[2] in (3, 4))) and min(pixels.shape) > 0
         if not is_image or pixels.dtype != np.uint8:
             advice = how_to_convert(pixels, "image") if is_image else ""
             raise ValueError(f"{wanted}; got {pixels.dtype} {[*pixels.shape]}{advice}")
+        if is_grey:  # A view of the same memory with three equal channels.
+            pixels = np.broadcast_to(np.reshape(pixels, (*pixels.shape[:2], 1)), (*pixels.shape[:2], 3))
         return Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
 
     def __deepcopy__(self, memo: object) -> "Picture":

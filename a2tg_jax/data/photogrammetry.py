@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from a2tg_jax.data.assembly import PointCloud, rigid_viewmat
+from a2tg_jax.data.assembly import PointCloud, rigid_motion
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, warn_of_unposed
 from a2tg_jax.data.ply import read_ply_points
@@ -117,7 +117,7 @@ def _posed_cameras(file: Path) -> list[tuple[str, Element, np.ndarray]]:
             world = of_chunk if world is None else world
             if world is not None:
                 own = world @ own
-                # s·R has the determinant s³; poses are rigid. rigid_viewmat reports a scale of 0.
+                # s·R has the determinant s³; poses are rigid. rigid_motion reports a scale of 0.
                 own[:3, :3] /= np.cbrt(abs(np.linalg.det(world[:3, :3]))) or 1.0
             found.append((label, sensor, own))
     by_offset = "have no own pose, such as {}: placed by their sensors' offsets from the master, in units of its pose"
@@ -136,7 +136,7 @@ def _offset(sensor: Element, master: Element | None, file: Path) -> np.ndarray |
         """Return the rigid motion [4, 4] from a sensor's frame to its rig's; None if it has none."""
         if part.find("rotation") is None and part.find("translation") is None:
             return None
-        return rigid_viewmat(_motion(part, file), f"{file}: sensor {part.get('id')}")
+        return rigid_motion(_motion(part, file), f"{file}: sensor {part.get('id')}")
 
     from_sensor, from_master = (None if part is None else in_rig(part) for part in (sensor, master))
     if from_sensor is None and (from_master is None or sensor.get("master_id") is not None):

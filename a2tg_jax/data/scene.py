@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jax import Array
 
-from a2tg_jax.core.cameras import Camera, check_is_camera
+from a2tg_jax.core.cameras import Camera, check_camera, check_is_camera
 from a2tg_jax.core.checks import check_array, check_kind, check_number, check_shape
 from a2tg_jax.core.notebook_display import THUMBNAIL, enlarged, html_image, png
 from a2tg_jax.core.numerics import evenly_chosen
@@ -41,7 +41,7 @@ class View:
     camera: Camera
     """Its camera in the normalised world, float32, of the image's size."""
     picture: Picture
-    """Its pixels, in memory or on disk; an array [H, W, 3] or [H, W, 4] uint8 may be given as well."""
+    """Its pixels, in memory or on disk; an array uint8 [H, W, 3], [H, W, 4], or grey [H, W] may be given as well."""
     mask: Mask | None = None
     """Mask of the pixels that count in losses and metrics, or an array [H, W] bool; None counts all."""
     depth: DepthMap | None = None
@@ -137,12 +137,35 @@ def check_scene(scene: Scene) -> None:
 
 
 def check_are_views(views: Sequence[View], call: str) -> None:
-    """Raise ValueError, which shows the right call, unless the views are a list or a tuple of at least one view."""
+    """Raise ValueError, which shows the right call, unless the views are a list or a tuple of at least one view, each
+    as `check_view` wants it."""
     others = [item for item in views if not isinstance(item, View)] if isinstance(views, list | tuple) else [views]
     if others:
         raise ValueError(f"views must be views, such as scene.train; got {type(others[0]).__name__}: use {call}")
     if not views:
         raise ValueError("views must hold at least one view; got none (scene.test needs a test_every that leaves some)")
+    for view in views:
+        check_view(view)
+
+
+def check_view(view: View) -> None:
+    """Raise ValueError, naming the view, unless its photograph, mask and depth map have the size of its camera, and
+    some pixels count."""
+    check_camera(view.camera, f"view {view.name}: camera")
+    height, width, picture = view.camera.height, view.camera.width, view.picture
+    if picture.shape not in ((height, width, 3), (height, width, 4)) or picture.dtype != np.uint8:
+        raise ValueError(
+            f"picture of view {view.name} must be uint8 {[height, width, 3]}, as large as its camera says, or have "
+            f"an opacity as 4th channel; got {np.dtype(picture.dtype)} {list(picture.shape)}"
+        )
+    for name, image in (("mask", view.mask), ("depth", view.depth)):
+        if image is not None and image.shape != (height, width):
+            raise ValueError(
+                f"{name} of view {view.name} must be {[height, width]}, as large as its camera says; "
+                f"got {list(image.shape)}"
+            )
+    if view.mask is not None and not view.mask.num:
+        raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or fix its mask")
 
 
 def origin_of_scene(scene: Scene) -> Origin:

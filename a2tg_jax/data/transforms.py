@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from a2tg_jax.core.cameras import LONGEST_SIDE
-from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_viewmat
+from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_motion
 from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.image_files import inside
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
@@ -169,7 +169,7 @@ def _read_shots(
             raise ValueError(f"{what}: its transform_matrix must be 4x4 numbers; got shape {pose.shape}")
         camera_to_world = np.eye(4)
         camera_to_world[:3] = pose[:3] * [1.0, -1.0, -1.0, 1.0]  # from OpenGL's camera to OpenCV's
-        viewmat = np.linalg.inv(rigid_viewmat(camera_to_world, what))
+        viewmat = np.linalg.inv(rigid_motion(camera_to_world, what))
         photos.append(Photo(name, viewmat, (path.parent, path.name), below, lens, what, mask, depths, counted))
     place = files[0][0]
     shots = iter(read_photos(photos, options, place, place.parent, lambda name: f"remove its frame from {place}"))

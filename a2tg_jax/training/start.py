@@ -11,12 +11,12 @@ import numpy as np
 from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
 from a2tg_jax.appearance.base import join_rows
 from a2tg_jax.appearance.parts import nearest_gaussians
-from a2tg_jax.core.cameras import Camera, check_camera
+from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.data.assembly import Sight, unseeing
-from a2tg_jax.data.scene import Scene, View
+from a2tg_jax.data.scene import Scene, View, check_view
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
 from a2tg_jax.training.losses import SSIM_WINDOW
@@ -135,21 +135,7 @@ def check_views(views: tuple[View, ...]) -> None:
     if not views:
         raise ValueError("scene.train must hold at least one view; got none")
     for view in views:
-        check_camera(view.camera, f"view {view.name}: camera")
-        height, width, picture = view.camera.height, view.camera.width, view.picture
-        if picture.shape not in ((height, width, 3), (height, width, 4)) or picture.dtype != np.uint8:
-            raise ValueError(
-                f"picture of view {view.name} must be uint8 {[height, width, 3]}, as large as its camera says, or have "
-                f"an opacity as 4th channel; got {np.dtype(picture.dtype)} {list(picture.shape)}"
-            )
-        for name, image in (("mask", view.mask), ("depth", view.depth)):
-            if image is not None and image.shape != (height, width):
-                raise ValueError(
-                    f"{name} of view {view.name} must be {[height, width]}, as large as its camera says; "
-                    f"got {list(image.shape)}"
-                )
-        if view.mask is not None and not view.mask.num:
-            raise ValueError(f"the mask of view {view.name} excludes every pixel: leave the view out or fix its mask")
+        check_view(view)
 
 
 def _rows_needed(stage: Stage, num: int, system: System) -> int:
