@@ -1,5 +1,6 @@
 """Frames of a video: sharp ones, apart from each other, turned as players show them."""
 
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -36,9 +37,9 @@ def test_motion_is_measured_in_widths(shift):
 WIDTH, HEIGHT = 96, 64
 
 
-def encode(path, frames, *, codec="mpeg4", still=None):
+def encode(path, frames, *, codec="mpeg4", still=None, aspect=1):
     """Writes grey frames [HEIGHT, WIDTH] as a video; `still` is the disposition of a larger picture in a stream before
-    it."""
+    it, `aspect` the ratio of the sides of its pixels."""
     av = pytest.importorskip("av", reason="the extra [video] is not installed")
     with av.open(f"file:{path}", "w") as container:
         if still is not None:
@@ -46,6 +47,7 @@ def encode(path, frames, *, codec="mpeg4", still=None):
             cover.width, cover.height, cover.pix_fmt, cover.disposition = 640, 480, "yuvj420p", still
         stream = container.add_stream(codec, rate=25)
         stream.width, stream.height, stream.pix_fmt, stream.bit_rate = WIDTH, HEIGHT, "yuv420p", 4_000_000
+        stream.codec_context.sample_aspect_ratio = Fraction(aspect)
         if still is not None:
             black = av.VideoFrame.from_ndarray(np.zeros((480, 640, 3), np.uint8), format="rgb24")
             container.mux([*cover.encode(black), *cover.encode()])
@@ -99,6 +101,28 @@ def test_frames_are_turned_and_mirrored_as_players_show_them(tmp_path, matrix):
     for (x, y), grey in QUADRANTS.items():
         right, down = a * x + c * y, b * x + d * y
         assert abs(int(pixels[height * (2 + down) // 4, width * (2 + right) // 4]) - grey) < 8
+
+
+@pytest.mark.parametrize("is_turned", [False, True])
+@pytest.mark.parametrize(("aspect", "size"), [("3/2", (144, 64)), ("3/4", (96, 85)), ("1/1", (96, 64))])
+def test_frames_have_square_pixels(tmp_path, aspect, size, is_turned):
+    """The shorter side of the pixels is stretched, before a turn: the square of light stays where its share is."""
+    grey = np.zeros((HEIGHT, WIDTH))
+    grey[HEIGHT // 2 :, : WIDTH // 4] = 255
+    encode(tmp_path / "clip.mp4", [grey] * 3, aspect=aspect)
+    if is_turned:
+        data = bytearray((tmp_path / "clip.mp4").read_bytes())
+        at = data.index(b"tkhd") + 4 + 40
+        for place, value in ((0, 0), (4, 1), (12, -1), (16, 0)):
+            data[at + place : at + place + 4] = (value * 65536).to_bytes(4, "big", signed=True)
+        (tmp_path / "clip.mp4").write_bytes(bytes(data))
+    extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 3, progress=False)
+    pixels = np.asarray(Image.open(min((tmp_path / "frames").iterdir())))[..., 0]
+    stored = np.rot90(pixels) if is_turned else pixels  # It was turned clockwise.
+    assert stored.shape[::-1] == size
+    lit = np.argwhere(stored > 128)
+    np.testing.assert_allclose(lit.min(axis=0), [size[1] / 2, 0], atol=2)
+    np.testing.assert_allclose(lit.max(axis=0), [size[1], size[0] / 4], atol=2)
 
 
 class FrameOfNewerKind:

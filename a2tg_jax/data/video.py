@@ -1,4 +1,4 @@
-"""Photographs from a video: sharp, well-spaced frames, turned as players show them.
+"""Photographs from a video: sharp, well-spaced frames, turned and stretched to square pixels as players show them.
 
 A first pass scores small greyscale frames, a second one writes the chosen ones.
 """
@@ -48,7 +48,7 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
     Returns:
       (number written, number of frames of the video).
     """
-    stream = _chosen_stream(video)
+    stream, size = _chosen_stream(video)
     sharpness, places = [], []
     seen, path = None, 0.0
     is_interlaced = False
@@ -72,7 +72,10 @@ def extract_frames(video: Path, folder: Path, count: int, *, progress: bool = Tr
     # Decoded again, because all frames would not fit into memory.
     for number, frame in enumerate(_frames(video, stream, "writing frames", progress)):
         if number in chosen:
-            pixels = _as_shown(frame.to_ndarray(format="rgb24"), _display_matrix(frame))
+            matrix = _display_matrix(frame)  # A frame of another size has none.
+            if (frame.width, frame.height) != size:
+                frame = frame.reformat(*size, format="rgb24", interpolation="BICUBIC")
+            pixels = _as_shown(frame.to_ndarray(format="rgb24"), matrix)
             Image.fromarray(np.ascontiguousarray(pixels)).save(folder / f"{number:06d}.jpg", quality=QUALITY)
     return len(chosen), len(places)
 
@@ -126,8 +129,9 @@ def _conversion(video: Path, options: str = "") -> str:
     return f"convert it: ffmpeg -i {as_argument(video)} {options and options + ' '}converted.mp4"
 
 
-def _chosen_stream(video: Path) -> int:
-    """Return the index of the largest stream that is no single picture, such as a cover."""
+def _chosen_stream(video: Path) -> tuple[int, tuple[int, int]]:
+    """Return the index of the largest stream that is no single picture, such as a cover, and (width, height) of its
+    frames with square pixels."""
     with _opened(video) as container:
         streams = [stream for stream in container.streams.video if not stream.disposition & STILLS]
         if len(streams) > 1:
@@ -147,9 +151,12 @@ def _chosen_stream(video: Path) -> int:
                 f"ffmpeg -i {as_argument(video)} -map 0:NUMBER -c copy other.mp4",
                 stacklevel=3,
             )
-        if chosen.width * chosen.height > MAX_PIXELS:
-            raise ValueError(f"{video}: has frames of more than {MAX_PIXELS // 10**6} megapixels")
-        return int(chosen.index)
+        aspect = float(chosen.sample_aspect_ratio or 1)  # Of a pixel; 0: unknown.
+        # The shorter side of the pixels grows, so that nothing is lost.
+        size = round(chosen.width * max(aspect, 1.0)), round(chosen.height * max(1 / aspect, 1.0))
+        if size[0] * size[1] > MAX_PIXELS:
+            raise ValueError(f"{video}: has frames of more than {MAX_PIXELS // 10**6} megapixels, {size[0]}x{size[1]}")
+        return int(chosen.index), size
 
 
 def _frames(video: Path, stream_index: int, phase: str, progress: bool) -> Iterator[Any]:
