@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from a2tg_jax.data import assembly
 from a2tg_jax.data.colmap_library import pycolmap
@@ -366,6 +367,57 @@ def test_points_beside_a_transforms_file(tmp_path, file, values, name):
     scene = load_scene(tmp_path)
     assert len(scene.points) == 4
     np.testing.assert_allclose(scene.points[0], scene.transform.apply(TARGET), atol=1e-6)
+
+
+# Rows of (x, y, z), as ns-process-data moves COLMAP's world: now, in its first versions, with
+# --keep-original-world-coordinate, and as a user may.
+WORLDS = {
+    "now": np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]),
+    "first": np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]),
+    "kept": np.eye(4)[:3],
+    "scaled": np.array([[0.0, 0, -2, 5], [2, 0, 0, -3], [0, -2, 0, 1]]),
+}
+
+
+def write_colmap(folder, world, names):
+    """COLMAP's model of the cameras and points of a transforms file, in the world from which `world` [3, 4] leads to
+    the file's."""
+    scale = np.cbrt(np.linalg.det(world[:, :3]))
+    back = np.linalg.inv(np.concatenate([world, [[0, 0, 0, 1.0]]]))[:3]
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} 100 104 58 47\n")
+    lines = []
+    for index, name in enumerate(names):
+        pose = camera_to_world(index, len(names))
+        rotation = (scale * back[:, :3] @ pose[:3, :3] @ np.diag([1.0, -1, -1])).T
+        center = back[:, :3] @ pose[:3, 3] + back[:, 3]
+        numbers = [*Rotation.from_matrix(rotation).as_quat(scalar_first=True), *(-rotation @ center)]
+        lines.append(f"{index + 1} {' '.join(map(repr, map(float, numbers)))} 1 {name}\n\n")
+    (folder / "images.txt").write_text("".join(lines))
+    points = np.concatenate([TARGET[None], np.eye(3)]) @ back[:, :3].T + back[:, 3]
+    lines = [f"{i} {' '.join(map(repr, map(float, point)))} 255 0 51 0.5\n" for i, point in enumerate(points)]
+    (folder / "points3D.txt").write_text("".join(lines))
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])
+def test_points_of_the_colmap_model_beside_a_transforms_file(tmp_path, world, name):
+    frames = write_frames(tmp_path)
+    write_json(tmp_path, frames, name, **FOCAL, **SIZE)
+    write_colmap(tmp_path / "colmap/sparse/0", WORLDS[world], [f"{index:02d}.png" for index in range(8)])
+    scene = load_scene(tmp_path)
+    np.testing.assert_allclose(scene.points, scene.transform.apply([TARGET, *np.eye(3)]), atol=1e-6)
+    np.testing.assert_allclose(scene.colors, np.tile(np.float32([1, 0, 0.2]), (4, 1)), atol=1e-6)
+
+
+@no_points
+@pytest.mark.parametrize("names", [[f"other{index}.png" for index in range(8)], NAMES[::-1], NAMES[:1]])
+def test_a_colmap_model_of_other_poses_has_no_points_for_the_scene(tmp_path, names):
+    write_json(tmp_path, write_frames(tmp_path), **FOCAL, **SIZE)
+    write_colmap(tmp_path / "colmap/sparse/0", WORLDS["now"], names)
+    with pytest.warns(UserWarning, match="other photographs or poses than the scene: its points are not used"):
+        scene = load_scene(tmp_path)
+    assert len(scene.points) > 4
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,16 @@
 """COLMAP scenes: a sparse model (.bin or .txt) next to a folder of images."""
 
+import re
 import warnings
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.core.similarity import camera_centers
+from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.assembly import PointCloud, assemble_scene, every_kth, rigid_viewmat
 from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.colmap_files import KINDS, POINT, FrameRecord, ImageRecord, RigRecord, num_images, read_file
@@ -29,6 +30,8 @@ TRIED_NAMES = 10
 """Number of photographs to look for before giving up on a folder."""
 POINTS_PLY = "points3D.ply"
 """Points of models without COLMAP's points3D, as depth networks write them."""
+LARGEST_MISFIT = 0.02
+"""Largest distance between the places of a camera in two reconstructions, in units of the cameras' extent."""
 SAME_PLACE = 1e-3
 """Largest distance between the cameras of a panorama, in units of the distance between neighbouring frames. A
 refined rig differs from one place by about that much."""
@@ -133,6 +136,53 @@ def read_cameras_and_points(path: Path) -> tuple[np.ndarray, PointCloud]:
     model = _model_of(path)
     contents = _read_model(model)
     return contents.viewmats[np.argsort([image.name for image in contents.images])], _start_cloud(model, contents)
+
+
+def points_in_world_of(path: Path, viewmats: Mapping[str, np.ndarray]) -> PointCloud | None:
+    """Return the points of a COLMAP model in the world of other poses [4, 4] of its photographs, by name.
+
+    Programs turn, scale and move COLMAP's world, and not all of them write down how, so the poses decide. None, with a
+    warning, if they do not fit; None if there is no model.
+    """
+    if not find_models(path):
+        return None
+    model = _model_of(path)
+    contents = _read_model(model)
+    own = {_plain_name(image.name): viewmat for image, viewmat in zip(contents.images, contents.viewmats, strict=True)}
+    others = {_plain_name(name): viewmat for name, viewmat in viewmats.items()}
+    shared = sorted(own.keys() & others.keys())
+    to_world = None
+    if shared:
+        to_world = _between(np.stack([own[name] for name in shared]), np.stack([others[name] for name in shared]))
+    if to_world is None:
+        message = f"{model}: has other photographs or poses than the scene: its points are not used"
+        warnings.warn(message, stacklevel=3)
+        return None
+    cloud = _start_cloud(model, contents)
+    return PointCloud(to_world.apply(cloud.points), cloud.colors)
+
+
+def _plain_name(name: str) -> str:
+    """Return the path of a photograph below its folder `images` or `images_k`, without suffix."""
+    return re.sub(r"^images(_\d+)?/", "", PurePosixPath(name.replace("\\", "/")).with_suffix("").as_posix())
+
+
+def _between(viewmats: np.ndarray, others: np.ndarray) -> Similarity | None:
+    """Return the similarity from the world of poses [V, 4, 4] to the world of other poses of the same cameras; None if
+    there is none."""
+    # A camera has the same axes in both: Rᵀ of the others is rotation·Rᵀ.
+    left, _, right = np.linalg.svd(np.einsum("vji,vjk->ik", others[:, :3, :3], viewmats[:, :3, :3]))
+    rotation = left @ right
+    centers = camera_centers(viewmats) @ rotation.T
+    wanted = camera_centers(others)
+    around, wanted_around = centers - centers.mean(axis=0), wanted - wanted.mean(axis=0)
+    if not around.any():
+        return None
+    scale = float((around * wanted_around).sum() / (around**2).sum())
+    misfit = np.linalg.norm(scale * around - wanted_around, axis=1).max()
+    if np.linalg.det(rotation) < 0 or not misfit <= LARGEST_MISFIT * np.linalg.norm(wanted_around, axis=1).max():
+        return None
+    return Similarity(scale, rotation, wanted.mean(axis=0) - scale * centers.mean(axis=0))
 
 
 def viewmat_of(image: ImageRecord) -> np.ndarray:

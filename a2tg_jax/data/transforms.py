@@ -4,7 +4,7 @@ Readers of other programs make `Frames` of the same form.
 
 Poses are camera-to-world in OpenGL's camera frame (x right, y up, z backward). nerfstudio's `applied_transform` is the
 change of COLMAP's world before the file was written. Poses and points of `ply_file_path` have both gone through it, so
-both are in the file's own world, which is the original world here.
+both are in the file's own world, which is the original world here. Points of its COLMAP model have not, and are moved.
 """
 
 import functools
@@ -17,6 +17,7 @@ import numpy as np
 
 from a2tg_jax.core.cameras import LONGEST_SIDE
 from a2tg_jax.data.assembly import PointCloud, Shot, assemble_scene, every_kth, rigid_motion
+from a2tg_jax.data.colmap import points_in_world_of
 from a2tg_jax.data.colmap_cameras import ColmapCamera
 from a2tg_jax.data.image_files import inside
 from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
@@ -73,7 +74,7 @@ def load_transforms(file: Path, options: Options) -> Scene:
             message = f"{len(unused)} of {len(names)} frames are in no list that is used, such as {unused[0]}{only}"
             warnings.warn(f"{file}: {message}", stacklevel=3)
         train, test = ([shot for shot in shots if shot.name in chosen] for chosen in (train_names, test_names))
-    cloud = _points_beside(file, meta)
+    cloud = _points_beside(file, [meta], shots)
     return assemble_scene(scene_name(file.resolve().parent), train, test, cloud, source=str(file))
 
 
@@ -88,7 +89,7 @@ def load_blender(folder: Path, options: Options) -> Scene:
     metas = [_read_meta(file) for file in files]
     groups = _read_shots(list(zip(files, metas, strict=True)), options)
     train, test = groups if len(groups) == 2 else every_kth(groups[0], options.test_every)
-    cloud = _points_beside(train_file, *metas)
+    cloud = _points_beside(train_file, metas, groups[0])
     return assemble_scene(scene_name(folder), train, test, cloud, source=str(folder), is_object=True)
 
 
@@ -108,11 +109,14 @@ def check_images(file: Path, frames: Sequence[object], lacking: Sequence[str], n
         warnings.warn(f"{message}{shortened(lacking[0])}: not used", stacklevel=3)
 
 
-def _points_beside(file: Path, *metas: dict[str, Any]) -> PointCloud | None:
-    """Return the points that transforms files of a folder name, or else those in one of `POINT_FILES`, or None."""
+def _points_beside(file: Path, metas: Sequence[dict[str, Any]], shots: Sequence[Shot]) -> PointCloud | None:
+    """Return the points that transforms files of a folder name, or else those in one of `POINT_FILES`, or else of
+    nerfstudio's COLMAP model, or None."""
     named = [meta["ply_file_path"] for meta in metas if meta.get("ply_file_path")]
-    usual = [name for name in POINT_FILES if not named and is_regular(file.parent / name)]
-    return next((read_ply_points(file.parent / name) for name in (*named, *usual)), None)
+    usual = [name for name in POINT_FILES if is_regular(file.parent / name)]
+    if named or usual:
+        return read_ply_points(file.parent / (*named, *usual)[0])
+    return points_in_world_of(file.parent / "colmap", {shot.name: shot.viewmat for shot in shots})
 
 
 def _read_meta(file: Path) -> dict[str, Any]:
