@@ -61,6 +61,7 @@ from .io.formats import load_splats as load_splats, save_splats as save_splats
 from .io.gltf import load_gltf as load_gltf, save_gltf as save_gltf
 from .io.model_file import load_model as load_model, save_model as save_model
 from .io.ply import load_ply as load_ply, save_ply as save_ply
+from .io.torch_checkpoint import to_gsplat as to_gsplat
 from .io.usd import load_usd as load_usd, save_usd as save_usd
 from .mcmc import (
     FillingMcmc as FillingMcmc,

@@ -231,9 +231,8 @@ def test_a_bake_of_a_run_is_kept(tmp_path, monkeypatch, capsys):
     assert len(baked) == 4 and "baked/a2tg-textures.npz" in run.written()
 
 
-@pytest.mark.parametrize(("name", "reason"), [("b.sog", "pip install"), ("b.pt", "can be read, but not written")])
-def test_a_file_that_cannot_be_written_is_refused_before_baking(tmp_path, monkeypatch, capsys, name, reason):
+def test_a_file_that_cannot_be_written_is_refused_before_baking(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gaussforge", None)
     monkeypatch.setattr(conversion, "open_source", lambda *_: pytest.fail("the model was read"))
-    assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / name), "--bake"]) == 2
-    assert reason in capsys.readouterr().err
+    assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.sog"), "--bake"]) == 2
+    assert "pip install" in capsys.readouterr().err

@@ -105,12 +105,16 @@ def test_other_programs_gaussians_and_poses_are_taken(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     gaussians = a2tg.init_from_points([[0, 0, 2], [0.1, 0, 2]], [[1, 1, 1]] * 2)
     a2tg.save_ply("point_cloud.ply", gaussians)
-    scales = jnp.column_stack([gaussians.log_scales, jnp.zeros(2)])
-    splats = {"means": gaussians.means, "quats": gaussians.quats, "scales": scales}
-    splats |= {"opacities": gaussians.logit_opacities, "sh0": gaussians.sh[:, :1], "shN": gaussians.sh[:, 1:]}
+    model = a2tg.Model(gaussians)
+    a2tg.save_splats("ckpt_29999_rank0.pt", model)
+    saved = []
+    torch = SimpleNamespace(tensor=np.array, save=lambda value, path: saved.append((path, value)))
     seen = a2tg.look_at([0, -2, 1], [0, 0, 0], width=8, height=8)
     to_world = jnp.linalg.inv(seen.viewmat) @ jnp.diag(jnp.array([1.0, -1.0, -1.0, 1.0]))
     poses = {"camera_to_world": to_world, "world_view_transform": seen.viewmat.T}
-    names = run("coming-from", {"a2tg": a2tg, "jnp": jnp, "splats": splats, **poses})
+    names = run("coming-from", {"a2tg": a2tg, "jnp": jnp, "torch": torch, "model": model, **poses})
     np.testing.assert_allclose(names["viewmat"], seen.viewmat, atol=1e-6)
     np.testing.assert_array_equal(names["gaussians"].sh, gaussians.sh)
+    path, checkpoint = saved[0]
+    assert path == "scene.pt" and [*checkpoint["splats"]] == [*a2tg.to_gsplat(model)]
+    assert a2tg.load_splats("scene.pt").num == 2

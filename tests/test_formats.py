@@ -197,11 +197,6 @@ def test_what_a_format_does_not_keep():
         format_of("a.xyz")
 
 
-def test_an_unknown_suffix_to_write_is_answered_with_those_that_can_be_written(tmp_path):
-    with pytest.raises(ValueError, match=r"known are \.npz(?!.*\.pt)"):
-        save_splats(tmp_path / "a.xyz", Model(some_gaussians()))
-
-
 def test_a_damaged_sog_is_refused_before_gaussforge_reads_it(tmp_path):
     """It would crash, or return other numbers."""
     needs_gaussforge()

@@ -1,5 +1,6 @@
-"""Checkpoints of PyTorch are read without PyTorch, and nothing that they pickle is run."""
+"""Checkpoints of PyTorch are read and written without PyTorch, and nothing that they pickle is run."""
 
+import dataclasses
 import io
 import os
 import pickle
@@ -11,10 +12,10 @@ from collections import OrderedDict
 
 import numpy as np
 import pytest
-from small_values import assert_same, some_gaussians
+from small_values import assert_same, some_gaussians, some_world
 
-from a2tg_jax import Model, load_splats
-from a2tg_jax.io.formats import save_splats
+from a2tg_jax import Model, load_splats, save_splats, to_gsplat
+from a2tg_jax.core.origin import Origin
 from a2tg_jax.io.torch_checkpoint import STORAGES
 
 UTILS, TORCH = types.ModuleType("torch._utils"), types.ModuleType("torch")
@@ -245,9 +246,118 @@ def test_numbers_of_16_bits(tmp_path, monkeypatch):
     np.testing.assert_allclose(found.means, some_gaussians().means, rtol=2**-8)
 
 
-def test_checkpoints_are_not_written(tmp_path):
-    with pytest.raises(ValueError, match="can be read, but not written"):
-        save_splats(tmp_path / "a.pt", Model(some_gaussians()))
+def test_files_that_are_no_zip_are_refused(tmp_path):
     (tmp_path / "a.pt").write_bytes(b"\x80\x02}q\x00.")
     with pytest.raises(ValueError, match=r"PyTorch checkpoint \(1\.6"):
         load_splats(tmp_path / "a.pt")
+
+
+# Written
+
+
+class PlainUnpickler(pickle.Unpickler):
+    """What `torch.load(weights_only=True)` does, by NumPy: it calls these functions only."""
+
+    def __init__(self, archive):
+        super().__init__(io.BytesIO(archive.read("archive/data.pkl")))
+        self.archive = archive
+
+    def find_class(self, module, name):
+        return {
+            "torch.FloatStorage": "<f4",
+            "torch._utils._rebuild_tensor_v2": self.tensor,
+            "collections.OrderedDict": OrderedDict,
+        }[f"{module}.{name}"]
+
+    def persistent_load(self, pid):
+        kind, dtype, key, device, num = pid
+        numbers = np.frombuffer(self.archive.read(f"archive/data/{key}"), dtype)
+        assert (kind, device, num) == ("storage", "cpu", len(numbers))
+        return numbers
+
+    def tensor(self, storage, offset, size, stride, requires_grad, hooks):
+        assert (offset, requires_grad, hooks) == (0, False, OrderedDict())
+        array = storage.reshape(size)
+        assert not array.size or stride == tuple(own // 4 for own in array.strides)
+        return array
+
+
+def unpickled(path):
+    with zipfile.ZipFile(path) as archive:
+        names = {name for name in archive.namelist() if "/data/" not in name}
+        assert names == {"archive/data.pkl", "archive/byteorder", "archive/version"}
+        assert archive.read("archive/byteorder") == b"little" and archive.testzip() is None
+        return PlainUnpickler(archive).load()
+
+
+def of_degree(degree):
+    return dataclasses.replace(some_gaussians(), sh=some_gaussians().sh[:, : (degree + 1) ** 2])
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_written_checkpoints_have_the_names_and_shapes_of_gsplat(tmp_path, degree):
+    gaussians = of_degree(degree)
+    save_splats(tmp_path / "a.pt", Model(gaussians))
+    found = unpickled(tmp_path / "a.pt")
+    assert [*found] == ["step", "splats"] and found["step"] == 0
+    third = np.asarray(gaussians.log_scales).min(axis=1, keepdims=True) + np.log(1e-3)
+    wanted = {
+        "means": gaussians.means, "quats": gaussians.quats, "scales": np.concatenate([gaussians.log_scales, third], 1),
+        "opacities": gaussians.logit_opacities, "sh0": gaussians.sh[:, :1], "shN": gaussians.sh[:, 1:],
+    }  # fmt: skip
+    given = to_gsplat(Model(gaussians))
+    assert [*found["splats"]] == [*wanted] == [*given]
+    for name, array in wanted.items():
+        np.testing.assert_allclose(found["splats"][name], array, rtol=1e-6, err_msg=name)
+        np.testing.assert_array_equal(found["splats"][name], given[name], err_msg=name)
+        assert given[name].dtype == np.float32 and given[name].flags.writeable
+    assert_same(load_splats(tmp_path / "a.pt").gaussians, gaussians)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_written_checkpoints_of_nerfstudio_have_the_shapes_of_splatfacto(tmp_path, degree):
+    """It makes features_rest of degree 3, and changes the number of rows alone when it loads."""
+    gaussians = of_degree(degree)
+    save_splats(tmp_path / "a.ckpt", Model(gaussians))
+    found = unpickled(tmp_path / "a.ckpt")
+    assert {name: found[name] for name in ("step", "optimizers", "scalers")} == {
+        "step": 0,
+        "optimizers": {},
+        "scalers": {},
+    }
+    shapes = {name.removeprefix("_model.gauss_params."): array.shape for name, array in found["pipeline"].items()}
+    assert shapes == {
+        "means": (7, 3), "quats": (7, 4), "scales": (7, 3), "opacities": (7, 1), "features_dc": (7, 3),
+        "features_rest": (7, 15, 3),
+    }  # fmt: skip
+    back = load_splats(tmp_path / "a.ckpt").gaussians
+    assert_same(dataclasses.replace(back, sh=back.sh[:, : gaussians.sh.shape[1]]), gaussians)
+    assert not back.sh[:, gaussians.sh.shape[1] :].any()
+
+
+def test_written_checkpoints_are_in_the_worlds_of_ply_files(tmp_path):
+    model = Model(some_gaussians(), origin=Origin.of_cameras([], transform=some_world()))
+    for world in ("original", "upright"):
+        save_splats(tmp_path / "a.pt", model, world=world)
+        save_splats(tmp_path / "a.ply", model, world=world)
+        assert_same(load_splats(tmp_path / "a.pt").gaussians, load_splats(tmp_path / "a.ply").gaussians)
+    far = dataclasses.replace(some_world(), translation=np.array([0.0, 5e6, 0.0]))
+    with pytest.warns(UserWarning, match="to_gsplat: positions are relative to"):
+        assert (
+            np.abs(to_gsplat(dataclasses.replace(model, origin=Origin.of_cameras([], transform=far)))["means"]).max()
+            < 10
+        )
+
+
+def test_pytorch_opens_what_is_written(tmp_path):
+    torch = pytest.importorskip("torch", reason="PyTorch is not installed")
+    for name, model in (
+        ("a.pt", Model(some_gaussians())),
+        ("a.ckpt", Model(of_degree(1))),
+        ("b.pt", Model(of_degree(0))),
+    ):
+        save_splats(tmp_path / name, model)
+        found, wanted = torch.load(tmp_path / name, weights_only=True), unpickled(tmp_path / name)
+        key = "pipeline" if name == "a.ckpt" else "splats"
+        for own, array in wanted[key].items():
+            np.testing.assert_array_equal(found[key][own].numpy(), array)

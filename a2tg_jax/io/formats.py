@@ -16,7 +16,7 @@ from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.other_programs import World, cut_numbers
 from a2tg_jax.io.ply import load_ply_model, save_ply
 from a2tg_jax.io.splat_files import import_gaussforge, load_by_gaussforge, load_ksplat, save_by_gaussforge, save_ksplat
-from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians
+from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians, save_checkpoint_gaussians
 from a2tg_jax.io.usd import import_usd, load_usd, save_usd
 from a2tg_jax.model import Model
 
@@ -36,7 +36,7 @@ class FileFormat:
 
     name: str
     load: Callable[[Path], Model | Gaussians]
-    save: Writer | None
+    save: Writer
     keeps_appearance: bool = False
     """Whether textures, and everything else that splats show, are kept."""
     keeps_origin: bool = False
@@ -61,7 +61,7 @@ _GLTF = FileFormat("glTF", load_gltf, save_gltf, True, True, is_exact=False, has
 _USD = FileFormat(
     "OpenUSD", load_usd, save_usd, keeps_origin=True, is_exact=False, import_library=lambda path: import_usd()
 )
-_CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, None)
+_CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, save_checkpoint_gaussians)
 FORMATS = {
     ".npz": FileFormat("model", load_model, save_model, True, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
@@ -79,24 +79,21 @@ FORMATS = {
 """Formats by suffix. If two match a name, the first is used."""
 
 
-def format_of(path: str | os.PathLike[str], *, is_written: bool = False) -> FileFormat:
-    """Return the format of a file, to read or to be written, by its suffix. ValueError: the suffix is unknown."""
+def format_of(path: str | os.PathLike[str]) -> FileFormat:
+    """Return the format of a file by its suffix. ValueError: the suffix is unknown."""
     # Not Path.suffix: .compressed.ply has two dots.
     name = Path(path).name.lower()
     for suffix, found in FORMATS.items():
         if name.endswith(suffix):
             return found
-    known = [suffix for suffix, found in FORMATS.items() if not is_written or found.save is not None]
-    near = did_you_mean(Path(name).suffix, known)
-    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix{near}; known are {', '.join(known)}")
+    near = did_you_mean(Path(name).suffix, FORMATS)
+    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix{near}; known are {', '.join(FORMATS)}")
 
 
 def writer_of(path: str | os.PathLike[str]) -> Writer:
     """Return the function that writes a file, by its suffix, after importing what it needs. ValueError: the suffix is
-    unknown, an optional library is missing, or the format is read-only."""
-    found = format_of(path, is_written=True)
-    if found.save is None:
-        raise ValueError(f"{shortened(os.fspath(path))}: {found.name} files can be read, but not written")
+    unknown, or an optional library is missing."""
+    found = format_of(path)
     if found.import_library is not None:
         found.import_library(Path(path))
     return found.save
