@@ -1,6 +1,7 @@
 """The command line on a custom system, a file in the current folder."""
 
 import json
+import re
 import shutil
 import sys
 import tomllib
@@ -76,6 +77,9 @@ def test_other_commands(inside, tmp_path, capsys):
     assert all(np.asarray(Image.open(path)).std() > 1 for path in frames)
     assert cli.main(["train", *MINE, "--help-all"]) == 0
     text = capsys.readouterr().out
+    assert "Weight of the contrast: larger values make rings fainter. (default: 0.2)" in " ".join(
+        re.split(r"[\s│]+", text)
+    )
     assert "--contrast-weight" in text and "--rings-rate" in text and "--texture.cap" not in text
 
 

@@ -181,6 +181,50 @@ def test_a_grid_file_of_ones_own_names_scenes_and_table(tmp_path):
     assert [method.label for method in grid.methods] == ["2DGS*-MCMC"], "a reference among the variants is one method"
 
 
+OWN_SYSTEM = """
+import dataclasses
+
+import a2tg_jax as a2tg
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plain(a2tg.System):
+    stage1_iterations: int = 7
+    stage2_iterations: int = 0
+    sharpness: float = 1.0
+    densify: a2tg.Mcmc = a2tg.Mcmc(cap=5_000)
+    name = "plain"
+
+    def stages(self):
+        events = (a2tg.Noise(), self.densify)
+        losses = self.loss.terms()
+        return (a2tg.Stage("plain", a2tg.Appearance(), events, losses, self.rates, self.stage1_iterations, 0.0),)
+
+
+class Short(Plain):
+    @classmethod
+    def presets(cls):
+        return {"paper": cls(), "quick": cls(sharpness=2.0)}
+"""
+
+
+def test_a_custom_system_needs_the_preset_of_the_scale(tmp_path, monkeypatch):
+    (tmp_path / "own_systems.py").write_text(OWN_SYSTEM, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def system_of(name, preset=""):
+        text = OWN_GRID.replace('system = "bytewise"', f'system = "own_systems:{name}"')
+        grid = read_grid(own_grid(tmp_path, text.replace("budgets = [0.3]", f"gaussians = [400]\n{preset}")), "small")
+        return next(grid.jobs({})).system
+
+    with pytest.raises(ValueError, match="plain has the presets paper; got 'quick'; the class method `presets`"):
+        system_of("Plain")
+    plain, short = system_of("Plain", 'preset = "paper"'), system_of("Short")
+    assert (plain.sharpness, short.sharpness) == (1.0, 2.0)
+    assert plain.stage1_iterations == short.stage1_iterations == 2_000
+    assert plain.densify.cap == short.densify.cap == 400
+
+
 @pytest.mark.parametrize(
     "before, after, words",
     [

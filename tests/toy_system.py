@@ -59,6 +59,8 @@ class Toy(a2tg.System):
     stage1_iterations: int = 20
     factor: float = 0.9
     contrast_weight: float = 0.1
+    """Weight of the contrast: larger values
+    make rings fainter."""
     rings_rate: float = 1e-2
 
     name = "toy"

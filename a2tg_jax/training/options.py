@@ -263,7 +263,7 @@ class System:
         if name not in presets:
             raise ValueError(
                 f"{cls.name or cls.__name__} has the presets {', '.join(presets)}; got {shortened(name)!r}"
-                f"{did_you_mean(name, presets)}"
+                f"{did_you_mean(name, presets)}; the class method `presets` defines others"
             )
         return changed_config(presets[name], options, cls.__name__) if options else presets[name]
 
