@@ -77,7 +77,7 @@ def test_other_commands(inside, tmp_path, capsys):
     assert all(np.asarray(Image.open(path)).std() > 1 for path in frames)
     assert cli.main(["train", *MINE, "--help-all"]) == 0
     text = capsys.readouterr().out
-    assert "Weight of the contrast: larger values make rings fainter. (default: 0.2)" in " ".join(
+    assert "Weight of the contrast: larger values make rings fainter. (default: 0.1)" in " ".join(
         re.split(r"[\s│]+", text)
     )
     assert "--contrast-weight" in text and "--rings-rate" in text and "--texture.cap" not in text
