@@ -312,6 +312,23 @@ def test_what_is_wrong_with_masks_of_photographs(tmp_path):
         run_sfm(tmp_path / "photos", tmp_path / "scene", masks=tmp_path / "cut", progress=False)
 
 
+@pytest.mark.parametrize("panorama", ["yes", "no"])
+def test_grey_masks_of_photographs_are_named(tmp_path, panorama):
+    """And masks of 16 and 235, as frames of videos have, are staged black and white."""
+    for index in range(3):
+        save_blocks(tmp_path / "photos" / f"{index}.jpg", 64, 32, np.random.default_rng(0))
+        (tmp_path / "cut").mkdir(exist_ok=True)
+        levels = np.where(np.arange(64) < 32, 235, 100 if index == 1 else 16) * np.ones((32, 1))
+        Image.fromarray(levels.astype(np.uint8)).save(tmp_path / "cut" / f"{index}.png")
+    with pytest.warns(UserWarning, match=r"cut: 1 of 3 masks have areas .* neither black nor white, such as 1\.png"):
+        found = staged([tmp_path / "photos"], tmp_path / "work", panorama, masks=tmp_path / "cut")
+    staged_masks = [read_pixels(tmp_path / "work" / "masks" / f"{name}.png")[..., 0] for name in found.names]
+    assert {level for mask in staged_masks for level in np.unique(mask)} == {0, 255}
+    if panorama == "no":
+        np.testing.assert_array_equal(staged_masks[0], np.where(np.arange(64) < 32, 255, 0) * np.ones((32, 1)))
+        assert (staged_masks[1] == 255).all()
+
+
 def test_masks_of_panoramas_are_cut(tmp_path):
     """So are alpha channels. Masks exclude what is above the horizon, and a quarter left of the middle is clear."""
     pixels = np.full((64, 128, 4), 200, np.uint8)

@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 from test_data_colmap import HEIGHT, WIDTH, dot_place, write_scene
 from test_data_transforms import FOCAL, SIZE, write_frames, write_json
 
 from a2tg_jax import Gaussians2dMcmc, evaluate, fit, load_scene, polish, psnr, ssim, synthetic_scene
+from a2tg_jax.data.photo_reading import read_mask
 from a2tg_jax.measure.metrics import load_lpips, lpips
 from a2tg_jax.training.start import initial_model
 
@@ -96,6 +98,78 @@ def test_a_mask_in_an_alpha_channel(tmp_path, pixels, top_only):
     wanted = left_half() & (np.arange(HEIGHT) < (30 if top_only else HEIGHT))[:, None]
     for view in views_of(load_scene(tmp_path)):
         np.testing.assert_array_equal(view.mask.read(), wanted)
+
+
+SPOTS = gaussian_filter(np.random.default_rng(0).normal(size=(HEIGHT, WIDTH)), 4) > 0
+"""A mask of many edges."""
+
+
+def in_alpha(levels):
+    return np.dstack([np.full((HEIGHT, WIDTH, 3), 255), levels])
+
+
+LEVELS = {
+    "0 1": (0, 1), "0 3": (0, 3), "0 16": (0, 16), "0 200": (0, 200), "0 255": (0, 255), "3 255": (3, 255),
+    "16 235": (16, 235), "16 255": (16, 255), "red": ((0, 0, 0), (255, 0, 0)),
+    "nearly black": ((3, 16, 9), (250, 251, 9)),
+}  # fmt: skip
+"""Levels or colours of excluded and of kept pixels."""
+
+
+@pytest.mark.parametrize("kind", ["png", "alpha", "jpg 95", "jpg 50", "blurred"])
+@pytest.mark.parametrize("name", LEVELS)
+def test_black_may_be_dark_or_noisy(tmp_path, name, kind):
+    """Of levels 0 to 16 that JPEG leaves around edges, too few are left to tell."""
+    levels = np.where(SPOTS.reshape(HEIGHT, WIDTH, *[1] * np.ndim(LEVELS[name][0])), *LEVELS[name][::-1]).astype(
+        np.uint8
+    )
+    if (kind == "alpha" and levels.ndim == 3) or (kind[0] in "bj" and levels.max() < 64):
+        pytest.skip("no such mask")
+    levels = in_alpha(levels) if kind == "alpha" else levels
+    levels = gaussian_filter(levels.astype(float), (1, 1, 0)[: levels.ndim]) if kind == "blurred" else levels
+    file = tmp_path / ("mask.jpg" if kind[0] == "j" else "mask.png")
+    options = {"quality": int(kind[-2:])} if kind[0] == "j" else {}
+    Image.fromarray(levels.astype(np.uint8)).save(file, **options)
+    mask = read_mask(file, (WIDTH, HEIGHT))
+    assert (mask.counts != SPOTS).mean() <= (0.02 if kind == "blurred" else 0.005 if kind[0] == "j" else 0)
+    assert not mask.has_grey_areas
+
+
+CLASSES = np.add.outer(np.arange(HEIGHT) // 12, np.arange(WIDTH) // 16)
+"""Numbers of classes, 0 to 14, in areas."""
+
+
+@pytest.mark.parametrize(
+    ("levels", "counts", "is_told"),
+    [
+        (CLASSES, CLASSES > 0, False),
+        (CLASSES * (CLASSES < 2) + 16 * (CLASSES == 2), (CLASSES == 1) | (CLASSES == 2), False),
+        (17 * CLASSES + (CLASSES > 0), CLASSES > 1, True),
+        (np.where(SPOTS, 255, 120 * left_half()), SPOTS | left_half(), True),
+        (CLASSES + 1, CLASSES > -1, True),
+        (np.full_like(CLASSES, 1), CLASSES > -1, False),
+        (np.full_like(CLASSES, 255), CLASSES > -1, False),
+        (np.full_like(CLASSES, 16), CLASSES > -1, True),
+        (np.zeros_like(CLASSES), CLASSES < 0, False),
+    ],
+    ids=["classes", "dark classes", "light classes", "grey", "classes from 1", "all 1", "all 255", "all 16", "none"],
+)  # fmt: skip
+def test_masks_of_several_levels(tmp_path, levels, counts, is_told):
+    Image.fromarray(levels.astype(np.uint8)).save(tmp_path / "mask.png")
+    mask = read_mask(tmp_path / "mask.png", (WIDTH, HEIGHT))
+    np.testing.assert_array_equal(mask.counts, counts)
+    assert mask.has_grey_areas == is_told
+
+
+@pytest.mark.parametrize("mask_as", ["ignored", "background"])
+def test_masks_that_are_neither_black_nor_white_are_named(tmp_path, mask_as):
+    write_scene(tmp_path)
+    for index, name in enumerate(NAMES):
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        levels = np.where(left_half(), 255, 100 if index in (2, 5) else 0).astype(np.uint8)
+        Image.fromarray(levels).save(tmp_path / "masks" / name)
+    with pytest.warns(UserWarning, match=r"masks: 2 of 9 masks have areas .* white, such as img_02\.png: pixels above"):
+        load_scene(tmp_path, mask_as=mask_as)
 
 
 def test_what_is_wrong_with_masks(tmp_path):

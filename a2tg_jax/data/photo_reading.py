@@ -5,7 +5,7 @@ share, plus as many others as its memory has room for. The rest is read when it 
 
 Next to the folder `images` may be
  - `masks` with NAME.EXT.png (as in COLMAP), NAME.png or NAME.EXT for NAME.EXT. Black, or transparent, excludes a
-   pixel; everything else keeps it, as with COLMAP and nerfstudio;
+   pixel; everything else keeps it, as with COLMAP and nerfstudio. Black may be 16, as in videos, or noisy, as in JPEG;
  - `depths` with NAME.npy or NAME.png. What they hold is an option of the training (`training.depth_prior`). They are
    read when a training needs them;
  - `images_k` and `masks_k` with copies at 1/k of the size.
@@ -21,6 +21,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from a2tg_jax.data.assembly import Shot
 from a2tg_jax.data.decoding import MAX_PIXELS, picture_size, read_grey, read_pixels
@@ -34,6 +35,8 @@ from a2tg_jax.host.remote_files import Unreachable, is_remote
 from a2tg_jax.host.text import shortened
 
 MASKS, DEPTHS = "masks", "depths"
+HALF = 128
+"""Level from which on a pixel of a mask is bright."""
 AlphaMeaning = Literal["transparency", "mask"]
 """Meaning of the alpha channel: transparency over a background, or a mask, of which only opaque pixels count."""
 MaskMeaning = Literal["ignored", "background"]
@@ -44,6 +47,13 @@ MAX_ASPECT_ERROR = 0.01
 """Largest relative difference of aspect between an image and its camera, beyond one pixel of rounding."""
 MAX_DEPTH_ASPECT_ERROR = 0.02
 """Largest relative difference of aspect between a depth map and its photograph, beyond two pixels of rounding."""
+NEARLY_BLACK = 1 / 8
+"""Largest level of black in a mask, as a share of its largest level: 16 of 235 in videos, and noise of JPEG."""
+NEAR_EDGE = 17
+"""Side in pixels of the square around a grey pixel of a mask that has black and white if it is on an edge: blocks of
+JPEG, which have 8 pixels, reach half as far."""
+MOST_GREY = 0.01
+"""Largest share of other grey pixels in a mask without a warning."""
 ROUNDING = 1.0
 """Largest difference in pixels between a side of a smaller copy and the photograph's side divided by the downscale."""
 
@@ -106,6 +116,8 @@ class _Facts(NamedTuple):
     is_stored: bool
     """Whether the view has the pixels of the file, neither undistorted nor downscaled."""
     mask: Mask | None
+    has_grey_mask: bool = False
+    """Whether its mask file has areas that are neither black nor white."""
 
 
 def read_photos(
@@ -165,7 +177,21 @@ def read_photos(
     elif lacking:
         message = f"{place}: {len(lacking)} of {len(shots)} photographs have no mask, such as {lacking[0]}"
         warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
+    masks = [own.mask[0] for own in found if own.mask is not None]
+    grey = [own.mask[0] for own, each in zip(found, facts, strict=True) if own.mask and each.has_grey_mask]
+    warn_of_grey(grey, masks)
     return shots
+
+
+def warn_of_grey(grey: Sequence[Path], masks: Sequence[Path]) -> None:
+    """Warn of masks with areas that are neither black nor white, among all masks."""
+    if grey:
+        warnings.warn(
+            f"{grey[0].parent}: {len(grey)} of {len(masks)} masks have areas that are neither black nor white, such as "
+            f"{grey[0].name}: pixels above an eighth of the largest level count; make a mask black where pixels must "
+            "not count, and white elsewhere",
+            stacklevel=4,
+        )
 
 
 def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple[_Facts, Shot]:
@@ -199,7 +225,7 @@ def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple
 
     def whole_view(pixels: np.ndarray) -> np.ndarray:
         if mask_file is not None and cuts_out:
-            pixels = _cut_out(pixels, read_mask(mask_file[0], stored, lens.size))
+            pixels = _cut_out(pixels, read_mask(mask_file[0], stored, lens.size).counts)
         return lens.view_pixels(pixels, downscale)[0]
 
     def view(pixels: np.ndarray) -> np.ndarray:
@@ -213,16 +239,18 @@ def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple
     if facts is None:
         pixels = whole_view(photograph)
         is_stored, counts = pixels is photograph, None
-        if mask_file is not None and not cuts_out:
-            counts = _view_mask(*mask_file, lens, stored, size)
-        elif mask_file is None and photo.counted is not None:
+        mask = None if mask_file is None else read_mask(mask_file[0], stored, lens.size)
+        if mask is not None and mask_file is not None and not cuts_out:
+            counts = _view_mask(mask.counts, mask_file[1], lens, size)
+        elif mask is None and photo.counted is not None:
             counts = photo.counted(pixels)
         if options.alpha == "mask" and pixels.shape[2] == 4:
             is_opaque = pixels[..., 3] == 255
             counts = is_opaque if counts is None else is_opaque & counts
             # A view would keep the alpha channel in memory.
             pixels, is_stored = np.ascontiguousarray(pixels[..., :3]), False
-        facts = _Facts(stored, pixels.shape, is_stored, None if counts is None else Mask.of(counts))
+        has_grey_mask = mask is not None and mask.has_grey_areas
+        facts = _Facts(stored, pixels.shape, is_stored, None if counts is None else Mask.of(counts), has_grey_mask)
         picture = options.shelf.keep(pixels, file, None if is_stored else view)
     else:
         picture = options.shelf.read_later(facts.shape, file, None if facts.is_stored else view)
@@ -331,14 +359,11 @@ def mask_names(name: str) -> tuple[str, str, str]:
     return f"{name}.png", str(Path(name).with_suffix(".png")), name
 
 
-def _view_mask(
-    file: Path, downscale: int, lens: Lens, stored: tuple[int, int], view_size: tuple[int, int]
-) -> np.ndarray:
-    """Return the mask [H, W] of a view, undistorted and downscaled as its photograph was.
+def _view_mask(counts: np.ndarray, downscale: int, lens: Lens, view_size: tuple[int, int]) -> np.ndarray:
+    """Return the mask [H, W] of a view of (width, height), undistorted and downscaled as its photograph was.
 
-    A pixel counts if all its source pixels count. Sizes are (width, height), of the photograph's file and of the view.
+    A pixel counts if all its source pixels count.
     """
-    counts = read_mask(file, stored, lens.size)
     # Pillow takes no [H, W, 1]. Resampled, only 255 from nothing but 255 stays 255.
     planes = np.repeat(np.where(counts, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)
     planes, _ = lens.view_pixels(planes, downscale)
@@ -355,13 +380,21 @@ def _cut_out(pixels: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return np.dstack([pixels[..., :3], np.where(counts, opacities, np.uint8(0))])
 
 
-def read_mask(file: Path, *sizes: tuple[int, int]) -> np.ndarray:
-    """Return a mask [H, W] bool, True where pixels count, of one of some sizes (width, height), the photograph's
-    first."""
+class MaskFile(NamedTuple):
+    """A mask as a file has it."""
+
+    counts: np.ndarray
+    """[H, W] bool, True where pixels count."""
+    has_grey_areas: bool
+    """Whether it has areas that are neither black nor white."""
+
+
+def read_mask(file: Path, *sizes: tuple[int, int]) -> MaskFile:
+    """Return a mask of one of some sizes (width, height), the photograph's first."""
     pixels = read_pixels(file)
-    counts = np.asarray(pixels[..., :3].any(axis=-1))
+    counts, has_grey_areas = _divided(pixels[..., :3].max(axis=-1))
     if pixels.shape[2] == 4 and (pixels[..., 3] != pixels[0, 0, 3]).any():  # The alpha channel is a mask.
-        is_opaque = pixels[..., 3].astype(bool)
+        is_opaque, has_grey_areas = _divided(pixels[..., 3])
         lit = pixels[is_opaque & counts]
         # Colours hold a mask too if there are two of them, one black: not in a cut-out photograph, nor where all are
         # black. A file with a mask in both excludes what either does.
@@ -370,7 +403,25 @@ def read_mask(file: Path, *sizes: tuple[int, int]) -> np.ndarray:
     if counts.shape[::-1] not in sizes:
         found, wanted = (f"{width}x{height}" for width, height in (counts.shape[::-1], sizes[0]))
         raise ValueError(f"{file}: is {found}, but its photograph is {wanted}; a mask must be of the same size")
-    return counts
+    return MaskFile(counts, has_grey_areas)
+
+
+def _divided(levels: np.ndarray) -> MaskFile:
+    """Divide the pixels of a mask [H, W] uint8 into black and white.
+
+    White is the largest level: 255, or 1 in a mask of 0 and 1. Grey pixels on edges between black and white, as JPEG
+    and resizing make them, are what they are nearer to; in areas of their own they count.
+    """
+    white, black = int(levels.max()), int(levels.min())
+    # Dark levels are numbers of classes, of which 0 is none.
+    darkest = NEARLY_BLACK * white if white >= HALF else 0.0
+    is_grey = (levels > darkest) & (levels <= white / 2)
+    if is_grey.mean() > MOST_GREY:
+        is_on_edge = (minimum_filter(levels, NEAR_EDGE) <= darkest) & (maximum_filter(levels, NEAR_EDGE) > white / 2)
+        if (is_grey & ~is_on_edge).mean() > MOST_GREY:
+            return MaskFile(levels > darkest, white >= HALF or black > 0)
+    # Of one dark level, such as 16, it may be black or the number of a class.
+    return MaskFile(levels > white / 2, 1 < white < HALF and black > 0)
 
 
 def find_depths(images: Path, name: str) -> Path | None:

@@ -25,8 +25,8 @@ from a2tg_jax.data.decoding import picture_size, read_pixels
 from a2tg_jax.data.image_files import map_in_threads
 from a2tg_jax.data.lenses import Lens
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS
-from a2tg_jax.data.photo_reading import MASKS
-from a2tg_jax.data.staging import HALF, Panorama, Staged, directions, stage
+from a2tg_jax.data.photo_reading import HALF, MASKS
+from a2tg_jax.data.staging import Panorama, Staged, directions, stage
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.host.machine import num_threads
 from a2tg_jax.host.progress_bars import counting, has_terminal

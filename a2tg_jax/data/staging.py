@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
 from a2tg_jax.data.image_files import map_in_threads, on_disk
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS, find_photos, is_video
-from a2tg_jax.data.photo_reading import MASKS, mask_names, read_mask
+from a2tg_jax.data.photo_reading import HALF, MASKS, mask_names, read_mask, warn_of_grey
 from a2tg_jax.data.video import extract_frames
 from a2tg_jax.host.text import counted
 
@@ -34,8 +34,6 @@ COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 """Suffixes of the images that COLMAP can write; it reads by content."""
 LOSSLESS_FORMATS = ("PNG", "TIFF", "BMP")
 QUALITY = 95
-HALF = 128
-"""Level from which on a pixel of a warped mask counts."""
 FIELD_OF_VIEW = np.deg2rad(100.0)
 """Field of view of each square view of a panorama; with the headings below no direction is left out."""
 AROUND = 6
@@ -158,9 +156,11 @@ def stage(
     if masks is not None and lacking:
         message = f"{masks}: {len(lacking)} of {len(photos)} photographs have no mask, such as {lacking[0]}"
         warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
-    groups = _stage_flat([photo for photo in photos if not photo.is_panorama], folder)
+    grey: list[Path] = []
+    groups = _stage_flat([photo for photo in photos if not photo.is_panorama], folder, grey)
     tops = {name.partition("/")[0] for group in groups for name in group.names}
-    rigs = _stage_panoramas([photo for photo in photos if photo.is_panorama], folder, tops, tell)
+    rigs = _stage_panoramas([photo for photo in photos if photo.is_panorama], folder, tops, tell, grey)
+    warn_of_grey(sorted(grey), [photo.mask for photo in photos if photo.mask is not None])
     num_turned = sum(photo.facts.is_turned for photo in photos)
     if num_turned:
         tell(f"{counted(num_turned, 'photograph')} turned as EXIF says")
@@ -192,6 +192,16 @@ def _made_unique(names: Sequence[str], others: Iterable[str] = ()) -> list[str]:
     return unique
 
 
+def _mask_levels(photo: _Photo, grey: list[Path]) -> np.ndarray | None:
+    """Return the mask [H, W] uint8 of a photograph, 0 or 255, or None; add its file to `grey` if it has grey areas."""
+    if photo.mask is None:
+        return None
+    mask = read_mask(photo.mask, photo.facts.size)
+    if mask.has_grey_areas:
+        grey.append(photo.mask)
+    return np.uint8(255) * mask.counts
+
+
 def _save_mask(levels: np.ndarray, name: Path, folder: Path) -> None:
     """Save the mask [H, W] uint8 of a photograph below the folder of photographs, black and white."""
     target = folder.with_name(MASKS) / f"{name.relative_to(folder)}.png"
@@ -199,8 +209,9 @@ def _save_mask(levels: np.ndarray, name: Path, folder: Path) -> None:
     Image.fromarray(levels >= HALF).convert("L").save(target)
 
 
-def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
-    """Link or write again photographs that are no panoramas, and group them by source, size and lens."""
+def _stage_flat(photos: list[_Photo], folder: Path, grey: list[Path]) -> tuple[CameraGroup, ...]:
+    """Link or write again photographs that are no panoramas, and group them by source, size and lens; add masks with
+    grey areas to `grey`."""
 
     def wanted_name(photo: _Photo) -> str:
         """Return a photograph's name in the folder: with another suffix if its own does not suit the file there."""
@@ -214,8 +225,9 @@ def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
 
     def place(photo: _Photo, target: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
-        if photo.mask is not None:
-            _save_mask(np.uint8(255) * read_mask(photo.mask, photo.facts.size), target, folder)
+        levels = _mask_levels(photo, grey)
+        if levels is not None:
+            _save_mask(levels, target, folder)
         if photo.facts.format in COLMAP_FORMATS and not photo.facts.is_turned:
             try:
                 # Whether os.link follows symbolic links depends on the system.
@@ -238,22 +250,23 @@ def _stage_flat(photos: list[_Photo], folder: Path) -> tuple[CameraGroup, ...]:
 
 
 def _stage_panoramas(
-    photos: list[_Photo], folder: Path, tops: Iterable[str], tell: Callable[[str], None]
+    photos: list[_Photo], folder: Path, tops: Iterable[str], tell: Callable[[str], None], grey: list[Path]
 ) -> tuple[Rig, ...]:
-    """Cut panoramas into views, and return a rig for each of their sizes, in a folder of none of the names `tops`."""
+    """Cut panoramas into views, and return a rig for each of their sizes, in a folder of none of the names `tops`; add
+    masks with grey areas to `grey`."""
     by_size: dict[tuple[int, int], list[_Photo]] = defaultdict(list)
     for photo in photos:
         by_size[photo.facts.size].append(photo)
 
     def cut(photo: _Photo, top: str, view: str) -> None:
         pixels = read_pixels(photo.file)
-        mask = None if photo.mask is None else np.uint8(255) * read_mask(photo.mask, photo.facts.size)[..., None]
+        levels = _mask_levels(photo, grey)
         for direction in directions():
             target = folder / top / direction.name / view
             target.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(cut_view(pixels, direction)).save(target, quality=QUALITY)
-            if mask is not None:
-                _save_mask(cut_view(mask, direction)[..., 0], target, folder)
+            if levels is not None:
+                _save_mask(cut_view(levels[..., None], direction)[..., 0], target, folder)
 
     rigs = []
     tops = _made_unique([f"panorama{number or ''}" for number in range(len(by_size))], tops)
