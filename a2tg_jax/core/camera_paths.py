@@ -3,7 +3,7 @@
 c is a camera centre, d its optical axis (unit); all of it in float64.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +26,11 @@ MIN_AXIS_SPREAD = 1e-3
 """Smallest eigenvalue of the mean of I - d·dᵀ (about the squared angle between axes) that fixes a point."""
 LEAST_FACING = 0.5
 """Smallest median cosine between optical axes and the directions to the subject."""
+FEWEST_TO_COMPARE = 5
+"""Smallest number of cameras of which one may count as outlying."""
+FAR, FARTHEST, LARGEST_MISS = 5.0, 30.0, 3.0
+"""Distances from which on cameras are outlying if their axes miss the others by more than `LARGEST_MISS`, and in any
+case, in units of the distance at which the others see their subject: a thirtieth of the size it has for these."""
 LARGEST_ELEVATION = np.radians(80)  # a camera straight above has no level horizon (`looking`)
 FEWEST = 4
 """Smallest number of cameras whose right axes are trusted over their mean up."""
@@ -49,6 +54,57 @@ def nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
     if np.linalg.eigvalsh(normal_matrix)[0] < MIN_AXIS_SPREAD:
         return centers.mean(axis=0)
     return np.linalg.solve(normal_matrix, np.einsum("vij,vj->i", projections, centers) / len(centers))
+
+
+def distance_to_subject(viewmats: np.ndarray) -> float:
+    """Return the median distance of cameras [V, 4, 4] from the point nearest to their optical axes; NaN if most do not
+    look there, such as along a street."""
+    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    offsets = nearest_point(centers, axes) - centers
+    distances = np.linalg.norm(offsets, axis=1)
+    facing = np.sum(offsets * axes, axis=1) / np.maximum(distances, 1e-12)
+    return float(np.median(distances)) if np.median(facing) >= LEAST_FACING else np.nan
+
+
+def outlying_cameras(viewmats: np.ndarray, distance_of: Callable[[np.ndarray], float] | None = None) -> np.ndarray:
+    """Return [V] bool, True for cameras [V, 4, 4] so far from the others that they cannot show the same, as wrong poses
+    are.
+
+    At most a third is. A gap separates them: the nearest of them is `FAR` times as far from the middle as any of the
+    others, and as the others' subject from these. Trajectories of any length have no such gap.
+
+    Args:
+      viewmats: world-to-camera matrices.
+      distance_of: function from indices of cameras to the distance at which these see their subject, or NaN if it is
+        unknown; None: `distance_to_subject`.
+    """
+    num = len(viewmats)
+    is_outlying = np.zeros(num, bool)
+    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    offsets = np.median(centers, axis=0) - centers
+    distances = np.linalg.norm(offsets, axis=1)
+    # |offset × axis| is the distance from the middle to the axis; behind a camera, the distance from the camera counts.
+    misses = np.where(np.sum(offsets * axes, axis=1) > 0, np.linalg.norm(np.cross(offsets, axes), axis=1), distances)
+    order = np.argsort(distances, kind="stable")
+    for num_others in range(num - num // 3, num if num >= FEWEST_TO_COMPARE else 0):
+        others, rest = order[:num_others], order[num_others:]
+        extent = distances[others[-1]]
+        # All others at one place, such as a panorama, have no extent to compare with.
+        if not 0 < FAR * extent < distances[rest[0]]:
+            continue
+        seen = distance_to_subject(viewmats[others]) if distance_of is None else distance_of(others)
+        reach, far = (extent, FARTHEST) if np.isnan(seen) else (max(extent, seen), FAR)
+        is_far = (distances > far * reach) & (misses > LARGEST_MISS * reach)
+        is_outlying[rest] = ((distances > FARTHEST * reach) | is_far)[rest]
+        if is_outlying.any():
+            break
+    return is_outlying
+
+
+def without_outlying(cameras: Sequence[Camera]) -> list[Camera]:
+    """Return the cameras without those far from all others."""
+    is_outlying = outlying_cameras(_viewmats(cameras))
+    return [camera for camera, is_far in zip(cameras, is_outlying, strict=True) if not is_far]
 
 
 def vertical_of(viewmats: np.ndarray) -> np.ndarray:
@@ -114,13 +170,14 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: np.ndarray | None 
     default the one estimated from the cameras.
 
     It keeps the cameras' mean distance and elevation, looks at the subject with a level horizon, and begins at the side
-    of the first camera, whose intrinsics and image size are used throughout.
+    of the first camera, whose intrinsics and image size are used throughout. Cameras far from all others do not count.
 
     Raises:
       ValueError: if there are no cameras or frames, or the cameras do not look at one subject.
     """
     if not cameras or num_frames < 1:
         raise ValueError(f"an orbit needs a camera and a frame; got {len(cameras)} cameras, {num_frames} frames")
+    cameras = without_outlying(cameras)
     viewmats = _viewmats(cameras)
     centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
     subject, up = nearest_point(centers, axes), vertical_of(viewmats) if up is None else up

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from a2tg_jax.core.camera_paths import LEAST_FACING, nearest_point
+from a2tg_jax.core.camera_paths import LEAST_FACING, distance_to_subject, nearest_point, outlying_cameras
 from a2tg_jax.core.cameras import LARGEST_COORDINATE, MAX_SKEW, Camera, check_calibration, pinhole_pixels
 from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.numerics import evenly_chosen
@@ -22,7 +22,7 @@ from a2tg_jax.core.similarity import Similarity, camera_centers
 from a2tg_jax.data.photo_points import MOST_PLAIN, MOST_VIEWS, Look, agreeing_points, plain_share
 from a2tg_jax.data.photo_store import DepthMap, Mask, Picture
 from a2tg_jax.data.scene import Scene, View
-from a2tg_jax.host.text import counted
+from a2tg_jax.host.text import counted, first_names
 
 NUM_POINTS = 10_000
 """Most points that a scene without any gets, but for more in views that would see none."""
@@ -101,8 +101,9 @@ def assemble_scene(
     # Sorted for _check_shots, and so that sums over cameras do not depend on the order of the files.
     shots = sorted([*train, *test], key=lambda shot: shot.name)
     _check_shots(shots, len(train), source)
+    is_outlying = _warn_of_outlying(shots, cloud, source)
     try:
-        transform = normalizing_similarity(np.stack([shot.viewmat for shot in shots]))
+        transform = normalizing_similarity(np.stack([shot.viewmat for shot in shots])[~is_outlying])
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     viewmats = {shot.name: transform.apply_to_viewmat(shot.viewmat) for shot in shots}
@@ -142,8 +143,33 @@ def assemble_scene(
         points=np.asarray(points, np.float32),
         colors=colors.astype(np.float32) / np.float32(255),
         transform=transform,
-        scale=scene_scale(camera_centers(np.stack(list(viewmats.values())))),
+        scale=scene_scale(camera_centers(np.stack(list(viewmats.values()))[~is_outlying])),
     )
+
+
+def _warn_of_outlying(shots: Sequence[Shot], cloud: PointCloud | None, source: str) -> np.ndarray:
+    """Return [V] bool, the shots whose cameras are far from all others, which a warning names."""
+
+    def distance_of(indices: np.ndarray) -> float:
+        """Return the median depth of what cameras see of the cloud."""
+        points = (
+            np.empty((0, 3)) if cloud is None else evenly_chosen(cloud.points[are_somewhere(cloud.points)], FIRST_LOOK)
+        )
+        sights = [Sight.of(shot.viewmat, shot.K, shot.picture.size, shot.rays) for shot in (shots[i] for i in indices)]
+        depths = [np.median(seen) for sight in sights if len(seen := sight.depths_seen(points, 0.0))]
+        return float(np.median(depths)) if depths else distance_to_subject(np.stack([s.viewmat for s in sights]))
+
+    viewmats = np.stack([shot.viewmat for shot in shots])
+    is_outlying = outlying_cameras(viewmats, distance_of)
+    if is_outlying.any():
+        names = [shot.name for shot, is_far in zip(shots, is_outlying, strict=True) if is_far]
+        warnings.warn(
+            f"{source}: {counted(len(names), 'camera')} of {len(shots)} far from all others: {first_names(names)}. "
+            "The others alone decide the world's origin and unit. If these poses are wrong, remove the photographs or "
+            "correct the poses",
+            stacklevel=4,
+        )
+    return is_outlying
 
 
 def _start_without_points(
@@ -204,11 +230,16 @@ class Sight(NamedTuple):
         viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
         return Sight.of(viewmat, K, (camera.height, camera.width), camera.rays)
 
+    def depths_seen(self, points: np.ndarray, near_plane: float = NEAR_PLANE) -> np.ndarray:
+        """Return the depths [S] of the points, among [P, 3], that are in the picture and beyond the near plane."""
+        own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        own = own[own[:, 2] > near_plane]
+        places = pinhole_pixels(own, self.K)
+        return np.asarray(own[((places >= self.low) & (places <= self.high)).all(axis=1), 2])
+
     def num_seen(self, points: np.ndarray, near_plane: float = NEAR_PLANE) -> int:
         """Return the number of points [P, 3] in the picture and beyond the near plane."""
-        own = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        places = pinhole_pixels(own[own[:, 2] > near_plane], self.K)
-        return int(((places >= self.low) & (places <= self.high)).all(axis=1).sum())
+        return len(self.depths_seen(points, near_plane))
 
 
 def unseeing(points: np.ndarray, sights: Sequence[Sight]) -> list[int]:

@@ -105,7 +105,8 @@ class Scene:
     transform: Similarity
     """Similarity from the original world of the input to the normalised world; its inverse brings results back."""
     scale: float
-    """scene_scale: 1.1 × the largest distance of a camera, train or test, from their mean."""
+    """scene_scale: 1.1 × the largest distance of a camera, train or test, from their mean; cameras far from all others,
+    of which loading warns, do not count."""
 
     def __repr__(self) -> str:
         sizes = {view.picture.size for view in (*self.train, *self.test)}

@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from a2tg_jax.core.camera_paths import nearest_point
+from a2tg_jax.core.camera_paths import nearest_point, outlying_cameras
 from a2tg_jax.core.cameras import Camera, checked_cameras
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.host.optional import optional
@@ -175,13 +175,14 @@ def common_sphere(viewmats: ArrayLike, center: ArrayLike | None = None) -> tuple
     """Return centre [3] and radius of the sphere that cameras [V, 4, 4] look at.
 
     The centre is the point nearest to all optical axes unless it is given, the radius twice the median distance of the
-    cameras from it.
+    cameras from it. Cameras far from all others do not count.
     """
-    viewmats = np.asarray(viewmats, np.float64)
-    centers = camera_centers(viewmats)
+    given = np.asarray(viewmats, np.float64)
+    counted = given[~outlying_cameras(given)]
+    centers = camera_centers(counted)
     if center is None:
         # Row 2 of a rotation is the optical axis in the world.
-        center = nearest_point(centers, viewmats[:, 2, :3]) if len(viewmats) > 1 else centers[0]
+        center = nearest_point(centers, counted[:, 2, :3]) if len(counted) > 1 else centers[0]
     center = np.asarray(center, np.float64)
     return center, float(RADII * np.median(np.linalg.norm(centers - center, axis=1)))
 

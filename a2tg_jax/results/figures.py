@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from a2tg_jax.core.camera_paths import smooth_path
+from a2tg_jax.core.camera_paths import smooth_path, without_outlying
 from a2tg_jax.core.cameras import Camera, resize_camera
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.data.colmap import read_cameras_and_points
@@ -296,7 +296,7 @@ def flight(model: Model, settings: RenderSettings) -> bytes | None:
     if len(cameras) < 2:
         return None
     path = []
-    for camera in smooth_path(cameras, FLIGHT_FRAMES):
+    for camera in smooth_path(without_outlying(cameras), FLIGHT_FRAMES):
         scale = min(1.0, FLIGHT_SIDE / max(camera.width, camera.height))
         path.append(resize_camera(camera, *(max(1, round(scale * side)) for side in (camera.width, camera.height))))
     # Capacity is planned from some of the cameras, and grows if another needs more.

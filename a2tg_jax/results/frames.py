@@ -15,7 +15,7 @@ from typing import Literal, get_args
 
 from PIL import Image
 
-from a2tg_jax.core.camera_paths import path_through, smooth_path, turntable
+from a2tg_jax.core.camera_paths import path_through, smooth_path, turntable, without_outlying
 from a2tg_jax.core.cameras import Camera, crop_camera
 from a2tg_jax.host.atomic import replacing, write_whole
 from a2tg_jax.host.progress_bars import progress_over
@@ -205,7 +205,7 @@ def _cameras(model: Model, route: Route | Path, num_frames: int) -> Iterator[tup
     if route != "test":
         cameras = [camera for _, _, camera in views]
         if route == "smooth":
-            return numbered(smooth_path(cameras, num_frames))
+            return numbered(smooth_path(without_outlying(cameras), num_frames))
         return numbered(turntable(cameras, num_frames, model.origin.up))
     if not model.origin.is_test.any():
         raise ValueError("the run has no test views; render a path instead with `path` smooth")
