@@ -34,21 +34,17 @@ from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.formats import FORMATS, file_bytes, files_of, format_of, lost_by, unseen_elsewhere
 from a2tg_jax.io.model_file import number_in_file
-from a2tg_jax.io.splat_files import KINDS
 from a2tg_jax.results import model_source, run_training
 from a2tg_jax.results.folder import RunFolder
 from a2tg_jax.results.model_source import check_init, write_first_stage
 from a2tg_jax.results.record import RunRecord, SceneSource, read_record, write_record
 from a2tg_jax.results.run_training import RunOptions, begin_run
 
-OTHERS = [".ply", ".ksplat", *(f".{kind}" for kind in KINDS)]
+CODED = [".compressed.ply", ".spz", ".sog", ".splat", ".ksplat"]
+OTHERS = [".ply", *CODED]
 TEXTURES = "textures (bake turns them into plain splats)"
 CUT = "colours of 1 Gaussian beyond the format's range (cut)"
 RNG = np.random.default_rng(0)
-
-
-def needs_gaussforge() -> None:
-    pytest.importorskip("gaussforge", reason="gaussforge is not installed")
 
 
 def textured() -> Model:
@@ -74,12 +70,8 @@ def matched(found: Model, model: Model) -> Model:
     return found[np.linalg.norm(apart, axis=-1).argmin(axis=0)]
 
 
-FAST = (".ply", ".spz")
-
-
-@pytest.mark.parametrize("suffix", [pytest.param(x, marks=[pytest.mark.long] * (x not in FAST)) for x in OTHERS])
+@pytest.mark.parametrize("suffix", OTHERS)
 def test_splats_come_back_from_files_of_other_programs(tmp_path, suffix):
-    needs_gaussforge()
     model = small_scene()
     save_splats(tmp_path / f"a{suffix}", model)
     found = matched(load_splats(tmp_path / f"a{suffix}"), model).gaussians
@@ -96,7 +88,6 @@ def test_splats_come_back_from_files_of_other_programs(tmp_path, suffix):
 
 
 def test_compressed_ply_and_sog_say_that_splats_are_flat(tmp_path):
-    needs_gaussforge()
     save_splats(tmp_path / "a.compressed.ply", small_scene())
     assert b"\ncomment SplatRenderMode: 2dgs\n" in (tmp_path / "a.compressed.ply").read_bytes()[:200]
     save_splats(tmp_path / "a.sog", small_scene())
@@ -104,33 +95,27 @@ def test_compressed_ply_and_sog_say_that_splats_are_flat(tmp_path):
         assert json.loads(archive.read("meta.json"))["model"] == "2dgs"
 
 
-def test_the_library_reads_what_a_run_leaves(tmp_path):
-    needs_gaussforge()
-    import gaussforge
-
-    save_ply(tmp_path / "a.ply", some_gaussians(5))
-    read = gaussforge.GaussForge().read((tmp_path / "a.ply").read_bytes(), "ply")["data"]
-    np.testing.assert_array_equal(np.frombuffer(read["positions"], "<f4").reshape(-1, 3), some_gaussians(5).means)
-    np.testing.assert_array_equal(np.frombuffer(read["rotations"], "<f4").reshape(-1, 4), some_gaussians(5).quats)
-    np.testing.assert_array_equal(np.frombuffer(read["alphas"], "<f4"), some_gaussians(5).logit_opacities)
-
-
-def test_a_damaged_file_is_one_clear_line(tmp_path):
-    needs_gaussforge()
-    for suffix in (".spz", ".sog"):
-        (tmp_path / f"a{suffix}").write_bytes(b"nothing of the kind")
-        with pytest.raises(ValueError, match=r"gaussforge reports|is damaged or no SOG file"):
-            load_splats(tmp_path / f"a{suffix}")
-
-
-def test_a_missing_library_is_told_with_its_command(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "gaussforge", None)
-    with pytest.raises(ValueError, match=r"pip install 'a2tg-jax\[formats\]'"):
-        save_splats(tmp_path / "a.spz", small_scene())
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
+def test_gaussforge_reads_our_files_as_we_do(tmp_path, suffix):
+    """It shares no code with this library."""
+    gaussforge = pytest.importorskip("gaussforge", reason="gaussforge is not installed")
+    save_splats(tmp_path / f"a{suffix}", small_scene())
+    own = load_splats(tmp_path / f"a{suffix}").gaussians
+    read = gaussforge.GaussForge().read((tmp_path / f"a{suffix}").read_bytes(), suffix[1:])["data"]
+    names = ("positions", "alphas", "colors", "scales", "rotations")
+    means, logits, colors, scales, quats = (np.frombuffer(read[name], "<f4").reshape(own.num, -1) for name in names)
+    np.testing.assert_allclose(means, own.means, atol=1e-6)
+    np.testing.assert_allclose(colors, own.sh[:, 0], atol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-logits[:, 0].astype(np.float64))), own.opacities, atol=2e-6)
+    np.testing.assert_allclose(scales[:, :2], own.log_scales, atol=1e-5)
+    assert scales[:, 2].max() < scales[:, :2].min()
+    np.testing.assert_allclose(np.abs(np.sum(quats * np.asarray(own.quats), axis=1)), 1, atol=1e-3)
+    rest = np.frombuffer(read["sh"], "<f4").reshape(own.num, own.sh.shape[1] - 1, 3)
+    # Bins of compressed PLY are decoded at their centres by us, and by gaussforge at their ends.
+    np.testing.assert_allclose(rest, own.sh[:, 1:], atol=0.02 if suffix == ".compressed.ply" else 1e-5)
 
 
 def test_positions_beyond_a_format_are_refused_or_told(tmp_path):
-    needs_gaussforge()
     path, near = tmp_path / "a.spz", small_scene()
     means = near.gaussians.means.at[0].add(4100).at[1].add(-2050)  # No other origin has all within reach.
     far = dataclasses.replace(near, gaussians=dataclasses.replace(near.gaussians, means=means))
@@ -148,7 +133,6 @@ def test_positions_beyond_a_format_are_refused_or_told(tmp_path):
 @pytest.mark.parametrize(("suffix", "num"), [(".spz", 5), (".splat", 3), (".ksplat", 3), (".compressed.ply", 2)])
 def test_cut_colours_and_scales_are_counted(tmp_path, suffix, num):
     """The count is that of the Gaussians that come back changed."""
-    needs_gaussforge()
     g = small_scene().gaussians
     sh = g.sh.at[:3, 0, 0].set(4).at[3:5, 15, 2].set(-5)
     g = dataclasses.replace(g, log_scales=g.log_scales.at[:2].set(-10.5), sh=sh)
@@ -162,7 +146,7 @@ def test_cut_colours_and_scales_are_counted(tmp_path, suffix, num):
     assert (printed in lost) == (suffix == ".spz") == bool(np.abs(found.log_scales - g.log_scales).max() > 0.4)
 
 
-@pytest.mark.parametrize("suffix", [f".{kind}" for kind in KINDS])
+@pytest.mark.parametrize("suffix", CODED)
 def test_a_file_without_gaussians_is_refused(tmp_path, suffix):
     with pytest.raises(ValueError, match="has no Gaussians"):
         save_splats(tmp_path / f"a{suffix}", Model(some_gaussians(3)[:0]))
@@ -195,29 +179,6 @@ def test_what_a_format_does_not_keep():
     assert format_of("a.compressed.ply").name != format_of("a.ply").name
     with pytest.raises(ValueError, match=r"known are \.npz"):
         format_of("a.xyz")
-
-
-def test_a_damaged_sog_is_refused_before_gaussforge_reads_it(tmp_path):
-    """It would crash, or return other numbers."""
-    needs_gaussforge()
-    path = tmp_path / "a.sog"
-    save_splats(path, small_scene())
-    data = path.read_bytes()
-    for place in (0, len(data) // 4, len(data) // 2, len(data) - 10):
-        path.write_bytes(data[:place] + bytes([data[place] ^ 255]) + data[place + 1 :])
-        with pytest.raises(ValueError, match=r"a\.sog: is damaged"):
-            load_splats(path)
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("other.txt", "")
-    with pytest.raises(ValueError, match=r"a\.sog: is not SOG: it has no meta\.json"):
-        load_splats(path)
-
-
-def test_libraries_print_nothing_on_the_standard_output(tmp_path, capfd):
-    needs_gaussforge()
-    save_splats(tmp_path / "a.spz", small_scene())
-    load_splats(tmp_path / "a.spz")
-    assert capfd.readouterr().out == ""
 
 
 @pytest.mark.parametrize("data", [b"", b"glXF\x02\xb0\xff", b"{"])

@@ -106,7 +106,6 @@ def positions_in(data: bytes, suffix: str, num: int) -> np.ndarray:
 
 @pytest.mark.parametrize("suffix", [".splat", ".ksplat", ".sog", ".spz", ".compressed.ply", ".ply"])
 def test_files_are_relative_to_an_offset_which_some_hold(tmp_path, suffix):
-    pytest.importorskip("gaussforge")
     model, true = map_scene()
     with pytest.warns(UserWarning, match="positions are relative to") as warned:
         a2tg.save_splats(tmp_path / f"a{suffix}", model)
@@ -127,7 +126,6 @@ def test_files_are_relative_to_an_offset_which_some_hold(tmp_path, suffix):
 
 def test_sog_and_spz_hold_scenes_that_only_lie_far_away(tmp_path):
     """The header of the one has the offset; the other has no place for it."""
-    pytest.importorskip("gaussforge")
     with pytest.warns(UserWarning, match=r"'offset' in its meta\.json"):
         a2tg.save_splats(tmp_path / "a.sog", map_scene()[0])
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
@@ -165,8 +163,6 @@ def test_an_offset_that_is_no_number_is_refused_and_other_comments_are_ignored(t
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog", ".spz", ".splat", ".ksplat"])
 def test_scenes_near_the_origin_have_no_offset(tmp_path, suffix):
     """Also in a local grid a few hundred metres away, which float32 holds."""
-    if suffix != ".ply":
-        pytest.importorskip("gaussforge")
     for middle in (np.zeros(3), np.array([3.0, -2.0, 1.0]), np.array([300.0, 200.0, 50.0])):
         model, true = map_scene(middle)
         with warnings.catch_warnings():

@@ -95,7 +95,6 @@ def node_matrix(path) -> np.ndarray:
 
 @pytest.mark.parametrize("suffix", [".splat", ".ksplat", ".spz", ".sog", ".compressed.ply"])
 def test_all_formats_have_the_same_axes(tmp_path, suffix):
-    pytest.importorskip("gaussforge", reason="gaussforge is not installed")
     model = captured(some_world())
     a2tg.save_ply(tmp_path / "a.ply", model, world="upright")
     a2tg.save_splats(tmp_path / f"a{suffix}", model, world="upright")

@@ -11,6 +11,7 @@ from a2tg_jax.cli.arguments import EditFile, LastModel, LpipsWeights, RunFolderP
 from a2tg_jax.cli.train import open_browser, print_result
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.text import counted, defaulting_to
+from a2tg_jax.io.formats import splats_at
 from a2tg_jax.mesh.files import mesh_files
 from a2tg_jax.results.compression import CompressOptions, compress
 from a2tg_jax.results.conversion import BakeOptions, PlacementOptions, convert
@@ -415,8 +416,9 @@ class Info:
     """Print JSON, for programs."""
 
     def run(self) -> None:
-        if is_regular(self.folder):
-            print(json_text(file_facts(self.folder)) if self.json else describe_file(self.folder))
+        path = splats_at(self.folder)
+        if is_regular(path):
+            print(json_text(file_facts(path)) if self.json else describe_file(path))
             return
         if not self.folder.exists():
             raise FileNotFoundError(f"{self.folder}: no such file or folder")

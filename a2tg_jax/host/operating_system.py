@@ -111,26 +111,6 @@ def own_output_only() -> None:
     sys.stdout, sys.stderr = moved(sys.stdout, 1), moved(sys.stderr, 2)
 
 
-@contextlib.contextmanager
-def printing_to_stderr() -> Iterator[None]:
-    """Send what C++ libraries print on the standard output to the standard error."""
-    if sys.stdout is not None:
-        sys.stdout.flush()
-    try:
-        kept = os.dup(1)
-    except OSError:  # The process has no standard output.
-        yield
-        return
-    try:
-        os.dup2(2, 1)
-        yield
-    finally:
-        if (library := _c_library()) is not None:
-            library.fflush(None)  # A pipe gets C's output only now.
-        os.dup2(kept, 1)
-        os.close(kept)
-
-
 @functools.cache
 def _c_library() -> Any:
     try:

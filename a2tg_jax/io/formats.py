@@ -7,15 +7,17 @@ from pathlib import Path
 
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK
-from a2tg_jax.host.regular_files import expanded
+from a2tg_jax.host.regular_files import expanded, is_regular
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.compact import load_compact, save_compact
 from a2tg_jax.io.gltf import load_gltf, save_gltf
 from a2tg_jax.io.gltf_container import buffer_files
 from a2tg_jax.io.model_file import load_model, save_model
-from a2tg_jax.io.other_programs import World, cut_numbers
-from a2tg_jax.io.ply import load_ply_model, save_ply
-from a2tg_jax.io.splat_files import import_gaussforge, load_by_gaussforge, load_ksplat, save_by_gaussforge, save_ksplat
+from a2tg_jax.io.other_programs import World, cut_numbers, writer_as
+from a2tg_jax.io.ply import encode_packed_ply, load_ply_model, save_ply
+from a2tg_jax.io.sog import HEADER, encode_sog, load_sog, sog_files
+from a2tg_jax.io.splat_files import encode_ksplat, encode_splat, load_ksplat, load_splat
+from a2tg_jax.io.spz import encode_spz, load_spz
 from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians, save_checkpoint_gaussians
 from a2tg_jax.io.usd import import_usd, load_usd, save_usd
 from a2tg_jax.model import Model
@@ -36,7 +38,7 @@ class FileFormat:
 
     name: str
     load: Callable[[Path], Model | Gaussians]
-    save: Writer
+    save: Writer | None
     keeps_appearance: bool = False
     """Whether textures, and everything else that splats show, are kept."""
     keeps_origin: bool = False
@@ -50,28 +52,25 @@ class FileFormat:
     """Whether numbers come back unrounded."""
     has_extension: bool = False
     """Whether other programs also read the file, but only its plain splats."""
-    import_library: Callable[[Path], object] | None = None
+    import_library: Callable[[], object] | None = None
     """Import of the optional library that writing needs; raises ValueError, with what to install, without it."""
 
 
-_GAUSSFORGE = FileFormat(
-    "SPZ", load_by_gaussforge, save_by_gaussforge, is_exact=False, import_library=import_gaussforge
-)
 _GLTF = FileFormat("glTF", load_gltf, save_gltf, True, True, is_exact=False, has_extension=True)
-_USD = FileFormat(
-    "OpenUSD", load_usd, save_usd, keeps_origin=True, is_exact=False, import_library=lambda path: import_usd()
-)
+_USD = FileFormat("OpenUSD", load_usd, save_usd, keeps_origin=True, is_exact=False, import_library=import_usd)
 _CHECKPOINT = FileFormat("checkpoint", load_checkpoint_gaussians, save_checkpoint_gaussians)
 FORMATS = {
     ".npz": FileFormat("model", load_model, save_model, True, True, True),
     ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
-    # Our own reader: reading needs no optional library.
-    ".compressed.ply": dataclasses.replace(_GAUSSFORGE, name="compressed PLY", load=load_ply_model),
+    ".compressed.ply": FileFormat(
+        "compressed PLY", load_ply_model, writer_as("compressed.ply", encode_packed_ply), is_exact=False
+    ),
     ".ply": FileFormat("PLY", load_ply_model, save_ply),
-    ".spz": _GAUSSFORGE,
-    ".sog": dataclasses.replace(_GAUSSFORGE, name="SOG"),
-    ".splat": dataclasses.replace(_GAUSSFORGE, name=".splat", highest_degree=0),
-    ".ksplat": FileFormat(".ksplat", load_ksplat, save_ksplat, highest_degree=2, is_exact=False),
+    ".spz": FileFormat("SPZ", load_spz, writer_as("spz", encode_spz), is_exact=False),
+    ".sog": FileFormat("SOG", load_sog, writer_as("sog", encode_sog), is_exact=False),
+    HEADER: FileFormat("unbundled SOG", load_sog, None),
+    ".splat": FileFormat(".splat", load_splat, writer_as("splat", encode_splat), highest_degree=0, is_exact=False),
+    ".ksplat": FileFormat(".ksplat", load_ksplat, writer_as("ksplat", encode_ksplat), highest_degree=2, is_exact=False),
     **dict.fromkeys((".glb", ".gltf"), _GLTF),
     **dict.fromkeys((".usda", ".usdc", ".usdz", ".usd"), _USD),
     **dict.fromkeys((".pt", ".pth", ".ckpt"), _CHECKPOINT),
@@ -92,11 +91,18 @@ def format_of(path: str | os.PathLike[str]) -> FileFormat:
 
 def writer_of(path: str | os.PathLike[str]) -> Writer:
     """Return the function that writes a file, by its suffix, after importing what it needs. ValueError: the suffix is
-    unknown, or an optional library is missing."""
+    unknown, an optional library is missing, or the format is read-only."""
     found = format_of(path)
+    if found.save is None:
+        raise ValueError(f"{shortened(os.fspath(path))}: {found.name} can be read, but not written; write *.sog")
     if found.import_library is not None:
-        found.import_library(Path(path))
+        found.import_library()
     return found.save
+
+
+def splats_at(path: Path) -> Path:
+    """Return the file of splats at a path: the meta.json of a folder that is SOG, or else the path."""
+    return path / HEADER if path.is_dir() and is_regular(path / HEADER) else path
 
 
 def load_splats(path: str | os.PathLike[str]) -> Model:
@@ -105,7 +111,7 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
     Ellipsoids of 3DGS files become flat, with a warning if that changes them.
 
     Args:
-      path: the file, whose suffix is its format.
+      path: the file, whose suffix is its format; SOG may also be a folder with a meta.json.
 
     Returns:
       The model.
@@ -114,7 +120,8 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
       FileNotFoundError: if there is no such file.
       ValueError: if the suffix is unknown, an optional library is missing, or the file is damaged.
     """
-    loaded = format_of(path).load(expanded(path))
+    path = splats_at(expanded(path))
+    loaded = format_of(path).load(path)
     return Model(loaded) if isinstance(loaded, Gaussians) else loaded
 
 
@@ -147,7 +154,10 @@ def files_written(path: Path) -> list[Path]:
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the files that hold a written model: its own first, and the buffers that a *.gltf names."""
+    """Return the files that hold a written model: its own first, then the buffers that a *.gltf names, or the pictures
+    of an unbundled SOG."""
+    if path.name.lower() == HEADER:
+        return sog_files(path)
     return [path, *(buffer_files(path) if path.suffix.lower() == ".gltf" else [])]
 
 

@@ -25,12 +25,17 @@ from a2tg_jax.io.config_json import config_from_dict
 from a2tg_jax.io.gltf_container import Builder, Document, mesh_nodes
 from a2tg_jax.io.model_file import appearance_from_dict, appearance_to_dict, background_of, origin_of
 from a2tg_jax.io.model_rows import Rows, check_encodable, model_of, rows_of_model
+from a2tg_jax.io.spz import GLTF_AXES, spz_model
 from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
 from a2tg_jax.model import Model
 from a2tg_jax.texture import MAX_SIDE
 
 SPLATS, EXTENSION = "KHR_gaussian_splatting", "A2TG_splat_textures"
-READ = {SPLATS, EXTENSION, "KHR_mesh_quantization"}
+SPZ = (
+    f"{SPLATS}_compression_spz_2", f"{SPLATS}_compression_spz", "KHR_spz_gaussian_splats_compression",
+)  # fmt: skip
+"""Drafts of an extension whose bufferView is an SPZ file: inside `SPLATS`, the last one instead of it."""
+READ = {SPLATS, EXTENSION, *SPZ, "KHR_mesh_quantization", "KHR_materials_unlit"}
 """Extensions that a file may require."""
 MEANS, ROTATION, SCALE, OPACITY = "POSITION", f"{SPLATS}:ROTATION", f"{SPLATS}:SCALE", f"{SPLATS}:OPACITY"
 DESCRIBED = {
@@ -185,15 +190,20 @@ def load_gltf(path: str | os.PathLike[str]) -> Model:
             (_model_of(document, primitive), matrix)
             for node, matrix in mesh_nodes(document)
             for primitive in document.entry("meshes", node["mesh"])["primitives"]
-            if SPLATS in primitive.get("extensions", {})
+            if {SPLATS, SPZ[-1]} & {*primitive.get("extensions", {})}
         )
         return others.joined_parts(parts, "y")
 
 
 def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
     """Return the model of some splats, in the world of their node."""
+    described = primitive["extensions"].get(SPLATS, {})
+    inside = primitive["extensions"] | described.get("extensions", {})
+    for name in SPZ:
+        if name in inside:
+            # Cesium and others take the axes of the SPZ for those of glTF, as its default axes are.
+            return spz_model(document.view(inside[name]["bufferView"], name), document.path, GLTF_AXES)
     splats = _splats(document, primitive["attributes"])
-    described = primitive["extensions"][SPLATS]
     for name in ("kernel", "colorSpace"):
         if (found := described.get(name)) != DESCRIBED[name]:
             message = f"its splats have the {name} {shortened(found)}; they are read as {DESCRIBED[name]}"

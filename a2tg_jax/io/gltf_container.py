@@ -155,12 +155,8 @@ class Document:
             raise ValueError(f"{what} is a sparse accessor, which this program does not read")
         dtype, columns = np.dtype(COMPONENTS[accessor["componentType"]]), SIDES[kind]
         view, size = self.entry("bufferViews", accessor["bufferView"]), dtype.itemsize * columns
-        data = self._buffer(view.get("buffer"), what)
-        start, length = _count(view, "byteOffset", what, 0), _count(view, "byteLength", what)
+        data, start, length = self._within(view, what)
         stride, count = _count(view, "byteStride", what, size), _count(accessor, "count", what)
-        # Python's integers do not overflow, so sums of claimed numbers are safe to compare.
-        if start + length > len(data):
-            raise ValueError(f"{what} reaches beyond its buffer of {len(data)} bytes")
         if stride < size or stride > max(size, MOST_STRIDE):
             raise ValueError(f"{what} has a stride of {stride} bytes for {size}")
         first = start + _count(accessor, "byteOffset", what, 0)
@@ -176,6 +172,20 @@ class Document:
             # glTF: max(c / 127, −1) for signed bytes, since −128 would be below −1.
             values = np.maximum(values / np.float32(np.iinfo(dtype).max), np.float32(-1.0))
         return values
+
+    def view(self, index: object, what: str) -> bytes:
+        """Return the bytes of a buffer view. ValueError, naming it `what`: it is missing, or exceeds its buffer."""
+        data, start, length = self._within(self.entry("bufferViews", index), what)
+        return data[start : start + length]
+
+    def _within(self, view: Mapping[str, object], what: str) -> tuple[bytes, int, int]:
+        """Return the buffer of a view, the view's first byte, and its length."""
+        data = self._buffer(view.get("buffer"), what)
+        start, length = _count(view, "byteOffset", what, 0), _count(view, "byteLength", what)
+        # Python's integers do not overflow, so sums of claimed numbers are safe to compare.
+        if start + length > len(data):
+            raise ValueError(f"{what} reaches beyond its buffer of {len(data)} bytes")
+        return data, start, length
 
     def _buffer(self, index: Any, what: str) -> bytes:
         """Return the bytes of a buffer; each is read once."""

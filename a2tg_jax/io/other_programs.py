@@ -10,7 +10,7 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -24,16 +24,18 @@ from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gau
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, check_similarity, transform_gaussians
+from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.text import counted, first_names, shortened
+from a2tg_jax.io.columns import morton
 from a2tg_jax.io.model_file import origin_arrays, origin_header
-from a2tg_jax.io.validate import LARGEST_LOG_SCALE, check_origin
+from a2tg_jax.io.validate import LARGEST_LOG_SCALE, check_model, check_origin
 from a2tg_jax.model import Model, concatenate
 
 Up = Literal["y", "z"]
 World = Literal["upright", "original"]
 """World of a file: the original one, or that one turned until −y is up, as other programs show it."""
 Kind = str
-"""gaussforge's name of a format, such as "spz"; "ply" stands for all with float32 positions."""
+"""Name of a format: its suffix without the dot, such as "spz"; "ply" stands for all with float32 positions."""
 UPRIGHT: Mapping[Up, np.ndarray] = {
     # (x, y, z) → (x, z, −y): a quarter turn about x.
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
@@ -46,6 +48,8 @@ LEVEL = math.cos(math.radians(3))
 LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-6
 LEAST_LENGTH = 1e-9
 """Length of a quaternion below which, and above whose inverse, it is made a unit quaternion."""
+LEAST_THIRD_SCALE = math.exp(-20)
+CURVE_BITS = 16
 THICKNESS = 1e-3
 """Ratio of a flat Gaussian's third scale in a file to its shorter one."""
 # Turns by 120° and −120° about (1, 1, 1), and none.
@@ -200,6 +204,63 @@ def third_log_scales(log_scales: np.ndarray) -> np.ndarray:
     return log_scales.min(axis=1, keepdims=True) + np.log(THICKNESS)
 
 
+class PlacedSplats(NamedTuple):
+    """Splats as a file of another program holds them: one or more, sorted along a Z curve, all with one third scale."""
+
+    splats: Ellipsoids
+    offset: np.ndarray
+    """[3], which the positions are relative to."""
+    turn: np.ndarray
+    """[3, 3] rotation from the original world."""
+
+
+def writer_as(kind: Kind, encode: Callable[[PlacedSplats], bytes]) -> Callable[..., None]:
+    """Return a function that writes the Gaussians of a model in a format.
+
+    It takes a path, a model and a `world`, as `save_ply` does. Positions that the format would round too far are
+    relative to whole numbers, which a warning names. It raises ValueError if there are no Gaussians, they are invalid,
+    or the format cannot hold their positions.
+    """
+
+    def save(path: str | os.PathLike[str], model: Gaussians | Model, *, world: World = "original") -> None:
+        gaussians, offset, _, turn = world_gaussians(model, kind=kind, world=world)
+        if not gaussians.num:
+            raise ValueError(f"{path}: the model has no Gaussians; a file of this format has at least one")
+        check_model(Model(gaussians))  # Never write a file that would not load.
+        check_positions(kind, gaussians, os.fspath(path))
+        means = np.asarray(gaussians.means, np.float64)
+        low, high = means.min(axis=0), means.max(axis=0)
+        # 1e-30: all means may be equal along an axis.
+        codes = ((means - low) / np.maximum(high - low, 1e-30) * (2**CURVE_BITS - 1)).astype(np.int64)
+        # Stable: equal codes keep their order, so that files repeat.
+        splats = splats_of(Model(gaussians[np.argsort(morton(codes.T, CURVE_BITS), kind="stable")]))
+        # Formats that round scales by a table then spend one entry on the third.
+        splats.scales[:, 2] = max(splats.scales[:, 2].min(), LEAST_THIRD_SCALE)
+        write_whole(path, encode(PlacedSplats(splats, offset, turn)))
+        warn_of_offset(kind, offset, path)
+
+    return save
+
+
+def without_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index [N] of the largest number of unit quaternions [N, 4], and the others [N, 3], with the signs that
+    they have where the largest is positive."""
+    largest = np.argmax(np.abs(quats), axis=1)
+    is_largest = np.arange(4) == largest[:, None]
+    signs = np.where(quats[is_largest] < 0, -1.0, 1.0)
+    return largest, quats[~is_largest].reshape(-1, 3) * signs[:, None]
+
+
+def with_largest(smaller: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Return the quaternions [N, 4] that `without_largest` was given, or their negatives."""
+    is_largest = np.arange(4) == largest[:, None]
+    quats = np.empty(is_largest.shape)
+    quats[~is_largest] = smaller.ravel()
+    # Rounding may push the squares above 1.
+    quats[is_largest] = np.sqrt(np.maximum(1 - np.sum(smaller**2, axis=1), 0.0))
+    return quats
+
+
 def linear_colors(colors: np.ndarray) -> np.ndarray:
     """Return linear colours of sRGB colours in [0, 1]."""
     # IEC 61966-2-1.
@@ -224,6 +285,15 @@ def gaussians_of(
     logits = np.log(opacities) - np.log1p(-opacities)
     columns = flat_rows(os.fspath(path), *numbers, logits, splats.sh, keeps_all=keeps_all)
     return Gaussians(*(jnp.asarray(values, jnp.float32) for values in columns))
+
+
+def model_of_splats(
+    splats: Ellipsoids, path: str | os.PathLike[str], *, is_flat: bool = False, origin: Origin | None = None
+) -> Model:
+    """Return the model of a file's splats, as `gaussians_of`. ValueError: none of them can be drawn."""
+    model = Model(gaussians_of(splats, path, is_flat=is_flat), origin=origin)
+    check_model(model)
+    return model
 
 
 def flat_rows(
@@ -490,7 +560,7 @@ OFFSET_PLACES = {
     "compressed.ply": "the comment 'offset' in the file says so",
     "sog": "'offset' in its meta.json says so",
 }
-"""Where a file has the offset of its positions, by gaussforge's name of its format."""
+"""Where a file has the offset of its positions, by the name of its format."""
 
 
 def offset_for(kind: Kind, means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:

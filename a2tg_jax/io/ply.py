@@ -305,15 +305,11 @@ def unpacked_vertices(ply: PlyFile) -> np.ndarray:
     packed = vertices["packed_rotation"]
     smaller = np.stack(
         # Numbers other than the largest of a unit quaternion are within ±1/√2.
-        [(share - 0.5) * np.sqrt(2) for share in _unpacked(packed & np.uint32((1 << 30) - 1), (10,) * 3)]
+        [(share - 0.5) * np.sqrt(2) for share in _unpacked(packed & np.uint32((1 << 30) - 1), (10,) * 3)],
+        axis=1,
     )
-    largest, index = (
-        np.sqrt(np.maximum(1 - np.sum(smaller**2, axis=0), 0.0)),
-        (packed >> np.uint32(30)).astype(np.int64),
-    )
-    # Number k is smaller[k] if the largest comes later, and smaller[k − 1] if it came before.
-    before, after = np.stack([*smaller, smaller[2]]), np.stack([smaller[0], *smaller])
-    columns |= {f"rot_{k}": np.where(index == k, largest, np.where(index > k, before[k], after[k])) for k in range(4)}
+    quats = others.with_largest(smaller, packed >> np.uint32(30))
+    columns |= {f"rot_{k}": quats[:, k] for k in range(4)}
     *colors, opacity = _unpacked(vertices["packed_color"], (8,) * 4)
     # Older files have colours in [0, 1] without bounds.
     if set(COLOR_BOUNDS) <= set(ply.fields["chunk"]):
@@ -340,3 +336,54 @@ def _unpacked(packed: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
         shift -= num
         found.append(((packed >> np.uint32(shift)) & np.uint32((1 << num) - 1)) / ((1 << num) - 1))
     return found
+
+
+def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """Return numbers [N, C] in [0, 1] packed into one unsigned integer, as `_unpacked` reads them."""
+    packed = np.zeros(len(shares), np.uint32)
+    for column, num in zip(shares.T, bits, strict=True):
+        steps = np.uint32((1 << num) - 1)
+        packed = packed << np.uint32(num) | np.rint(np.clip(column, 0, 1) * steps).astype(np.uint32)
+    return packed
+
+
+def encode_packed_ply(placed: others.PlacedSplats) -> bytes:
+    """Return splats as a PLY as SuperSplat packs it."""
+    splats, num = placed.splats, len(placed.splats.means)
+    starts = np.arange(0, num, CHUNK)
+    colors = 0.5 + SH_C0 * splats.sh[:, 0]
+    bounds, shares = [], []
+    for values in (splats.means, np.log(splats.scales), colors):
+        # As float32, so that readers divide by the same bounds.
+        values = values.astype(np.float32)
+        low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+        bounds += [low, high]
+        low, width = (np.repeat(ends, CHUNK, axis=0)[:num].astype(np.float64) for ends in (low, high - low))
+        shares.append((values - low) / np.where(width > 0, width, 1.0))
+    positions, scales, shares_of_colors = shares
+    largest, smaller = others.without_largest(splats.quats)
+    rotations = largest.astype(np.uint32) << np.uint32(30) | _packed(smaller / np.sqrt(2) + 0.5, (10,) * 3)
+    # In the order of PACKED.
+    vertices = np.stack(
+        [
+            _packed(positions, (11, 10, 11)),
+            rotations,
+            _packed(scales, (11, 10, 11)),
+            _packed(np.concatenate([shares_of_colors, splats.opacities[:, None]], axis=1), (8,) * 4),
+        ],
+        axis=1,
+    )
+    # Channel by channel; a byte is one of 256 bins.
+    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(num, -1)
+    codes = np.floor(np.clip((rest / SH_RANGE + 0.5) * 256, 0, 255)).astype(np.uint8)
+    elements = [
+        ("chunk", len(starts), "float", (*BOUNDS, *COLOR_BOUNDS)),
+        ("vertex", num, "uint", PACKED),
+        ("sh", num, "uchar", SH_REST[: rest.shape[1]]),
+    ]
+    header = f"ply\nformat binary_little_endian 1.0\ncomment {FLAT_MARK}\n{place_comments(placed.offset, placed.turn)}"
+    for name, count, kind, attributes in elements:
+        if attributes:
+            header += f"element {name} {count}\n" + "".join(f"property {kind} {each}\n" for each in attributes)
+    columns = (np.concatenate(bounds, axis=1).astype("<f4"), vertices.astype("<u4"), codes)
+    return f"{header}end_header\n".encode("ascii") + b"".join(column.tobytes() for column in columns)

@@ -17,7 +17,7 @@ from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.scene import Scene, origin_of_scene
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.edit_file import apply_edit, load_edit
-from a2tg_jax.io.formats import FORMATS, format_of, load_splats
+from a2tg_jax.io.formats import FORMATS, format_of, load_splats, splats_at
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.other_programs import plain_gaussians
 from a2tg_jax.io.web_scene import encode_web_scene
@@ -96,6 +96,7 @@ def open_source(path: Path, name: str | None = None, edit: Path | None = None) -
         change = load_edit(edit)  # Before a large model is read.
         source = open_source(path, name)
         return dataclasses.replace(source, model=apply_edit(source.model, change))
+    path = splats_at(path)
     if path.is_dir():
         run = _run_at(path)
         record, planned = finished_stage(run, name)
@@ -155,6 +156,7 @@ def check_init(file: Path, out: Path, system: System) -> Model:
     The file is of any format that `load_splats` reads: plain splats in the photographs' original world, or a model.
     Raises ValueError if there is no such file, the folder holds a run, or the splats exceed the system's budget.
     """
+    file = splats_at(file)
     if not is_regular(file):
         raise ValueError(f"init: there is no file {file}")
     format_of(file)
