@@ -1,6 +1,7 @@
 """Captures of other programs: files as each program writes them, of images that show one point as a white dot."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -437,6 +438,7 @@ def test_a_world_of_a_map_stays_there(tmp_path):
         ("clip.osv", "equirectangular MP4"),
         ("poses_bounds.npy", "a2tg sfm"),
         ("opensfm/reconstruction.json", "export_colmap"),
+        ("cameras.csv", "or XMP beside the photographs"),
         ("database.db", "colmap mapper"),
     ],
 )
@@ -450,6 +452,75 @@ def test_a_capture_that_is_not_read(tmp_path, name, words):
         (tmp_path / f"{index}.jpg").touch()
     with pytest.raises(FileNotFoundError, match=rf"{words}.* or find cameras again: a2tg sfm .* SCENE|a2tg sfm finds"):
         load_scene(tmp_path)
+
+
+def test_of_several_exports_of_metashape_the_usual_name_is_read(tmp_path):
+    write_metashape(tmp_path)
+    focals = {}
+    for name in ("cameras (1).xml", "a.xml", "CAMERAS.XML"):
+        (tmp_path / name).write_text(metashape_xml(WORLD, lens=f"<f>{100 + 10 * len(focals)}</f>"))
+        focals[name] = 100 + 10 * len(focals)
+    (tmp_path / "cameras.xml").rename(tmp_path / "old.xml")
+    (tmp_path / "other.xml").write_text("<not-cameras/>")
+    with pytest.warns(
+        UserWarning, match=r"CAMERAS\.XML is read, and not a\.xml, cameras \(1\)\.xml, old\.xml; to read"
+    ):
+        scene = load_scene(tmp_path)
+    assert scene.train[0].camera.K[0, 0] == focals["CAMERAS.XML"]
+    assert load_scene(tmp_path / "a.xml").train[0].camera.K[0, 0] == focals["a.xml"]
+    (tmp_path / "CAMERAS.XML").unlink()
+    with pytest.warns(UserWarning, match=r"a\.xml is read, and not"):
+        assert load_scene(tmp_path).train[0].camera.K[0, 0] == focals["a.xml"]
+
+
+def write_record3d_twice(folder):
+    write_record3d(folder)
+    shutil.copy(folder / "metadata", folder / "metadata.json")
+
+
+def write_polycam_twice(folder):
+    write_polycam(folder)
+    shutil.copytree(folder / "keyframes", folder, dirs_exist_ok=True)
+
+
+def write_realityscan_twice(folder):
+    write_realityscan(folder / "images")
+    write_realityscan(folder)
+
+
+def write_nerfstudio_twice(folder):
+    write_nerfstudio(folder)
+    shutil.copy(folder / "transforms.json", folder / "transforms (1).json")
+
+
+def write_blender_twice(folder):
+    write_nerfstudio(folder)
+    shutil.copy(folder / "transforms.json", folder / "transforms_train.json")
+    (folder / "transforms.json").rename(folder / "transforms_train (1).json")
+
+
+@pytest.mark.parametrize(
+    ("writer", "read", "other"),
+    [
+        (write_record3d_twice, "metadata", "metadata.json"),
+        (write_polycam_twice, "corrected_cameras", "../corrected_cameras"),
+        (write_realityscan_twice, "0.xmp", "images/0.xmp"),
+        (write_nerfstudio_twice, "transforms.json", "transforms (1).json"),
+        (write_blender_twice, "transforms_train.json", "transforms_train (1).json"),
+    ],
+)
+def test_of_several_exports_one_is_read_with_a_warning(tmp_path, writer, read, other):
+    writer(tmp_path)
+    with pytest.warns(UserWarning, match=re.escape(f"{read} is read, and not {other}; to read another")):
+        check_dots(load_scene(tmp_path), 0.1)
+
+
+def test_a_copy_of_transforms_alone_is_named(tmp_path):
+    write_nerfstudio(tmp_path)
+    (tmp_path / "transforms.json").rename(tmp_path / "transforms (1).json")
+    with pytest.raises(FileNotFoundError, match=r"has no transforms\.json, but transforms \(1\)\.json: give that file"):
+        load_scene(tmp_path)
+    check_dots(load_scene(tmp_path / "transforms (1).json"))
 
 
 def test_transforms_come_first(tmp_path):

@@ -21,7 +21,16 @@ from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.photogrammetry import metashape, realityscan
 from a2tg_jax.data.scene import Scene, scene_name, warn_of_lenses
 from a2tg_jax.data.synthetic import synthetic_scene
-from a2tg_jax.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, Frames, load_blender, load_frames, load_transforms
+from a2tg_jax.data.transforms import (
+    BLENDER_FILES,
+    NERFSTUDIO_FILE,
+    Frames,
+    load_blender,
+    load_folder,
+    load_frames,
+    load_transforms,
+    transforms_in,
+)
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.remote_files import RemotePath, check_reachable, is_remote, is_url, located
 from a2tg_jax.host.text import as_argument
@@ -216,6 +225,8 @@ def _read(path: Path, options: Options) -> Scene:
     if hint is not None:
         again = f"; or find cameras again: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
         raise FileNotFoundError(f"{path}: {hint}{again}")
+    if others := transforms_in(path):
+        raise FileNotFoundError(f"{path}: has no {NERFSTUDIO_FILE}, but {others[0].name}: give that file itself")
     # Such as scene/images, or a folder in it.
     scene = next((parent for parent in path.resolve().parents[:2] if _loader(parent) is not None), None)
     if scene is not None:
@@ -231,7 +242,7 @@ def _loader(path: Path) -> Callable[[Options], Scene] | None:
     if find_models(path):
         return functools.partial(load_colmap, path)
     if is_regular(path / NERFSTUDIO_FILE):
-        return functools.partial(load_transforms, path / NERFSTUDIO_FILE)
+        return functools.partial(load_folder, path)
     if is_regular(path / BLENDER_FILES[0]):
         return functools.partial(load_blender, path)
     below = path / "colmap"  # nerfstudio's, whose transforms.json is preferred

@@ -4,7 +4,6 @@ Polycam's raw data are keyframes with a JSON file each (<https://github.com/Poly
 named by number, next to metadata with all poses.
 """
 
-import functools
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.decoding import picture_size, read_grey, read_pixels
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, map_in_threads
-from a2tg_jax.data.transforms import Frames, check_images
+from a2tg_jax.data.transforms import Frames, check_images, warn_of_others
 from a2tg_jax.host.json_text import MOST_BYTES, read_object
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
@@ -41,11 +40,18 @@ IMAGE_FOLDERS = ("rgb", "rgbd", ".")
 
 def polycam(path: Path) -> Callable[[], Frames] | None:
     """Return the function that reads Polycam's raw data in a folder; None if there are none."""
+    found = []
     for base in (path / "keyframes", path):
-        for cameras, images in ((base / cameras, base / images) for cameras, images in POLYCAM_FOLDERS):
-            if cameras.is_dir() and images.is_dir() and any(cameras.glob("*.json")):
-                return functools.partial(_polycam_frames, cameras, images)
-    return None
+        pairs = [(base / cameras, base / images) for cameras, images in POLYCAM_FOLDERS]
+        found += [pair for pair in pairs if pair[0].is_dir() and pair[1].is_dir() and any(pair[0].glob("*.json"))][:1]
+    if not found:
+        return None
+
+    def read() -> Frames:
+        warn_of_others(found[0][0], [cameras for cameras, _ in found])
+        return _polycam_frames(*found[0])
+
+    return read
 
 
 def _polycam_frames(cameras: Path, images: Path) -> Frames:
@@ -113,11 +119,17 @@ def _within_border(pixels: np.ndarray) -> np.ndarray:
 
 def record3d(path: Path) -> Callable[[], Frames] | None:
     """Return the function that reads Record3D's frames in a folder; None if there are none."""
-    for file in (path / name for name in METADATA):
-        # The name alone says little.
-        if is_regular(file) and b'"poses"' in read_regular(file, MOST_BYTES):
-            return functools.partial(_record3d_frames, file)
-    return None
+    # The name alone says little.
+    files = [file for file in (path / name for name in METADATA) if is_regular(file)]
+    files = [file for file in files if b'"poses"' in read_regular(file, MOST_BYTES)]
+    if not files:
+        return None
+
+    def read() -> Frames:
+        warn_of_others(files[0], files)
+        return _record3d_frames(files[0])
+
+    return read
 
 
 def _record3d_frames(file: Path) -> Frames:

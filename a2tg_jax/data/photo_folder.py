@@ -73,6 +73,7 @@ FOUND_BY: tuple[tuple[str, str], ...] = (
     ("*.sfm", "has Meshroom's cameras: its node ExportColmap writes what is read"),
     ("*.mvs", "is a scene of OpenMVS, which is not read: export COLMAP's format"),
     ("pose/*.txt", "has a pose for each image (ScanNet), which are not read: write transforms.json"),
+    ("*.csv", "may be RealityScan's list of cameras, which is not read: export COLMAP, or XMP beside the photographs"),
     ("database.db", "has COLMAP's database without a model: colmap mapper writes sparse/0"),
 )
 """Pattern of files below the capture's folder, and what to do. The first that fits is reported."""

@@ -6,7 +6,6 @@ fisheye) for a ray at the angle θ, then Brown's distortion. RealityScan (Realit
 each photograph.
 """
 
-import functools
 import re
 import warnings
 from collections import defaultdict
@@ -21,9 +20,9 @@ from a2tg_jax.data.assembly import PointCloud, rigid_motion
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, warn_of_unposed
 from a2tg_jax.data.ply import read_ply_points
-from a2tg_jax.data.transforms import Frames, check_images
+from a2tg_jax.data.transforms import Frames, check_images, warn_of_others
 from a2tg_jax.host.json_text import MOST_BYTES
-from a2tg_jax.host.regular_files import is_regular, open_regular, read_regular
+from a2tg_jax.host.regular_files import is_regular, names_in, open_regular, read_regular
 from a2tg_jax.host.text import shortened
 
 Element = ElementTree.Element
@@ -34,6 +33,7 @@ FARTHEST_POINTS = 100.0
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Change of a camera's frame between OpenCV and OpenGL."""
 UNDISTORTED = "export undistorted images in COLMAP's format instead"
+METASHAPE_FILE = "cameras.xml"
 SWITCHED_OFF = ("0", "false")
 """Values of a camera's attribute enabled that leave it out."""
 HIGHER_TERMS = {"frame": ("k4", "p3", "p4"), "equidistant": ("p3", "p4"), "equisolid": ("p1", "p2", "p3", "p4")}
@@ -54,14 +54,25 @@ FILM_WIDTH = 36.0
 
 
 def metashape(path: Path) -> Callable[[], Frames] | None:
-    """Return the function that reads Metashape's cameras, an XML file or one in a folder; None if there is none."""
-    for file in [path] if is_regular(path) else sorted(path.glob("*.xml")):
-        if file.suffix.lower() == ".xml":
+    """Return the function that reads Metashape's cameras, an XML file or one in a folder; None if there is none.
+
+    Of several in a folder, cameras.xml is read, or else the first by name, with a warning.
+    """
+    files = []
+    for file in [path] if is_regular(path) else [path / name for name in names_in(path)]:
+        if file.suffix.lower() == ".xml" and is_regular(file):
             with open_regular(file) as opened:
-                is_found = b"<sensors" in opened.read(HEAD_BYTES)
-            if is_found:
-                return functools.partial(_metashape_frames, file)
-    return None
+                if b"<sensors" in opened.read(HEAD_BYTES):
+                    files.append(file)
+    if not files:
+        return None
+    chosen = next((file for file in files if file.name.lower() == METASHAPE_FILE), files[0])
+
+    def read() -> Frames:
+        warn_of_others(chosen, files)
+        return _metashape_frames(chosen)
+
+    return read
 
 
 def _metashape_frames(file: Path) -> Frames:
@@ -224,11 +235,20 @@ def _equidistant_terms(lens: dict[str, Any], what: str) -> dict[str, float]:
 def realityscan(path: Path) -> Callable[[], Frames] | None:
     """Return the function that reads RealityScan's XMP files in a folder, or anywhere below its folder images; None if
     there are none."""
+    folders = []
     for found in (path.glob("*.xmp"), (path / "images").rglob("*.xmp")):
         files = [file for file in sorted(found) if b"xcr:Rotation" in read_regular(file, MOST_BYTES)]
         if files:
-            return functools.partial(_realityscan_frames, path, files)
-    return None
+            folders.append(files)
+    if not folders:
+        return None
+
+    def read() -> Frames:
+        # Files of another alignment may be left in one of the two.
+        warn_of_others(folders[0][0], [files[0] for files in folders])
+        return _realityscan_frames(path, folders[0])
+
+    return read
 
 
 def _realityscan_frames(path: Path, files: list[Path]) -> Frames:

@@ -8,8 +8,10 @@ both are in the file's own world, which is the original world here. Points of it
 """
 
 import functools
+import os
 import warnings
 from collections.abc import Callable, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,8 +27,8 @@ from a2tg_jax.data.photo_reading import Counted, Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
 from a2tg_jax.host.json_text import read_json
-from a2tg_jax.host.regular_files import is_regular
-from a2tg_jax.host.text import shortened
+from a2tg_jax.host.regular_files import is_regular, names_in
+from a2tg_jax.host.text import first_names, shortened
 
 NERFSTUDIO_FILE = "transforms.json"
 BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
@@ -85,6 +87,7 @@ def load_blender(folder: Path, options: Options) -> Scene:
     training view is a test view.
     """
     train_file, test_file = (folder / name for name in BLENDER_FILES)
+    warn_of_others(train_file, transforms_in(folder))
     files = [train_file, test_file] if is_regular(test_file) else [train_file]
     metas = [_read_meta(file) for file in files]
     groups = _read_shots(list(zip(files, metas, strict=True)), options)
@@ -98,6 +101,30 @@ def load_frames(made: Frames, options: Options) -> Scene:
     (shots,) = _read_shots([(made.file, {"frames": made.frames})], options, made.counted)
     name = scene_name(made.file.resolve().parent)
     return assemble_scene(name, *every_kth(shots, options.test_every), made.cloud, source=str(made.file))
+
+
+def warn_of_others(chosen: Path, files: Sequence[Path]) -> None:
+    """Warn of further files of cameras than the one that is read, such as a second export beside it."""
+    others = [file for file in files if file != chosen]
+    if others:
+        names = first_names([os.path.relpath(file, chosen.parent) for file in others])
+        warnings.warn(
+            f"{chosen.parent}: {chosen.name} is read, and not {names}; to read another, give that file, or a folder "
+            "without the others",
+            stacklevel=3,
+        )
+
+
+def load_folder(folder: Path, options: Options) -> Scene:
+    """Read the transforms.json of a folder, with a warning if others are beside it."""
+    warn_of_others(folder / NERFSTUDIO_FILE, transforms_in(folder))
+    return load_transforms(folder / NERFSTUDIO_FILE, options)
+
+
+def transforms_in(folder: Path) -> list[Path]:
+    """Return transforms.json and files of similar names in a folder, such as "transforms (1).json"; no splits."""
+    names = [name for name in names_in(folder) if fnmatchcase(name.lower(), "transforms*.json")]
+    return [folder / name for name in names if name not in (*BLENDER_FILES, "transforms_val.json")]
 
 
 def check_images(file: Path, frames: Sequence[object], lacking: Sequence[str], nothing: str) -> None:
