@@ -219,6 +219,7 @@ def next_sizes(
 
     s_x/s_y > k_A and s_y < k_S: Tu doubles. s_y/s_x > k_A and s_x < k_S: Tv doubles. Otherwise both double. Each
     axis stops at the cap, so that a 4×1 texture becomes 4×2 at a cap of 4. An empty texture grows as one of 1×1 does.
+    Sizes of Gaussians whose scales are NaN or infinite do not change, so that `select` never chooses these.
 
     Args:
       sizes: [N, 2] integers (Tv, Tu).
@@ -257,7 +258,8 @@ def next_sizes(
     doubles = np.stack([~is_thin_u, ~is_thin_v], axis=1)
     present = np.maximum(sizes, 1)
     # The maximum keeps sides that are above the cap already.
-    return np.where(doubles, np.maximum(present, np.minimum(2 * present, cap)), present)
+    grown = np.where(doubles, np.maximum(present, np.minimum(2 * present, cap)), present)
+    return np.where(np.isfinite(scales).all(axis=1, keepdims=True), grown, sizes)
 
 
 def most_textures(sizes: np.ndarray, num_bytes: float, cap: int) -> Shape:

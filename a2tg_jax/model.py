@@ -12,7 +12,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from a2tg_jax.appearance import Appearance, count_floats, in_words, template_of
-from a2tg_jax.appearance.base import check_arrays_given, join_rows, num_colors_of, take_rows
+from a2tg_jax.appearance.base import check_appearance, check_arrays_given, join_rows, num_colors_of, take_rows
 from a2tg_jax.appearance.parts import MAX_DEGREE, bands_of_dense, degrees_of_sizes, dense_bands
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
@@ -26,7 +26,7 @@ from a2tg_jax.core.similarity import Similarity, transform_gaussians
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.render import render_appearance, with_features
-from a2tg_jax.texture import Textures
+from a2tg_jax.texture import Textures, check_textures
 
 SAME_PLACE = 1e-5
 """Largest distance between two models' origins that count as the same."""
@@ -82,9 +82,10 @@ class Model:
           rows: a mask [N] of bool, indices [M], which may repeat, or a slice.
 
         Raises:
-          ValueError: if it is none of these, or an index is out of range.
+          ValueError: if it is none of these, an index is out of range, or the appearance has other rows.
         """
         model = self.live
+        check_appearance(model.appearance, model.gaussians)
         return model._taken(_indices(rows, model.num))
 
     def _taken(self, rows: np.ndarray) -> "Model":
@@ -146,8 +147,9 @@ class Model:
           The model.
 
         Raises:
-          ValueError: if it has none; the message says how to build one that has.
+          ValueError: if it has none, where the message says how to build one that has, or their numbers differ.
         """
+        check_textures(textures, self.gaussians.num)
         return dataclasses.replace(self, appearance=self.appearance.with_textures(textures))
 
     @property
@@ -295,6 +297,7 @@ def concatenate(models: Sequence[Model]) -> Model:
         raise ValueError("concatenate needs at least one model, in a list")
     for index, model in enumerate(models):
         check_kind(f"models[{index}]", model, Model)
+        check_appearance(model.appearance, model.gaussians)
     models = [model.live for model in models]
     first, words = models[0], [in_words(model.appearance) for model in models]
     for model, shown in zip(models, words, strict=True):

@@ -61,6 +61,17 @@ def added_bytes(sizes, proposed):
     return 16 * (np.prod(proposed, 1) - np.prod(sizes, 1))
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_textures_of_unknown_scales_stay_and_are_never_chosen(bad):
+    sizes, scales = np.array([[2, 1], [0, 0], [1, 1], [2, 2]]), np.full((4, 2), 0.1)
+    scales[:3, 1] = bad
+    scales[1, 0] = np.nan
+    proposed = next_sizes(sizes, scales, k_a=4.0, k_s=0.01, cap=4)
+    np.testing.assert_array_equal(proposed, [*sizes[:3], [4, 4]])
+    for rule in ({"threshold": 0.0}, {"fraction": 1.0}, {"budget_bytes": 1e6}):
+        assert select(np.ones(4), sizes, proposed, **rule).tolist() == [False, False, False, True]
+
+
 def test_threshold_takes_exactly_those_above():
     for seed in range(4):
         statistic, sizes, proposed = random_event(200, seed)

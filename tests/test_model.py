@@ -11,7 +11,8 @@ from scenes_random import as_camera, as_gaussians, draw_scene
 from small_values import assert_same, some_gaussians, some_world
 from test_hostile_models import refused, spoiled, with_array, with_header
 
-from a2tg_jax.appearance import Appearance, Exponents, Texture, TextureOptions, allocate_appearance, template_of
+from a2tg_jax import concatenate, save_ply, to_gsplat
+from a2tg_jax.appearance import Appearance, Bands, Exponents, Texture, TextureOptions, allocate_appearance, template_of
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import pytree, static
@@ -237,6 +238,33 @@ def test_a_model_of_wrong_shapes_is_not_written(tmp_path):
 
 
 @pytest.mark.long
+def test_rows_of_another_number_are_refused(tmp_path):
+    """Both numbers are named; four textures of seven Gaussians would otherwise move to the wrong ones."""
+    textures, few = textures_from_arrays(some_textures()), textures_from_arrays(some_textures(4))
+    model = Model(some_gaussians(), Appearance(texture=Texture(textures), exponents=Exponents(jnp.zeros(7))))
+    coefficients = allocate_appearance(Appearance(bands=Bands()), jax.random.key(0), some_gaussians()[:4]).coefficients
+    words = "are of 4 Gaussians, but there are 7"
+    for replace in (model.with_textures, model.appearance.with_textures):
+        with pytest.raises(ValueError, match=f"textures {words}"):
+            replace(few)
+    with pytest.raises(ValueError, match=f"coefficients {words}"):
+        model.appearance.with_coefficients(coefficients)
+    with pytest.raises(ValueError, match=r"shapes must be \[7\]; got \[4\]"):
+        model.appearance.with_shapes(jnp.zeros(4))
+    wrong = Model(some_gaussians(), Appearance(texture=Texture(few)))
+    uses = {
+        "rows": lambda: wrong[2:4],
+        "ply": lambda: save_ply(tmp_path / "a.ply", wrong),
+        "gsplat": lambda: to_gsplat(wrong),
+        "npz": lambda: save_model(tmp_path / "a.npz", wrong),
+        "concatenate": lambda: concatenate([wrong, wrong]),
+    }
+    for name, use in uses.items():
+        with pytest.raises(ValueError, match=f"textures {words}"):
+            pytest.fail(f"{name}: {use()}")
+    assert not [*tmp_path.iterdir()]
+
+
 @pytest.mark.usefixtures("x64")
 def test_a_moved_model_shows_the_same_to_its_cameras():
     scene = draw_scene(9)

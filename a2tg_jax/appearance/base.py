@@ -37,7 +37,7 @@ from a2tg_jax.appearance.parts import (
 )
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import FLOATS, described
+from a2tg_jax.core.checks import FLOATS, check_shape, described
 from a2tg_jax.core.gaussians import Gaussians, logit, share
 from a2tg_jax.core.geometry import homographies
 from a2tg_jax.core.numerics import Integer, at_least
@@ -45,7 +45,7 @@ from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
 from a2tg_jax.core.table import Table, check_places, check_table, is_table
 from a2tg_jax.parallel.sharded_rows import rows_joined, rows_moved
-from a2tg_jax.texture import Textures
+from a2tg_jax.texture import Textures, check_textures
 
 T = TypeVar("T")
 
@@ -245,20 +245,32 @@ class Appearance:
         return None if self.exponents is None else self.exponents.shapes
 
     def with_textures(self, textures: Textures) -> Self:
-        """Return the appearance with other textures. ValueError: it has none."""
+        """Return the appearance with other textures. ValueError: it has none, or another number of rows."""
         if self.texture is None:
             raise ValueError(
                 f"no textures to replace in {in_words(self)}: build a model with Appearance(texture=Texture(textures))"
             )
+        check_textures(textures, self._num_rows)
         return dataclasses.replace(self, texture=dataclasses.replace(self.texture, texels=textures))
 
     def with_coefficients(self, coefficients: Coefficients) -> Self:
-        """Return the appearance, which has bands, with other coefficients."""
+        """Return the appearance, which has bands, with other coefficients. ValueError: it has another number of
+        rows."""
+        check_table(coefficients, self._num_rows, "coefficients")
         return dataclasses.replace(self, bands=Bands(coefficients))
 
     def with_shapes(self, shapes: Array) -> Self:
-        """Return the appearance, which has exponents, with other shapes."""
+        """Return the appearance, which has exponents, with other shapes. ValueError: it has another number of rows."""
+        check_shape("shapes", shapes, ("N" if self._num_rows is None else self._num_rows,))
         return dataclasses.replace(self, exponents=Exponents(shapes))
+
+    @property
+    def _num_rows(self) -> int | None:
+        """Number of Gaussians that the arrays of the parts are for; None for a template."""
+        for table in (self.textures, self.coefficients):
+            if table is not None:
+                return table.num
+        return None if self.shapes is None else int(self.shapes.shape[0])
 
 
 def appearance_for(

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.appearance.parts import MAX_DEGREE, nearest_gaussians
 from a2tg_jax.core.camera_paths import upright_rotation
 from a2tg_jax.core.checks import LARGEST_NUMBER
@@ -105,6 +106,7 @@ def plain_gaussians(gaussians: Gaussians | Model, *, keeps_shapes: bool = False)
     """
     if isinstance(gaussians, Model):
         model = gaussians.live
+        check_appearance(model.appearance, model.gaussians)
         gaussians, shown = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh)), model.appearance
         if shown.shapes is not None and not keeps_shapes:
             gaussians = nearest_gaussians(gaussians, np.asarray(shown.shapes))
