@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from scipy import sparse
 
 from a2tg_jax.core.sh import NUM_BASES
@@ -152,7 +152,10 @@ def _named_pictures(header: dict[str, Any]) -> list[str]:
     for group, count in PICTURES.items():
         if group == "shN" and not header.get(group):
             continue
-        found = header[group]["files"]
+        described = header.get(group)
+        if not isinstance(described, dict):
+            raise ValueError(f"{HEADER} describes no {group}; got {shortened(described)}")
+        found = described.get("files")
         if not isinstance(found, list) or len(found) != count or not all(isinstance(name, str) for name in found):
             raise ValueError(f"{HEADER} must name {count} pictures of {group}; got {shortened(found)}")
         for name in found:
@@ -166,12 +169,16 @@ def _splats(files: _Files) -> others.Ellipsoids:
     header = files.header
     is_first = header.get("version", 1) == 1
     num = _count(header["means"]["shape"][0] if is_first else header["count"], "splats")
-    low, high = (_codes(files, header["means"]["files"][index], num).astype(np.int64) for index in (0, 1))
+    has_rest = bool(header.get("shN")) and header["shN"].get("bands") != 0
+    names = [name for group in ("means", "quats", "scales", "sh0") for name in header[group]["files"]]
+    low, high, turns, scale_codes, color_codes, *labels = _rows(
+        files, [*names, *(header["shN"]["files"][1:] if has_rest else [])], num
+    )
     ends = [_numbers(header["means"], name, 3, "means") for name in ("mins", "maxs")]
-    logarithms = ends[0] + (low[:, :3] + 256 * high[:, :3]) / LEVELS * (ends[1] - ends[0])
+    steps = low[:, :3] + 256 * high[:, :3].astype(np.int64)
+    logarithms = ends[0] + steps / LEVELS * (ends[1] - ends[0])
     means = np.sign(logarithms) * np.expm1(np.abs(logarithms))
 
-    turns = _codes(files, header["quats"]["files"][0], num)
     if turns[:, 3].min() < LARGEST_INDEX_0:
         bad = int(np.count_nonzero(turns[:, 3] < LARGEST_INDEX_0))
         raise ValueError(
@@ -181,7 +188,6 @@ def _splats(files: _Files) -> others.Ellipsoids:
     smaller = (turns[:, :3] / 255 * 2 - 1) / math.sqrt(2)
     quats = others.with_largest(smaller, turns[:, 3].astype(np.int64) - LARGEST_INDEX_0)
 
-    scale_codes, color_codes = (_codes(files, header[group]["files"][0], num) for group in ("scales", "sh0"))
     scales = np.exp(_decoded(header["scales"], "scales", scale_codes[:, :3], is_first=is_first))
     if is_first:  # The fourth column is the logit of the opacity.
         colors = _decoded(header["sh0"], "sh0", color_codes, is_first=True)
@@ -190,13 +196,14 @@ def _splats(files: _Files) -> others.Ellipsoids:
         colors = _decoded(header["sh0"], "sh0", color_codes[:, :3], is_first=False)
         opacities = color_codes[:, 3] / 255
     sh = colors[:, None, :3]
-    if header.get("shN") and (header["shN"].get("bands") != 0):
-        sh = np.concatenate([sh, _rest(files, num, is_first=is_first)], axis=1)
+    if has_rest:
+        places = labels[0][:, 0] + 256 * labels[0][:, 1].astype(np.int64)
+        sh = np.concatenate([sh, _rest(files, places, is_first=is_first)], axis=1)
     return others.Ellipsoids(*(values.astype(np.float32) for values in (means, quats, scales, opacities, sh)))
 
 
-def _rest(files: _Files, num: int, *, is_first: bool) -> np.ndarray:
-    """Return the coefficients [num, K, 3] above degree 0."""
+def _rest(files: _Files, places: np.ndarray, *, is_first: bool) -> np.ndarray:
+    """Return the coefficients [N, K, 3] above degree 0 at these places [N] among the sets of a file."""
     described = files.header["shN"]
     centroids, labels = described["files"]
     pixels = _pixels(files, centroids)
@@ -212,8 +219,6 @@ def _rest(files: _Files, num: int, *, is_first: bool) -> np.ndarray:
     count = room if is_first else _count(described["count"], "sets of spherical harmonics")
     if count > room:
         raise ValueError(f"{centroids} holds {room:,} sets of spherical harmonics, but {HEADER} says {count:,}")
-    label_codes = _codes(files, labels, num).astype(np.int64)
-    places = label_codes[:, 0] + 256 * label_codes[:, 1]
     if places.max() >= count:
         raise ValueError(f"{labels} refers to set {places.max():,} of spherical harmonics (from 0) of {count:,}")
     sets = pixels[..., :3].reshape(room, COEFFICIENTS[degree], 3)
@@ -227,13 +232,18 @@ def _count(value: object, what: str) -> int:
     return value
 
 
-def _codes(files: _Files, name: str, num: int) -> np.ndarray:
-    """Return the first pixels [num, 4] of a picture. ValueError: it has fewer."""
-    pixels = _pixels(files, name)
-    height, width, _ = pixels.shape
-    if num > height * width:
-        raise ValueError(f"{name} has {width}x{height} pixels, too few for {num:,} splats")
-    return pixels.reshape(-1, 4)[:num]
+def _rows(files: _Files, names: list[str], num: int) -> list[np.ndarray]:
+    """Return the first pixels [num, 4] of pictures. ValueError: one has fewer, or they differ in size."""
+    found: list[np.ndarray] = []
+    for name in names:
+        pixels = _pixels(files, name)
+        height, width, _ = pixels.shape
+        if num > height * width:
+            raise ValueError(f"{name} has {width}x{height} pixels, too few for {num:,} splats")
+        if found and pixels.shape != found[0].shape:
+            raise ValueError(f"{name} has {width}x{height} pixels, and {names[0]} another size")
+        found.append(pixels)
+    return [pixels.reshape(-1, 4)[:num] for pixels in found]
 
 
 def _pixels(files: _Files, name: str) -> np.ndarray:
@@ -247,7 +257,12 @@ def _pixels(files: _Files, name: str) -> np.ndarray:
             if width * height <= most:
                 if image.mode not in ("RGB", "RGBA"):
                     raise ValueError(f"its pixels are {image.mode}, not RGB or RGBA of 8 bits")
+                # The chunk of lossless pixels.
+                if image.format == "WEBP" and b"VP8L" not in data:
+                    raise ValueError("it is compressed with loss, which changes its numbers")
                 return np.asarray(image.convert("RGBA"))
+    except UnidentifiedImageError:
+        raise ValueError(f"the picture {name} is damaged, or neither WebP nor PNG") from None
     except Exception as error:  # Damaged pictures raise anything from SyntaxError to struct.error.
         reason = shortened(str(error) or type(error).__name__)
         raise ValueError(f"the picture {name} is damaged ({reason})") from error
@@ -261,7 +276,7 @@ def _decoded(described: Mapping[str, Any], group: str, codes: np.ndarray, *, is_
         count = 1 if group == "shN" else codes.shape[-1]
         low, high = (_numbers(described, name, count, group) for name in ("mins", "maxs"))
         return low + codes / 255 * (high - low)
-    codebook = described["codebook"]
+    codebook = described.get("codebook")
     if isinstance(codebook, list) and len(codebook) == CODEBOOK and codebook[0] is None:
         # Early programs left the first number out: https://github.com/playcanvas/engine reads it as one more step.
         codebook = [codebook[1] + (codebook[1] - codebook[-1]) / (CODEBOOK - 1), *codebook[1:]]
@@ -273,7 +288,7 @@ def _decoded(described: Mapping[str, Any], group: str, codes: np.ndarray, *, is_
 
 def _numbers(described: Mapping[str, Any], name: str, count: int, group: str) -> np.ndarray:
     """Return a field of `count` numbers; one may be without a list."""
-    values = described[name]
+    values = described.get(name)
     found = _checked_numbers(values if isinstance(values, list) else [values], f"{group}.{name}")
     if len(found) != count:
         raise ValueError(f"{group}.{name} of {HEADER} must be {count} numbers; got {len(found)}")
