@@ -89,7 +89,7 @@ class Now(NamedTuple):
     keys: Array
     """[num_keys] random keys."""
     iteration: Array
-    """Iteration just done, from 1."""
+    """Iteration just done, from 1; in a stage that `continues` the one before, always the last."""
     rate_of_means: Array
     """Learning rate of the means, in world units."""
     num_iterations: Array
@@ -153,7 +153,8 @@ class Event:
     """
 
     limited_by: ClassVar[str] = ""
-    """Field that bounds the number of Gaussians, such as "cap"; advice names it."""
+    """Field that bounds the number of Gaussians, such as "cap"; training starts from at most as many, and advice names
+    it."""
 
     def check_options(self) -> None:
         """Check the ranges of the fields (host). A stage calls it, and a system whose option the event is.
@@ -204,8 +205,9 @@ class Event:
 
     @property
     def most_gaussians(self) -> int | None:
-        """Largest number of Gaussians that training may start from; None: any."""
-        return None
+        """Largest number of Gaussians that training may start from; by default the field `limited_by`, or None for any
+        number."""
+        return getattr(self, self.limited_by) if self.limited_by else None
 
     def num_rows(self, num: int, num_iterations: int) -> int:
         """Return the number of Gaussians that the event can reach from `num`, and of allocated rows (host)."""

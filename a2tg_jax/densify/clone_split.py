@@ -90,10 +90,6 @@ class CloneSplitPrune(StepEvent):
         # In 3DGS's program after 500 and before 15,000 of 30,000 iterations, every 100.
         return Times(num_iterations // 60 + 1, num_iterations // 2 - 1, max(10, round(num_iterations / 300)))
 
-    @property
-    def most_gaussians(self) -> int:
-        return self.cap
-
     def num_rows(self, num: int, num_iterations: int) -> int:
         return max(num, self.cap)
 

@@ -291,7 +291,8 @@ def tune_compact(
     )
     shared = {field.name: getattr(system, field.name) for field in dataclasses.fields(System)}
     # Tuning changes no sizes, so no budget applies.
-    one_stage = _OneStage(**shared | {"memory_budget": None}, stage=tuning)
+    own = {"memory_budget": None, "initial_gaussians": None, "sh_degree": start.gaussians.sh_degree}
+    one_stage = _OneStage(**shared | own, stage=tuning)
     found = fit_stage(scene, one_stage, 0, start, progress=progress, title=title).model
     return Tuned(dataclasses.replace(found, origin=start.origin), choices, grids)
 

@@ -5,6 +5,7 @@
       run.toml                   the scene, the system with every number, the systems compared (`results.record`)
       checkpoints/NAME-*.npz     the newest two of the stage that is being trained, to resume from
       models/NAME.npz            the model of each finished stage, with cameras, world and background
+      states/NAME.npz            the state at the end of a system's last stage, which --more continues
       corrections/NAME.json      exposure and pose of each training view, if they were learned
       history/NAME.csv           loss, PSNR, Gaussians, MB over the iterations
       tensorboard/events.*       the same for TensorBoard, with --tensorboard
@@ -157,6 +158,17 @@ class RunFolder:
 
     def checkpoint(self, name: str, iteration: int) -> Path:
         return self.path / "checkpoints" / f"{name}-{iteration:010d}.npz"
+
+    def state(self, name: str) -> Path:
+        return self.path / "states" / f"{name}.npz"
+
+    def keep_state(self, name: str, iteration: int) -> None:
+        """Keep the checkpoint of a stage's last iteration, if it is there, as its state at the end."""
+        checkpoint = self.checkpoint(name, iteration)
+        if checkpoint.is_file():
+            state = self.own(self.state(name))
+            state.parent.mkdir(exist_ok=True)
+            checkpoint.replace(state)
 
     def diverged(self, name: str, iteration: int) -> Path:
         return self.path / "diverged" / f"{name}-{iteration:010d}.npz"

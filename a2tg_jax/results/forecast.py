@@ -148,12 +148,14 @@ def forecast_run(scene: Scene, plan: RunPlan, num_given: int | None = None, num_
     )
     limits = [] if num_given is None else ["init"]
     limits += [name for planned in plan.stages for name in planned.system.limits()]
-    # Models stay, checkpoints of one stage at a time, and sheets of photograph, renders and error.
+    # Models stay, the states that can be continued, checkpoints of one stage at a time, and sheets of photograph,
+    # renders and error. The last stage's state is one of its checkpoints.
+    kept = sum(stages[name].model_bytes for name in plan.kept_states[:-1])
     pixels = sum(view.camera.width * view.camera.height for view in scene.test or scene.train)
     pictures = PICTURE_PER_PIXEL * (3 + max(1, len(plan.chains) - 1)) * pixels
     return RunForecast(
         phases,
-        disk_bytes=sum(model_bytes) + KEPT_STATES * STATES * max(model_bytes) + pictures,
+        disk_bytes=sum(model_bytes) + STATES * (kept + KEPT_STATES * max(model_bytes)) + pictures,
         limits=tuple(dict.fromkeys(limits)),
         whole={name: stage.whole_bytes for name, stage in stages.items()},
     )

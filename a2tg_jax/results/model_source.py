@@ -8,10 +8,8 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import transform_gaussians
 from a2tg_jax.data.load import is_scene
 from a2tg_jax.data.scene import Scene, origin_of_scene
@@ -28,7 +26,7 @@ from a2tg_jax.results.history import write_history
 from a2tg_jax.results.record import PlannedStage, RunRecord, read_record
 from a2tg_jax.training import History, System
 from a2tg_jax.training.stage import BACKGROUNDS
-from a2tg_jax.training.start import new_appearance
+from a2tg_jax.training.start import left_out, new_appearance, with_degree
 
 SHOWN = f"a run folder, or a file *{', *'.join(FORMATS)}"
 MOST_LISTED = 5
@@ -167,14 +165,8 @@ def check_init(file: Path, out: Path, system: System) -> Model:
         system.check_given_number(splats.num)
     except ValueError as error:
         raise ValueError(f"init: {file}: {error}") from error
-    shown, lost = splats.appearance, []
-    has_shapes = shown.exponents is not None
-    if has_shapes and system.stages()[0].appearance.exponents is None:
-        lost.append("the shapes of its kernels (the nearest Gaussians replace them)")
-    if not shown.is_portable or shown.texture is not None:
-        lost.append("what its splats show besides " + ("kernels" if has_shapes else "Gaussians"))
-    if splats.sh.shape[1] > NUM_BASES[degree]:
-        lost.append(f"its spherical harmonics above degree {degree}")
+    # The first stage begins with an appearance of its own.
+    lost = left_out(splats, degree, system.stages()[0].appearance)
     if lost:
         warnings.warn(f"`init` {file} leaves out {' and '.join(lost)}", stacklevel=2)
     return splats
@@ -191,11 +183,7 @@ def write_first_stage(run: RunFolder, record: RunRecord, splats: Model, scene: S
     # File → original world → the scene's normalised one.
     to_scene = scene.transform if splats.origin is None else splats.origin.transform.inverse().then(scene.transform)
     gaussians = transform_gaussians(plain_gaussians(splats, keeps_shapes=shapes is not None), to_scene)
-    # Spherical harmonics are cut or zero-padded to the degree at which training begins.
-    sh = np.zeros((gaussians.num, NUM_BASES[system.initial_sh_degree], 3), np.float32)
-    num = min(sh.shape[1], gaussians.sh.shape[1])
-    sh[:, :num] = np.asarray(gaussians.sh)[:, :num]
-    gaussians = dataclasses.replace(gaussians, sh=jnp.asarray(sh))
+    gaussians = with_degree(gaussians, system.initial_sh_degree)
     shown = new_appearance(appearance, gaussians, system)
     if shapes is not None:
         shown = shown.with_shapes(shapes)

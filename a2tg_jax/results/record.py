@@ -378,6 +378,13 @@ class RunPlan:
         """The stages of the main system."""
         return next(iter(self.chains.values()))
 
+    @property
+    def kept_states(self) -> tuple[str, ...]:
+        """The stages whose state at the end is kept: each system's last, and those that another one continues."""
+        ends = {chain[-1] for chain in self.chains.values()}
+        continued = {planned.start for planned in self.stages if planned.stage.continues}
+        return tuple(name for name in self.names if name in ends | continued)
+
     def __getitem__(self, name: str) -> PlannedStage:
         """Return the stage of this name. Raises ValueError if there is none."""
         for planned in self.stages:

@@ -47,7 +47,7 @@ from a2tg_jax.results.folder import (
 from a2tg_jax.results.forecast import doubts_about, print_forecast, room_for_photographs, time_after
 from a2tg_jax.results.history import EventWriter, write_history
 from a2tg_jax.results.model_source import check_init, write_first_stage
-from a2tg_jax.results.record import OnNan, PlannedStage, RunRecord, is_finished, read_record, write_record
+from a2tg_jax.results.record import OnNan, PlannedStage, RunPlan, RunRecord, is_finished, read_record, write_record
 from a2tg_jax.results.report import RunResult
 from a2tg_jax.results.run_evaluation import check_held_out, check_weights, evaluate_run
 from a2tg_jax.training import (
@@ -249,7 +249,7 @@ def train_run(
         else:
             events = EventWriter(run, planned.name) if options.tensorboard else None
             own = functools.partial(fit, after=after[planned.name])
-            result = _train_stage(run, planned, scene, own, events, record.on_nan)
+            result = _train_stage(run, record.plan, planned, scene, own, events, record.on_nan)
             if events is not None:
                 events.add(result.history)
                 events.close()
@@ -257,6 +257,8 @@ def train_run(
             # After the history: a model says that its stage is finished.
             save_model(run.own(path), result.model, {"system": system_to_dict(planned.system)})
         # Also if the model was there: a process may have been killed between the two.
+        if planned.name in record.plan.kept_states:
+            run.keep_state(planned.name, planned.stage.iterations)
         run.drop_old_checkpoints(planned.name, keep=0)
     # Ends `follow_first_process`.
     _send_stage(None)
@@ -264,6 +266,7 @@ def train_run(
 
 def _train_stage(
     run: RunFolder,
+    plan: RunPlan,
     planned: PlannedStage,
     scene: Scene,
     fit: Callable[..., StageResult],
@@ -291,6 +294,9 @@ def _train_stage(
         if start is not None:
             model = load_model(start)
             check_held_out(model, scene, start)
+        if resume is None and planned.stage.continues and planned.start is not None:
+            resume = _last_state(run, plan[planned.start], planned.name)
+            resumed = None if resume is None else run.state(planned.start)
         _send_stage(planned.name, [resumed, start], num_restored)
         try:
             return fit(
@@ -330,17 +336,11 @@ def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | No
         except ValueError as error:
             damaged.append((path, error))
             continue
-        _check_options(path, checkpoint.system, planned.system)
+        _check_made_alike(path, checkpoint, planned)
         for damaged_path, damage in damaged:
             aside = damaged_path.replace(run.own(damaged_path.with_name(damaged_path.name + DAMAGED)))
             warnings.warn(
                 f"{damage}; it was renamed to {aside.name}, and training continues from {path.name}", stacklevel=2
-            )
-        differences = [] if checkpoint.machine is None else checkpoint.machine.differences(this_machine())
-        if differences:
-            warnings.warn(
-                f"{path.name} was made on another machine, so last bits will differ: {'; '.join(differences)}",
-                stacklevel=2,
             )
         return checkpoint
     if damaged:
@@ -348,6 +348,36 @@ def _newest_checkpoint(run: RunFolder, planned: PlannedStage) -> Checkpoint | No
             f"{damaged[0][1]}; there is no other checkpoint: delete it to train {planned.name} from its beginning"
         )
     return None
+
+
+def _last_state(run: RunFolder, before: PlannedStage, name: str) -> Checkpoint | None:
+    """Return the state at the end of a stage, which the stage of that name continues; None, with a warning, if it was
+    not kept. Raises ValueError if it cannot be read, or was made with other options."""
+    path = run.state(before.name)
+    if not path.is_file():
+        warnings.warn(
+            f"{name} continues {before.name} without Adam's moments, so that the first iterations may make pictures "
+            f"worse: there is no {path}",
+            stacklevel=3,
+        )
+        return None
+    try:
+        state = load_checkpoint(path, system=type(before.system))
+    except ValueError as error:
+        raise ValueError(f"{error}; delete it to train {name} without Adam's moments") from error
+    _check_made_alike(path, state, before)
+    return state
+
+
+def _check_made_alike(path: Path, checkpoint: Checkpoint, planned: PlannedStage) -> None:
+    """Raise ValueError if a checkpoint was made with other options than the record's; warn if on another machine."""
+    _check_options(path, checkpoint.system, planned.system)
+    differences = [] if checkpoint.machine is None else checkpoint.machine.differences(this_machine())
+    if differences:
+        warnings.warn(
+            f"{path.name} was made on another machine, so last bits will differ: {'; '.join(differences)}",
+            stacklevel=3,
+        )
 
 
 def _check_options(path: Path, made: System, wanted: System) -> None:

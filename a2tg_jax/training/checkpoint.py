@@ -132,6 +132,11 @@ class Checkpoint:
         return int(self.state.iteration)
 
     @property
+    def is_at_end(self) -> bool:
+        """Whether its stage is finished."""
+        return self.iteration == self.system.all_stages()[self.stage].iterations
+
+    @property
     def model(self) -> Model:
         """The Gaussians that exist, and what they show."""
         return self.state.model.live
@@ -321,16 +326,26 @@ def check_history(history: History) -> None:
 
 
 def check_resume(resume: Checkpoint, system: System, index: int) -> None:
-    """Raise ValueError unless the checkpoint is of that stage of that system."""
+    """Raise ValueError unless the checkpoint is of that stage of that system, which may have further stages, or of the
+    end of the stage that it continues."""
     if resume.stage != index:
-        raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to be resumed")
-    if resume.system == system:
+        stages = system.all_stages()
+        if resume.stage != index - 1 or not stages[index].continues:
+            raise ValueError(f"the checkpoint is of stage {resume.stage + 1}, but stage {index + 1} was to be resumed")
+        if not resume.is_at_end:
+            raise ValueError(
+                f"the checkpoint is of iteration {resume.iteration:,} of {stages[resume.stage].iterations:,} of stage "
+                f"{resume.stage + 1}, which stage {index + 1} continues: resume that one first"
+            )
+    if resume.system == dataclasses.replace(system, more=system.more[: len(resume.system.more)]):
         return
     before, now, advice = type(resume.system), type(system), ""
     values, others = flatten_config(resume.system), flatten_config(system)
     if before is now:
         pairs = {name: (values[name], others[name]) for name in values if values[name] != others[name]}
         differing = ", ".join(f"{name} {value!r}, not {other!r}" for name, (value, other) in pairs.items())
+        if any(name.endswith("iterations") for name in pairs):
+            advice = "; for further iterations after the last call result.more(scene, iterations)"
     elif (before.__module__, before.__qualname__) == (now.__module__, now.__qualname__):  # A notebook's cell ran twice.
         differing = f"the class {now.__name__} as it was before it was defined again"
         advice = f", or with load_checkpoint(path, {now.__name__}) of what save_checkpoint wrote, for the new class"

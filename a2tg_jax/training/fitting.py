@@ -3,10 +3,13 @@
 import dataclasses
 import os
 import warnings
+from typing import Any
+
+import jax
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind, kind_of
-from a2tg_jax.core.gaussians import check_process
+from a2tg_jax.core.gaussians import Gaussians, check_process
 from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.text import counted, in_bytes, shortened
@@ -17,7 +20,7 @@ from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, Stag
 from a2tg_jax.training.options import System
 from a2tg_jax.training.reports import RestOfRun
 from a2tg_jax.training.stage import BACKGROUNDS
-from a2tg_jax.training.start import check_loss_data, check_start, check_views
+from a2tg_jax.training.start import check_loss_data, check_start, check_views, given_start
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,6 +50,38 @@ class FitResult:
     """The system that was trained."""
     stages: tuple[StageResult, ...]
     """Stages that were trained; if training was resumed in a later stage, the earlier ones are missing."""
+    checkpoint: Checkpoint | None = None
+    """State at the end, in the memory of the host: three times as large as the model, for `more`."""
+
+    def more(self, scene: Scene, iterations: int, **options: Any) -> "FitResult":
+        """Continue the last stage for further iterations.
+
+        It begins with the state at its end, Adam's moments and corrections included. Learning rates and all other
+        schedules stay as they were at the end. Of the stage's events, only those of every iteration happen, such as
+        noise: no Gaussians or texels are added. You can call it again on its result.
+
+        Args:
+          scene: the scene of the training.
+          iterations: number of further iterations.
+          **options: other arguments of `fit`, such as `progress` or `session`.
+
+        Returns:
+          The result, with the further stage after the others.
+
+        Raises:
+          ValueError: if the result has no `checkpoint`, and otherwise as `fit`.
+
+        Examples:
+          >>> system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=20)
+          >>> result = a2tg.fit(scene, system, progress=False).more(scene, 10, progress=False)
+          >>> [stage.name for stage in result.stages]
+          ['gaussians', 'more']
+        """
+        if self.checkpoint is None:
+            raise ValueError("the result has no checkpoint to continue from: take what fit returns")
+        system = dataclasses.replace(self.system, more=(*self.system.more, iterations))
+        further = fit(scene, system, resume=self.checkpoint, **options)
+        return dataclasses.replace(further, stages=(*self.stages, *further.stages))
 
     @property
     def model(self) -> Model:
@@ -84,6 +119,7 @@ def fit(
     scene: Scene,
     system: System,
     *,
+    start: Model | None = None,
     resume: Checkpoint | None = None,
     on_checkpoint: OnCheckpoint | None = None,
     checkpoint_every: int | None = None,
@@ -97,7 +133,11 @@ def fit(
     Args:
       scene: from `load_scene` or `synthetic_scene`.
       system: stages and options, such as `A2tg.preset("quick")`.
-      resume: a checkpoint of the same system.
+      start: the model that the first stage starts from, in the world of the scene; None: Gaussians at the scene's
+        points. Its spherical harmonics are cut off or padded with zeros to the degree at which the system begins.
+        `initial_gaussians` and `initial_opacity` do not apply. To train a result on at the rates where it ended, call
+        `FitResult.more`.
+      resume: a checkpoint of the same system, which may now have further stages (`more`).
       on_checkpoint: called with the state every `checkpoint_every` iterations and at the end of each stage. The next
         iteration reuses the state's buffers, so save or copy it in the call.
       checkpoint_every: None: at the end of each stage only.
@@ -124,29 +164,42 @@ def fit(
       >>> result.history.iteration
       array([10, 20])
     """
-    _check_arguments(scene, system, resume, checkpoint_every)
-    stages, first = system.all_stages(), 0 if resume is None else resume.stage
-    check_loss_data(scene.train, stages[first:])
-    if resume is None:
+    _check_arguments(scene, system, start, resume, checkpoint_every)
+    stages, first = system.all_stages(), 0
+    if resume is not None:
+        if start is not None:
+            raise ValueError("start and resume are both given, but a checkpoint has its own model: leave out start")
+        first = resume.stage
+        # Nothing is left of a finished stage that the next one continues.
+        if first + 1 < len(stages) and stages[first + 1].continues and resume.is_at_end:
+            first += 1
+        check_resume(resume, system, first)
+    elif start is None:
         check_start(scene, system)
     else:
-        check_resume(resume, system, first)
+        start = given_start(start, scene, system, 0)
+    check_loss_data(scene.train, stages[first:])
     session = session or Session()
     results: list[StageResult] = []
     with signals.noted((signals.CTRL_C,)) as is_interrupted:
         for index in range(first, len(stages)):
-            # A checkpoint is of the first stage that is trained here.
-            start = results[-1].model if results else None
-            run = StageRun(scene, system, index, start, None if results else resume, session=session)
+            run = StageRun(scene, system, index, start, resume, session=session)
             run.train(
                 on_checkpoint, checkpoint_every, progress, is_stopped=lambda: is_interrupted() or is_stopped(),
                 on_log=on_log,
             )  # fmt: skip
-            results.append(_result_of(run, scene, is_last=index == len(stages) - 1))
-    return FitResult(system, tuple(results))
+            is_last = index == len(stages) - 1
+            results.append(_result_of(run, scene, is_last=is_last))
+            start = results[-1].model
+            resume = run.checkpoint if is_last or stages[index + 1].continues else None
+    assert resume is not None
+    # In the memory of the host, not of a GPU, which further trainings need.
+    return FitResult(system, tuple(results), dataclasses.replace(resume, state=jax.device_get(resume.state)))
 
 
-def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None, checkpoint_every: int | None) -> None:
+def _check_arguments(
+    scene: Scene, system: System, start: Model | None, resume: Checkpoint | None, checkpoint_every: int | None
+) -> None:
     """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
     check_process()
     is_path = str, os.PathLike
@@ -164,6 +217,17 @@ def _check_arguments(scene: Scene, system: System, resume: Checkpoint | None, ch
         raise ValueError(f"system must be a System; got {found}{example}")
     if resume is not None:
         check_kind("resume", resume, Checkpoint, "use load_checkpoint(path)" if isinstance(resume, is_path) else "")
+    if start is not None:
+        hints = {
+            str: "use load_model(path)",
+            os.PathLike: "use load_model(path)",
+            Gaussians: "use Model(gaussians), in the world of the scene",
+            FitResult: "use result.model, or call result.more(scene, iterations) to train on",
+            StageResult: "use result.model",
+            Checkpoint: "give it as resume",
+        }
+        hint = next((text for kind, text in hints.items() if isinstance(start, kind)), "")
+        check_kind("start", start, Model, hint)
     if checkpoint_every is not None and checkpoint_every < 1:
         raise ValueError(f"checkpoint_every must be at least 1; got {checkpoint_every}")
     system.check()
@@ -195,8 +259,8 @@ def fit_stage(
       scene: as in `fit`.
       system: as in `fit`.
       index: stage, from 0.
-      start: the model to start from; None: Gaussians at the scene's points.
-      resume: a checkpoint of this stage; None: begin it.
+      start: the model to start from, as in `fit`; not used with `resume`.
+      resume: a checkpoint of this stage, or of the end of the stage that it continues; None: begin it.
       on_checkpoint: as in `fit`.
       checkpoint_every: as in `fit`.
       on_log: as in `fit`.
@@ -222,13 +286,15 @@ def fit_stage(
       >>> len(result.history.psnr)
       2
     """
-    _check_arguments(scene, system, resume, checkpoint_every)
+    _check_arguments(scene, system, start, resume, checkpoint_every)
     stages = system.all_stages()
     if not 0 <= index < len(stages):
         raise ValueError(f"index must be in 0..{len(stages) - 1}, one of the stages; got {index}")
     check_loss_data(scene.train, stages[index : index + 1])
     if resume is not None:
         check_resume(resume, system, index)
+    elif start is not None:
+        start = given_start(start, scene, system, index)
     run = StageRun(scene, system, index, start, resume, num_restored, session)
     run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch, on_log, after)
     return _result_of(run, scene, is_last=index == len(stages) - 1)

@@ -54,6 +54,7 @@ from a2tg_jax.training.step import (
     StepInfo,
     StepSettings,
     TrainState,
+    continued_state,
     initial_state,
     jitted_step,
 )
@@ -169,7 +170,7 @@ class StageRun:
         system: the options.
         index: number of the stage in `system.all_stages()`, from 0.
         start: the model to start from; None: `resume`, or Gaussians at the scene's points.
-        resume: a checkpoint of this stage (`checkpoint.check_resume`).
+        resume: a checkpoint of this stage, or of the end of the stage that it continues (`checkpoint.check_resume`).
         num_restored: which order of the views, from 0; None: the checkpoint's order, or the first.
         session: what trainings of this process share; None: a new one.
         """
@@ -177,9 +178,11 @@ class StageRun:
         self.mesh, exchange = self.session.mesh, self.session.exchange
         self._exchange = None if exchange is None else exchange.for_batches(system.batch_size)
         self.views, self.system, self.index = scene.train, system, index
-        self.stage = system.all_stages()[index]
-        self.num_restored = (resume.num_restored if resume else 0) if num_restored is None else num_restored
-        self._earlier = resume.history if resume else History.empty()
+        stages = system.all_stages()
+        self.stage = stages[index]
+        own = resume if resume is not None and resume.stage == index else None
+        self.num_restored = (own.num_restored if own else 0) if num_restored is None else num_restored
+        self._earlier = own.history if own else History.empty()
         self._rows: list[dict[str, float]] = []
         """Rows of the history since then."""
 
@@ -196,6 +199,8 @@ class StageRun:
             check_corrections(resume.state.corrections, len(self.views))
             warn_of_uneven_rows(resume.state.model.gaussians.num, self.session.num_devices)
             state = copied(resume.state)
+            if own is None:
+                state = continued_state(stages[index - 1], self.stage, state)
         self.state = self._with_room(spread(self.mesh, state))
 
         self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))
@@ -219,7 +224,7 @@ class StageRun:
         self.time_left: datetime.timedelta | None = None
         """Remaining time of the run, about; None at the beginning."""
         self.num_regrown = self.num_compiled = 0
-        self.num_refused = resume.num_refused if resume else 0
+        self.num_refused = own.num_refused if own else 0
 
     def _with_room(self, state: TrainState) -> TrainState:
         """Return the state, padded for what events will add between steps, so that no step is compiled again."""

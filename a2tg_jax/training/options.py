@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import budget_in_bytes, bytes_per_gaussian, megabytes_of
 from a2tg_jax.core.checks import check_int, check_number, fields_of
-from a2tg_jax.events import EVERY_ITERATION, Event, StepEvent
+from a2tg_jax.events import Event
 from a2tg_jax.host.text import did_you_mean, in_bytes, shortened
 from a2tg_jax.io.config_json import changed_config, check_config, config_to_dict, flatten_config
 from a2tg_jax.rasterize.kernels.platforms import MAX_TILE_SIZE
@@ -144,8 +144,8 @@ class System:
     corrections: Corrections = dataclasses.field(default_factory=Corrections)
     """Options of exposures and poses."""
     more: tuple[int, ...] = ()
-    """Iterations of further stages. Each repeats the last stage on its model, without growth. With --resume, they are
-    added to a finished run."""
+    """Iterations of further stages, in which the last one continues at the learning rates where it ended, without
+    growth. With --resume, they are added to a finished run."""
 
     name: ClassVar[str] = ""
     """Name on the command line."""
@@ -231,7 +231,7 @@ class System:
         raise NotImplementedError(f"{type(self).__name__} must compose its stages")
 
     def all_stages(self) -> tuple[Stage, ...]:
-        """Return the stages, and the further ones of `more`.
+        """Return the stages, and the further ones of `more`, in which the last one continues.
 
         Of the last stage's events, these keep the ones of every iteration, such as noise: the others have happened.
         """
@@ -239,9 +239,8 @@ class System:
         if not self.more:
             return stages
         last = stages[-1]
-        kept = [each for each in last.events if isinstance(each, StepEvent)]
-        kept = [each for each in kept if each.times(last.iterations) == EVERY_ITERATION]
-        further = dataclasses.replace(last, events=tuple(kept), raises_sh_degree=False)
+        kept = tuple(last.events[index] for index in last.lasting())
+        further = dataclasses.replace(last, events=kept, raises_sh_degree=False, continues=True)
         names = ["more", *(f"more-{number}" for number in range(2, len(self.more) + 1))]
         pairs = zip(names, self.more, strict=True)
         return (*stages, *(dataclasses.replace(further, name=name, iterations=length) for name, length in pairs))
@@ -321,6 +320,11 @@ class System:
             raise ValueError(f"the stages of {type(self).__name__} must have different names; got {', '.join(names)}")
         for stage in self.all_stages():
             stage.check()
+        for before, stage in zip([None, *stages], stages, strict=False):
+            if stage.continues and (before is None or _kept_parts(before) != _kept_parts(stage)):
+                raise ValueError(
+                    f"stage {stage.name!r}: continues needs a stage before, of the same appearance and corrections"
+                )
         # Corrections that would do nothing.
         if self.corrections.exposure_kind != "affine" and not self.exposure:
             raise ValueError(
@@ -383,6 +387,11 @@ class System:
                     f"Gaussians of {size:,.0f} bytes when the stage {stage.name!r} begins, and {num:,} are given: "
                     "raise it, leave it out, or give fewer"
                 )
+
+
+def _kept_parts(stage: Stage) -> tuple[object, ...]:
+    """Return what a stage and one that continues it have in common."""
+    return stage.appearance, [correction.name for correction in stage.corrections]
 
 
 def like(kind: Any, other: object) -> Any:

@@ -113,6 +113,9 @@ class Stage:
     """Whether the stage begins with degree 0 and adds one after every thirtieth of its length."""
     cools_down: bool = static(default=False)
     """Whether all learning rates also fall linearly over the stage, to a tenth at its end."""
+    continues: bool = static(default=False)
+    """Whether this is the stage before for further iterations: it begins with that one's last state, Adam's moments
+    included, and all schedules, such as learning rates, stay at their end."""
 
     @property
     def statistic(self) -> Statistic | None:
@@ -235,11 +238,20 @@ class Stage:
         factor = 1 - (1 - COOLED) * progress
         return jax.tree.map(lambda rate: rate * factor.astype(jnp.result_type(rate, float)), rates)
 
+    def lasting(self) -> tuple[int, ...]:
+        """Return the indices of the events that happen after every iteration, such as noise (host)."""
+        return tuple(
+            index
+            for index, event in enumerate(self.events)
+            if isinstance(event, StepEvent) and event.times(self.iterations) == EVERY_ITERATION
+        )
+
     def clock(self) -> "Clock":
         """Return the schedule for the step (host)."""
         times = (event.times(self.iterations) if isinstance(event, StepEvent) else None for event in self.events)
         return Clock(
             num_iterations=self.iterations,
+            done=self.iterations if self.continues else 0,
             per_iteration=1.0 / self.iterations,
             log_decay=math.log(self.rates.means_final_factor),
             sh_interval=max(1, round(self.iterations / 30)),  # 1,000 of 30,000 iterations in 3DGS
@@ -252,6 +264,8 @@ class Clock(NamedTuple):
     """The schedule of a stage as numbers, traced in the step."""
 
     num_iterations: int
+    done: int
+    """Iterations of the schedules that are over when the stage begins: none, or all of them."""
     per_iteration: float
     """1 / num_iterations."""
     log_decay: float
@@ -263,6 +277,10 @@ class Clock(NamedTuple):
     largest_loss: float = math.inf
     """Largest loss; the step is not taken beyond it."""
 
+    def scheduled(self, iteration: Array) -> Array:
+        """Return the iteration of the schedules at an iteration of the stage; traced."""
+        return jnp.minimum(iteration + self.done, self.num_iterations)
+
     def progress(self, iteration: Array) -> Array:
-        """Return the share of the stage that a number of finished iterations is; traced."""
-        return jnp.clip(jnp.asarray(iteration, jnp.result_type(float)) * self.per_iteration, 0.0, 1.0)
+        """Return the share of the schedules that is over after a number of finished iterations; traced."""
+        return jnp.clip(jnp.asarray(iteration + self.done, jnp.result_type(float)) * self.per_iteration, 0.0, 1.0)

@@ -15,9 +15,13 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.pytree import combine, partition
+from a2tg_jax.core.sh import NUM_BASES
+from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.data.assembly import Sight, unseeing
 from a2tg_jax.data.scene import Scene, View, check_view
+from a2tg_jax.events import Event
 from a2tg_jax.host.text import shortened
+from a2tg_jax.io.other_programs import plain_gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.training.losses import SSIM_WINDOW
 from a2tg_jax.training.options import System
@@ -138,6 +142,92 @@ def check_views(views: tuple[View, ...]) -> None:
         check_view(view)
 
 
+def given_start(start: Model, scene: Scene, system: System, index: int) -> Model:
+    """Return a model that a stage is to start from, with spherical harmonics of the degree at which training begins.
+
+    Warns of what the stage leaves out, and of options that do not apply. Raises ValueError, naming the option, if there
+    are more Gaussians than a cap or the memory budget allows.
+    """
+    stages, start = system.all_stages(), start.live
+    stage, degree, num = stages[index], system.initial_sh_degree, start.num
+    if index and system.memory_budget is not None:
+        system.check_given_number(num)
+    for event in stage.events:
+        most = event.most_gaussians
+        if index == 0 and most is not None and num > most:
+            limit = _limit_of(event, system)
+            raise ValueError(
+                f"start must have at most {most:,} Gaussians, for which {limit} has room; got {num:,}: raise {limit}, "
+                f"or start from some of them, such as start[:{most}]"
+            )
+    if index == 0 and system.initial_gaussians not in (None, num):
+        warnings.warn(
+            f"initial_gaussians of {system.initial_gaussians:,} does not apply: training starts from the {num:,} "
+            "Gaussians of start",
+            stacklevel=3,
+        )
+    transform = scene.transform if start.origin is None else start.origin.transform
+    if not _are_close(transform, scene.transform):
+        warnings.warn(
+            "start was made in another world than the scene's, so that its Gaussians are elsewhere: give "
+            "start.transform(start.origin.transform.inverse().then(scene.transform))",
+            stacklevel=3,
+        )
+    shown = template_of(start.appearance)
+    # What the stage before ends with is meant to be replaced, such as textures by others.
+    is_expected = shown == stage.appearance or (index > 0 and shown == stages[index - 1].appearance)
+    if is_expected and start.gaussians.sh_degree == degree:
+        return start
+    if is_expected and start.appearance.coefficients is not None:
+        raise ValueError(
+            f"start has spherical harmonics of degree {start.gaussians.sh_degree} for all Gaussians, and "
+            f"{type(system).__name__} begins with degree {degree}: choose the options that it was trained with"
+        )
+    lost = left_out(start, degree, None if is_expected else stage.appearance)
+    if lost:
+        warnings.warn(f"start: stage {stage.name!r} leaves out {' and '.join(lost)}", stacklevel=3)
+    if is_expected:
+        return dataclasses.replace(start, gaussians=with_degree(start.gaussians, degree))
+    keeps_shapes = stage.appearance.exponents is not None
+    gaussians = with_degree(plain_gaussians(start, keeps_shapes=keeps_shapes), degree)
+    return dataclasses.replace(
+        start, gaussians=gaussians, appearance=start.appearance if keeps_shapes else Appearance()
+    )
+
+
+def left_out(model: Model, degree: int, template: Appearance | None) -> list[str]:
+    """Return in words what is dropped of a model that gets spherical harmonics of a degree, and an appearance of the
+    template's options, in which only the shapes of kernels are kept; None: it keeps its own."""
+    shown, lost = model.appearance, []
+    has_shapes = shown.exponents is not None
+    if has_shapes and template is not None and template.exponents is None:
+        lost.append("the shapes of its kernels (the nearest Gaussians replace them)")
+    if template is not None and (not shown.is_portable or shown.texture is not None):
+        lost.append("what its splats show besides " + ("kernels" if has_shapes else "Gaussians"))
+    if model.sh[:, NUM_BASES[degree] :].any():
+        lost.append(f"its spherical harmonics above degree {degree}")
+    return lost
+
+
+def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """Return Gaussians with spherical harmonics of another degree, cut off or padded by zeros (host)."""
+    sh = np.zeros((gaussians.num, NUM_BASES[degree], 3), gaussians.sh.dtype)
+    num = min(sh.shape[1], gaussians.sh.shape[1])
+    sh[:, :num] = np.asarray(gaussians.sh)[:, :num]
+    return dataclasses.replace(gaussians, sh=jnp.asarray(sh))
+
+
+def _are_close(one: Similarity, other: Similarity) -> bool:
+    """Return whether two similarities are equal but for rounding."""
+    pairs = zip(dataclasses.astuple(one), dataclasses.astuple(other), strict=True)
+    return all(np.allclose(a, b, rtol=1e-6, atol=1e-6) for a, b in pairs)
+
+
+def _limit_of(event: Event, system: System) -> str:
+    """Return the path of the option that bounds the number of Gaussians of an event."""
+    return f"{system.path_of(event)}.{event.limited_by}" if system.memory_budget is None else "memory_budget"
+
+
 def _rows_needed(stage: Stage, num: int, system: System) -> int:
     """Return the rows that a stage allocates for `num` Gaussians. ValueError: naming the options to change, if an event
     cannot reach its number."""
@@ -146,10 +236,9 @@ def _rows_needed(stage: Stage, num: int, system: System) -> int:
         try:
             rows = max(rows, event.num_rows(num, stage.iterations))
         except ValueError as error:
-            reason, field, path = str(error), event.limited_by, system.path_of(event)
+            reason, field, limit = str(error), event.limited_by, _limit_of(event, system)
             if not (field and reason.startswith(field)):
-                raise ValueError(f"{path}: {reason}") from error
-            limit = f"{path}.{field}" if system.memory_budget is None else "memory_budget"
+                raise ValueError(f"{system.path_of(event)}: {reason}") from error
             reason = limit + reason.removeprefix(field)
             raise ValueError(f"{reason}: raise {system.more_growth()}, or lower {limit}") from error
     return rows
@@ -171,6 +260,14 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
     divides the number of rows. ValueError: if Gaussians would be added to a model whose textures have grown.
     """
     gaussians, shapes, num = model.gaussians, model.appearance.shapes, model.gaussians.num
+    for event in stage.events:
+        most = event.most_gaussians
+        if most is not None and num > most:
+            warnings.warn(
+                f"stage {stage.name!r} begins with {num:,} Gaussians, more than the {_limit_of(event, system)} of "
+                f"{most:,}: none is added",
+                stacklevel=2,
+            )
     room = -(-_rows_needed(stage, num, system) // num_devices) * num_devices
     if shapes is not None and stage.appearance.exponents is None:
         warnings.warn(

@@ -101,6 +101,21 @@ def initial_state(stage: Stage, model: Model, names: Sequence[str] = (), origin:
     )
 
 
+def continued_state(before: Stage, stage: Stage, state: TrainState) -> TrainState:
+    """Return the state before the first iteration of a stage that continues the one before, given that one's last
+    state. Events that both stages hold continue as well."""
+    known = {id(event): own for event, own in zip(before.events, state.events, strict=True)}
+    events = []
+    for event in stage.events:
+        own = known.get(id(event))
+        is_new = own is None and stage.is_ahead(event)
+        events.append(event.init(state.model) if is_new else own)
+    # Two arrays: the step takes over each buffer once.
+    iteration = jnp.zeros((), jnp.int32)
+    status = jnp.zeros((), jnp.int32)
+    return dataclasses.replace(state, events=tuple(events), iteration=iteration, status=status)
+
+
 class BatchGradients(NamedTuple):
     """Loss and gradients of the V views of a step, [V, ...]."""
 
@@ -212,9 +227,10 @@ def attempt(
     statistic = jnp.zeros_like(colors), jnp.zeros(colors.shape[:2], bool)
     if found.statistic is not None and stage.statistic is not None:
         statistic = read_probe(found.statistic, stage.statistic, width, height)
-    now = Now(keys[1:], iteration, stage.cooled(rate, progress), jnp.asarray(clock.num_iterations), scene_scale)
+    at, length = clock.scheduled(iteration), jnp.asarray(clock.num_iterations)
+    now = Now(keys[1:], at, stage.cooled(rate, progress), length, scene_scale)
     change, events = _events(
-        settings.due, stage, clock, now, Seen(cameras, *statistic, colors), model, moments, state.events
+        settings.due, stage, clock, iteration, now, Seen(cameras, *statistic, colors), model, moments, state.events
     )
     corrections = tuple(
         updated(correction, known, rows, grad, progress)  # type: ignore[arg-type]
@@ -322,8 +338,8 @@ def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array,
 
 
 def _events(
-    due: tuple[bool, ...] | None, stage: Stage, clock: Clock, now: Now, seen: Seen, model: Model, moments: AdamState,
-    states: Sequence[Any],
+    due: tuple[bool, ...] | None, stage: Stage, clock: Clock, iteration: Array, now: Now, seen: Seen, model: Model,
+    moments: AdamState, states: Sequence[Any],
 ) -> tuple[Change, tuple[Any, ...]]:  # fmt: skip
     """Gather statistics for the events, and apply those inside the step, which must keep all shapes."""
     nothing = EventInfo(jnp.asarray(True), jnp.zeros((), jnp.int32))
@@ -353,7 +369,7 @@ def _events(
                 model, moments, state, info = apply(carry)
             elif is_due is None and state is not None:  # The step itself decides.
                 wait = lambda carry: (*carry, nothing)  # noqa: E731
-                model, moments, state, info = jax.lax.cond(times.is_due(now.iteration), apply, wait, carry)
+                model, moments, state, info = jax.lax.cond(times.is_due(iteration), apply, wait, carry)
             infos = EventInfo(infos.is_possible & info.is_possible, infos.num_refused + info.num_refused)
         left.append(state)
     return Change(model, moments, None, infos), tuple(left)
