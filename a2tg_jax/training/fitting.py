@@ -57,7 +57,7 @@ class FitResult:
         """Continue the last stage for further iterations.
 
         It begins with the state at its end, Adam's moments and corrections included. Learning rates and all other
-        schedules stay as they were at the end. Of the stage's events, only those of every iteration happen, such as
+        schedules stay as they were at the end. Of the stage's events, only the ones of every iteration happen, such as
         noise: no Gaussians or texels are added. You can call it again on its result.
 
         Args:
