@@ -251,3 +251,79 @@ def test_an_event_with_a_cap_caps_the_start():
     two = dataclasses.replace(smaller, stage2_iterations=5)
     with pytest.warns(UserWarning, match=r"begins with 40 Gaussians, more than the growing\.cap of 30: none is added"):
         fit_stage(SCENE, two, 1, fitted(system).model, progress=False)
+
+
+# Resuming with another scene
+
+
+@pytest.fixture(scope="module")
+def middle(tmp_path_factory):
+    """A checkpoint file within the first stage."""
+    path = tmp_path_factory.mktemp("middle") / "checkpoint.npz"
+
+    def keep(checkpoint):
+        if checkpoint.iteration == 5:
+            a2tg.save_checkpoint(path, checkpoint)
+
+    fitted(START, on_checkpoint=keep, checkpoint_every=5)
+    return path
+
+
+def with_first_view(**changes):
+    first, *others = SCENE.train
+    return dataclasses.replace(SCENE, train=(dataclasses.replace(first, **changes), *others))
+
+
+def resumed(scene, path):
+    return a2tg.fit(scene, START, resume=a2tg.load_checkpoint(path), progress=False, session=SESSION).model
+
+
+def test_other_views_are_named(middle):
+    first, second, *_ = SCENE.train
+    fewer = dataclasses.replace(SCENE, train=SCENE.train[1:])
+    with pytest.raises(ValueError, match=rf"trained on 5 views, and the scene has 4.*: {first.name} missing; resume"):
+        resumed(fewer, middle)
+    with pytest.raises(ValueError, match=f": {first.name} missing, x.png new; resume with"):
+        resumed(with_first_view(name="x.png"), middle)
+    turned = dataclasses.replace(SCENE, train=SCENE.train[::-1])
+    with pytest.raises(ValueError, match="their order differs"):
+        resumed(turned, middle)
+    with pytest.raises(ValueError, match=f"with other cameras of {first.name}: resume"):
+        resumed(with_first_view(camera=second.camera), middle)
+
+
+def test_exchanged_photographs_and_masks_are_named(middle):
+    first, second, *_ = SCENE.train
+    with pytest.warns(UserWarning, match=f"have changed since the checkpoint was made: {first.name}; what"):
+        resumed(with_first_view(picture=second.picture), middle)
+    mask = np.ones((30, 40), bool)
+    mask[0, 0] = False
+    with pytest.warns(UserWarning, match=f"have changed since the checkpoint was made: {first.name}; what"):
+        resumed(with_first_view(mask=a2tg.Mask.of(mask)), middle)
+
+
+def test_pixels_are_the_same_wherever_they_are_kept(middle):
+    """A copy in memory, and pixels of which nothing is known because nobody has read them."""
+    wanted = bits_of(fitted(START).model)
+    first = SCENE.train[0]
+    assert bits_of(resumed(with_first_view(picture=a2tg.Picture.of(first.picture.read().copy())), middle)) == wanted
+    unread = dataclasses.replace(first.picture, checksum=None)
+    assert bits_of(resumed(with_first_view(picture=unread), middle)) == wanted
+
+
+def test_checkpoints_without_a_record_of_the_views_are_resumed(middle, tmp_path):
+    """As earlier versions wrote them."""
+    kept = dataclasses.replace(a2tg.load_checkpoint(middle), views=None)
+    a2tg.save_checkpoint(tmp_path / "old.npz", kept)
+    again = a2tg.load_checkpoint(tmp_path / "old.npz")
+    assert again.views is None
+    assert bits_of(resumed(SCENE, tmp_path / "old.npz")) == bits_of(fitted(START).model)
+
+
+@pytest.mark.parametrize("name", ["viewmats", "Ks", "sizes", "pixels", "masks"])
+def test_a_damaged_record_of_the_views_is_named(middle, tmp_path, name):
+    kept = a2tg.load_checkpoint(middle)
+    views = dataclasses.replace(kept.views, **{name: getattr(kept.views, name)[1:]})
+    a2tg.save_checkpoint(tmp_path / "damaged.npz", dataclasses.replace(kept, views=views))
+    with pytest.raises(ValueError, match=rf"damaged\.npz: views\.{name} must"):
+        a2tg.load_checkpoint(tmp_path / "damaged.npz")

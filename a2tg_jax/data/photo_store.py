@@ -57,6 +57,8 @@ class Picture:
     """Type of the pixels."""
     is_remote: bool = False
     """Whether reading waits for object storage."""
+    checksum: int | None = None
+    """CRC-32 of its pixels; None if they have not been read."""
 
     @staticmethod
     def of(pixels: "np.ndarray | Picture") -> "Picture":
@@ -77,7 +79,7 @@ class Picture:
             raise ValueError(f"{wanted}; got {pixels.dtype} {[*pixels.shape]}{advice}")
         if is_grey:  # A view of the same memory with three equal channels.
             pixels = np.broadcast_to(np.reshape(pixels, (*pixels.shape[:2], 1)), (*pixels.shape[:2], 3))
-        return Picture(pixels.shape, lambda: pixels, True, pixels.dtype)
+        return Picture(pixels.shape, lambda: pixels, True, pixels.dtype, checksum=_checksum(pixels))
 
     def __deepcopy__(self, memo: object) -> "Picture":
         """Return the picture itself, which nothing changes."""
@@ -134,6 +136,11 @@ class Mask:
     def is_full(self) -> bool:
         """Whether all pixels count."""
         return self.num == self.shape[0] * self.shape[1]
+
+    @property
+    def checksum(self) -> int:
+        """CRC-32 of its bits."""
+        return zlib.crc32(zlib.decompress(self.data))
 
     def read(self) -> np.ndarray:
         """Return [H, W] bool."""
@@ -252,10 +259,11 @@ class Shelf:
 
     def _left(self, pixels: np.ndarray, source: Path, view: Processing | None) -> Picture:
         """Return a picture of pixels without room in memory. Arguments as for `keep`."""
+        checksum = _checksum(pixels)
         if view is None or (is_remote(source) and not self._takes_disk(pixels.nbytes)):
             # docs/reliability.md, "Photographs beyond the memory"
-            checksum = zlib.crc32(np.ascontiguousarray(pixels).data)
-            return Picture(pixels.shape, _FileRead(source, view, checksum), is_remote=is_remote(source))
+            read_again = _FileRead(source, view, checksum)
+            return Picture(pixels.shape, read_again, is_remote=is_remote(source), checksum=checksum)
         folder, shape = cache_folder(), pixels.shape
         try:
             with self._lock:
@@ -279,7 +287,7 @@ class Shelf:
                 file.readinto(again)  # type: ignore[attr-defined]
             return again
 
-        return Picture(shape, read)
+        return Picture(shape, read, checksum=checksum)
 
     def _takes_disk(self, num_bytes: int) -> bool:
         """Reserve bytes in the share of the disk for pictures of remote files; return whether it had them.
@@ -300,6 +308,10 @@ class Shelf:
             return True
 
 
+def _checksum(pixels: np.ndarray) -> int:
+    return zlib.crc32(np.ascontiguousarray(pixels).data)
+
+
 def _read_file(source: Path, view: Processing | None) -> np.ndarray:
     stored = read_pixels(source)
     return np.ascontiguousarray(stored if view is None else view(stored))
@@ -315,6 +327,6 @@ class _FileRead:
 
     def __call__(self) -> np.ndarray:
         pixels = _read_file(self.source, self.view)
-        if zlib.crc32(pixels.data) != self.checksum:
+        if _checksum(pixels) != self.checksum:
             raise ValueError(f"{self.source}: has changed since the scene was loaded; restore it or start again")
         return pixels

@@ -23,6 +23,7 @@ from a2tg_jax.io.validate import check_count, check_finite, check_like, check_mo
 from a2tg_jax.model import Model
 from a2tg_jax.training.corrections import initial_corrections
 from a2tg_jax.training.options import System
+from a2tg_jax.training.recorded_views import RecordedViews
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.stage import Stage
 from a2tg_jax.training.step import EXPLODED, TrainState, initial_state
@@ -125,6 +126,8 @@ class Checkpoint:
     """Devices that trained it; other devices can resume it."""
     num_refused: int = 0
     """Number of Gaussians so far that were not added for lack of room."""
+    views: RecordedViews | None = None
+    """The training views, with checksums of their photographs; None if they are unknown."""
 
     @property
     def iteration(self) -> int:
@@ -183,9 +186,12 @@ def save_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> Non
         "devices": config_to_dict(checkpoint.devices),
         "num_refused": checkpoint.num_refused,
         "terms": [*checkpoint.history.terms],
+        "views": None if checkpoint.views is None else checkpoint.views.names,
     }
     shown = arrays_of(model.appearance, model.gaussians.sh_degree)
     arrays = {f"{SHOWN}{name}": array for name, array in shown.items()}
+    if checkpoint.views is not None:
+        arrays |= {f"{VIEWS}{name}": array for name, array in checkpoint.views.arrays.items()}
     state = dataclasses.replace(state, moments=_packed(model, state.moments))
     rest = _rest(state), dataclasses.asdict(checkpoint.history)
     for place, leaf in jax.tree_util.tree_leaves_with_path((model.gaussians, rest)):
@@ -247,13 +253,19 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], option
         check_count(name, count, np.iinfo(np.int32).max)
     machine = config_from_dict(Machine, header["machine"], "machine")
     devices = config_from_dict(Devices, header["devices"], "devices")
-    return Checkpoint(options, index, state, history, machine=machine, devices=devices, **counts)
+    views = None
+    if header.get("views") is not None:  # Checkpoints of earlier versions do not record them.
+        own = {name.removeprefix(VIEWS): array for name, array in arrays.items() if name.startswith(VIEWS)}
+        views = RecordedViews.of_arrays(header["views"], own)
+    return Checkpoint(options, index, state, history, machine=machine, devices=devices, views=views, **counts)
 
 
 LONGEST_DIFFERENCE = 300
 """Largest number of characters of the options that differ from a checkpoint's."""
 SHOWN = "shown/"
 """Prefix of the names of appearance arrays."""
+VIEWS = "views/"
+"""Prefix of the names of arrays about the training views."""
 
 
 def _rest(state: TrainState) -> tuple[object, ...]:

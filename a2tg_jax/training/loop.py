@@ -41,6 +41,7 @@ from a2tg_jax.training.checkpoint import COLUMNS, TERM, Checkpoint, History, Int
 from a2tg_jax.training.corrections import check_corrections
 from a2tg_jax.training.divergence import DivergedError, largest_loss, what_diverged
 from a2tg_jax.training.options import System
+from a2tg_jax.training.recorded_views import RecordedViews
 from a2tg_jax.training.reports import LearningCheck, ProgressBar, RestOfRun, StageEffects
 from a2tg_jax.training.returned import calling, checked_change
 from a2tg_jax.training.stage import BACKGROUNDS
@@ -178,6 +179,7 @@ class StageRun:
         self.mesh, exchange = self.session.mesh, self.session.exchange
         self._exchange = None if exchange is None else exchange.for_batches(system.batch_size)
         self.views, self.system, self.index = scene.train, system, index
+        self._recorded_views = RecordedViews.of(scene.train)
         stages = system.all_stages()
         self.stage = stages[index]
         own = resume if resume is not None and resume.stage == index else None
@@ -197,6 +199,8 @@ class StageRun:
             state = initial_state(self.stage, spread(self.mesh, model), names, start.origin)
         else:
             check_corrections(resume.state.corrections, len(self.views))
+            if resume.views is not None:
+                resume.views.check(self.views)
             warn_of_uneven_rows(resume.state.model.gaussians.num, self.session.num_devices)
             state = copied(resume.state)
             if own is None:
@@ -261,7 +265,7 @@ class StageRun:
         """Present state; the next step reuses its buffers."""
         return Checkpoint(
             self.system, self.index, readable(self.state), self.history, self.num_restored,
-            devices=self.session.devices, num_refused=self.num_refused,
+            devices=self.session.devices, num_refused=self.num_refused, views=self._recorded_views,
         )  # fmt: skip
 
     def train(

@@ -1,0 +1,95 @@
+"""Training views as checkpoints record them, so that training is resumed with the same ones."""
+
+import dataclasses
+import warnings
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from a2tg_jax.core.checks import check_shape
+from a2tg_jax.data.scene import View
+from a2tg_jax.host.text import first_names, shortened
+
+UNKNOWN = -1
+"""Checksum of pixels that were not read, or of a missing mask."""
+CAMERA_TOLERANCE = 1e-4
+"""Difference of cameras by which two machines may disagree."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RecordedViews:
+    """What tells V training views from others, in their order; numpy arrays."""
+
+    names: tuple[str, ...]
+    viewmats: np.ndarray
+    """[V, 4, 4] world to camera, as the scene gives them."""
+    Ks: np.ndarray
+    """[V, 3, 3]"""
+    sizes: np.ndarray
+    """[V, 2] (height, width)."""
+    pixels: np.ndarray
+    """[V] CRC-32 of the pixels of the photographs."""
+    masks: np.ndarray
+    """[V] CRC-32 of the masks."""
+
+    @staticmethod
+    def of(views: Sequence[View]) -> "RecordedViews":
+        """Return the record of some views; no photograph is read."""
+        pixels = [UNKNOWN if view.picture.checksum is None else view.picture.checksum for view in views]
+        masks = [UNKNOWN if view.mask is None else view.mask.checksum for view in views]
+        return RecordedViews(
+            names=tuple(view.name for view in views),
+            viewmats=np.array([view.camera.viewmat for view in views], np.float64),
+            Ks=np.array([view.camera.K for view in views], np.float64),
+            sizes=np.array([view.picture.size for view in views], np.int64),
+            pixels=np.array(pixels, np.int64),
+            masks=np.array(masks, np.int64),
+        )
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays by name."""
+        return {name: getattr(self, name) for name in ("viewmats", "Ks", "sizes", "pixels", "masks")}
+
+    @staticmethod
+    def of_arrays(names: object, arrays: Mapping[str, np.ndarray]) -> "RecordedViews":
+        """Return the record of names and `arrays` from a file. ValueError: they do not fit each other."""
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"views must be a list of names; got {shortened(names)}")
+        shapes = {"viewmats": (4, 4), "Ks": (3, 3), "sizes": (2,), "pixels": (), "masks": ()}
+        for name, shape in shapes.items():
+            check_shape(f"views.{name}", arrays[name], (len(names), *shape))
+            if arrays[name].dtype.kind not in "if":
+                raise ValueError(f"views.{name} must be numbers; got {arrays[name].dtype}")
+        return RecordedViews(tuple(names), **{name: arrays[name] for name in shapes})
+
+    def check(self, views: Sequence[View]) -> None:
+        """Raise ValueError if a training is resumed with other views, sizes or cameras; warn of other pixels."""
+        given = RecordedViews.of(views)
+        advice = "resume with the scene that it was made from, or give its model to fit as start"
+        if given.names != self.names:
+            lost = [name for name in self.names if name not in given.names]
+            new = [name for name in given.names if name not in self.names]
+            parts = [f"{first_names(found)} {verb}" for found, verb in ((lost, "missing"), (new, "new")) if found]
+            what = ", ".join(parts) or "their order differs"
+            raise ValueError(
+                f"the checkpoint was trained on {len(self.names)} views, and the scene has {len(given.names)} to train "
+                f"on: {what}; {advice}"
+            )
+        differ = (self.sizes != given.sizes).any(axis=1)
+        for own, other in ((self.viewmats, given.viewmats), (self.Ks, given.Ks)):
+            is_close = np.isclose(own, other, rtol=CAMERA_TOLERANCE, atol=CAMERA_TOLERANCE)
+            differ |= ~is_close.all(axis=(1, 2))
+        if differ.any():
+            raise ValueError(f"the checkpoint was trained with other cameras of {self._named(differ)}: {advice}")
+        is_known = (self.pixels != UNKNOWN) & (given.pixels != UNKNOWN)
+        changed = (is_known & (self.pixels != given.pixels)) | (self.masks != given.masks)
+        if changed.any():
+            warnings.warn(
+                f"photographs or masks have changed since the checkpoint was made: {self._named(changed)}; what was "
+                "learned from the former ones stays in the model",
+                stacklevel=3,
+            )
+
+    def _named(self, chosen: np.ndarray) -> str:
+        return first_names([self.names[index] for index in np.flatnonzero(chosen)])
