@@ -182,13 +182,57 @@ def test_attributes_that_are_not_read_are_named(tmp_path):
     rows = np.ones((2, len(names)))
     rows[:, [names.index("scale_2"), names.index("filter_3D")]] = -20, 0
     write_ply(tmp_path / "g.ply", names, rows)
-    with pytest.warns(UserWarning, match=r"g\.ply: does not read beta, f_offset_\*; if the program") as told:
+    with pytest.warns(
+        UserWarning, match=r"g\.ply: does not read beta, f_offset_0 to f_offset_1; if the program"
+    ) as told:
         load_ply(tmp_path / "g.ply")
     assert "filter" not in str(told[0].message) and "red" not in str(told[0].message)
     names = ["x", "y", "z", "f_anchor_feat_0", "opacity", "scale_0", "scale_1"]
     write_ply(tmp_path / "g.ply", names, np.zeros((2, len(names))))
     with pytest.raises(ValueError, match=r"no attribute f_dc_0.*networks make splats of these anchors"):
         load_ply(tmp_path / "g.ply")
+
+
+def test_text_with_blank_lines_and_words_for_nan(tmp_path):
+    """Programs of Microsoft's compiler write NaN as -nan(ind) or 1.#QNAN."""
+    rows = np.random.default_rng(0).normal(size=(5, len(ATTRIBUTES)))
+    write_ply(tmp_path / "whole.ply", ATTRIBUTES, rows[:2], "ascii")
+    write_ply(tmp_path / "g.ply", ATTRIBUTES, rows, "ascii")
+    text = (tmp_path / "g.ply").read_text()
+    for row, word in zip(rows[2:], ("-nan(ind)", "1.#QNAN", "nan"), strict=True):
+        text = text.replace(repr(float(np.float32(row[0]))), word)
+    header, body = text.split("end_header\n")
+    (tmp_path / "g.ply").write_text(header + "end_header\n\n" + body.replace("\n", "\n \n"))
+    with pytest.warns(UserWarning, match="3 Gaussians of 5 left out"):
+        assert_same(load_ply(tmp_path / "g.ply"), load_ply(tmp_path / "whole.ply"))
+
+
+@pytest.mark.parametrize("words", [" 7", " x", ""])
+def test_rows_of_text_with_another_number_of_numbers_are_named(tmp_path, words):
+    rows = np.ones((3, len(ATTRIBUTES)))
+    write_ply(tmp_path / "g.ply", ATTRIBUTES, rows, "ascii")
+    *lines, second, _ = (tmp_path / "g.ply").read_text().splitlines(keepends=True)
+    wrong = second.rstrip() + words if words else second.rpartition(" ")[0]
+    (tmp_path / "g.ply").write_text("".join([*lines, wrong + "\n", second]))
+    with pytest.raises(ValueError, match=r"g\.ply: row 1 \(from 0\) of vertex must be 61 numbers; got 1\.0 1\.0"):
+        load_ply(tmp_path / "g.ply")
+
+
+def test_elements_before_the_vertices_are_skipped(tmp_path):
+    write_ply(tmp_path / "g.ply", ATTRIBUTES, np.random.default_rng(0).normal(size=(3, len(ATTRIBUTES))))
+    data = (tmp_path / "g.ply").read_bytes()
+    element = b"element camera 2\nproperty double focal\nproperty uchar id\nelement vertex"
+    header, body = data.replace(b"element vertex", element).split(b"end_header\n", 1)
+    (tmp_path / "h.ply").write_bytes(header + b"end_header\n" + bytes(2 * 9) + body)
+    assert_same(load_ply(tmp_path / "h.ply"), load_ply(tmp_path / "g.ply"))
+    (tmp_path / "h.ply").write_bytes(
+        (header + b"end_header\n" + bytes(2 * 9) + body).replace(b"uchar id", b"list uchar int id")
+    )
+    with pytest.raises(ValueError, match="cannot read the camera property 'list uchar int id'"):
+        load_ply(tmp_path / "h.ply")
+    (tmp_path / "h.ply").write_bytes(data.replace(b"format binary_little_endian 1.0\n", b""))
+    with pytest.raises(ValueError, match="has no format line"):
+        load_ply(tmp_path / "h.ply")
 
 
 def test_a_third_scale_of_0_is_flat(tmp_path):
@@ -270,7 +314,7 @@ def test_ply_of_a_model_is_in_its_original_world(tmp_path):
         (lambda path: path.write_bytes(b"not a ply\n"), "is not a PLY file"),
         (
             lambda path: path.write_bytes(path.read_bytes().replace(b"binary_little_endian", b"ascii")),
-            "a line of it is",
+            r"row \d+ \(from 0\) of vertex must be",
         ),
         (lambda path: path.write_bytes(b"ply\nformat binary_little_endian 1.0\n"), "header does not end"),
         (lambda path: path.write_bytes(path.read_bytes()[:-1]), "is cut off"),

@@ -237,7 +237,6 @@ def test_a_model_of_wrong_shapes_is_not_written(tmp_path):
 # The value
 
 
-@pytest.mark.long
 def test_rows_of_another_number_are_refused(tmp_path):
     """Both numbers are named; four textures of seven Gaussians would otherwise move to the wrong ones."""
     textures, few = textures_from_arrays(some_textures()), textures_from_arrays(some_textures(4))
@@ -265,6 +264,7 @@ def test_rows_of_another_number_are_refused(tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("x64")
 def test_a_moved_model_shows_the_same_to_its_cameras():
     scene = draw_scene(9)

@@ -1,6 +1,8 @@
 """Untrusted PLY files: their header and tables, and points with colours from them."""
 
+import itertools
 import os
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import BinaryIO
@@ -19,6 +21,8 @@ NUMPY_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 PLY_TYPES = dict(zip(OLD_TYPES + NEW_TYPES, NUMPY_TYPES * 2, strict=True))
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 LONGEST_LINE, MOST_LINES, MOST_DIGITS = 4096, 10_000, 20
+NOT_NUMBERS = re.compile(rb"[+-]?(1\.#\w+|nan\(\w*\))", re.IGNORECASE)
+"""Words such as -nan(ind) and 1.#QNAN."""
 OFFSET = "offset"
 """First word of the comment with the origin of positions."""
 ROTATION = "rotation"
@@ -84,11 +88,17 @@ class PlyFile:
             raise ValueError(f"{self.path}: has no attribute {', '.join(missing)}; {wanted} is expected")
 
     def require_vertices(self, names: Iterable[str], wanted: str) -> None:
-        """Raise ValueError unless vertices come first, can be read and have the named properties."""
-        if [*self.counts][:1] != ["vertex"] or not self.encoding:
-            found = shortened([*self.counts])
-            raise ValueError(f"{self.path}: vertices must be the first element of the PLY; it has {found}")
+        """Skip what is before the vertices. Raise ValueError unless all that can be read, and they have the named
+        properties."""
+        if not self.encoding:
+            raise ValueError(f"{self.path}: its PLY header has no format line")
+        if "vertex" not in self.counts:
+            raise ValueError(f"{self.path}: has no vertices; its elements are {shortened([*self.counts])}")
         self.require("vertex", names, wanted)
+        for element in itertools.takewhile(lambda name: name != "vertex", self.counts):
+            self.require(element, (), wanted)
+            if self.fields[element]:
+                self.read(element)
 
     def read(self, element: str) -> np.ndarray:
         """Return the structured rows [count] of the next element, which must be required before; float64 from text.
@@ -110,13 +120,23 @@ class PlyFile:
         if not is_text:
             return np.frombuffer(self._file.read(count * size), dtype, count)
         rows = np.empty((count, len(fields)))
-        try:
-            for row in rows:
-                row[:] = [float(word) for word in self._file.readline(LONGEST_LINE).split()[: len(fields)]]
-        except ValueError:
-            raise ValueError(
-                f"{self.path}: a line of it is not a {element} of {len(fields)} numbers; export it again"
-            ) from None
+        for index in range(count):
+            line = self._file.readline(LONGEST_LINE)
+            while line.isspace():
+                line = self._file.readline(LONGEST_LINE)
+            # As programs of Microsoft's compiler write NaN and infinity.
+            words = [b"nan" if NOT_NUMBERS.fullmatch(word) else word for word in line.split()]
+            try:
+                numbers = [float(word) for word in words]
+            except ValueError:
+                numbers = []
+            if len(numbers) != len(fields):
+                found = shortened(line.decode("ascii", "replace")) or "the end of the file"
+                raise ValueError(
+                    f"{self.path}: row {index:,} (from 0) of {element} must be {len(fields)} numbers; got {found}; "
+                    "export it again"
+                )
+            rows[index] = numbers
         return rows.view([(name, np.float64) for name in fields])[:, 0]
 
     @property

@@ -5,10 +5,11 @@ axis; the model keeps its place in it. Positions that a format would round too f
 are relative to an offset.
 """
 
+import collections
 import dataclasses
 import math
 import os
-import re
+import string
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple
@@ -421,11 +422,15 @@ def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.
 
 def warn_of_unread(names: Iterable[str], path: str | os.PathLike[str]) -> None:
     """Warn of the attributes of a file's Gaussians that are not read, unless there are none; f_rest_* is read."""
-    # Many names differ in a number only.
-    kinds = sorted({re.sub(r"_\d+$", "_*", name) for name in names} - {"f_rest_*"})
+    # Many names differ in a number only, and f_offset_9 comes before f_offset_10.
+    by_stem = collections.defaultdict(list)
+    for name in sorted(names, key=lambda name: (len(name), name)):
+        by_stem[name.rstrip(string.digits)].append(shortened(name))
+    by_stem.pop("f_rest_", None)
+    kinds = [own[0] if len(own) == 1 else f"{own[0]} to {own[-1]}" for own in by_stem.values()]
     if kinds:
         message = (
-            f"{os.fspath(path)}: does not read {first_names([shortened(kind) for kind in kinds])}; if the program that "
+            f"{os.fspath(path)}: does not read {first_names(kinds)}; if the program that "
             "wrote the file draws by these attributes, its Gaussians look different here"
         )
         warnings.warn(message, stacklevel=5)
