@@ -16,7 +16,7 @@ from a2tg_jax.appearance.base import check_appearance, check_arrays_given, join_
 from a2tg_jax.appearance.parts import MAX_DEGREE, bands_of_dense, degrees_of_sizes, dense_bands
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import check_kind, check_unmasked, short_repr
+from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked, short_repr
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.notebook_display import html_table
 from a2tg_jax.core.origin import BLACK, Color, Origin
@@ -172,8 +172,10 @@ class Model:
         return np.concatenate([own, dense], axis=1, dtype=own.dtype)[:, : NUM_BASES[highest]]
 
     def with_sh(self, sh: np.ndarray) -> "Model":
-        """Return the same model with other spherical harmonics, as `sh` gives them; degrees stay (host)."""
+        """Return the same model with other spherical harmonics, as `sh` gives them; degrees stay (host). ValueError:
+        they have another shape."""
         base = self.gaussians.sh_degree
+        check_shape("sh", sh, (self.gaussians.num, "K", 3))
         own = jnp.asarray(sh[:, : NUM_BASES[base]], self.gaussians.sh.dtype)
         model = dataclasses.replace(self, gaussians=dataclasses.replace(self.gaussians, sh=own))
         if self.appearance.coefficients is None:

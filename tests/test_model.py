@@ -250,6 +250,8 @@ def test_rows_of_another_number_are_refused(tmp_path):
         model.appearance.with_coefficients(coefficients)
     with pytest.raises(ValueError, match=r"shapes must be \[7\]; got \[4\]"):
         model.appearance.with_shapes(jnp.zeros(4))
+    with pytest.raises(ValueError, match=r"sh must be \[7, K, 3\]; got \[4, 16, 3\]"):
+        model.with_sh(np.zeros((4, 16, 3)))
     wrong = Model(some_gaussians(), Appearance(texture=Texture(few)))
     uses = {
         "rows": lambda: wrong[2:4],

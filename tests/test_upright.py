@@ -134,3 +134,9 @@ def test_the_command_line_says_how_a_file_was_turned(tmp_path, capsys):
     arguments = ["convert", str(tmp_path / "m.npz"), str(tmp_path / "m.glb"), "--world", "original"]
     assert main(arguments) == 2
     assert "--world has no effect on" in capsys.readouterr().err
+
+
+def test_a_world_of_another_name_is_refused(tmp_path):
+    for write in (a2tg.save_ply, a2tg.save_splats):
+        with pytest.raises(ValueError, match="world must be one of upright, original; got 'up'"):
+            write(tmp_path / "a.ply", a2tg.Model(some_gaussians()), world="up")

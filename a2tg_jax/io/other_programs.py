@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.appearance.parts import MAX_DEGREE, nearest_gaussians
 from a2tg_jax.core.camera_paths import upright_rotation
-from a2tg_jax.core.checks import LARGEST_NUMBER
+from a2tg_jax.core.checks import LARGEST_NUMBER, check_literal
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, SH_C0, Gaussians, check_gaussians, logit
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.sh import NUM_BASES
@@ -126,6 +126,7 @@ def world_gaussians(
     world: World = "original",
 ) -> WorldGaussians:
     """Return the Gaussians of a model without its appearance, in a file's world; arguments as in `save_ply`."""
+    check_literal("world", world, World)
     plain = plain_gaussians(gaussians)
     if transform is None and isinstance(gaussians, Model) and gaussians.origin is not None:
         transform = gaussians.origin.transform
