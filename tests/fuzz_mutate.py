@@ -4,6 +4,7 @@ Each takes the bytes of a sound file and a generator, and gives other bytes. Imp
 """
 
 import copy
+import gzip
 import io
 import json
 import re
@@ -115,6 +116,24 @@ def of_npz(data, rng):
     for _ in range(rng.integers(1, 3)):
         ENTRY_CHANGES[rng.integers(len(ENTRY_CHANGES))](entries, rng)
     return zipped(entries, zipfile.ZIP_DEFLATED if rng.random() < 0.1 else zipfile.ZIP_STORED)
+
+
+def of_zip(data, rng):
+    """One or two changes of the files of a ZIP: of JSON what it says, of others their bytes, or of their names."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    for _ in range(rng.integers(1, 3)):
+        name = list(entries)[int(rng.integers(len(entries)))]
+        if rng.random() < 0.2:
+            _move_entries(entries, rng)
+        else:
+            entries[name] = (of_json if name.endswith(".json") else of_bytes)(entries[name], rng)
+    return zipped(entries)
+
+
+def of_gzip(data, rng):
+    """A change of what a gzip stream holds, under a right checksum."""
+    return gzip.compress(of_bytes(gzip.decompress(data), rng), mtime=0)
 
 
 def of_compact(data, rng):

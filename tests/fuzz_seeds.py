@@ -2,12 +2,15 @@
 
 import dataclasses
 import shutil
+import zipfile
 from pathlib import Path
+from zipfile import ZIP_DEFLATED
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from fuzz_commands import write_runs
+from fuzz_mutate import zipped
 from fuzz_readers import PICTURES
 from PIL import Image
 from run_folders import create_run
@@ -17,6 +20,7 @@ from test_data_colmap import CAMERAS, write_scene as write_colmap
 from test_data_transforms import FOCAL, SIZE, write_blender, write_frames, write_json, write_ply
 from test_io import write_ply as write_splats
 from test_others import OTHERS
+from test_spz import SAFE_ORBIT, declaring, glb_of, gltf_of, with_records
 
 import a2tg_jax as a2tg
 from a2tg_jax import save_compact, save_gltf, save_model, save_ply
@@ -48,7 +52,7 @@ def write_seeds(folder: Path) -> None:
     """A folder for each name of `READERS`."""
     _write_scenes(folder)
     _write_pictures(folder / "pictures")
-    for name in ("models", "compact", "checkpoints", "gaussians", "ksplat", "gltf", "lpips"):
+    for name in ("models", "compact", "checkpoints", "gaussians", "ksplat", "splats", "gltf", "lpips"):
         (folder / name).mkdir()
     for name, system in SYSTEMS.items():
         model = _with_shapes(some_model(system()))
@@ -65,10 +69,27 @@ def write_seeds(folder: Path) -> None:
     shutil.copy(OTHERS / "scene.compressed.ply", folder / "gaussians" / "packed.ply")
     for file in OTHERS.glob("*.ksplat"):
         shutil.copy(file, folder / "ksplat")
+    _write_splats(folder / "splats")
+    described = gltf_of((OTHERS / "scene.spz").read_bytes(), "KHR_gaussian_splatting_compression_spz_2")
+    (folder / "gltf" / "spz.glb").write_bytes(glb_of(described))
     _write_lpips(folder / "lpips" / "squeeze.npz")
     _write_run(folder / "run")
     write_runs(folder / "commands")
     jax.clear_caches()
+
+
+def _write_splats(folder: Path) -> None:
+    """SOG, also packed and as a folder, SPZ of versions 3 and 4, also with an extension, and .splat."""
+    for name in ("scene.sog", "scene.spz"):
+        shutil.copy(OTHERS / name, folder)
+    with zipfile.ZipFile(folder / "scene.sog") as archive:
+        archive.extractall(folder)
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    (folder / "packed.sog").write_bytes(zipped({f"a/{name}": data for name, data in contents.items()}, ZIP_DEFLATED))
+    (folder / "records.spz").write_bytes(with_records(SAFE_ORBIT, declaring(4)))
+    model = a2tg.load_splats(folder / "scene.sog")
+    a2tg.save_splats(folder / "gzip.spz", model)
+    a2tg.save_splats(folder / "a.splat", model)
 
 
 def _with_shapes(model: Model) -> Model:

@@ -285,6 +285,7 @@ def of_headers() -> dict[str, tuple[bytes, str]]:
         "file above": (lambda h: h["sh0"].update(files=["../x.webp"]), "names the picture ../x.webp"),
         "file elsewhere": (lambda h: h["sh0"].update(files=["/etc/passwd"]), "names the picture /etc/passwd"),
         "file of Windows": (lambda h: h["sh0"].update(files=["..\\x.webp"]), "names the picture"),
+        "long file": (lambda h: h["sh0"].update(files=["x" * 999]), "names the picture x+…; a short name"),
         "number as a file": (lambda h: h["sh0"].update(files=[7]), "must name 1 pictures of sh0"),
         "4 bands": (lambda h: h["shN"].update(bands=4), "shN_centroids.webp is 960 pixels wide"),
         "2 bands": (lambda h: h["shN"].update(bands=2), "shN_centroids.webp is 960 pixels wide"),

@@ -128,6 +128,16 @@ def gltf_of(spz: bytes, name: str) -> dict:
     }  # fmt: skip
 
 
+def glb_of(described: dict) -> bytes:
+    """The same as a *.glb."""
+    binary = base64.b64decode(described["buffers"][0]["uri"].partition(",")[2])
+    described = described | {"buffers": [{"byteLength": len(binary)}]}
+    parts = (json.dumps(described).encode(), b" ", 0x4E4F534A), (binary, b"\0", 0x004E4942)
+    chunks = [(data + padding * (-len(data) % 4), kind) for data, padding, kind in parts]
+    body = b"".join(struct.pack("<II", len(data), kind) + data for data, kind in chunks)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
 @pytest.mark.parametrize(
     "name",
     [
@@ -139,8 +149,9 @@ def test_gltf_with_spz_inside_is_read(tmp_path, name):
     """x, y and z of the file are those of glTF, whose +y is up; here +z is up. A file that declares axes is turned."""
     plain = np.asarray(loaded(tmp_path, SCENE).means)
     for records, turned in (((), plain), ((declaring(AXES.index("RDF") + 1),), plain * [1, -1, -1])):
-        data = json.dumps(gltf_of(with_records(*records), name)).encode()
-        found = loaded(tmp_path, data, "a.gltf")
+        described = gltf_of(with_records(*records), name)
+        found = loaded(tmp_path, glb_of(described), "a.glb")
+        assert found == loaded(tmp_path, json.dumps(described).encode(), "a.gltf")
         np.testing.assert_allclose(found.means, turned @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]).T, atol=1e-6)
         assert found.sh.shape == (90, 16, 3)
 

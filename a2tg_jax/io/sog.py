@@ -31,6 +31,7 @@ from a2tg_jax.host.regular_files import read_regular, room_of
 from a2tg_jax.host.text import PROGRAM, shortened
 from a2tg_jax.io import other_programs as others
 from a2tg_jax.io.columns import LARGEST_FLOAT, LONGEST_WEBP_SIDE
+from a2tg_jax.io.gltf_container import LONGEST_NAME
 from a2tg_jax.io.ply import place_marks
 from a2tg_jax.io.validate import existing_bytes, reading
 from a2tg_jax.model import Model
@@ -159,8 +160,11 @@ def _named_pictures(header: dict[str, Any]) -> list[str]:
         if not isinstance(found, list) or len(found) != count or not all(isinstance(name, str) for name in found):
             raise ValueError(f"{HEADER} must name {count} pictures of {group}; got {shortened(found)}")
         for name in found:
-            if PurePosixPath(name).name != name or "\\" in name or "\0" in name:
-                raise ValueError(f"{HEADER} names the picture {shortened(name)}; a name without folders is expected")
+            is_plain = PurePosixPath(name).name == name and "\\" not in name and "\0" not in name
+            if not is_plain or len(name) > LONGEST_NAME:
+                raise ValueError(
+                    f"{HEADER} names the picture {shortened(name)}; a short name without folders is wanted"
+                )
         names += found
     return names
 
