@@ -10,6 +10,7 @@ from test_compact import MODELS, plain, textured
 from test_gltf import assert_shows_the_same
 
 from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.io import usd_fields
 from a2tg_jax.io.other_programs import joined_parts, matrix_of, upright
 from a2tg_jax.io.usd import load_usd, save_usd
 from a2tg_jax.model import Model
@@ -179,6 +180,15 @@ def test_files_that_are_cut_off(tmp_path, suffix):
         refused(path, "not a USD file, or is damaged|holds no splats")
     with pytest.raises(FileNotFoundError, match="no such USD file"):
         load_usd(tmp_path / f"none{suffix}")
+
+
+def test_a_file_that_ends_usd_core_is_refused(tmp_path, monkeypatch):
+    save_usd(tmp_path / "m.usdc", Model(some_gaussians(3)))
+    crash = tmp_path / "crash.py"
+    crash.write_text("import ctypes; ctypes.string_at(0)")
+    monkeypatch.setattr(usd_fields, "__file__", str(crash))
+    with pytest.raises(ValueError, match=r"m\.usdc: .*is damaged \(usd-core ended with status -11\)"):
+        load_usd(tmp_path / "m.usdc")
 
 
 def test_without_usd_core_the_error_says_what_to_install(tmp_path, monkeypatch):

@@ -207,6 +207,15 @@ def test_a_damaged_video_of_any_name_comes_with_advice(tmp_path, suffix, data):
         a2tg.run_sfm(tmp_path / f"clip.{suffix}", tmp_path / "scene", progress=False)
 
 
+def test_a_video_in_an_unknown_codec_is_named(tmp_path):
+    """FFmpeg lists its stream, which has no size."""
+    encode(tmp_path / "a.avi", [np.zeros((HEIGHT, WIDTH))] * 2)
+    data = (tmp_path / "a.avi").read_bytes()
+    (tmp_path / "a.avi").write_bytes(data.replace(b"FMP4", b"ZZZZ"))
+    with pytest.raises(ValueError, match=r"a\.avi: has no video stream that can be decoded; convert it: ffmpeg"):
+        extract_frames(tmp_path / "a.avi", tmp_path / "frames", 5, progress=False)
+
+
 def test_what_is_no_video_is_named(tmp_path):
     pytest.importorskip("av", reason="the extra [video] is not installed")
     write_video(tmp_path / "other.mp4")

@@ -133,7 +133,9 @@ def _chosen_stream(video: Path) -> tuple[int, tuple[int, int]]:
     """Return the index of the largest stream that is no single picture, such as a cover, and (width, height) of its
     frames with square pixels."""
     with _opened(video) as container:
-        streams = [stream for stream in container.streams.video if not stream.disposition & STILLS]
+        # A stream without a codec is one that FFmpeg cannot decode.
+        known = [stream for stream in container.streams.video if stream.codec_context is not None]
+        streams = [stream for stream in known if not stream.disposition & STILLS]
         if len(streams) > 1:
             counts = {stream.index: 0 for stream in streams}
             for packet in container.demux(streams):
@@ -142,7 +144,7 @@ def _chosen_stream(video: Path) -> tuple[int, tuple[int, int]]:
                     break
             streams = [stream for stream in streams if counts[stream.index] > 1] or streams
         if not streams:
-            raise ValueError(f"{video}: has no video stream")
+            raise ValueError(f"{video}: has no video stream that can be decoded; {_conversion(video)}")
         chosen = max(streams, key=lambda stream: int(stream.width * stream.height))
         if len(streams) > 1:
             found = ", ".join(f"{stream.index} ({stream.width}x{stream.height})" for stream in streams)

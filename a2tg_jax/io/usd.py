@@ -7,7 +7,10 @@ the first two axes. It cannot hold textures. The library usd-core reads and writ
 import json
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +20,10 @@ from a2tg_jax.core.origin import BLACK
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.json_text import parse_json
+from a2tg_jax.host.npz import read_npz
 from a2tg_jax.host.regular_files import MOST_ARRAY_BYTES, expanded, is_regular, open_regular
 from a2tg_jax.host.text import shortened
-from a2tg_jax.io import other_programs as others
+from a2tg_jax.io import other_programs as others, usd_fields
 from a2tg_jax.io.model_file import background_of, origin_of
 from a2tg_jax.io.validate import check_model, check_suffix, live_model, reading
 from a2tg_jax.model import Model
@@ -132,76 +136,64 @@ def load_usd(path: str | os.PathLike[str]) -> Model:
       ValueError: if usd-core is missing, or the file is not USD, is damaged, or holds no splats.
     """
     check_suffix(path, "load_usd")
-    usd, path = import_usd(), expanded(path)
+    import_usd()
+    path = expanded(path)
     if not is_regular(path):
         raise FileNotFoundError(f"{path}: no such USD file")
     # usd-core opens the path itself: this checks the size and the permission first.
     open_regular(path, MOST_ARRAY_BYTES).close()
     with reading(path):
-        try:
-            stage = usd.Usd.Stage.Open(str(path))
-            up: others.Up = "z" if usd.UsdGeom.GetStageUpAxis(stage) == usd.UsdGeom.Tokens.z else "y"
-            unit = float(usd.UsdGeom.GetStageMetersPerUnit(stage))
-            fields = (prim for prim in stage.Traverse() if prim.IsA(usd.UsdVol.ParticleField))
-            return others.joined_parts(
-                ((_model_of(usd, prim, path), _world_of(usd, prim, unit)) for prim in fields), up
-            )
-        except RuntimeError as error:  # usd-core's errors, which have several lines.
-            raise ValueError(f"is not a USD file, or is damaged ({shortened(str(error))})") from error
+        described, arrays = _read_apart(path)
+        up: others.Up = "z" if described["is_z_up"] else "y"
+        to_metres = np.diag([*[described["unit"]] * 3, 1.0])
+        parts = (
+            (_model_of(field, arrays, f"{index}:", path), to_metres @ np.reshape(field["matrix"], (4, 4)))
+            for index, field in enumerate(described["fields"])
+        )
+        return others.joined_parts(parts, up)
 
 
-def _world_of(usd: Any, prim: object, unit: float) -> np.ndarray:
-    """Return the matrix [4, 4] from a particle field to the world, in metres."""
-    placed = usd.UsdVol.ParticleField(prim).ComputeLocalToWorldTransform(usd.Usd.TimeCode.EarliestTime())
-    return np.diag([unit, unit, unit, 1.0]) @ np.array(placed, np.float64).T
+def _read_apart(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return what `usd_fields` reads from a file, in a process that a damaged file may end."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder, "fields.npz")
+        command = [sys.executable, "-P", usd_fields.__file__, str(path.absolute()), str(out), ORIGIN]
+        # Packages may be in places that only this process knows.
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+        done = subprocess.run(command, env=environment, capture_output=True, check=False)
+        if done.returncode:
+            reason = done.stderr.decode(errors="replace")
+            if done.returncode != usd_fields.REFUSED:
+                reason = f"usd-core ended with status {done.returncode}"
+            raise ValueError(f"is not a USD file, or is damaged ({shortened(' '.join(reason.split()))})")
+        arrays = read_npz(out)
+    return parse_json(arrays.pop("described").tobytes(), allow_nan=True), arrays
 
 
-def _model_of(usd: object, prim: Any, path: Path) -> Model:
+def _model_of(field: Mapping[str, Any], arrays: Mapping[str, np.ndarray], prefix: str, path: Path) -> Model:
     """Return the model of a particle field, in the field's own world."""
-    kernels = set(prim.GetAppliedSchemas()) & {SURFLET, ELLIPSOID}
+    kernels = {*field["schemas"]} & {SURFLET, ELLIPSOID}
     if len(kernels) != 1:
-        raise ValueError(f"its particle field {shortened(str(prim.GetPath()))} must have a kernel of Gaussians")
-    gaussians = others.gaussians_of(_splats(usd, prim, path), path, is_flat=SURFLET in kernels)
-    kept = prim.GetCustomDataByKey(ORIGIN)
-    described = parse_json(kept) if isinstance(kept, str) else {"background": BLACK}
-    # A model without an origin has a background alone.
-    origin = None if set(described) == {"background"} else origin_of(described, described)
-    model = Model(gaussians, background=background_of(described), origin=origin)
-    check_model(model)
-    return model
-
-
-def _splats(usd: Any, prim: Any, path: Path) -> others.Ellipsoids:
-    """Return the numbers of a particle field.
-
-    Attributes that are too long are cut; missing or too short ones have the schema's defaults.
-    """
-    means = _numbers(usd, prim, "positions", 3)
-    if means is None:
-        means = np.zeros((0, 3), np.float32)
-    num = len(means)
-    degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get(usd.Usd.TimeCode.EarliestTime())
-    bases = (int(degree) + 1) ** 2
-    sh = _numbers(usd, prim, "radiance:sphericalHarmonicsCoefficients", 3, num * bases)
-    if sh is None:
-        sh = np.zeros((num, 1, 3), np.float32)
+        raise ValueError(f"its particle field {shortened(field['path'])} must have a kernel of Gaussians")
+    # Missing attributes have the schema's defaults.
+    means = arrays.get(f"{prefix}positions", np.zeros((0, 3), np.float32))
+    num, degree = len(means), field["degree"]
+    if f"{prefix}sh" in arrays:
+        sh = arrays[f"{prefix}sh"].reshape(num, (degree + 1) ** 2, 3)
+        sh = sh[:, : NUM_BASES[others.degree_to_read(degree, str(path))]]
     else:
-        sh = sh.reshape(num, bases, 3)[:, : NUM_BASES[others.degree_to_read(int(degree), str(path))]]
+        sh = np.zeros((num, 1, 3), np.float32)
 
     def column(name: str, default: tuple[float, ...]) -> np.ndarray:
-        values = _numbers(usd, prim, name, len(default), num)
-        return np.tile(np.asarray(default, np.float32), (num, 1)) if values is None else values
+        return arrays.get(prefix + name, np.tile(np.asarray(default, np.float32), (num, 1)))
 
     # Quatf arrays become xyzw in NumPy.
     quats = column("orientations", (0.0, 0.0, 0.0, 1.0))[:, [3, 0, 1, 2]]
-    return others.Ellipsoids(means, quats, column("scales", (1.0, 1.0, 1.0)), column("opacities", (1.0,))[:, 0], sh)
-
-
-def _numbers(usd: Any, prim: Any, name: str, columns: int, wanted: int | None = None) -> np.ndarray | None:
-    """Return the first `wanted` rows [n, columns] of an attribute of floats, else halves; None if it is missing."""
-    # The schema's half attributes end in h; floats win if both are authored.
-    for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
-        values = attribute.Get(usd.Usd.TimeCode.EarliestTime()) if attribute else None
-        if values is not None and len(values) >= (wanted or 0):
-            return np.asarray(values).reshape(-1, columns)[:wanted].astype(np.float32)
-    return None
+    splats = others.Ellipsoids(means, quats, column("scales", (1.0, 1.0, 1.0)), column("opacities", (1.0,))[:, 0], sh)
+    gaussians = others.gaussians_of(splats, path, is_flat=SURFLET in kernels)
+    kept = {"background": BLACK} if field["origin"] is None else parse_json(field["origin"])
+    # A model without an origin has a background alone.
+    origin = None if set(kept) == {"background"} else origin_of(kept, kept)
+    model = Model(gaussians, background=background_of(kept), origin=origin)
+    check_model(model)
+    return model
