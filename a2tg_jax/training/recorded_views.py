@@ -18,7 +18,7 @@ CAMERA_TOLERANCE = 1e-4
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RecordedViews:
-    """What tells V training views from others, in their order; numpy arrays."""
+    """Names, cameras and checksums of V training views, in their order."""
 
     names: tuple[str, ...]
     viewmats: np.ndarray
