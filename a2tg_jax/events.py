@@ -19,6 +19,7 @@ from jax.typing import DTypeLike
 from a2tg_jax.appearance.base import clear_rows
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_floats, check_mask, check_shape
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import safe_divide, safe_norm
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import BLACK, Color
@@ -101,7 +102,7 @@ class Now(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Due:
+class Due(NamedFields):
     """Information for an event on the host."""
 
     index: int = 1
@@ -144,7 +145,7 @@ class Change(NamedTuple):
     You are warned if it made none in the whole stage."""
 
 
-class Event:
+class Event(NamedFields):
     """Base class of both kinds of event.
 
     Where several devices train together, the rows of arrays are spread over the devices; what `init`, `gather` and
@@ -368,7 +369,7 @@ def read_probe(found: Array, statistic: str, width: int, height: int) -> tuple[A
 
 
 @pytree
-class GradientStatistics:
+class GradientStatistics(NamedFields):
     """Sums from which each Gaussian's average gradient norm over views is computed."""
 
     total: Array

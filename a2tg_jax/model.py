@@ -18,6 +18,7 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind, check_shape, check_unmasked, short_repr
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.notebook_display import html_table
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.core.pytree import beside, partition, pytree, static
@@ -33,7 +34,7 @@ SAME_PLACE = 1e-5
 
 
 @pytree
-class Model:
+class Model(NamedFields):
     """Gaussians and their appearance, N rows each.
 
     Methods marked "(host)" read numbers of the device, and cannot be called under jit.

@@ -327,3 +327,9 @@ def test_a_damaged_record_of_the_views_is_named(middle, tmp_path, name):
     a2tg.save_checkpoint(tmp_path / "damaged.npz", dataclasses.replace(kept, views=views))
     with pytest.raises(ValueError, match=rf"damaged\.npz: views\.{name} must"):
         a2tg.load_checkpoint(tmp_path / "damaged.npz")
+
+
+@pytest.mark.parametrize("call", [lambda: a2tg.fit(SCENE, START), lambda: fit_stage(SCENE, START, 0)])
+def test_training_is_not_traced(call):
+    with pytest.raises(ValueError, match=r"^fit reads values and compiles steps of its own, so it cannot be traced"):
+        jax.jit(lambda x: x * call().model.gaussians.means)(2.0)

@@ -40,6 +40,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import FLOATS, check_shape, described
 from a2tg_jax.core.gaussians import Gaussians, logit, share
 from a2tg_jax.core.geometry import homographies
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import Integer, at_least
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
@@ -53,7 +54,7 @@ MAX_ALPHA = 0.99  # as in 3DGS
 
 
 @pytree(kw_only=True)
-class Appearance:
+class Appearance(NamedFields):
     """Plain 2D Gaussians with optional parts, and base class of other appearances."""
 
     texture: Texture | None = None

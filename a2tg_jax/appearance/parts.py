@@ -18,6 +18,7 @@ from jax.typing import ArrayLike, DTypeLike
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.checks import check_number
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, Gaussians, logit
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import Integer, within
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis
@@ -26,7 +27,7 @@ from a2tg_jax.parallel.sharded_rows import on_host, placed_like
 from a2tg_jax.texture import NEUTRAL_TEXEL, Textures, allocate_textures, check_textures
 
 
-class Part:
+class Part(NamedFields):
     """Part of an appearance: static options, and arrays with a row for each Gaussian, None until they are allocated."""
 
     def allocate(self, gaussians: Gaussians) -> Self:
@@ -60,7 +61,7 @@ EXTENT = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
-class TextureOptions:
+class TextureOptions(NamedFields):
     """Conventions of textures. The defaults follow the paper's text, `official()` the authors' program."""
 
     uv: Literal["texel-centre", "align-corners"] = "texel-centre"

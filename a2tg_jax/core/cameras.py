@@ -18,6 +18,7 @@ from a2tg_jax.core.checks import (
     make_plain,
     short_repr,
 )
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.pytree import pytree, static
 
 LONGEST_SIDE = 100_000
@@ -35,7 +36,7 @@ LARGEST_COORDINATE = LARGEST_NUMBER
 
 
 @pytree
-class Camera:
+class Camera(NamedFields):
     """One view: a pinhole camera in OpenCV's frame, x right, y down, z forward; pixel centres are at +0.5.
 
     `viewmat` and `K` are differentiable; the image size is static.

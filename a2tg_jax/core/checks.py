@@ -46,6 +46,16 @@ def check_kind(name: str, value: object, kind: type | tuple[type, ...], hint: st
     raise ValueError(f"{name} must be {' or '.join(nouns)}; got {kind_of(value)}{hint and f': {hint}'}")
 
 
+def check_untraced(call: str) -> None:
+    """Raise ValueError if a function that reads values is called by one that JAX traces."""
+    # Under jit, arrays of constants are tracers too.
+    if isinstance(jnp.zeros(()), jax.core.Tracer):
+        raise ValueError(
+            f"{call} reads values and compiles steps of its own, so it cannot be traced: call it outside jax.jit, scan "
+            "and other transformations"
+        )
+
+
 def check_literal(name: str, value: object, literal: object) -> None:
     """Raise ValueError unless a value is one of a `Literal`."""
     if value not in get_args(literal):

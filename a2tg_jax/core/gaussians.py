@@ -26,6 +26,7 @@ from a2tg_jax.core.checks import (
     plain_array,
     short_repr,
 )
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import safe_divide, safe_sqrt
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.sh import NUM_BASES
@@ -66,7 +67,7 @@ LEAST_INITIAL_COLOR = 0.05
 
 
 @pytree
-class Gaussians:
+class Gaussians(NamedFields):
     """N flat Gaussians as unconstrained arrays, all of one dtype: float32, or float64.
 
     A Gaussian at (u, v), in standard deviations from its centre, has the weight exp(−(u² + v²)/2) (2DGS, Huang et al.,

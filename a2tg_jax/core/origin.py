@@ -12,6 +12,7 @@ import numpy as np
 
 from a2tg_jax.core.camera_paths import vertical_of
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.similarity import Similarity
 
 Color = tuple[float, float, float]
@@ -21,7 +22,7 @@ WHITE: Color = (1.0, 1.0, 1.0)
 
 # eq=False: the generated == would ask arrays for one truth value, which raises.
 @dataclasses.dataclass(frozen=True, eq=False)
-class Origin:
+class Origin(NamedFields):
     """V cameras and their world, on the host. Two origins are equal if all their numbers are."""
 
     viewmats: np.ndarray

@@ -15,11 +15,12 @@ from a2tg_jax.core.cameras import MAX_SKEW
 from a2tg_jax.core.checks import LARGEST_NUMBER, check_array, check_kind, check_shape
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.geometry import fibonacci
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.sh import sh_basis
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Similarity:
+class Similarity(NamedFields):
     """Map x' = scale·rotation·x + translation, from the original world to the normalised one (or back, `inverse`).
 
     Examples:

@@ -19,6 +19,7 @@ from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_mask, check_shape, plain_array, short_repr
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved
 
@@ -44,7 +45,7 @@ class Shape(NamedTuple):
 
 
 @pytree
-class Table:
+class Table(NamedFields):
     """Blocks of all Gaussians, by size. A subclass defines how blocks are resized and what padding contains.
 
     Its floats are differentiable; `partition` keeps its integers from `jax.grad`.

@@ -18,6 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import DTypeLike
 
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.data.decoding import read_pixels
 from a2tg_jax.host.machine import memory_limit
 from a2tg_jax.host.remote_files import is_remote
@@ -44,7 +45,7 @@ def how_to_convert(values: object, name: str) -> str:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Picture:
+class Picture(NamedFields):
     """Pixels, in memory or on disk. `read` always returns the same."""
 
     shape: tuple[int, ...]
@@ -108,7 +109,7 @@ class Picture:
 
 
 @dataclasses.dataclass(frozen=True)
-class Mask:
+class Mask(NamedFields):
     """[H, W] bool, True where a pixel counts, as compressed bits. All masks of a scene take less than one
     photograph."""
 

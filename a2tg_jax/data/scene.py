@@ -12,6 +12,7 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera, check_camera, check_is_camera
 from a2tg_jax.core.checks import check_array, check_kind, check_number, check_shape
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.notebook_display import THUMBNAIL, enlarged, html_image, png
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.origin import BLACK, Origin
@@ -33,7 +34,7 @@ GENERIC_NAMES = {
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class View:
+class View(NamedFields):
     """One photograph with its camera."""
 
     name: str
@@ -89,7 +90,7 @@ class View:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(NamedFields):
     """Photographs, cameras and points in the normalised world. A value of numpy arrays, not a pytree."""
 
     name: str

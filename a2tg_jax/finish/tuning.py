@@ -18,7 +18,9 @@ from jax import Array
 
 from a2tg_jax.appearance import in_words, template_of
 from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MAX_DEGREE, MOST_SHARE
+from a2tg_jax.core.checks import check_untraced
 from a2tg_jax.core.gaussians import Gaussians, logit
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import normalize
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition, pytree
@@ -208,7 +210,7 @@ def partly_rounded(rounding: GridRounding, model: Model, is_rounded: Model) -> M
 
 
 @dataclasses.dataclass(frozen=True)
-class Tuned:
+class Tuned(NamedFields):
     """A model whose numbers are on the grids of a compact file."""
 
     model: Model
@@ -259,6 +261,7 @@ def tune_compact(
         corrections are missing.
       DivergedError: if the loss or a gradient is not finite, or the loss explodes.
     """
+    check_untraced("tune_compact")
     stage = system.stages()[-1]
     check_encodable(model.appearance)
     if iterations < 1:

@@ -34,9 +34,12 @@ def as_argument(path: Path) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return "; did you mean KNOWN?" for the known name closest to a misspelt one; empty if none is close."""
-    close = difflib.get_close_matches(name, known, n=1)
-    return f"; did you mean {close[0]}?" if close else ""
+    """Return "; did you mean KNOWN?" for the known name closest to a misspelt one, or several that are as close; empty
+    if none is close."""
+    close = sorted(difflib.get_close_matches(name, known, n=3))
+    likeness = [difflib.SequenceMatcher(None, each, name).ratio() for each in close]
+    closest = [each for each, ratio in zip(close, likeness, strict=True) if ratio == max(likeness)]
+    return f"; did you mean {' or '.join(closest)}?" if closest else ""
 
 
 def counted(num: int, noun: str) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import check_gaussians
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import parse_json
 from a2tg_jax.host.regular_files import expanded, room_of
@@ -67,7 +68,7 @@ LARGEST_CHUNK, LEAST_CHUNK = 16384, 256
 
 
 @dataclasses.dataclass(frozen=True)
-class CompactChoices:
+class CompactChoices(NamedFields):
     """Precision of each group of numbers: 1 to 16 bits, in even steps from the smallest to the largest, or floats.
 
     The defaults cost a few hundredths of a decibel.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from a2tg_jax.core.floaters import floater_scores
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import Color, Origin
 from a2tg_jax.core.similarity import Similarity, check_similarity
 from a2tg_jax.host.atomic import write_whole
@@ -26,7 +27,7 @@ REACH = 2.5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Box:
+class Box(NamedFields):
     """Box of a crop, in the model's world: low ≤ axes · x ≤ high."""
 
     axes: np.ndarray
@@ -38,7 +39,7 @@ class Box:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Edit:
+class Edit(NamedFields):
     """Changes of a model, in its own world. Those that are None change nothing."""
 
     crop: Box | None = None

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from a2tg_jax.core.camera_paths import nearest_point, outlying_cameras
 from a2tg_jax.core.cameras import Camera, checked_cameras
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.host.optional import optional
 from a2tg_jax.host.progress_bars import progress_over
@@ -41,7 +42,7 @@ SAME = 1e-3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MeshResult:
+class MeshResult(NamedFields):
     """A mesh, and figures of its extraction."""
 
     mesh: Mesh

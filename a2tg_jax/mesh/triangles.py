@@ -8,6 +8,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.host.optional import optional
 
@@ -20,7 +21,7 @@ CHUNK = 1 << 20
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Mesh:
+class Mesh(NamedFields):
     """Triangles with colours of vertices, or with a texture."""
 
     vertices: np.ndarray

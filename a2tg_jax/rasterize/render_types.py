@@ -9,6 +9,7 @@ from a2tg_jax.appearance import TextureOptions
 from a2tg_jax.core.cameras import Camera, resize_camera
 from a2tg_jax.core.checks import check_int, check_kind, check_number, short_repr
 from a2tg_jax.core.geometry import NEAR_PLANE
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.notebook_display import as_bytes, enlarged, png
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.similarity import Similarity
@@ -18,7 +19,7 @@ from a2tg_jax.rasterize.splats import Wanted
 
 
 @dataclasses.dataclass(frozen=True)
-class RenderSettings:
+class RenderSettings(NamedFields):
     """Static options of a rendering; hashable, so that jit can close over them or take them as static.
 
     Examples:
@@ -99,7 +100,7 @@ class Geometry:
 
 
 @pytree
-class RenderOutput:
+class RenderOutput(NamedFields):
     """Images of a view."""
 
     color: Array

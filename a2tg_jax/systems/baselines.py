@@ -12,6 +12,7 @@ from typing import ClassVar, Self
 from a2tg_jax.appearance import Appearance, Billboards, MovableKernels, Texture, TextureOptions
 from a2tg_jax.appearance.movable_kernels import FLOATS_PER_KERNEL, NUM_KERNELS
 from a2tg_jax.core.checks import check_number
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.densify.clone_split import CloneSplitPrune, OpacityReset
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, densify_times
@@ -131,7 +132,7 @@ AUTHORS_LOG_SCALES = 3e-3
 
 
 @dataclasses.dataclass(frozen=True)
-class KernelRates:
+class KernelRates(NamedFields):
     """Adam's learning rates of the kernels."""
 
     colors: float = 1.25e-3
@@ -185,7 +186,7 @@ AUTHORS_RATES = LearningRates(sh_degree0=5e-3, sh_rest=2.5e-4)
 
 
 @dataclasses.dataclass(frozen=True)
-class BillboardOptions:
+class BillboardOptions(NamedFields):
     """The pictures of the billboards."""
 
     side: int = 16

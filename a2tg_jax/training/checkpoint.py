@@ -12,6 +12,7 @@ import numpy as np
 from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.appearance.files import arrays_of, with_arrays
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.table import is_table
@@ -30,7 +31,7 @@ from a2tg_jax.training.step import EXPLODED, TrainState, initial_state
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class History:
+class History(NamedFields):
     """Log of a training, one entry every 10 iterations; arrays of one length."""
 
     stage: np.ndarray
@@ -107,7 +108,7 @@ TERM = "loss_"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Checkpoint:
+class Checkpoint(NamedFields):
     """A training run stopped between two iterations."""
 
     system: System

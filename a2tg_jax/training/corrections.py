@@ -16,6 +16,7 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera, moved_viewmat
 from a2tg_jax.core.checks import check_number
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.optim import AdamState, adam_init, adam_update
 from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import pytree, static
@@ -25,7 +26,7 @@ MOST_READABLE = 100
 """Largest number of numbers of a row that `learned` lists."""
 
 
-class Correction:
+class Correction(NamedFields):
     """Base class of corrections; it changes nothing."""
 
     name: ClassVar[str]

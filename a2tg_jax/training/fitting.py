@@ -8,8 +8,9 @@ from typing import Any
 import jax
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
-from a2tg_jax.core.checks import check_kind, kind_of
+from a2tg_jax.core.checks import check_kind, check_untraced, kind_of
 from a2tg_jax.core.gaussians import Gaussians, check_process
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.text import counted, in_bytes, shortened
@@ -24,7 +25,7 @@ from a2tg_jax.training.start import check_loss_data, check_start, check_views, g
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class StageResult:
+class StageResult(NamedFields):
     """Result of one stage."""
 
     name: str
@@ -43,7 +44,7 @@ class StageResult:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FitResult:
+class FitResult(NamedFields):
     """Result of training."""
 
     system: System
@@ -202,6 +203,7 @@ def _check_arguments(
 ) -> None:
     """Raise ValueError unless the arguments are of their classes, and the training views and the options are valid."""
     check_process()
+    check_untraced("fit")
     is_path = str, os.PathLike
     example = ""
     if isinstance(scene, is_path):

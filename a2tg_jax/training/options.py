@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from a2tg_jax.core.budget import budget_in_bytes, bytes_per_gaussian, megabytes_of
 from a2tg_jax.core.checks import check_int, check_number, fields_of
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.events import Event
 from a2tg_jax.host.text import did_you_mean, in_bytes, shortened
 from a2tg_jax.io.config_json import changed_config, check_config, config_to_dict, flatten_config
@@ -28,7 +29,7 @@ from a2tg_jax.training.terms import (
 
 
 @dataclasses.dataclass(frozen=True)
-class LossConfig:
+class LossConfig(NamedFields):
     """Weights of the photometric loss and of the optional terms (0 is off, the paper's setting)."""
 
     ssim_weight: float = Photometric.ssim_weight
@@ -81,7 +82,7 @@ class LossConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class Corrections:
+class Corrections(NamedFields):
     """Options of `exposure` and `refine_poses`."""
 
     exposure_kind: Literal["affine", "grid"] = "affine"
@@ -105,7 +106,7 @@ SENSIBLE_GAUSSIANS = 10_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class System:
+class System(NamedFields):
     """A training method as a value: its fields are its options, `stages` composes the training.
 
     Derive a custom system from this class, add fields and compose its stages; the command line takes it as

@@ -16,6 +16,7 @@ from jax import Array
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats, in_words
 from a2tg_jax.core.checks import check_kind, check_number, fields_of, kind_of
 from a2tg_jax.core.gaussians import Gaussians, no_rows
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import BLACK, WHITE, Color
 from a2tg_jax.core.pytree import check_pytree, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
@@ -30,7 +31,7 @@ from a2tg_jax.training.terms import Target
 
 
 @pytree
-class LearningRates:
+class LearningRates(NamedFields):
     """Adam's learning rates of the Gaussians."""
 
     means: float = 1.6e-4
@@ -89,7 +90,7 @@ class LossTerm(Protocol):
 
 
 @pytree
-class Stage:
+class Stage(NamedFields):
     """A part of training with one appearance, one loss and one schedule. A pytree: its numbers are traced."""
 
     name: str = dataclasses.field(metadata={"static": True})

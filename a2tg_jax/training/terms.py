@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import safe_divide
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.model import Model
@@ -22,7 +23,7 @@ from a2tg_jax.training.returned import check_scalar
 
 
 @pytree
-class Target:
+class Target(NamedFields):
     """Target that a render is compared with."""
 
     camera: Camera
@@ -53,7 +54,7 @@ LossFunction = Callable[[Model, Target, RenderOutput], Array]
 
 
 @pytree
-class Term:
+class Term(NamedFields):
     """Function of model, target and render, times a weight.
 
     Examples:
