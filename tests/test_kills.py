@@ -5,7 +5,7 @@ from kills import kill_runs
 
 TINY = (
     *("--system", "gaussians-2d-mcmc", "--downscale", "6", "--stage1-iterations", "60", "--initial-gaussians", "60"),
-    *("--densify.cap", "60"),
+    *("--densify.cap", "60", "--more", "40"),
 )
 
 

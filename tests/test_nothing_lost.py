@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from run_folders import create_run, some_result
 
-from a2tg_jax import Change, StepEvent
+from a2tg_jax import Change, StepEvent, fit
 from a2tg_jax.cli import main as cli, runs
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host import signals
@@ -609,6 +609,10 @@ def test_a_file_budget_goes_with_a_memory_budget(tmp_path):
         dataclasses.replace(record, file_budget="nine")
 
 
+def assert_same_bits(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
 def test_a_finished_run_is_trained_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_training, "evaluate_run", lambda *_, **__: some_result())
     run = RunFolder(tmp_path / "run")
@@ -626,7 +630,31 @@ def test_a_finished_run_is_trained_on(tmp_path, monkeypatch, capsys):
     models = [load_model(run.model(name)) for name in names]
     assert run.model(NAME).read_bytes() == before and len({model.num for model in models}) == 1
     assert not np.array_equal(models[1].sh, models[2].sh)
+    # The same bits as in one run, and as in Python.
+    at_once = RunFolder(tmp_path / "at-once")
+    assert cli.main([*TRAIN, "--more", "4", "4", "--out", str(at_once.path), "--quiet"]) == 0
+    assert_same_bits(load_model(at_once.model(names[2])), models[2])
+    result = fit(SOURCE.load(), read_record(run).options, progress=False)
+    assert_same_bits(result.model, models[2])
     run.model(names[2]).unlink()
     assert cli.main([*resuming, "--more", "4"]) == 2
     assert "--more trains a finished run on: first finish this one with a2tg train" in capsys.readouterr().err
     assert cli.main(resuming) == 0 and run.model(names[2]).is_file()
+    assert_same_bits(load_model(run.model(names[2])), models[2])
+    # A process that was killed between writing the model and keeping its state.
+    end = run.checkpoint(names[2], 4)
+    end.parent.mkdir(exist_ok=True)
+    run.state(names[2]).rename(end)
+    assert cli.main([*resuming, "--more", "4"]) == 0 and run.state(names[2]).is_file() and not end.exists()
+    # Runs of earlier versions kept no state.
+    last = read_record(run).plan.main[-1]
+    run.model(last).unlink()
+    run.state(names[2]).unlink()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert cli.main(resuming) == 0
+    assert f"a2tg: warning: {last} continues {names[2]} without Adam's moments" in capsys.readouterr().err
+    run.model(last).unlink()
+    run.state(names[2]).write_bytes(b"damaged")
+    assert cli.main(resuming) == 2
+    assert "delete it to train gaussians-2d-mcmc-more-3 without Adam's moments" in capsys.readouterr().err

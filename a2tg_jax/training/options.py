@@ -154,8 +154,10 @@ class System(NamedFields):
     """Version of the method. Raise it when the same options train another model."""
 
     def __post_init__(self) -> None:
-        """Convert the memory budget to a number of MB."""
+        """Convert the memory budget to a number of MB, and a list of iterations to a tuple."""
         object.__setattr__(self, "memory_budget", megabytes_of(self.memory_budget))
+        if isinstance(self.more, list):  # A list equals no tuple.
+            object.__setattr__(self, "more", tuple(self.more))
 
     @property
     def initial_sh_degree(self) -> int:
