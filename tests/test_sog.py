@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fuzz_mutate import zipped
+from hostile_files import put
 from PIL import Image
 from small_values import some_gaussians
 from test_others import NUM, OTHERS, check, match, numbers, scene
@@ -63,6 +64,7 @@ def test_a_folder_its_header_and_a_zipped_folder_are_read(tmp_path, capsys):
         found = load_splats(path)
         assert found == wanted
         assert main(["convert", str(path), str(tmp_path / "b.npz"), "--overwrite"]) == 0
+        assert ("zipped without it, are a *.sog" in capsys.readouterr().out) == (path.suffix != ".sog")
         assert load_splats(tmp_path / "b.npz").num == NUM
         assert main(["info", str(path)]) == 0 and "90 Gaussians" in capsys.readouterr().out
     assert main(["convert", str(tmp_path / "b.npz"), str(folder / "meta.json"), "--overwrite"]) == 2
@@ -80,6 +82,14 @@ def test_pictures_of_a_folder_that_git_lfs_did_not_fetch(tmp_path):
     pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 123456\n"
     (folder / "quats.webp").write_bytes(pointer)
     with pytest.raises(ValueError, match=r"quats\.webp.*git lfs pull"):
+        load_splats(folder)
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe", "sparse"])
+def test_pictures_of_a_folder_that_are_no_files(tmp_path, kind):
+    folder = unpacked(tmp_path / "scene")
+    put(folder / "quats.webp", kind)
+    with pytest.raises(ValueError, match=r"quats\.webp: (is not a regular file|has 100,000,000,000 bytes)"):
         load_splats(folder)
 
 

@@ -233,7 +233,8 @@ def writer_as(kind: Kind, encode: Callable[[PlacedSplats], bytes]) -> Callable[.
         check_model(Model(gaussians))  # Never write a file that would not load.
         check_positions(kind, gaussians, os.fspath(path))
         means = np.asarray(gaussians.means, np.float64)
-        low, high = means.min(axis=0), means.max(axis=0)
+        low = means.min(axis=0)
+        high = means.max(axis=0)
         # 1e-30: all means may be equal along an axis.
         codes = ((means - low) / np.maximum(high - low, 1e-30) * (2**CURVE_BITS - 1)).astype(np.int64)
         # Stable: equal codes keep their order, so that files repeat.

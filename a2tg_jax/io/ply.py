@@ -349,17 +349,21 @@ def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 def encode_packed_ply(placed: others.PlacedSplats) -> bytes:
     """Return splats as a PLY as SuperSplat packs it."""
-    splats, num = placed.splats, len(placed.splats.means)
+    splats = placed.splats
+    num = len(splats.means)
     starts = np.arange(0, num, CHUNK)
     colors = 0.5 + SH_C0 * splats.sh[:, 0]
-    bounds, shares = [], []
+    bounds = []
+    shares = []
     for values in (splats.means, np.log(splats.scales), colors):
         # As float32, so that readers divide by the same bounds.
         values = values.astype(np.float32)
-        low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+        low = np.minimum.reduceat(values, starts)
+        high = np.maximum.reduceat(values, starts)
         bounds += [low, high]
-        low, width = (np.repeat(ends, CHUNK, axis=0)[:num].astype(np.float64) for ends in (low, high - low))
-        shares.append((values - low) / np.where(width > 0, width, 1.0))
+        chunks = np.arange(num) // CHUNK
+        width = (high - low).astype(np.float64)[chunks]
+        shares.append((values - low[chunks]) / np.where(width > 0, width, 1.0))
     positions, scales, shares_of_colors = shares
     largest, smaller = others.without_largest(splats.quats)
     rotations = largest.astype(np.uint32) << np.uint32(30) | _packed(smaller / np.sqrt(2) + 0.5, (10,) * 3)

@@ -142,7 +142,8 @@ def _checked_header(data: bytes) -> dict[str, Any]:
         raise ValueError(f"{HEADER} cannot be read as JSON ({error})") from error
     if not isinstance(header, dict) or not isinstance(header.get("means"), dict):
         raise ValueError(f"is not SOG: {HEADER} describes no means")
-    if (version := header.get("version", 1)) not in (1, VERSION):
+    version = header.get("version", 1)
+    if version not in (1, VERSION):
         raise ValueError(f"is SOG of version {shortened(version)}; versions 1 and 2 are read")
     return header
 
@@ -312,9 +313,11 @@ def _checked_numbers(values: object, what: str) -> np.ndarray:
 
 def encode_sog(placed: others.PlacedSplats) -> bytes:
     """Return splats as a *.sog, always the same for the same splats."""
-    splats, num = placed.splats, len(placed.splats.means)
+    splats = placed.splats
+    num = len(splats.means)
     logarithms = np.sign(splats.means) * np.log1p(np.abs(splats.means.astype(np.float64)))
-    low, high = logarithms.min(axis=0), logarithms.max(axis=0)
+    low = logarithms.min(axis=0)
+    high = logarithms.max(axis=0)
     shares = (logarithms - low) / np.where(high > low, high - low, 1.0)
     steps = np.rint(shares * LEVELS).astype(np.int64)
     largest, smaller = others.without_largest(splats.quats)
@@ -396,7 +399,8 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     while len(groups[0]) > LARGEST_GROUP:
         groups = [half for group in groups for half in _halves(rows, group)]
     share = MOST_ENTRIES // len(groups)
-    labels, entries = np.zeros(num, np.int64), []
+    labels = np.zeros(num, np.int64)
+    entries = []
     for index, group in enumerate(groups):
         centres, nearest = _clustered(rows[group], share)
         entries.append(centres)

@@ -79,7 +79,8 @@ KSPLAT_DEGREE = 2
 
 def encode_ksplat(placed: others.PlacedSplats) -> bytes:
     """Return splats as a *.ksplat of compression level 0, with degrees up to 2."""
-    splats, num = placed.splats, len(placed.splats.means)
+    splats = placed.splats
+    num = len(splats.means)
     degree = min(NUM_BASES.index(splats.sh.shape[1]), KSPLAT_DEGREE)
     rows = np.zeros(num, _ksplat_rows(0, degree))
     rows["means"], rows["scales"], rows["quats"] = splats.means, splats.scales, splats.quats

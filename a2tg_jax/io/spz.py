@@ -238,7 +238,8 @@ def _unpacked(data: bytes, size: int, name: str) -> np.ndarray:
 
 def _declared_axes(records: bytes) -> str:
     """Return the axes that the extensions of a file declare; "" if they declare none."""
-    place, axes = 0, ""
+    place = 0
+    axes = ""
     while place + RECORD.size <= len(records):
         kind, length = RECORD.unpack_from(records, place)
         place += RECORD.size
@@ -281,7 +282,8 @@ def _turned(gaussians: Gaussians, axes: str, wanted: str) -> Gaussians:
 
 def encode_spz(placed: others.PlacedSplats) -> bytes:
     """Return splats as an SPZ file, always the same for the same splats."""
-    splats, num = placed.splats, len(placed.splats.means)
+    splats = placed.splats
+    num = len(splats.means)
     degree = NUM_BASES.index(splats.sh.shape[1])
     fixed = np.rint(splats.means.astype(np.float64) * 2**FRACTIONAL_BITS).astype("<i4")
     largest, smaller = others.without_largest(splats.quats[:, [1, 2, 3, 0]].astype(np.float64))

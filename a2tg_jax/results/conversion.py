@@ -26,6 +26,7 @@ from a2tg_jax.io.formats import (
 from a2tg_jax.io.model_file import FORMAT, load_model, save_model
 from a2tg_jax.io.other_programs import World, world_line
 from a2tg_jax.io.ply import save_ply
+from a2tg_jax.io.sog import HEADER
 from a2tg_jax.model import Model
 from a2tg_jax.results.folder import RunFolder, check_new, check_output
 from a2tg_jax.results.model_source import Source, open_source
@@ -137,6 +138,8 @@ def write_converted(
         lines.append(world_line(model, world))
     if out.suffix.lower() == ".spz" and world == "upright":
         lines.append("programs that expect SPZ with +y up show it upside down: turn it half about x there")
+    if source_file.name.lower() == HEADER:
+        lines.append(f"source: {source_file.parent} is SOG as a folder; its files, zipped without it, are a *.sog")
     return "\n".join(lines)
 
 
