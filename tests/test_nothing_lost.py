@@ -658,3 +658,17 @@ def test_a_finished_run_is_trained_on(tmp_path, monkeypatch, capsys):
     run.state(names[2]).write_bytes(b"damaged")
     assert cli.main(resuming) == 2
     assert "delete it to train gaussians-2d-mcmc-more-3 without Adam's moments" in capsys.readouterr().err
+
+
+def test_the_next_stage_needs_the_views_of_the_one_before(tmp_path):
+    run, scene = create_run(tmp_path / "run"), SOURCE.load()
+    record = dataclasses.replace(RECORD, options=dataclasses.replace(RECORD.options, stage2_iterations=5))
+    write_record(run, record)
+    train_run(run, scene, QUIET)
+    run.model(record.plan.main[1]).unlink()
+    first, *others = scene.train
+    fewer = dataclasses.replace(scene, train=tuple(others))
+    difference = f"{len(others) + 1} views, and the scene has {len(others)} to train on: {first.name} missing; restore"
+    with pytest.raises(ValueError, match=f"{NAME}.npz was trained on {difference}"):
+        train_run(run, fewer, QUIET)
+    train_run(run, scene, QUIET)

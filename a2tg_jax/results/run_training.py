@@ -61,6 +61,7 @@ from a2tg_jax.training import (
     save_checkpoint,
 )
 from a2tg_jax.training.loop import IsStopped, Watch, never, unwatched
+from a2tg_jax.training.recorded_views import check_names
 from a2tg_jax.training.registry import system_from_dict, system_to_dict
 from a2tg_jax.training.start import check_loss_data, check_start
 
@@ -294,6 +295,12 @@ def _train_stage(
         if start is not None:
             model = load_model(start)
             check_held_out(model, scene, start)
+            if model.origin is not None:
+                trained = [
+                    name for name, is_test in zip(model.origin.names, model.origin.is_test, strict=True) if not is_test
+                ]
+                advice = "restore the photographs, or train in a new folder"
+                check_names(trained, [view.name for view in scene.train], str(start), advice)
         if resume is None and planned.stage.continues and planned.start is not None:
             resume = _last_state(run, plan[planned.start], planned.name)
             resumed = None if resume is None else run.state(planned.start)

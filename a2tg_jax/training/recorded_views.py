@@ -67,15 +67,7 @@ class RecordedViews:
         """Raise ValueError if a training is resumed with other views, sizes or cameras; warn of other pixels."""
         given = RecordedViews.of(views)
         advice = "resume with the scene that it was made from, or give its model to fit as start"
-        if given.names != self.names:
-            lost = [name for name in self.names if name not in given.names]
-            new = [name for name in given.names if name not in self.names]
-            parts = [f"{first_names(found)} {verb}" for found, verb in ((lost, "missing"), (new, "new")) if found]
-            what = ", ".join(parts) or "their order differs"
-            raise ValueError(
-                f"the checkpoint was trained on {len(self.names)} views, and the scene has {len(given.names)} to train "
-                f"on: {what}; {advice}"
-            )
+        check_names(self.names, given.names, "the checkpoint", advice)
         differ = (self.sizes != given.sizes).any(axis=1)
         for own, other in ((self.viewmats, given.viewmats), (self.Ks, given.Ks)):
             is_close = np.isclose(own, other, rtol=CAMERA_TOLERANCE, atol=CAMERA_TOLERANCE)
@@ -93,3 +85,16 @@ class RecordedViews:
 
     def _named(self, chosen: np.ndarray) -> str:
         return first_names([self.names[index] for index in np.flatnonzero(chosen)])
+
+
+def check_names(known: Sequence[str], given: Sequence[str], what: str, advice: str) -> None:
+    """Raise ValueError, naming the views that are missing or new, unless training has the same views as before."""
+    if list(known) == list(given):
+        return
+    lost = [name for name in known if name not in given]
+    new = [name for name in given if name not in known]
+    parts = [f"{first_names(found)} {verb}" for found, verb in ((lost, "missing"), (new, "new")) if found]
+    difference = ", ".join(parts) or "their order differs"
+    raise ValueError(
+        f"{what} was trained on {len(known)} views, and the scene has {len(given)} to train on: {difference}; {advice}"
+    )
