@@ -319,6 +319,7 @@ def of_archives() -> dict[str, tuple[bytes, str]]:
         "flipped byte": (data[:half] + bytes([data[half] ^ 255]) + data[half + 1 :], "is damaged"),
         "other ZIP": (zipped({"other.txt": b""}), r"is not SOG: it has no meta\.json"),
         "empty header": (zipped(entries() | {"meta.json": b""}), "meta.json cannot be read as JSON"),
+        "streamed": (zipped({"lod-meta.json": b"", "meta.json": b'{"lodLevels": 2}'}), "is streamed SOG"),
         "list as header": (zipped(entries() | {"meta.json": b"[]"}), "is not SOG: meta.json describes no means"),
         "deep header": (zipped(entries() | {"meta.json": b"[" * 10**5}), "meta.json cannot be read as JSON"),
         "labels beyond the sets": (with_picture("shN_labels.webp", lying_labels()), "refers to set 65,535 .* of 64"),

@@ -140,6 +140,8 @@ def _checked_header(data: bytes) -> dict[str, Any]:
         header = parse_json(data)
     except ValueError as error:
         raise ValueError(f"{HEADER} cannot be read as JSON ({error})") from error
+    if isinstance(header, dict) and "lodLevels" in header:
+        raise ValueError("is streamed SOG, which has its splats in folders: read one of them, such as 0_0")
     if not isinstance(header, dict) or not isinstance(header.get("means"), dict):
         raise ValueError(f"is not SOG: {HEADER} describes no means")
     version = header.get("version", 1)
