@@ -15,6 +15,7 @@ from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
 from a2tg_jax.host import signals
 from a2tg_jax.host.text import counted, in_bytes, shortened
 from a2tg_jax.model import Model
+from a2tg_jax.parallel.sharded_rows import on_host
 from a2tg_jax.training.checkpoint import Checkpoint, History, check_resume
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, Watch, never, unwatched
@@ -194,8 +195,8 @@ def fit(
             start = results[-1].model
             resume = run.checkpoint if is_last or stages[index + 1].continues else None
     assert resume is not None
-    # In the memory of the host, not of a GPU, which further trainings need.
-    return FitResult(system, tuple(results), dataclasses.replace(resume, state=jax.device_get(resume.state)))
+    # In the memory of the host, so that further trainings have the memory of the GPU.
+    return FitResult(system, tuple(results), dataclasses.replace(resume, state=jax.tree.map(on_host, resume.state)))
 
 
 def _check_arguments(
