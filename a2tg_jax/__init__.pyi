@@ -16,7 +16,13 @@ from .core.cameras import Camera as Camera, resize_camera as resize_camera
 from .core.gaussians import Gaussians as Gaussians, init_from_points as init_from_points
 from .core.optim import adam_init as adam_init, adam_update as adam_update, exponential_decay as exponential_decay
 from .core.origin import Origin as Origin
-from .core.pytree import combine as combine, partition as partition, pytree as pytree, static as static
+from .core.pytree import (
+    combine as combine,
+    partition as partition,
+    pytree as pytree,
+    shared as shared,
+    static as static,
+)
 from .core.similarity import Similarity as Similarity, transform_gaussians as transform_gaussians
 from .data.arrays import scene_from_arrays as scene_from_arrays
 from .data.assembly import with_validation_views as with_validation_views

@@ -10,7 +10,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -24,7 +23,7 @@ from a2tg_jax.core.numerics import safe_divide, safe_norm
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import BLACK, Color
 from a2tg_jax.core.pytree import combine, partition, pytree
-from a2tg_jax.core.table import Shape, Table, is_table
+from a2tg_jax.core.table import Shape, map_rows
 from a2tg_jax.data.scene import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
@@ -187,18 +186,19 @@ class Event(NamedFields):
         return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
 
     def gather(self, state: Any, rows: np.ndarray) -> Any:
-        """Return the state whose row i is the former row rows[i] (host). ValueError: by default, if an array does not
-        have a row for each Gaussian."""
+        """Return the state whose row i is the former row rows[i] (host). ValueError: by default, if an array that is no
+        field of `shared` does not have a row for each Gaussian."""
 
         def moved(leaf: Array) -> Array:
             if leaf.ndim and leaf.shape[0] != len(rows):
                 raise ValueError(
                     f"{type(self).__name__} has gathered an array {[*leaf.shape]}, without a row for each of the "
-                    f"{len(rows):,} Gaussians, and rows have moved: override gather"
+                    f"{len(rows):,} Gaussians, and rows have moved: override gather, or declare the field "
+                    "a2tg_jax.shared()"
                 )
             return rows_moved(leaf, rows) if leaf.ndim else leaf
 
-        return jax.tree.map(moved, state)
+        return map_rows(moved, lambda table: table.gather(rows), state)
 
     def observe(self, state: Any, model: Model, seen: Seen) -> Any:
         """Return the state after the views of an iteration; traced, and called while the event is still ahead."""
@@ -321,10 +321,8 @@ def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | 
 
 def gather_rows(model: Model, rows: Array | np.ndarray) -> Model:
     """Return the model whose row i is the former row rows[i], of all N."""
-    gaussians, appearance = jax.tree.map(
-        lambda leaf: leaf.gather(rows) if isinstance(leaf, Table) else rows_moved(leaf, rows),
-        (model.gaussians, model.appearance),
-        is_leaf=is_table,
+    gaussians, appearance = map_rows(
+        lambda array: rows_moved(array, rows), lambda table: table.gather(rows), (model.gaussians, model.appearance)
     )
     return dataclasses.replace(model, gaussians=gaussians, appearance=appearance)
 

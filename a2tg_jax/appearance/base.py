@@ -2,16 +2,17 @@
 
 Each of N splats may own a texture of one or more texels among all texels [T, C], and K numbers. At (u, v), in standard
 deviations, an appearance gives the position of the texture lookup (`texel_position`). From the C interpolated values
-and the K numbers it computes a colour residual and an alpha factor (`shade`):
+and the K numbers it computes a colour residual, an alpha factor and a colour factor, the tint (`shade`):
 
-    residual, factor = shade(numbers, texture interpolated at texel_position(region, u, v), u, v)
-    α = min(max_alpha, peak opacity · falloff(numbers, ρ) · factor),  colour = SH colour + residual
+    residual, factor, tint = shade(numbers, texture interpolated at texel_position(region, u, v), u, v)
+    α = min(max_alpha, peak opacity · falloff(numbers, ρ) · factor),  colour = SH colour · tint + residual
 
 `Appearance()` is plain 2DGS. Its optional parts are a texture, exponents of the kernels, and bands of spherical
 harmonics. A subclass adds its own arrays and overrides what differs; the parts work with it as well.
 
 An appearance whose arrays are None is a template, such as the one of a stage: it has the options only, and
-`allocate_appearance` makes the arrays for some Gaussians. A plain array of a subclass has a row for each Gaussian.
+`allocate_appearance` makes the arrays for some Gaussians. A plain array of a subclass has a row for each Gaussian,
+unless its field is `shared()`.
 """
 
 import dataclasses
@@ -27,9 +28,8 @@ from a2tg_jax.appearance.parts import (
     Bands,
     Coefficients,
     Exponents,
-    Factor,
     Part,
-    Residual,
+    Shading,
     Texture,
     TextureOptions,
     curves_of,
@@ -44,8 +44,8 @@ from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import Integer, at_least
 from a2tg_jax.core.pytree import partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
-from a2tg_jax.core.table import Table, check_places, check_table, is_table
-from a2tg_jax.parallel.sharded_rows import rows_joined, rows_moved
+from a2tg_jax.core.table import Table, check_places, check_table, is_whole, map_rows
+from a2tg_jax.parallel.sharded_rows import is_shared, on_host, rows_joined, rows_moved
 from a2tg_jax.texture import Textures, check_textures
 
 T = TypeVar("T")
@@ -96,9 +96,15 @@ class Appearance(NamedFields):
     def numbers(self, gaussians: Gaussians, camera: Camera) -> Array:
         """Return the differentiable numbers [N, K] of `shade` and `falloff`, which may depend on the view.
 
-        The renderer calls it once per view, and JAX differentiates it. Gradients of invisible rows are zero.
+        The renderer calls it once per view, and JAX differentiates it. Gradients of invisible rows are zero. What all
+        Gaussians share becomes columns as well, by `jnp.broadcast_to(weights, (gaussians.num, len(weights)))`.
         """
         return jnp.zeros((gaussians.num, 0), gaussians.means.dtype)
+
+    def numbers_at(self, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:
+        """Return `numbers`. Override this method instead if they depend on the highest active degree of spherical
+        harmonics, an integer that may be traced."""
+        return self.numbers(gaussians, camera)
 
     def homographies(self, gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
         """Return the homographies M [N, 3, 3] from (u, v, 1) to pixels, and normals [N, 3] in the world.
@@ -134,10 +140,11 @@ class Appearance(NamedFields):
             raise NotImplementedError(f"{type(self).__name__} has textures, but no method texel_position")
         return self.texture.position(region, u, v)
 
-    def shade(
-        self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array
-    ) -> tuple[Residual, Factor]:
-        """Return colour residual and alpha factor at (u, v), from the K numbers and the C values of the texture."""
+    def shade(self, numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array) -> Shading:
+        """Return colour residual and alpha factor at (u, v), from the K numbers and the C values of the texture.
+
+        A third result, if there is one, is the tint: D factors of the splat's own colours, or None.
+        """
         return (None, None) if self.texture is None else self.texture.shade(values, u, v)
 
     def falloff(self, numbers: tuple[Array, ...], rho: Array) -> Array:
@@ -333,9 +340,9 @@ def colors_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera,
     return appearance.own_colors(gaussians, camera, degree)
 
 
-def numbers_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera) -> Array:
+def numbers_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera, degree: Integer) -> Array:
     """Return the numbers [N, K] of the splats in a view, followed by the curves of kernels with exponents."""
-    own = appearance.numbers(gaussians, camera)
+    own = appearance.numbers_at(gaussians, camera, degree)
     shapes = appearance.shapes
     return own if shapes is None else jnp.concatenate([own, jnp.stack(curves_of(shapes), axis=1)], axis=1)
 
@@ -405,10 +412,15 @@ def projected(appearance: A) -> A:
 
 def count_floats(appearance: Appearance, num: int) -> int:
     """Return the trained floats of the first `num` Gaussians besides their own, without padding (host). An opacity that
-    is not trained counts as -1."""
+    is not trained counts as -1, what Gaussians share once, for 0 Gaussians as well."""
     total = -appearance.replaced_floats * num
-    for leaf in jax.tree.leaves(appearance, is_leaf=is_table):
-        total += leaf.count_floats(num) if isinstance(leaf, Table) else int(np.prod(leaf.shape[1:], dtype=int)) * num
+    for leaf in jax.tree.leaves(appearance, is_leaf=is_whole):
+        if is_shared(leaf):
+            total += sum(int(array.size) for array in jax.tree.leaves(leaf))
+        elif isinstance(leaf, Table):
+            total += leaf.count_floats(num)
+        else:
+            total += int(np.prod(leaf.shape[1:], dtype=int)) * num
     return total
 
 
@@ -421,17 +433,18 @@ def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
             raise ValueError(f"{kind}{jax.tree_util.keystr(path)} must be floats, {dtypes}; got {leaf.dtype}")
     for part in _parts_of(appearance).values():
         part.check(gaussians)
-    for field in array_fields(appearance):
-        name = f"{kind}.{field}"
-        # Parts were checked above.
-        for leaf in () if field in PARTS else jax.tree.leaves(getattr(appearance, field), is_leaf=is_table):
-            if isinstance(leaf, Table):
-                check_table(leaf, gaussians.num, name)
-                check_places(leaf, name)
-            elif str(leaf.dtype) not in FLOATS:
-                raise ValueError(f"{name} must be floats, {dtypes}; got {leaf.dtype}")
-            elif leaf.shape[:1] != (gaussians.num,):
-                raise ValueError(f"{name} must have a row for each of {gaussians.num} Gaussians; got {described(leaf)}")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(appearance, is_leaf=is_whole):
+        name = kind + jax.tree_util.keystr(path)
+        if path[0].name in PARTS:
+            continue  # Checked above.
+        if isinstance(leaf, Table):
+            check_table(leaf, gaussians.num, name)
+            check_places(leaf, name)
+        elif not is_shared(leaf) and leaf.shape[:1] != (gaussians.num,):
+            raise ValueError(
+                f"{name} must have a row for each Gaussian; got {described(leaf)} for {gaussians.num:,} of them: "
+                "declare the field by a2tg_jax.shared() if all Gaussians share it"
+            )
     appearance.check_arrays(gaussians)
 
 
@@ -448,31 +461,38 @@ def check_arrays_given(appearance: Appearance) -> None:
         )
 
 
-# Rows, of Gaussians and appearances alike: every array has a row for each Gaussian, every table a block
+# Rows, of Gaussians and appearances alike: every array has a row for each Gaussian, every table a block; what is shared
+# has neither
 
 
 def clear_rows(tree: T, is_cleared: Array) -> T:
     """Return moments with the rows of marked Gaussians [N] at zero; traceable. Tables must have their places."""
 
-    def cleared(leaf: Any) -> Any:
-        if is_table(leaf):
-            return leaf.clear(is_cleared)
-        return jnp.where(is_cleared.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.zeros_like(leaf), leaf)
+    def cleared(array: Array) -> Array:
+        return jnp.where(is_cleared.reshape(-1, *[1] * (array.ndim - 1)), jnp.zeros_like(array), array)
 
-    return jax.tree.map(cleared, tree, is_leaf=is_table)
+    return map_rows(cleared, lambda table: table.clear(is_cleared), tree)
 
 
 def take_rows(tree: T, rows: np.ndarray) -> T:
     """Return the rows of some Gaussians, which may repeat; tables in buckets as small as they need (host)."""
-    return jax.tree.map(
-        lambda leaf: leaf.take(rows) if is_table(leaf) else rows_moved(leaf, rows), tree, is_leaf=is_table
-    )
+    return map_rows(lambda array: rows_moved(array, rows), lambda table: table.take(rows), tree)
 
 
 def join_rows(trees: Sequence[T]) -> T:
-    """Concatenate the rows of several trees, which have the same structure except for their tables (host)."""
+    """Concatenate the rows of several trees, which have the same structure except for their tables (host).
 
-    def joined(*leaves: Any) -> Any:
-        return type(leaves[0]).joined(leaves) if is_table(leaves[0]) else rows_joined(leaves)
+    Raises:
+      ValueError: if what Gaussians share differs.
+    """
 
-    return jax.tree.map(joined, *trees, is_leaf=is_table)
+    def check_shared(path: Any, first: object, *others: object) -> None:
+        arrays = jax.tree.leaves(first) if is_shared(first) else []
+        for other in others if arrays else ():
+            found = jax.tree.leaves(other)
+            if len(found) != len(arrays) or not all(map(np.array_equal, map(on_host, arrays), map(on_host, found))):
+                name = jax.tree_util.keystr(path).rpartition("].")[-1]
+                raise ValueError(f"{name} must be equal in all models, because all Gaussians share it")
+
+    jax.tree_util.tree_map_with_path(check_shared, *trees, is_leaf=is_whole)
+    return map_rows(lambda *arrays: rows_joined(arrays), lambda *tables: type(tables[0]).joined(tables), *trees)

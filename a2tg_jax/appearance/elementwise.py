@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from a2tg_jax.appearance.base import Appearance, check_arrays_given, without_arrays
-from a2tg_jax.appearance.parts import Curve, Factor, Residual, falloff_of
+from a2tg_jax.appearance.parts import Curve, Factor, Residual, Tint, falloff_of
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.checks import check_kind, described
 from a2tg_jax.core.gaussians import Gaussians
@@ -45,7 +45,7 @@ class Elementwise(NamedTuple):
     """Per-pixel methods of an appearance, composed with its parts."""
 
     texel_position: Callable[[TextureRegion, Array, Array], tuple[Array, Array]]
-    shade: Callable[[tuple[Array, ...], tuple[Array, ...], Array, Array], tuple[Residual, Factor]]
+    shade: Callable[[tuple[Array, ...], tuple[Array, ...], Array, Array], tuple[Residual, Factor, Tint]]
     falloff: Callable[[tuple[Array, ...], Array], Array]
     max_alpha: float
     has_low_pass: bool
@@ -75,12 +75,14 @@ class StaticShading:
         own = self.appearance
         has_curve, has_features = own.exponents is not None, own.features is not None
 
-        def shade(numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array) -> tuple[Residual, Factor]:
-            # The curve is last (`numbers_in_view`). Features replace all colour, the residual as well.
-            shaded = own.shade(numbers[:-CURVE] if has_curve else numbers, values, u, v)
-            # `check_shading` names a result of another form.
-            is_pair = isinstance(shaded, tuple | list) and len(shaded) == 2
-            return (None, shaded[1]) if has_features and is_pair else shaded
+        def shade(numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array) -> Any:
+            # The curve is last (`numbers_in_view`).
+            shaded: Any = own.shade(numbers[:-CURVE] if has_curve else numbers, values, u, v)
+            if not isinstance(shaded, tuple | list) or len(shaded) not in (2, 3):
+                return shaded  # `check_shading` names a result of another form.
+            residual, factor, tint = (*shaded, None)[:3]
+            # Features replace all colour, residual and tint as well.
+            return (None, factor, None) if has_features else (residual, factor, tint)
 
         def falloff(numbers: tuple[Array, ...], rho: Array) -> Array:
             return falloff_of(Curve(*numbers[-CURVE:]), rho) if has_curve else own.falloff(numbers, rho)
@@ -172,14 +174,18 @@ def check_shading(static: StaticShading, arguments: Arguments) -> None:
             raise
 
     shaded = traced("shade")
-    wanted = f"(residual, factor): {num_colors} colours that are added, or None, and a factor, or None"
-    if not isinstance(shaded, tuple | list) or len(shaded) != 2:
-        raise ValueError(f"{name}.shade must return {wanted}; it returned {described(shaded)}")
-    residual, factor = shaded
-    if residual is not None and _sizes(residual) != ((),) * num_colors:
-        raise ValueError(f"{name}.shade must return {wanted}; the residual is {described(residual)}")
+    must = (
+        f"{name}.shade must return (residual, factor): {num_colors} colours that are added, or None, and a factor of "
+        f"alpha, or None; or (residual, factor, tint) with {num_colors} factors of the colours"
+    )
+    if not isinstance(shaded, tuple | list) or len(shaded) != 3:
+        raise ValueError(f"{must}; it returned {described(shaded)}")
+    residual, factor, tint = shaded
+    for part, colors in (("residual", residual), ("tint", tint)):
+        if colors is not None and _sizes(colors) != ((),) * num_colors:
+            raise ValueError(f"{must}; the {part} is {described(colors)}, of {described(shaded)}")
     if factor is not None and _sizes((factor,)) != ((),):
-        raise ValueError(f"{name}.shade must return {wanted}; the factor is {described(factor)}")
+        raise ValueError(f"{must}; the factor is {described(factor)}")
     if _sizes((weight := traced("falloff"),)) != ((),):
         raise ValueError(f"{name}.falloff must return one number for one rho; it returned {described(weight)}")
     if "texel_position" in functions and _sizes(position := traced("texel_position")) != ((), ()):
@@ -218,9 +224,9 @@ def elementwise_functions(static: StaticShading, arguments: Arguments) -> Elemen
     if takes_arrays(static, arguments):
         return functions
 
-    def shade(*given: Any) -> tuple[Residual, Factor]:
-        residual, factor = functions.shade(*given)
-        return None if residual is None else tuple(residual), factor
+    def shade(*given: Any) -> tuple[Residual, Factor, Tint]:
+        residual, factor, tint = functions.shade(*given)
+        return None if residual is None else tuple(residual), factor, None if tint is None else tuple(tint)
 
     return functions._replace(
         texel_position=functools.partial(_mapped, functions.texel_position),

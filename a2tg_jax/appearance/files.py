@@ -25,7 +25,8 @@ from a2tg_jax.appearance.parts import (
 )
 from a2tg_jax.core.gaussians import no_rows
 from a2tg_jax.core.sh import NUM_BASES
-from a2tg_jax.core.table import Table, is_table
+from a2tg_jax.core.table import Table, is_table, is_whole
+from a2tg_jax.parallel.sharded_rows import is_shared
 from a2tg_jax.texture import MAX_SIDE, Textures
 
 OLD_INNER = "inner."
@@ -73,20 +74,31 @@ def with_arrays(template: Appearance, arrays: Mapping[str, np.ndarray], sh_degre
         changes["texture"] = dataclasses.replace(template.texture, texels=_textures(arrays, "sizes", "texels"))
     # Two rows are enough to learn the structure of a subclass's arrays and the shape of a row.
     example = allocate_appearance(template, jax.random.key(0), no_rows(2, 1))
-    for field in own_fields(template):
+    own = own_fields(template)
 
-        def read(path: Any, leaf: Any, field: str = field) -> Any:
-            name = field + jax.tree_util.keystr(path)
-            if isinstance(leaf, Table):
-                old = f"{name}.sizes" not in arrays  # Version 0.2, of the pictures of billboards.
-                return _textures(arrays, *(("sizes", "texels") if old else (f"{name}.sizes", f"{name}.elements")))
-            array = _found(arrays, name)
-            if array.shape[1:] != leaf.shape[1:]:
-                raise ValueError(f"{name} must be [N, …] with rows {leaf.shape[1:]}; got {array.shape}")
-            return jnp.asarray(array)
+    def read(path: Any, leaf: Any) -> Any:
+        name = jax.tree_util.keystr(path).removeprefix(".")
+        if path[0].name not in own:
+            return leaf
+        if is_shared(leaf):
+            return jax.tree_util.tree_map_with_path(lambda inner, array: read_shared((*path, *inner), array), leaf)
+        if isinstance(leaf, Table):
+            old = f"{name}.sizes" not in arrays  # Version 0.2, of the pictures of billboards.
+            return _textures(arrays, *(("sizes", "texels") if old else (f"{name}.sizes", f"{name}.elements")))
+        array = _found(arrays, name)
+        if array.shape[1:] != leaf.shape[1:]:
+            raise ValueError(f"{name} must be [N, …] with rows {leaf.shape[1:]}; got {array.shape}")
+        return jnp.asarray(array)
 
-        changes[field] = jax.tree_util.tree_map_with_path(read, getattr(example, field), is_leaf=is_table)
-    return dataclasses.replace(template, **changes)
+    def read_shared(path: Any, leaf: Any) -> Any:
+        name = jax.tree_util.keystr(path).removeprefix(".")
+        array = _found(arrays, name)
+        if array.shape != leaf.shape:
+            raise ValueError(f"{name} must be {[*leaf.shape]}, as the appearance allocates it; got {[*array.shape]}")
+        return jnp.asarray(array)
+
+    found = jax.tree_util.tree_map_with_path(read, example, is_leaf=is_whole)
+    return dataclasses.replace(template, **changes, **{field: getattr(found, field) for field in own})
 
 
 def _found(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:

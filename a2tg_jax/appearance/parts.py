@@ -50,6 +50,10 @@ Residual = tuple[Array, ...] | None
 """Added to the D colours; None: 0."""
 Factor = Array | None
 """Multiplies alpha; None: 1."""
+Tint = tuple[Array, ...] | None
+"""Multiplies the splat's own D colours, before the residual is added; None: 1."""
+Shading = tuple[Residual, Factor] | tuple[Residual, Factor, Tint]
+"""Result of `Appearance.shade`."""
 
 
 # The texture of A²TG: where (u, v) is in a splat's texture, and how its RGB and alpha change the splat. `texture`

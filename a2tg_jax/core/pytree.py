@@ -1,4 +1,5 @@
-"""Frozen dataclasses that are pytrees: `pytree` decorates a class, `static` marks a field that is not traced.
+"""Frozen dataclasses that are pytrees: `pytree` decorates a class, `static` marks a field that is not traced, `shared`
+one without a row for each Gaussian.
 
 `jax.tree_util.register_dataclass` is not used: JAX 0.10 to 0.12 considers the structures of two such classes equal if
 only the classes differ, so that `jax.jit` may run the program of a class for its subclass. Classes registered with
@@ -14,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.host.text import name_replace
+
+from a2tg_jax.parallel.sharded_rows import Shared
 
 T = TypeVar("T")
 MARK = "_registered_pytree"
@@ -31,13 +34,28 @@ def static(*, default: object = dataclasses.MISSING) -> Any:
     return dataclasses.field(default=default, metadata={"static": True})
 
 
+def shared(*, default: object = None) -> Any:
+    """Return a field of arrays that all Gaussians share, such as the weights of a network, a codebook or a hash grid.
+
+    Events and other changes of rows leave it unchanged. Its floats are trained like those of other fields, and count
+    once in the bytes of a model. In a pytree it is within a node of its own (`parallel.sharded_rows.Shared`).
+
+    Args:
+      default: its default value; None, as in the template of an appearance, if left out.
+
+    Returns:
+      A field, for an array or any pytree of arrays, for a class that `pytree` decorates.
+    """
+    return dataclasses.field(default=default, metadata={"shared": True})
+
+
 def beside(*, default: object) -> Any:
     """Return a field outside the pytree: results of transformations have its default instead."""
     return dataclasses.field(default=default, metadata={"beside": True})
 
 
 @overload
-@dataclass_transform(frozen_default=True, field_specifiers=(static, beside, dataclasses.field))
+@dataclass_transform(frozen_default=True, field_specifiers=(static, shared, beside, dataclasses.field))
 def pytree(cls: type[T], /) -> type[T]: ...
 @overload
 def pytree(*, kw_only: bool = False, repr: bool = True) -> Callable[[type[T]], type[T]]: ...
@@ -70,11 +88,13 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     dynamic, fixed = tuple(kinds["dynamic"]), tuple(kinds["static"])
     # For errors, which name a leaf by its path, such as params.gaussians.means.
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in dynamic)
+    common = {field.name for field in dataclasses.fields(made) if field.metadata.get("shared")}
     left_out = {field.name: field.default for field in dataclasses.fields(made) if field.name in kinds["beside"]}
 
     def flatten(node: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         own = node.__dict__
-        return tuple(own[name] for name in dynamic), tuple(own[name] for name in fixed)
+        children = (Shared(own[name]) if name in common else own[name] for name in dynamic)
+        return tuple(children), tuple(own[name] for name in fixed)
 
     def flatten_with_keys(node: object) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         children, values = flatten(node)
@@ -84,6 +104,10 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
         node = object.__new__(made)
         # Through `__dict__`, because fields of a frozen dataclass cannot be assigned.
         node.__dict__.update(zip(dynamic, children, strict=True))
+        for name in common:
+            # Anything else is a stand-in of JAX, not from `flatten`.
+            if isinstance(node.__dict__[name], Shared):
+                node.__dict__[name] = node.__dict__[name].tree
         node.__dict__.update(zip(fixed, values, strict=True))
         node.__dict__.update(left_out)
         return node

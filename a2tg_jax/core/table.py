@@ -9,8 +9,8 @@ only a change of these, on the host, compiles a step again.
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, NamedTuple, Self
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,9 @@ from jax.typing import ArrayLike, DTypeLike
 from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_mask, check_shape, plain_array, short_repr
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.pytree import partition, pytree, static
-from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved
+from a2tg_jax.parallel.sharded_rows import is_shared, on_host, placed_like, rows_moved
 
+T = TypeVar("T")
 Size = tuple[int, ...]
 Group = tuple[np.ndarray, np.ndarray]
 """Indices [n] of Gaussians, and their blocks [n, T₁, …, C], all of one size."""
@@ -239,6 +240,25 @@ class Table(NamedFields):
 def is_table(leaf: object) -> bool:
     """Return whether a node of a pytree is a table, for `is_leaf` of `jax.tree`."""
     return isinstance(leaf, Table)
+
+
+def is_whole(node: object) -> bool:
+    """Return whether a node of a pytree is a table or shared by all Gaussians, for `is_leaf` of `jax.tree`: no array in
+    it has a row for each Gaussian."""
+    return is_table(node) or is_shared(node)
+
+
+def map_rows(of_array: Callable[..., Any], of_table: Callable[..., Any], *trees: T) -> T:
+    """Return the first tree with its rows changed: each array with a row for each Gaussian by `of_array`, each table by
+    `of_table`. Both also get the arrays or tables of the other trees. What all Gaussians share (`core.pytree.shared`)
+    stays as in the first tree."""
+
+    def mapped(*nodes: Any) -> Any:
+        if is_shared(nodes[0]):
+            return nodes[0]
+        return of_table(*nodes) if is_table(nodes[0]) else of_array(*nodes)
+
+    return jax.tree.map(mapped, *trees, is_leaf=is_whole)
 
 
 # Places

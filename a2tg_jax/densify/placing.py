@@ -24,7 +24,7 @@ from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import Color
 from a2tg_jax.core.pytree import pytree, static
-from a2tg_jax.core.table import is_table
+from a2tg_jax.core.table import is_table, map_rows
 from a2tg_jax.data.scene import View, counted_pixels, view_image
 from a2tg_jax.events import Change, Due, HostEvent, clear_moments, iterations_at
 from a2tg_jax.model import Model
@@ -93,7 +93,8 @@ class PlaceByError(HostEvent):
         def replaced(old: Array, new: ArrayLike) -> Array:
             return rows_replaced(old, rows, new)
 
-        gaussians, shown = jax.tree.map(replaced, (model.gaussians, model.appearance), (added, appearance))
+        own = model.gaussians, model.appearance
+        gaussians, shown = map_rows(replaced, replaced, own, (added, appearance))
         is_new = np.isin(np.arange(model.gaussians.num), rows)
         moments = jax.jit(clear_moments)(model, moments, placed_like(is_new, model.gaussians.means))
         num_live = placed_like(np.asarray(num + added.num, np.int32), model.gaussians.means)

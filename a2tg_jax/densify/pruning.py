@@ -127,7 +127,7 @@ def _weights(
     model: Model, cameras: Camera, rays: Array | None, counted: Array, least: Array, settings: RenderSettings
 ) -> tuple[Array, Array]:
     """Return the sums over views of one size and lens, and the numbers of views with at least `least`. A picture is
-    linear in the colours, so this is a backward pass of ones."""
+    linear in features, so this is a backward pass of ones."""
     nothing = jnp.zeros_like(model.gaussians.means)
 
     def of_view(found: tuple[Array, Array], view: tuple[Camera, Array]) -> tuple[tuple[Array, Array], None]:
@@ -135,7 +135,8 @@ def _weights(
         camera = dataclasses.replace(camera, rays=rays)
 
         def draw(colors: Array) -> Array:
-            appearance = dataclasses.replace(model.appearance, given_colors=colors)
+            # Not `given_colors`, which an appearance may multiply.
+            appearance = dataclasses.replace(model.appearance, features=colors)
             output, _ = render_traced(
                 model.gaussians, camera, appearance, jnp.zeros_like(colors[0]), settings,
                 has_geometry=False, num_live=model.num_live,

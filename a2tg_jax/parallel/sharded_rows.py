@@ -5,6 +5,7 @@ stay unchanged. On the host, arrays are read by `on_host` and written by `placed
 change takes a share of the memory of each device. All processes make the same calls.
 """
 
+import functools
 import warnings
 import zlib
 from collections.abc import Sequence
@@ -19,6 +20,35 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec as P
 from jax.typing import ArrayLike, DTypeLike
 
 T = TypeVar("T")
+
+
+@jax.tree_util.register_pytree_with_keys_class
+class Shared:
+    """Node of a pytree around arrays without rows, such as weights of a network, which every device has whole.
+
+    `core.pytree.shared` marks fields that are in one; `core.table.map_rows` leaves it unchanged.
+    """
+
+    def __init__(self, tree: Any):
+        """Args:
+        tree: arrays, or any pytree of them.
+        """
+        self.tree = tree
+
+    def tree_flatten_with_keys(self) -> tuple[tuple[tuple[str, Any]], None]:
+        """Return the content under an empty key: paths in errors and files name the field only."""
+        return (("", self.tree),), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, children: Sequence[Any]) -> "Shared":
+        """Return the node around its only child."""
+        return cls(*children)
+
+
+def is_shared(node: object) -> bool:
+    """Return whether a node of a pytree is shared by all rows, for `is_leaf` of `jax.tree`."""
+    return isinstance(node, Shared)
+
 
 LARGEST_PART = 2**28
 """Largest number of bytes read at a time. Each device holds them besides the array, for all processes."""
@@ -45,8 +75,8 @@ def sharding_of_rows(mesh: Mesh, shape: tuple[int, ...], axis: int = 0) -> Named
 
 def spread(mesh: Mesh | None, tree: T, axis: int = 0) -> T:
     """Return arrays with their rows, along an axis, spread over the devices, or on every device if D does not divide
-    them. Under jit it constrains where results are. ValueError: arrays that are not spread yet differ between
-    processes."""
+    them, or if they are `Shared`. Under jit it constrains where results are. ValueError: arrays that are not spread yet
+    differ between processes."""
     if mesh is None:
         return tree
     own = [x for x in jax.tree.leaves(tree) if not isinstance(x, jax.core.Tracer) and _is_own(x)]
@@ -59,12 +89,16 @@ def spread(mesh: Mesh | None, tree: T, axis: int = 0) -> T:
         if len(np.unique(multihost_utils.process_allgather(np.asarray(digest, np.uint32)))) > 1:
             raise ValueError("the processes differ after a change of the model: train on machines that are alike")
 
-    def of_leaf(x: Any) -> Any:
-        sharding = sharding_of_rows(mesh, jnp.shape(x), axis)
+    def at(sharding: NamedSharding, x: Any) -> Any:
         is_traced = isinstance(x, jax.core.Tracer)
         return jax.lax.with_sharding_constraint(x, sharding) if is_traced else placed(x, sharding)
 
-    return jax.tree.map(of_leaf, tree)
+    def of_leaf(x: Any) -> Any:
+        if is_shared(x):
+            return jax.tree.map(functools.partial(at, NamedSharding(mesh, P())), x)
+        return at(sharding_of_rows(mesh, jnp.shape(x), axis), x)
+
+    return jax.tree.map(of_leaf, tree, is_leaf=is_shared)
 
 
 def everywhere(mesh: Mesh | None, tree: T) -> T:

@@ -153,7 +153,7 @@ def show(
     `values` are interpolated from the splat's texture, and the splat's homography is not read. `rho_probe` is zero,
     added to ρ of the falloff to read the gradient there.
     """
-    residual, factor = functions.shade(splat.numbers, values, hit.u, hit.v)
+    residual, factor, tint = functions.shade(splat.numbers, values, hit.u, hit.v)
     # The slope of a falloff at infinity may be NaN.
     rho = hit.rho if functions.has_low_pass else jnp.where(hit.is_ray, hit.rho, 0.0)
     rho = rho if rho_probe is None else rho + rho_probe
@@ -164,8 +164,10 @@ def show(
     # Not >=: an alpha on its cap has a gradient, so that what starts or is projected there can fade.
     alpha = jnp.where(is_hidden, 0.0, jnp.where(a > functions.max_alpha, functions.max_alpha, a))
     channels: tuple[Array, ...] = splat.color
+    if tint is not None:
+        channels = tuple(base * own for base, own in zip(channels, tint, strict=True))
     if residual is not None:
-        channels = tuple(base + extra for base, extra in zip(splat.color, residual, strict=True))
+        channels = tuple(base + extra for base, extra in zip(channels, residual, strict=True))
     if splat.normal is not None:
         channels = (*channels, hit.depth, hit.depth * hit.depth, *splat.normal)
     return Shown(alpha, channels)

@@ -117,7 +117,7 @@ def project_gaussians(
       ValueError: if the appearance gives opacities, numbers or colours of another shape.
     """
     M, normals = appearance.homographies(gaussians, camera)
-    opacities, numbers = appearance.peak_opacities(gaussians), numbers_in_view(appearance, gaussians, camera)
+    opacities, numbers = appearance.peak_opacities(gaussians), numbers_in_view(appearance, gaussians, camera, sh_degree)
     colors = colors_in_view(appearance, gaussians, camera, sh_degree)
     name, num, num_colors = type(appearance).__name__, gaussians.num, num_colors_of(appearance)
     if opacities.shape != (num,) or numbers.shape[:-1] != (num,):

@@ -15,7 +15,7 @@ from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import combine, partition
-from a2tg_jax.core.table import is_table
+from a2tg_jax.core.table import map_rows
 from a2tg_jax.host.machine import ALONE, Devices, Machine, this_machine
 from a2tg_jax.host.text import counted, shortened
 from a2tg_jax.io.archive import read_archive, write_archive
@@ -280,10 +280,11 @@ def _packed(model: Model, moments: AdamState) -> AdamState:
     rows = np.arange(model.gaussians.num)
 
     def packed(moment: Model) -> Model:
-        whole = jax.tree.map(
-            lambda leaf: leaf.take(rows, padding=(0.0,) * len(leaf.padding)) if is_table(leaf) else leaf,
-            combine(moment.appearance, rest), is_leaf=is_table,
-        )  # fmt: skip
+        whole = map_rows(
+            lambda array: array,
+            lambda table: table.take(rows, padding=(0.0,) * len(table.padding)),
+            combine(moment.appearance, rest),
+        )
         return dataclasses.replace(moment, appearance=partition(whole)[0])
 
     return dataclasses.replace(moments, mu=packed(moments.mu), nu=packed(moments.nu))

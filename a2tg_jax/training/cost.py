@@ -105,7 +105,7 @@ def forecast_stages(
     """
     stages = system.all_stages()
     mean_pixels = sum(view.camera.width * view.camera.height for view in scene.train) / len(scene.train)
-    num, floats, shown = initial_number(scene, system, stages[0]), 0.0, None
+    num, floats, shared, shown = initial_number(scene, system, stages[0]), 0.0, 0, None
     if num_given is not None:
         num, stages = num_given, stages[1:]
         yield StageForecast(Bytes(), system.initial_bytes * num, num, num_programs=0, seconds=0, whole_bytes=0)
@@ -113,11 +113,12 @@ def forecast_stages(
         num = max([num, *(event.num_rows(num, stage.iterations) for event in stage.events)])
         if stage.appearance != shown:
             floats, shown = stage.floats_shown(system.initial_sh_degree), stage.appearance
+            shared = stage.shared_bytes
         own = floats_per_gaussian(system.initial_sh_degree) + floats
-        model_bytes = BYTES_PER_FLOAT * own * num
+        model_bytes = BYTES_PER_FLOAT * own * num + shared
         for event in stage.events:
             model_bytes = event.most_bytes(model_bytes, num, stage.iterations)
-        floats = model_bytes / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
+        floats = (model_bytes - shared) / BYTES_PER_FLOAT / num - floats_per_gaussian(system.initial_sh_degree)
         on_host = [event for event in stage.events if isinstance(event, HostEvent)]
         programs = 1 + sum(event.num_programs(stage.iterations) for event in on_host)
         whole = (1 + (STATES + 1) / num_devices) * model_bytes

@@ -62,7 +62,7 @@ def _not_finite(parameters: tuple[object, ...]) -> Iterator[str]:
     """Yield each leaf of (gaussians, appearance, corrections) with such numbers, and their rows."""
     for prefix, part in zip(("", "appearance", "corrections"), parameters, strict=True):
         for path, leaf in jax.tree_util.tree_flatten_with_path(part)[0]:
-            numbers = np.asarray(leaf)
+            numbers = np.atleast_1d(leaf)
             is_bad = ~np.isfinite(numbers).all(axis=tuple(range(1, numbers.ndim)))  # There may be 0 rows.
             if is_bad.any():
                 rows = np.flatnonzero(is_bad)

@@ -315,12 +315,13 @@ def _result_of(run: StageRun, scene: Scene, *, is_last: bool) -> StageResult:
 def warn_of_budget(system: System, model: Model) -> None:
     """Warn if a finished model does not fill its memory budget or exceeds it."""
     budget, used = system.budget_bytes, model.num_bytes
+    one = (used - model.bytes_of(0)) / model.num
     if budget is None or budget * (1 - LARGEST_SHORTFALL) <= used <= budget:
         return
     if used > budget:
         advice = f"compose the stages of {type(system).__name__} with System.budget_cap"
-    elif used + used / model.num > budget:
-        advice = f"there is no room for another Gaussian of {used / model.num:,.0f} bytes: raise memory_budget"
+    elif used + one > budget:
+        advice = f"there is no room for another Gaussian of {one:,.0f} bytes: raise memory_budget"
     else:
         advice = f"raise {system.more_growth()}"
     share = f"{used / budget:.1%} of the memory_budget of {budget:,}"

@@ -5,7 +5,7 @@ import math
 import typing
 from typing import Any, ClassVar, Literal, Self
 
-from a2tg_jax.core.budget import budget_in_bytes, bytes_per_gaussian, megabytes_of
+from a2tg_jax.core.budget import BYTES_PER_FLOAT, budget_in_bytes, bytes_per_gaussian, megabytes_of
 from a2tg_jax.core.checks import check_int, check_number, fields_of
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.events import Event
@@ -177,19 +177,24 @@ class System(NamedFields):
     @property
     def small_budget(self) -> str:
         """Number of Gaussians that fit into the memory budget, in words, if they are few; else empty."""
-        if self.budget_bytes is None or self.budget_bytes >= FEW_GAUSSIANS * (size := self.initial_bytes):
+        if self.budget_bytes is None:
             return ""
-        sensible = in_bytes(SENSIBLE_GAUSSIANS * size).replace(" ", "")
+        size, shared = self.initial_bytes, self.stages()[0].shared_bytes
+        left = self.budget_bytes - shared
+        if left >= FEW_GAUSSIANS * size:
+            return ""
+        sensible = in_bytes(SENSIBLE_GAUSSIANS * size + shared).replace(" ", "")
         return (
-            f"memory_budget has room for {int(self.budget_bytes // size)} Gaussians of {size:,.0f} bytes, and scenes "
+            f"memory_budget has room for {max(0, int(left // size))} Gaussians of {size:,.0f} bytes, and scenes "
             f"need thousands: {sensible} holds {SENSIBLE_GAUSSIANS:,}"
         )
 
-    def budget_cap(self, floats: float = 0) -> int | None:
+    def budget_cap(self, floats: float = 0, shared: int = 0) -> int | None:
         """Return the number of Gaussians that the memory budget has room for; None without a budget.
 
         Args:
           floats: further floats of each finished Gaussian, such as its texels.
+          shared: floats that all Gaussians share, such as the weights of a network.
 
         Raises:
           ValueError: if there are fewer than 2, or fewer than initial Gaussians.
@@ -197,7 +202,7 @@ class System(NamedFields):
         if self.budget_bytes is None:
             return None
         needed = bytes_per_gaussian(self.initial_sh_degree, floats)
-        cap = int(self.budget_bytes // needed)
+        cap = max(0, int((self.budget_bytes - BYTES_PER_FLOAT * shared) // needed))
         has_room = f"memory_budget of {self.memory_budget} MB has room for {cap:,} Gaussians of {needed:,.0f} bytes"
         if cap < 2:
             raise ValueError(f"{has_room}, and there must be 2: raise memory_budget")
@@ -384,9 +389,10 @@ class System(NamedFields):
         degree = self.initial_sh_degree
         for stage in self.stages():
             size = bytes_per_gaussian(degree, stage.floats_shown(degree))
-            if num * size > self.budget_bytes:
+            left = self.budget_bytes - stage.shared_bytes
+            if num * size > left:
                 raise ValueError(
-                    f"memory_budget of {self.memory_budget} MB has room for {int(self.budget_bytes // size):,} "
+                    f"memory_budget of {self.memory_budget} MB has room for {max(0, int(left // size)):,} "
                     f"Gaussians of {size:,.0f} bytes when the stage {stage.name!r} begins, and {num:,} are given: "
                     "raise it, leave it out, or give fewer"
                 )

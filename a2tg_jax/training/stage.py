@@ -14,6 +14,8 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats, in_words
+from a2tg_jax.appearance.base import check_appearance
+from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.checks import check_kind, check_number, fields_of, kind_of
 from a2tg_jax.core.gaussians import Gaussians, no_rows
 from a2tg_jax.core.named_fields import NamedFields
@@ -142,7 +144,14 @@ class Stage(NamedFields):
     def floats_shown(self, sh_degree: int) -> float:
         """Return the floats of appearance that a Gaussian of a degree has when the stage begins (host)."""
         few = no_rows(64, NUM_BASES[sh_degree])
-        return count_floats(allocate_appearance(self.appearance, jax.random.key(0), few), few.num) / few.num
+        shown = allocate_appearance(self.appearance, jax.random.key(0), few)
+        return (count_floats(shown, few.num) - count_floats(shown, 0)) / few.num
+
+    @property
+    def shared_bytes(self) -> int:
+        """Bytes of what the Gaussians share (host)."""
+        shown = allocate_appearance(self.appearance, jax.random.key(0), no_rows(2, 1))
+        return BYTES_PER_FLOAT * count_floats(shown, 0)
 
     def is_ahead(self, event: Event) -> bool:
         """Return whether an event happens at all (host)."""
@@ -222,8 +231,10 @@ class Stage(NamedFields):
                             "other static()"
                         )
         check_pytree(f"{where} appearance", self.appearance)
-        # Two rows are enough to learn whether there are arrays.
-        few = allocate_appearance(self.appearance, jax.random.key(0), no_rows(2, 1))
+        # Two rows are enough to learn whether there are arrays, and whether they have rows.
+        two = no_rows(2, 1)
+        few = allocate_appearance(self.appearance, jax.random.key(0), two)
+        check_appearance(few, two)
         if self.appearance_rate is None and jax.tree.leaves(few):
             raise ValueError(
                 f"{where} appearance_rate must be the learning rate of the arrays of {in_words(self.appearance)}, "

@@ -7,16 +7,17 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
-from a2tg_jax.appearance.base import join_rows
+from a2tg_jax.appearance.base import check_appearance, join_rows
 from a2tg_jax.appearance.parts import nearest_gaussians
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
-from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.core.table import Table, map_rows
 from a2tg_jax.data.assembly import Sight, unseeing
 from a2tg_jax.data.scene import Scene, View, check_view
 from a2tg_jax.events import Event
@@ -285,15 +286,20 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
         if shapes is not None and appearance.shapes is not None:
             appearance = appearance.with_shapes(appearance.shapes.at[:num].set(shapes))
     if is_same and room > num:
-        (new, rest), (old, _) = partition(appearance), partition(model.appearance)
-        # strict=False: whether structures agree is tested next.
-        pairs = zip(jax.tree.leaves(new), jax.tree.leaves(old), strict=False)
-        is_grown: bool = jax.tree.structure(new) != jax.tree.structure(old)  # type: ignore[operator]
-        if is_grown or any(more.shape[1:] != few.shape[1:] or len(more) < len(few) for more, few in pairs):
-            raise ValueError(
-                f"stage {stage.name!r} would add Gaussians to a model whose textures or degrees have grown already"
-            )
-        appearance = combine(jax.tree.map(lambda more, few: more.at[:num].set(few[:num]), new, old), rest)
+        grown = f"stage {stage.name!r} would add Gaussians to a model whose textures or degrees have grown already"
+
+        def with_spare(few: Array, more: Array) -> Array:
+            if more.shape[1:] != few.shape[1:] or len(more) < len(few):
+                raise ValueError(grown)
+            return more.at[:num].set(few[:num])
+
+        def with_spare_blocks(few: Table, more: Table) -> Table:
+            if more.bucket_sizes != few.bucket_sizes:
+                raise ValueError(grown)
+            return dataclasses.replace(more, buckets=tuple(map(with_spare, few.buckets, more.buckets)))
+
+        appearance = map_rows(with_spare, with_spare_blocks, model.appearance, appearance)
+    check_appearance(appearance, gaussians)
     return Model(gaussians, appearance, jnp.asarray(num, jnp.int32))
 
 

@@ -246,7 +246,7 @@ def attempt(
     checked = jax.tree.leaves((found.loss, grads, found.grads[2], made, [known.rows for known in corrections]))
     # Row by row first, then one reduction of all rows. Without the barrier XLA would reduce each leaf to one flag
     # apart, which costs a GPU two launches a leaf.
-    are_finite = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in checked]
+    are_finite = [jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in map(jnp.atleast_1d, checked)]
     is_finite = jnp.all(jax.lax.optimization_barrier(jnp.concatenate(are_finite)))
     return Attempt(found, (*grads, found.grads[2]), after, change.info, is_finite)
 
