@@ -21,9 +21,10 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.notebook_display import html_table
 from a2tg_jax.core.origin import BLACK, Color, Origin
-from a2tg_jax.core.pytree import beside, partition, pytree, static
+from a2tg_jax.core.pytree import beside, pytree, static
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity, transform_gaussians
+from a2tg_jax.core.table import map_rows
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.render import render_appearance, with_features
@@ -122,10 +123,11 @@ class Model(NamedFields):
     @property
     def num_padding_bytes(self) -> int:
         """Bytes of padding in the buffers (host)."""
-        floats, _ = partition(self.appearance)
-        allocated = sum(np.asarray(leaf.shape).prod() * leaf.dtype.itemsize for leaf in jax.tree.leaves(floats))
+        # Of tables without the places of the blocks, which are not counted.
+        arrays = map_rows(lambda array: array, lambda table: table.buckets, self.appearance)
+        allocated = sum(leaf.nbytes for leaf in jax.tree.leaves(arrays))
         filled = count_floats(self.appearance, self.num) + self.appearance.replaced_floats * self.num
-        return int(allocated) - BYTES_PER_FLOAT * filled
+        return allocated - BYTES_PER_FLOAT * filled
 
     @property
     def default_background(self) -> tuple[float, ...]:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec as P
 from scenes_random import fisheye
+from test_shared import Own
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import bytes_per_gaussian
@@ -497,6 +498,21 @@ def rows_are_read_and_moved(exchange):
         np.testing.assert_array_equal(rows_moved(values, np.arange(3)), values[:3], strict=True)
         columns = spread(exchange.mesh, values_of := rng.normal(size=(3, num)).astype(np.float32), axis=1)
         np.testing.assert_array_equal(on_host(columns), values_of)
+
+
+def shared(folder):
+    """What Gaussians share is whole on every device, though the devices divide its length, and learns as on one."""
+    own, networks = Own(events="splitting", sh_degree=0, stage1_iterations=12), []
+
+    def keep(checkpoint):
+        networks.append(checkpoint.state.model.appearance.network)
+
+    for count in (1, jax.device_count()):
+        fit(own, count, on_checkpoint=keep)
+    alone, together = networks
+    for name, values in together.items():
+        assert values.is_fully_replicated and len(values.sharding.device_set) == jax.device_count(), name
+        np.testing.assert_allclose(on_host(values), alone[name], atol=1e-4)
 
 
 def memory(folder):

@@ -76,6 +76,7 @@ class Shown(NamedTuple):
     margin: Float | float  # [H, W]
     kink: Float | float  # [H, W]
     is_relevant: Bool  # [H, W]; elsewhere it is too weak on either side of a decision of where the ray meets it
+    tint: Float | float = 1.0  # [H, W, 3], multiplies its colour before the residual is added
 
 
 class Layer(NamedTuple):
@@ -300,7 +301,7 @@ def shown_layer(scene: Scene, i: int, rules: Rules, hits: Hits, shown: Shown) ->
     return Layer(
         alpha=np.where(is_visible, np.minimum(strength, rules.max_alpha), 0.0),
         is_capped=strength > rules.max_alpha,
-        color=np.maximum(sh_color, 0) + shown.residual,
+        color=np.maximum(sh_color, 0) * shown.tint + shown.residual,
         depth=hits.depth,
         mean_depth=float(M[2, 2]),
         normal=-normal if facing > 0 else normal,

@@ -54,6 +54,16 @@ def glossy(scene: Scene, arrays: dict[str, Float], i: int, has_low_pass: bool = 
     return hits, Shown(opacity * falloff(hits.rho), residual, np.inf, np.inf, is_relevant)
 
 
+def painted(scene: Scene, arrays: dict[str, Float], i: int) -> tuple[Hits, Shown]:
+    """Colours times 1 + w·tanh(W·(u, v, code)) of a network that splats share, plus its first output."""
+    hits, opacity = hits_of(scene, i), sigmoid(scene.logit_opacities[i])
+    inputs = np.stack([hits.u, hits.v, np.full_like(hits.u, arrays["codes"][i])], axis=-1)
+    outputs = np.tanh(inputs @ arrays["first"].T) @ arrays["last"]
+    is_relevant = opacity * np.exp(-hits.closest_rho / 2) >= 0.99 * MIN_ALPHA
+    strength, residual = opacity * np.exp(-hits.rho / 2), outputs[..., :1] * np.ones(3)
+    return hits, Shown(strength, residual, np.inf, np.inf, is_relevant, tint=1 + outputs)
+
+
 def shaped(scene: Scene, arrays: dict[str, Float], i: int) -> tuple[Hits, Shown]:
     """A generalised Gaussian: the exponent of the falloff grows as (ρ + δ)^β, from 0 at ρ = 0 to 1 at ρ = 2."""
     hits, exponent, delta = hits_of(scene, i), np.exp(np.tanh(arrays["shapes"][i])), 0.02

@@ -20,7 +20,7 @@ from test_render_gradients import CLEARANCE, assert_gradients_close, differences
 from a2tg_jax import Camera, RenderSettings, allocate_textures, render_appearance
 from a2tg_jax.appearance import Appearance, Billboards, Exponents, MovableKernels
 from a2tg_jax.core.numerics import normalize
-from a2tg_jax.core.pytree import pytree, static
+from a2tg_jax.core.pytree import pytree, shared, static
 from a2tg_jax.rasterize.views import render_traced
 
 SIDE = 4
@@ -52,6 +52,28 @@ class Glossy(Appearance):
         return 2 * exponents * (jnp.exp(jnp.log(255 * opacities) / exponents) - 1)
 
 
+@pytree(kw_only=True)
+class Painted(Appearance):
+    """A small network of the place and of a code per splat, which all splats share, multiplies and adds to colours."""
+
+    codes: jax.Array
+    first: jax.Array = shared()
+    """[3, 3] weights of u, v and the code."""
+    last: jax.Array = shared()
+    """[3, 3] weights of the colours."""
+
+    def numbers(self, gaussians, camera):
+        weights = jnp.concatenate([self.first.reshape(-1), self.last.reshape(-1)])
+        return jnp.concatenate([self.codes[:, None], jnp.broadcast_to(weights, (gaussians.num, 18))], axis=1)
+
+    def shade(self, numbers, values, u, v):
+        code, *weights = numbers
+        first, last = weights[:9], weights[9:]
+        neurons = [jnp.tanh(first[i] * u + first[i + 1] * v + first[i + 2] * code) for i in (0, 3, 6)]
+        outputs = [sum(last[3 * i + color] * neuron for i, neuron in enumerate(neurons)) for color in range(3)]
+        return (outputs[0],) * 3, None, tuple(1 + output for output in outputs)
+
+
 def random_arrays(kind: str, num: int, dtype="float64") -> dict[str, np.ndarray]:
     """Arrays of an appearance. Numbers are of float32, so that both precisions start from the same ones."""
     rng = np.random.default_rng(1)
@@ -63,6 +85,9 @@ def random_arrays(kind: str, num: int, dtype="float64") -> dict[str, np.ndarray]
         "movable": lambda: {
             "centers": rng.normal(size=(num, 4, 2)), "sharpness": rng.uniform(0.05, 1, (num, 4)),
             "logit_opacities": rng.uniform(-1, 2, (num, 4)), "colors": rng.normal(scale=0.4, size=(num, 4, 3)),
+        },
+        "painted": lambda: {
+            "codes": rng.normal(size=num), "first": rng.normal(size=(3, 3)), "last": rng.normal(size=(3, 3)),
         },
         "shaped": lambda: {"shapes": rng.normal(scale=1.5, size=num)},
         "billboard": lambda: {
@@ -76,6 +101,10 @@ def random_arrays(kind: str, num: int, dtype="float64") -> dict[str, np.ndarray]
 
 def glossy(arrays: dict, **options) -> Glossy:
     return Glossy(**jax.tree.map(jnp.asarray, arrays), **options)
+
+
+def painted(arrays: dict) -> Painted:
+    return Painted(**jax.tree.map(jnp.asarray, arrays))
 
 
 def movable_kernels(arrays: dict) -> MovableKernels:
@@ -112,13 +141,14 @@ CASES = {
     "glossy, no low-pass filter": Case(
         "glossy", functools.partial(glossy, has_low_pass=False, max_alpha=0.7), True, 1, 0.7, {"has_low_pass": False}
     ),
+    "painted": Case("painted", painted, True, 53),
     "shaped": Case("shaped", shaped, True, 53),
     "movable kernels": Case("movable", movable_kernels, False, 1),
     "billboards": Case("billboard", billboards, False, 0),
 }
-FAST = "movable kernels"
-"""The case whose gradients the default tests compare."""
-some_long = [pytest.param(name, marks=[] if name == FAST else pytest.mark.long) for name in CASES]
+FAST = ("movable kernels", "painted")
+"""The cases whose gradients the default tests compare."""
+some_long = [pytest.param(name, marks=[] if name in FAST else pytest.mark.long) for name in CASES]
 
 
 def rendered(scene, appearance, compositor="auto", dtype="float64"):
@@ -207,7 +237,9 @@ def test_every_leaf_against_differences(name, compositor):
 
 
 @pytest.mark.usefixtures("gpu_kernels")
-@pytest.mark.parametrize("name", [FAST, pytest.param("billboards", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "name", ["movable kernels", *(pytest.param(own, marks=pytest.mark.long) for own in ("billboards", "painted"))]
+)
 def test_gpu_kernels_are_those_of_xla(name):
     # In this scene no splat is seen so edge-on that v² would leave float32 three digits.
     case, scene = CASES[name], draw_scene(1, num=16, width=19, height=13)

@@ -11,7 +11,7 @@ import pytest
 from a2tg_jax.training import Session
 
 SCRIPT = pathlib.Path(__file__).with_name("on_devices.py")
-LONG = ("xla", "batches", "training", "events", "overflowing", "textures", "memory", "lenses", "balance")
+LONG = ("xla", "batches", "training", "events", "shared", "overflowing", "textures", "memory", "lenses", "balance")
 """Names that one process takes, since they share what it compiles."""
 
 

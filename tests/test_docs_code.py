@@ -73,6 +73,8 @@ def test_examples_run_and_learn():
              for model in ("model", "trained")]  # fmt: skip
     assert views[1] < 0.9 * views[0]
     assert 2 <= names["pruned"].model.num < 200 == names["result"].model.num
+    painted = names["painted"].model
+    assert painted.num < 200 and painted.bytes_of(0) == 4 * 8 * 7 and abs(painted.appearance.codes).max() > 0
     assert names["gradient"].shape == (200, 5) and abs(names["gradient"]).max() > 0
 
 

@@ -742,7 +742,7 @@ def test_shading_of_scalars_is_applied_pixel_by_pixel(whole, by_hand):
     u, v = np.random.default_rng(0).normal(size=(2, 4, 5)).astype(np.float32)
 
     def total(shade, u, v):
-        residual, factor = shade((), (), u, v)
+        residual, factor = shade((), (), u, v)[:2]
         return sum(jnp.sum(jnp.sin(color)) for color in residual) + (0 if factor is None else jnp.sum(factor * u))
 
     found = jax.value_and_grad(total, argnums=(1, 2))(functions.shade, u, v)

@@ -37,8 +37,8 @@ def static(*, default: object = dataclasses.MISSING) -> Any:
 def shared(*, default: object = None) -> Any:
     """Return a field of arrays that all Gaussians share, such as the weights of a network, a codebook or a hash grid.
 
-    Events and other changes of rows leave it unchanged. Its floats are trained like those of other fields, and count
-    once in the bytes of a model. In a pytree it is within a node of its own (`parallel.sharded_rows.Shared`).
+    Events and other changes of rows leave it unchanged. Its floats are trained like other fields, and count once in the
+    bytes of a model.
 
     Args:
       default: its default value; None, as in the template of an appearance, if left out.
