@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.host.text import name_replace
-
 from a2tg_jax.parallel.sharded_rows import Shared
 
 T = TypeVar("T")
