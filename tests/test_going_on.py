@@ -214,6 +214,26 @@ def test_what_is_no_model_is_refused(result, wrong, hint):
             fit(SCENE, START, start=wrong(result))
 
 
+def test_an_invalid_model_is_refused_before_training(result):
+    model = result.model
+    gaussians = model.gaussians
+
+    def changed(**fields):
+        return dataclasses.replace(model, gaussians=dataclasses.replace(gaussians, **fields))
+
+    wrong = {
+        r"^start\.gaussians\.quats must": changed(quats=gaussians.quats[:5]),
+        r"^start\.gaussians\.means must be finite; 1 of 110": changed(means=gaussians.means.at[3].set(jnp.nan)),
+        "^start must have at least 2 Gaussians; got 1": model[:1],
+    }
+    for message, start in wrong.items():
+        with pytest.raises(ValueError, match=message):
+            fitted(START, start=start)
+    small = a2tg.A2tg(sh_degree=1, densify=START.densify, texture=a2tg.Upscale(select="budget", budget_mb=0.001))
+    with pytest.raises(ValueError, match=r"^texture\.budget_mb is 0\.001, but 110 Gaussians"):
+        fitted(small, start=model)
+
+
 def test_a_checkpoint_has_its_own_model(result):
     with pytest.raises(ValueError, match="start and resume are both given"):
         fitted(SYSTEM, start=result.model, resume=result.checkpoint)

@@ -13,6 +13,7 @@ from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
 from a2tg_jax.appearance.base import check_appearance, join_rows
 from a2tg_jax.appearance.parts import nearest_gaussians
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.checks import fields_of
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.sh import NUM_BASES
@@ -20,9 +21,10 @@ from a2tg_jax.core.similarity import Similarity
 from a2tg_jax.core.table import Table, map_rows
 from a2tg_jax.data.assembly import Sight, unseeing
 from a2tg_jax.data.scene import Scene, View, check_view
-from a2tg_jax.events import Event
+from a2tg_jax.events import LEAST_LEFT, Event
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.other_programs import plain_gaussians
+from a2tg_jax.io.validate import check_model
 from a2tg_jax.model import Model
 from a2tg_jax.training.losses import SSIM_WINDOW
 from a2tg_jax.training.options import System
@@ -146,12 +148,18 @@ def check_views(views: tuple[View, ...]) -> None:
 def given_start(start: Model, scene: Scene, system: System, index: int) -> Model:
     """Return a model that a stage is to start from, with spherical harmonics of the degree at which training begins.
 
-    Warns of what the stage leaves out, and of options that do not apply. Raises ValueError, naming the option, if there
-    are more Gaussians than a cap or the memory budget allows.
+    Warns of what the stage leaves out, and of options that do not apply. Raises ValueError if the model is invalid, or,
+    naming the option, if it has more Gaussians than a cap or a budget allows.
     """
+    with fields_of("start"):
+        check_model(start)
     stages, start = system.all_stages(), start.live
     stage, degree, num = stages[index], system.initial_sh_degree, start.num
-    if index and system.memory_budget is not None:
+    if num < LEAST_LEFT:
+        raise ValueError(f"start must have at least {LEAST_LEFT} Gaussians; got {num}")
+    if index == 0:
+        system.check_number(num)
+    elif system.memory_budget is not None:
         system.check_given_number(num)
     for event in stage.events:
         most = event.most_gaussians
