@@ -18,6 +18,8 @@ def __getattr__(name: str) -> Any:
     # The stub lists names, not modules.
     if name not in __all__ and importlib.util.find_spec(f"{__name__}.{name}") is not None:
         return importlib.import_module(f"{__name__}.{name}")
+    # Most names start JAX.
+    importlib.import_module(f"{__name__}.host.machine").check_ulimits()
     value = _import_name(name)
     # Each time, because it completes the modules that are imported so far.
     importlib.import_module(f"{__name__}.host.field_docs").list_fields()

@@ -1,5 +1,8 @@
 """What compiled programs leave behind."""
 
+import shutil
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import jax
@@ -8,7 +11,8 @@ import psutil
 import pytest
 
 from a2tg_jax import fit, synthetic_scene
-from a2tg_jax.host import machine
+from a2tg_jax.host import machine, operating_system
+from a2tg_jax.host.errors import error_text
 from a2tg_jax.host.machine import keep_room_for_programs, memory_limit, tidy_memory
 from a2tg_jax.host.operating_system import trim_heap
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
@@ -100,3 +104,61 @@ def test_memory_that_a_process_may_have(tmp_path, monkeypatch, name):
 
 def test_the_memory_of_this_process():
     assert 2**26 < psutil.Process().memory_info().rss <= memory_limit()
+
+
+@pytest.mark.parametrize("letter, used", [("v", 300 * 1024), ("d", 200 * 1024)])
+def test_a_ulimit_counts_what_is_reserved(tmp_path, monkeypatch, letter, used):
+    monkeypatch.setattr(machine, "ulimits", lambda: {letter: used + 50 * 1024})
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=900 * 1024))
+    memory = SimpleNamespace(rss=100 * 1024, vms=300 * 1024, data=200 * 1024)
+    monkeypatch.setattr(psutil, "Process", lambda: SimpleNamespace(memory_info=lambda: memory))
+    assert memory_limit(tmp_path) == 150 * 1024
+
+
+SMALL_FIT = """
+import a2tg_jax as a2tg
+scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=40)
+print(a2tg.fit(scene, a2tg.Gaussians2dMcmc(stage1_iterations=2), progress=False))
+"""
+
+
+def limited(option: str, limit: int, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python with a limit of its address space ("as") or data ("data")."""
+    program = shutil.which("prlimit")
+    if program is None:
+        pytest.skip("prlimit, of util-linux, is not installed")
+    command = [program, f"--{option}={limit}", sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.mark.parametrize("option, limit", [("as", 500), ("as", 1000), ("as", 1700), ("data", 200), ("data", 600)])
+def test_too_small_a_ulimit_is_refused_before_jax_crashes(option, limit):
+    """JAX ends such a process with SIGSEGV or SIGABRT, or waits forever."""
+    letter, kind = {"as": ("v", "address space"), "data": ("d", "data")}[option]
+    wanted = f"{limit / 1000:.2f} GB" if limit >= 1000 else f"{limit} MB"
+    command = limited(option, limit * 10**6, "-m", "a2tg_jax", "train", "synthetic", "--out", "never")
+    assert command.returncode == 2
+    assert command.stderr.startswith(f"a2tg: error: this process may reserve {wanted} of {kind}, and JAX")
+    assert f"ulimit -{letter} unlimited" in command.stderr and command.stderr.count("\n") == 1
+    library = limited(option, limit * 10**6, "-c", SMALL_FIT)
+    assert library.returncode == 1 and f"ValueError: this process may reserve {wanted} of {kind}" in library.stderr
+
+
+def test_what_needs_no_jax_runs_within_a_small_ulimit():
+    done = limited("as", 1_000_000_000, "-m", "a2tg_jax", "download", "--list")
+    assert done.returncode == 0 and "garden" in done.stdout, done.stderr
+    assert limited("as", 1_000_000_000, "-m", "a2tg_jax", "train", "--help").returncode == 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("option, letter", [("as", "v"), ("data", "d")])
+def test_the_least_ulimit_is_enough(option, letter):
+    stacks = machine.STACKS_PER_CORE * operating_system.num_cores() * operating_system.stack_bytes()
+    done = limited(option, machine.LEAST_ULIMITS[letter] + stacks, "-c", SMALL_FIT)
+    assert done.returncode == 0 and "FitResult(" in done.stdout, done.stderr
+
+
+def test_a_library_without_room_is_a_lack_of_memory():
+    error = ImportError("libzstd.so.1: failed to map segment from shared object")
+    assert error_text(error, "close other programs").startswith("not enough memory to load a library (libzstd.so.1")
+    assert error_text(ImportError("no module named x"), "") is None

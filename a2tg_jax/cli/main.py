@@ -14,6 +14,7 @@ from typing import Any
 from a2tg_jax.cli.flags import FLAGS
 from a2tg_jax.host import signals
 from a2tg_jax.host.errors import error_text
+from a2tg_jax.host.machine import check_ulimits
 from a2tg_jax.host.startup import configure_cpu
 from a2tg_jax.host.text import did_you_mean, shortened
 
@@ -55,6 +56,9 @@ COMMANDS = {
 """Module of `a2tg_jax.cli` and dataclass of each command."""
 CONVERTED = ("ply", "sog", "spz", "splat", "ksplat", "glb", "gltf", "usdz", "usda", "usdc", "npz", "a2tgz")
 """Suffixes of files that convert writes, tried as flags of export. `io.formats` has them too, but imports JAX."""
+WITHOUT_JAX = frozenset({"sfm", "download"})
+"""Commands that do not start JAX."""
+HELP = frozenset({"-h", "--help", "--help-all"})
 SMALLER = {
     "train": "close other programs, or give a larger --downscale, or a smaller --memory-budget or --batch-size",
     "render": "lower --size or --supersample",
@@ -85,6 +89,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         with warnings.catch_warnings(), signals.raised():
             warnings.showwarning = _show_warning
+            if name not in WITHOUT_JAX and HELP.isdisjoint(arguments):
+                check_ulimits()
             configure_cpu()
             try:
                 here = os.getcwd()

@@ -22,6 +22,8 @@ def error_text(error: Exception, less_memory: str) -> str | None:
     """
     if isinstance(error, ModuleNotFoundError) and error.name == "matplotlib":  # What commands import first of [train].
         return "this command needs matplotlib, which is not installed: pip install 'a2tg-jax[train]'"
+    if isinstance(error, ImportError) and "failed to map segment" in str(error):
+        return f"not enough memory to load a library ({shortened(str(error), 120)}): {less_memory}"
     # JAX's errors are RuntimeErrors; jax.errors itself takes a second to import.
     is_of_device = isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
     if is_of_device or isinstance(error, MemoryError):

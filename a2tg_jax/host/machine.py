@@ -5,19 +5,22 @@ JAX is imported in functions, so that the command line can answer a mistyped com
 
 import contextlib
 import dataclasses
+import faulthandler
 import functools
 import hashlib
 import itertools
 import math
 import os
 import platform
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import psutil
 from jaxlib.version import __version__ as jaxlib_version
 
-from a2tg_jax.host.operating_system import num_cores, trim_heap
+from a2tg_jax.host.operating_system import keep_one_heap, num_cores, stack_bytes, trim_heap, ulimits
+from a2tg_jax.host.text import in_bytes
 
 if TYPE_CHECKING:
     import jax
@@ -27,6 +30,10 @@ LARGEST_SHARE = 0.6
 """Share of a process's allowed memory mappings beyond which compiled programs are dropped."""
 MEMORY_FILES = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
 """File names of a control group's limit and use, in version 2 and in version 1."""
+LEAST_ULIMITS = {"v": 1_800_000_000, "d": 1_000_000_000}
+"""Bytes of address space and of data for Python's libraries, JAX and a short training, without stacks of threads."""
+STACKS_PER_CORE = 4
+"""Threads per core: two pools of XLA, and BLAS in numpy and in scipy."""
 
 _chosen: int | None = None
 
@@ -107,16 +114,46 @@ def cpu_quota(root: Path = Path("/")) -> float:
 def memory_limit(root: Path = Path("/")) -> int:
     """Return the total bytes of memory that this process may use: its own plus what is free now (host).
 
-    Limits of control groups count. A group's file cache counts as free.
+    Limits of control groups and of `ulimit` count. A group's file cache counts as free.
     """
+    process = psutil.Process()
     left: list[int] = [psutil.virtual_memory().available]
+    for letter, most in ulimits().items():
+        used = process.memory_info()
+        left.append(most - (used.vms if letter == "v" else used.data))
     for folder, (limit, usage) in itertools.product(control_groups(root, "memory"), MEMORY_FILES):
         with contextlib.suppress(OSError, ValueError):  # a file of the other version, or "max"
             room = int((folder / limit).read_text()) - int((folder / usage).read_text())
             stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
             # The kernel drops inactive file cache on demand. Version 1 has the sums over subgroups in total_*.
             left.append(room + int(stat.get("total_inactive_file", stat.get("inactive_file", 0))))
-    return int(psutil.Process().memory_info().rss) + max(0, min(left))
+    return int(process.memory_info().rss) + max(0, min(left))
+
+
+@functools.cache
+def check_ulimits() -> None:
+    """Check `ulimit` before JAX starts, which would end the process without a message.
+
+    If there is a limit, threads share one heap, and a crash later prints where it was.
+
+    Raises:
+      ValueError: if JAX needs more address space or data than this process may reserve.
+    """
+    limits = ulimits()
+    if not limits:
+        return
+    keep_one_heap()
+    stacks = STACKS_PER_CORE * num_cores() * stack_bytes()
+    for letter, limit in limits.items():
+        needed = LEAST_ULIMITS[letter] + stacks
+        if limit < needed:
+            kind = {"v": "address space", "d": "data"}[letter]
+            raise ValueError(
+                f"this process may reserve {in_bytes(limit)} of {kind}, and JAX with its threads needs about "
+                f"{in_bytes(needed)}: raise the limit (ulimit -{letter} unlimited), or request more memory for the job"
+            )
+    if sys.__stderr__ is not None and not faulthandler.is_enabled():
+        faulthandler.enable(sys.__stderr__)
 
 
 def tidy_memory() -> None:

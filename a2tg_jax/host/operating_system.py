@@ -12,6 +12,10 @@ from typing import Any, TextIO
 
 LOCKED_BYTE = 1 << 30
 """Position of the byte that Windows locks: past the file's end, because others cannot read a locked byte."""
+M_ARENA_MAX = -8
+"""Number of glibc's option for the largest number of heaps, in malloc.h."""
+STACK_BYTES = 8 << 20
+"""Usual size of a thread's stack."""
 HANDLER_SIZE = 1024
 """Bytes for C's struct sigaction, whose size depends on the system; glibc's has 152."""
 
@@ -82,6 +86,32 @@ def trim_heap() -> None:
     trim = getattr(_c_library(), "malloc_trim", None)
     if trim is not None:
         trim(0)
+
+
+def keep_one_heap() -> None:
+    """Let the threads that start from now on share one heap. glibc reserves 64 MB of address space for each other."""
+    set_option = getattr(_c_library(), "mallopt", None)
+    if set_option is not None:
+        set_option(M_ARENA_MAX, 1)
+
+
+def ulimits() -> dict[str, int]:
+    """Return the bytes that this process may reserve, by the letter of `ulimit`: v for address space, d for data.
+    Unlimited ones are left out; macOS does not enforce them, and Windows has none."""
+    if sys.platform != "linux":
+        return {}
+    import resource
+
+    soft = {"v": resource.getrlimit(resource.RLIMIT_AS)[0], "d": resource.getrlimit(resource.RLIMIT_DATA)[0]}
+    return {letter: limit for letter, limit in soft.items() if limit != resource.RLIM_INFINITY}
+
+
+def stack_bytes() -> int:
+    """Return the bytes of a new thread's stack on Linux."""
+    import resource
+
+    soft = resource.getrlimit(resource.RLIMIT_STACK)[0]
+    return STACK_BYTES if soft == resource.RLIM_INFINITY else soft
 
 
 def wait_in_abort() -> None:
