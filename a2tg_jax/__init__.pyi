@@ -98,6 +98,7 @@ from .mesh.triangles import (
 )
 from .model import Model as Model, concatenate as concatenate
 from .rasterize.render_types import RenderOutput as RenderOutput, RenderSettings as RenderSettings
+from .rasterize.views import EmptyRenderWarning as EmptyRenderWarning
 from .render import (
     CapacityWarning as CapacityWarning,
     render_appearance as render_appearance,

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from a2tg_jax.core.budget import number_to_reach
@@ -46,13 +47,13 @@ class MoveResult(NamedTuple):
 
     gaussians: Gaussians
     moments: Any
-    """Moments as given, with the rows of the hosts (and of the added) at zero."""
+    """Moments as given, with the rows of the hosts (and of the added) at zero; the count of Adam's state stays."""
     num_live: Array
     """int32."""
     info: MoveInfo
 
 
-def relocate(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Array | int) -> MoveResult:
+def relocate(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int) -> MoveResult:
     """Move each dead Gaussian (opacity at most 0.005) onto a live one, drawn with probability ∝ its opacity.
 
     Host and moved ones share opacity and size so that together they look like the host (3DGS-MCMC, Kheradmand et al.,
@@ -61,7 +62,7 @@ def relocate(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Arr
     Args:
       key: a random key.
       gaussians: N rows.
-      moments: pytree of arrays with leading axis N, such as (mu, nu) of Adam.
+      moments: state of Adam (`adam_init(gaussians)`), or a pytree of arrays with leading axis N.
       num_live: rows in use, 0 to N; may be traced.
 
     Returns:
@@ -72,8 +73,8 @@ def relocate(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Arr
       ValueError: if a leaf of `moments` has another leading axis.
 
     Examples:
-      >>> moments = jax.tree.map(jnp.zeros_like, gaussians)
-      >>> moved = a2tg.relocate(jax.random.key(0), gaussians, moments, gaussians.num)
+      >>> state = a2tg.adam_init(gaussians)
+      >>> moved = a2tg.relocate(jax.random.key(0), gaussians, state, gaussians.num)
       >>> moved.gaussians.num, int(moved.num_live)
       (200, 200)
     """
@@ -82,7 +83,7 @@ def relocate(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Arr
     return _moved(gaussians, moments, num_live, plan_relocation(key, gaussians.opacities, num_live))
 
 
-def grow(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Array | int, cap: Array | int) -> MoveResult:
+def grow(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int, cap: Array | int) -> MoveResult:
     """Grow the live count n to min(cap, max(n + 1, ⌊1.05·n⌋)) by copies of hosts drawn as in `relocate`.
 
     3DGS-MCMC (Kheradmand et al., 2024).
@@ -92,7 +93,7 @@ def grow(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Array |
     Args:
       key: a random key.
       gaussians: N rows.
-      moments: pytree of arrays with leading axis N.
+      moments: state of Adam (`adam_init(gaussians)`), or a pytree of arrays with leading axis N.
       num_live: rows in use, 0 to N; may be traced.
       cap: largest count, at most N; may be traced.
 
@@ -104,8 +105,8 @@ def grow(key: Array, gaussians: Gaussians, moments: AdamState, num_live: Array |
       ValueError: if a cap that is not traced exceeds N, or a leaf of `moments` has another leading axis.
 
     Examples:
-      >>> moments = jax.tree.map(jnp.zeros_like, gaussians)
-      >>> grown = a2tg.grow(jax.random.key(0), gaussians, moments, 100, cap=200)
+      >>> state = a2tg.adam_init(gaussians)
+      >>> grown = a2tg.grow(jax.random.key(0), gaussians, state, 100, cap=200)
       >>> int(grown.num_live)
       105
     """
@@ -256,12 +257,14 @@ def _copied_rows(hosts: Array, is_target: Array) -> tuple[Array, Array]:
     return jnp.where(is_target, hosts, jnp.arange(hosts.shape[0], dtype=jnp.int32)), num_draws
 
 
-def _moved(gaussians: Gaussians, moments: AdamState, num_live: Array, moves: Moves) -> MoveResult:
+def _moved(gaussians: Gaussians, moments: Any, num_live: Array, moves: Moves) -> MoveResult:
     """Copy rows from their hosts after sharing, and clear their moments."""
     logits, scales = share(gaussians.logit_opacities, gaussians.log_scales, moves.num_shares)
     copied = dataclasses.replace(gaussians, logit_opacities=logits, log_scales=scales)[moves.rows]
+    # Of the leaves, only the number of Adam's updates has no rows.
     moments = jax.tree.map(
-        lambda x: jnp.where(moves.is_reset.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x), moments
+        lambda x: jnp.where(moves.is_reset.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x) if x.ndim else x,
+        moments,
     )
     return MoveResult(copied, moments, num_live + moves.info.num_added, moves.info)
 
@@ -270,9 +273,14 @@ def _check_moments(gaussians: Gaussians, moments: object, num_live: Array | int)
     """Raise ValueError unless the Gaussians are well formed and every leaf has one row for each of them."""
     check_gaussians(gaussians)
     check_shape("num_live", num_live, ())
-    for leaf in jax.tree.leaves(moments):
-        if leaf.ndim == 0 or leaf.shape[0] != gaussians.num:
-            raise ValueError(f"every leaf of moments must have {gaussians.num} rows; got shape {leaf.shape}")
+    rows = (moments.mu, moments.nu) if isinstance(moments, AdamState) else moments
+    for path, leaf in jax.tree_util.tree_leaves_with_path(rows):
+        if np.ndim(leaf) == 0 or np.shape(leaf)[0] != gaussians.num:
+            name = f"moments{jax.tree_util.keystr(path)}"
+            raise ValueError(
+                f"moments must be adam_init(gaussians), or arrays with {gaussians.num} rows; got {name} of shape "
+                f"{[*np.shape(leaf)]}"
+            )
 
 
 def densify_times(num_iterations: int) -> Times:

@@ -10,7 +10,7 @@ import functools
 import threading
 import warnings
 from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from a2tg_jax.core.cameras import Camera, check_camera
 from a2tg_jax.core.checks import check_floats, check_kind, check_shape, check_unmasked, dtype_of, plain_array
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.rasterize.views import render_traced, with_capacity
+from a2tg_jax.rasterize.views import has_rows, render_traced, warn_of_empty, with_capacity
 from a2tg_jax.texture import Textures, check_textures
 
 
@@ -109,19 +109,18 @@ def render_appearance(
     check_is_appearance(appearance, gaussians)
     num_colors = num_colors_of(appearance)
     background = (0,) * num_colors if background is None else background
-    check_background(background, num_colors)
+    background = background_array(background, gaussians, num_colors)
     if num_live is not None:
         check_shape("num_live", num_live, ())
         is_known, num = not isinstance(num_live, jax.core.Tracer), gaussians.num
         if not jnp.issubdtype(dtype_of(num_live), jnp.integer) or (is_known and not 0 <= int(num_live) <= num):
             raise ValueError(f"num_live must be an integer, 0 to {num}; got {num_live}")
     planned = with_capacity(settings, gaussians, camera, appearance, num_live)
-    background = jnp.asarray(background, gaussians.means.dtype)
-    output, _ = jitted_render()(gaussians, camera, appearance, background, planned, num_live=num_live)
+    output, num_pairs = jitted_render()(gaussians, camera, appearance, background, planned, num_live=num_live)
     # A capacity planned here suffices; one from the caller may not.
     if settings.capacity is not None:
         kind = settings, camera.width, camera.height, gaussians.num
-        _watch_overflow(output.overflow, settings.capacity, kind)
+        _watch(_Watched(output.overflow, num_pairs, settings.capacity, has_rows(gaussians, num_live)), kind)
     return output
 
 
@@ -132,38 +131,53 @@ def jitted_render() -> Callable[..., tuple[RenderOutput, Array]]:
     return jax.jit(render_traced, static_argnums=(4,), static_argnames=("has_geometry",))
 
 
-def _watch_overflow(overflow: Array, capacity: int, kind: Hashable) -> None:
-    """Warn if this render, or one before it that is done by now, has overflowed; do nothing under jit and vmap.
+class _Watched(NamedTuple):
+    """A render that may not be done yet: whether it has overflowed, and whether it is empty."""
+
+    overflow: Any
+    num_pairs: Any
+    capacity: int
+    has_rows: bool
+
+
+def _watch(rendered: _Watched, kind: Hashable) -> None:
+    """Warn if this render, or one before it that is done by now, has overflowed or is empty; do nothing under jit and
+    vmap.
 
     The first render of a kind (settings, image size and number of Gaussians) is waited for; later ones are read once
     they are done, so that rendering stays asynchronous.
     """
-    if isinstance(overflow, jax.core.Tracer):
+    if isinstance(rendered.num_pairs, jax.core.Tracer):
         return
     with _watch_lock:
-        _pending.append((overflow, capacity))
+        _pending.append(rendered)
     if kind not in _watched_kinds:
         _watched_kinds.add(kind)
-        overflow.block_until_ready()
+        rendered.num_pairs.block_until_ready()
     while True:
         with _watch_lock:
-            if not _pending or not (_pending[0][0].is_deleted() or _pending[0][0].is_ready()):
+            if not _pending or not (_pending[0].num_pairs.is_deleted() or _pending[0].num_pairs.is_ready()):
                 return
-            done, its_capacity = _pending.popleft()
-        # The flag of a deleted output has no value to read.
-        if not done.is_deleted() and bool(done):
+            done = _pending.popleft()
+        # What is deleted has no value to read.
+        if done.num_pairs.is_deleted() or done.overflow.is_deleted():
+            continue
+        # Explicit transfers, which `jax.transfer_guard` lets pass.
+        if jax.device_get(done.overflow):
             warnings.warn(
-                f"settings.capacity of {its_capacity:,} was too small for a render: its image is only the background. "
+                f"settings.capacity of {done.capacity:,} was too small for a render: its image is only the background. "
                 "Plan it with settings = plan_render(model, cameras), or leave capacity=None outside jit",
                 CapacityWarning,
                 stacklevel=4,
             )
+        if done.has_rows and jax.device_get(done.num_pairs) == 0:
+            warn_of_empty("the camera of a render")
 
 
 _watch_lock = threading.Lock()  # threads may render at the same time
 _watched_kinds: set[Hashable] = set()
-_pending: collections.deque[tuple[Any, int]] = collections.deque(maxlen=64)
-"""Flags of renders that may not be done yet, and their capacities; the oldest are forgotten."""
+_pending: collections.deque[_Watched] = collections.deque(maxlen=64)
+"""Renders that may not be done yet; the oldest are forgotten."""
 
 
 def with_features(appearance: Appearance, features: ArrayLike | None, gaussians: Gaussians) -> Appearance:
@@ -179,8 +193,9 @@ def with_features(appearance: Appearance, features: ArrayLike | None, gaussians:
     return dataclasses.replace(appearance, features=jnp.asarray(features))
 
 
-def check_background(background: ArrayLike, num_colors: int = 3) -> None:
-    """Raise ValueError unless the background is one colour, of `num_colors` numbers."""
+def background_array(background: ArrayLike, gaussians: Gaussians, num_colors: int = 3) -> Array:
+    """Return the background as an array of the dtype in which Gaussians are drawn. ValueError: it is not one colour, of
+    `num_colors` numbers."""
     check_unmasked("background", background)
     if np.ndim(background) == 3:
         raise ValueError(
@@ -190,6 +205,12 @@ def check_background(background: ArrayLike, num_colors: int = 3) -> None:
     if isinstance(background, str):
         raise ValueError(f"background must be [{num_colors}] floats, such as (1, 1, 1) for white; got {background!r}")
     check_shape("background", background, (num_colors,))
+    # Without x64, JAX draws Gaussians of NumPy in float32 even if they are float64.
+    dtype = jnp.result_type(gaussians.means)
+    if any(isinstance(leaf, Array) for leaf in jax.tree.leaves(background)):
+        return jnp.asarray(background, dtype)
+    # An explicit transfer, which `jax.transfer_guard` lets pass.
+    return jax.device_put(np.asarray(background, dtype))
 
 
 def appearance_of(gaussians: Gaussians, textures: Textures | None, settings: RenderSettings) -> Appearance:

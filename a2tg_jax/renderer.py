@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 
-import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
@@ -18,8 +17,8 @@ from a2tg_jax.model import Model
 from a2tg_jax.parallel.exchange import exchange_of
 from a2tg_jax.parallel.exchange_room import room_of_view
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.rasterize.views import HEAD_ROOM, capacity_for, pairs_of_view, pairs_to_draw
-from a2tg_jax.render import appearance_of, check_background, jitted_render
+from a2tg_jax.rasterize.views import HEAD_ROOM, capacity_for, has_rows, pairs_of_view, pairs_to_draw, warn_of_empty
+from a2tg_jax.render import appearance_of, background_array, jitted_render
 from a2tg_jax.texture import Textures
 
 FIRST_ROOM = 1.5
@@ -83,6 +82,8 @@ def plan_render(
         raise ValueError("give an appearance or textures, not both")
     check_is_appearance(appearance, gaussians)
     most = max(pairs_to_draw(gaussians, camera, appearance, settings, num_live) for camera in cameras)
+    if most == 0 and has_rows(gaussians, num_live):
+        warn_of_empty("any of the cameras", stacklevel=3)
     return dataclasses.replace(settings, capacity=capacity_for(most, head_room))
 
 
@@ -155,10 +156,9 @@ class Renderer:
         check_gaussians(model.gaussians)
         check_is_appearance(model.appearance, model.gaussians)
         background = model.default_background if background is None else background
-        check_background(background, num_colors_of(model.appearance))
         self._gaussians, self._num_live = model.gaussians, model.num_live
         self._appearance = model.appearance
-        self._background = jnp.asarray(background, model.gaussians.means.dtype)
+        self._background = background_array(background, model.gaussians, num_colors_of(model.appearance))
         self._settings, self._has_geometry = settings, has_geometry
         own = [] if model.origin is None else model.origin.cameras
         self._known = evenly_chosen(own, PLANNED_CAMERAS)

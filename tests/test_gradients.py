@@ -44,6 +44,25 @@ def test_gradients_are_those_of_the_image_and_the_statistic_is_the_oracles():
     assert 0 < is_seen.sum() < len(is_seen)
 
 
+def test_a_gradient_of_textures_has_none_for_their_places():
+    scene = draw_scene(4)
+    gaussians, camera, textures = (make(scene, "float32") for make in (as_gaussians, as_camera, as_textures))
+    settings = RenderSettings(capacity=CAPACITY)
+
+    def loss(textures, factor):
+        return factor * jnp.mean(a2tg.render_image(gaussians, camera, textures, settings=settings).color ** 2)
+
+    def of_buckets(buckets):
+        return loss(dataclasses.replace(textures, buckets=buckets), 2.0)
+
+    value, found = jax.jit(a2tg.value_and_grad(loss))(textures, 2.0)
+    wanted = jax.jit(jax.value_and_grad(of_buckets))(textures.buckets)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6), (value, found.buckets), wanted)
+    assert found.bucket is None and found.row is None
+    with pytest.raises(ValueError, match="a pytree with floats, such as a model; got ndarray"):
+        a2tg.value_and_grad(loss)(np.arange(3), 2.0)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("event", [a2tg.Upscale(), a2tg.CloneSplitPrune(), a2tg.Upscale(gradient="screen")])
 def test_norms_are_those_that_events_average(event):

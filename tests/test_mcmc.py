@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from a2tg_jax.core.gaussians import DEAD_OPACITY, Gaussians, logit, rotation_matrices, share, stacked_integral
+from a2tg_jax.core.optim import AdamState, adam_init
 from a2tg_jax.mcmc import draw_hosts, grow, perturb, relocate
 
 KEY = jax.random.key(0)
@@ -177,8 +178,21 @@ def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="cap must be at most the 8 rows"):
         grow(KEY, gaussians, (), 4, 9)
     for step in (relocate, functools.partial(grow, cap=8)):
-        with pytest.raises(ValueError, match="moments must have 8 rows"):
+        with pytest.raises(ValueError, match=r"adam_init\(gaussians\), or arrays with 8 rows; got moments\['count'\]"):
             step(KEY, gaussians, {"count": jnp.zeros(())}, 4)
+        with pytest.raises(ValueError, match=r"got moments\[0\].means of shape \[9, 3\]"):
+            step(KEY, gaussians, adam_init(random_gaussians(9)), 4)
+
+
+@pytest.mark.parametrize("step", [relocate, lambda *args: grow(*args, NUM)], ids=["relocate", "grow"])
+def test_the_state_of_adam_moves_like_its_moments(step):
+    gaussians, *_ = dead_and_live()
+    mu, nu = ones_like_moments(gaussians)
+    state = AdamState(mu, jax.tree.map(lambda leaf: 2 * leaf, nu), jnp.int32(7))
+    found, wanted = step(KEY, gaussians, state, 40), step(KEY, gaussians, (state.mu, state.nu), 40)
+    assert isinstance(found.moments, AdamState) and int(found.moments.count) == 7
+    moved = found._replace(moments=(found.moments.mu, found.moments.nu))
+    jax.tree.map(np.testing.assert_array_equal, moved, wanted)
 
 
 @pytest.mark.parametrize("step", [relocate, lambda *args: grow(*args, NUM)], ids=["relocate", "grow"])

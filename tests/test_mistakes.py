@@ -406,9 +406,12 @@ CALLS = {
     "plan_render(MODEL, [CAMERA], appearance=MODEL.appearance)": "plan_render(model, cameras)",
     "Renderer(FLAT_SH)": "gaussians.sh … [7, K, 3] … K = 2",
     "Renderer(GAUSSIANS, CAMERA)": "appearance … Appearance … Camera",
+    "render_image(changed(means=np.zeros((7, 3))), CAMERA)": "gaussians.means must be float32 as quats, log_scales, "
+    "logit_opacities, sh are; got float64",
+    "RenderSettings(compositor='gpu')": "compositor must be one of auto, cuda, native, xla, autodiff … 'gpu'",
     "view_gradients(lambda m, o: 0.0, GAUSSIANS, CAMERA)": "model … Gaussians … Model(gaussians)",
     "view_gradients(lambda m, o: 0.0, MODEL, CAMERA, statistic='foo')": "statistic … position, screen, center … 'foo'",
-    "value_and_grad(jnp.sum)(jnp.ones(3))": "model … Model … ArrayImpl",
+    "value_and_grad(jnp.sum)(jnp.arange(3))": "first argument … pytree with floats … ArrayImpl",
     "resize_camera(CAMERA, 0, 12)": "width … int, at least 1 … 0",
     "smooth_path([CAMERA, CAMERA], '5')": "num_frames … int, at least 1 … '5'",
     "smooth_path(SCENE.train, 5)": "cameras[0] … Camera … View … view.camera",
@@ -670,6 +673,41 @@ def test_a_capacity_that_is_too_small_warns_eagerly():
         planned = a2tg.plan_render(model, [CAMERA])
         assert planned == a2tg.plan_render(model.gaussians, [CAMERA], appearance=model.appearance)
         assert not model.render(CAMERA, settings=planned).overflow
+
+
+def test_a_camera_that_sees_nothing_warns_eagerly():
+    model = a2tg.Model(some_gaussians(40))
+    planned = a2tg.plan_render(model, [CAMERA])
+    opengl = dataclasses.replace(CAMERA, viewmat=np.diag(np.float32([1, -1, -1, 1])) @ CAMERA.viewmat)
+    away = dataclasses.replace(CAMERA, viewmat=CAMERA.viewmat.at[2, 3].set(-100.0))
+    loss = lambda model, output: jnp.mean(output.color)  # noqa: E731
+    for camera in (opengl, away):
+        for see in (
+            lambda: model.render(camera),  # noqa: B023
+            lambda: a2tg.render_image(model.gaussians, camera),  # noqa: B023
+            lambda: jax.grad(lambda g: jnp.mean(a2tg.render_image(g, camera).color))(model.gaussians),  # noqa: B023
+            lambda: a2tg.view_gradients(loss, model, camera),  # noqa: B023
+            lambda: a2tg.plan_render(model, [camera, camera]),  # noqa: B023
+        ):
+            with pytest.warns(a2tg.EmptyRenderWarning, match="world to camera .* OpenCV axes"):
+                see()
+    # With a planned capacity the first render of a kind is waited for, later ones are reported with the next.
+    small = dataclasses.replace(opengl, width=31)
+    with pytest.warns(a2tg.EmptyRenderWarning) as caught:
+        model.render(small, settings=planned)
+    assert caught[0].filename == __file__
+    with pytest.warns(a2tg.EmptyRenderWarning):
+        jax.block_until_ready(model.render(dataclasses.replace(away, width=31), settings=planned))
+        model.render(CAMERA, settings=planned)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.jit(lambda camera: model.render(camera, settings=planned))(opengl)
+        a2tg.Renderer(model)(opengl)
+        a2tg.plan_render(model, [CAMERA, opengl])
+        for nothing in (model[:0], dataclasses.replace(model, num_live=jnp.int32(0))):
+            nothing.render(opengl)
+            nothing.render(opengl, settings=planned)
+            a2tg.plan_render(nothing, [opengl])
 
 
 def test_nan_in_a_ply_file(tmp_path):

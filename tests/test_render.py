@@ -112,6 +112,7 @@ def test_an_eager_call_finds_its_own_capacity():
     assert_equal_in_float64(scene, DEFAULT_RULES, output)
 
 
+@pytest.mark.filterwarnings("ignore::a2tg_jax.EmptyRenderWarning")
 def test_a_scene_wholly_behind_the_camera_is_background():
     scene = draw_scene(0)
     away = scene.viewmat.copy()

@@ -76,6 +76,33 @@ def test_donated_buffers():
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), found, wanted)
 
 
+@pytest.mark.parametrize("compositor", ["xla", "autodiff"])
+def test_programs_are_exported(compositor):
+    leaves, structure = jax.tree.flatten(some_gaussians())
+
+    def gradient(*leaves):
+        return jax.grad(functools.partial(loss, compositor=compositor))(jax.tree.unflatten(structure, leaves)).means
+
+    exported = jax.export.export(jax.jit(gradient))(*leaves)
+    wanted = jax.jit(jax.grad(loss))(some_gaussians()).means
+    np.testing.assert_allclose(exported.call(*leaves), wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_an_export_that_is_not_possible_names_the_compositor():
+    with pytest.raises(ValueError, match="compositor=native"):
+        jax.export.export(jax.jit(loss))(some_gaussians())
+
+
+def test_an_eager_render_makes_no_implicit_transfer():
+    gaussians, camera = jax.tree.map(jnp.asarray, (some_gaussians(), CAMERA))
+    settings = RenderSettings(capacity=1024)
+    render = lambda: render_image(gaussians, camera, background=(0.5, 0.5, 0.5), settings=settings)  # noqa: E731
+    wanted = np.asarray(render().color)
+    with jax.transfer_guard("disallow"):
+        found = render()
+    np.testing.assert_array_equal(found.color, wanted)
+
+
 SEVERAL_DEVICES = """
 import jax
 import jax.numpy as jnp

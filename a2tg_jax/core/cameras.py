@@ -97,7 +97,7 @@ def check_camera(camera: Camera, name: str = "camera") -> None:
             raise ValueError(f"{name}.{side} must be a positive number of pixels{kind}; got {value!r}")
     # Both may drift as gradient steps make them; a pose with NaN passes.
     if not isinstance(camera.viewmat, jax.core.Tracer):
-        viewmat = np.asarray(camera.viewmat, np.float64)
+        viewmat = np.asarray(jax.device_get(camera.viewmat), np.float64)
         rotation = viewmat[:3, :3]
         skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
         wanted = f"{name}.viewmat must be a rigid motion, world to camera, OpenCV axes (x right, y down, z forward)"
@@ -108,7 +108,7 @@ def check_camera(camera: Camera, name: str = "camera") -> None:
         if np.abs(viewmat[3] - [0, 0, 0, 1]).max() > MAX_DRIFT:
             raise ValueError(f"{wanted}; its last row must be 0, 0, 0, 1, and is {_numbers(viewmat[3])}")
     if not isinstance(camera.K, jax.core.Tracer):
-        K = np.asarray(camera.K, np.float64)
+        K = np.asarray(jax.device_get(camera.K), np.float64)
         focal = K[[0, 1], [0, 1]]
         is_upper = abs(K[1, 0]) <= MAX_DRIFT * focal[1] and np.abs(K[2] - [0, 0, 1]).max() <= MAX_DRIFT
         if not (np.isfinite(K).all() and (focal > 0).all() and is_upper):

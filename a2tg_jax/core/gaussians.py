@@ -153,9 +153,7 @@ def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
     for own in dataclasses.fields(gaussians):
         check_array(f"{name}.{own.name}", getattr(gaussians, own.name))
     check_floats(f"{name}.means", gaussians.means, ("N", 3))
-    num, dtype = gaussians.num, dtype_of(gaussians.means)
-    if str(dtype) not in FLOATS:
-        raise ValueError(f"{name} must be {' or '.join(FLOATS)}; got {dtype}")
+    num = gaussians.num
     check_floats(f"{name}.sh", gaussians.sh, (num, "K", 3))
     if (bases := gaussians.sh.shape[1]) not in NUM_BASES:
         raise ValueError(f"{name}.sh must be [{num}, K, 3] with K = 1, 4, 9 or 16, for degrees 0 to 3; got K = {bases}")
@@ -163,8 +161,15 @@ def check_gaussians(gaussians: Gaussians, name: str = "gaussians") -> None:
     for field, shape in shapes.items():
         value = getattr(gaussians, field)
         check_floats(f"{name}.{field}", value, shape)
-        if dtype_of(value) != dtype:
-            raise ValueError(f"{name}.{field} must be {dtype} as the means are; got {dtype_of(value)}")
+    dtypes = {field.name: str(dtype_of(getattr(gaussians, field.name))) for field in dataclasses.fields(gaussians)}
+    # The odd ones out are named, whichever field comes first.
+    usual = max(dtypes.values(), key=[*dtypes.values()].count)
+    if usual not in FLOATS:
+        raise ValueError(f"{name} must be {' or '.join(FLOATS)}; got {usual}")
+    for field, dtype in dtypes.items():
+        if dtype != usual:
+            others = ", ".join(other for other, own in dtypes.items() if own == usual)
+            raise ValueError(f"{name}.{field} must be {usual} as {others} are; got {dtype}")
 
 
 def rotation_columns(quat: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:

@@ -104,14 +104,16 @@ def adam_update(
     mu = jax.tree.map(lambda m, g: b1 * m + (1 - b1) * g, state.mu, grads)
     nu = jax.tree.map(lambda v, g: b2 * v + (1 - b2) * g * g, state.nu, grads)
 
-    # For each dtype once. In this order, so that the same program is compiled each time.
-    dtypes = dict.fromkeys(leaf.dtype for leaf in jax.tree.leaves(params))
+    # For each dtype once. In this order, so that the same program is compiled each time. `result_type`: without x64,
+    # JAX computes in float32 with float64 of NumPy.
+    dtypes = dict.fromkeys(map(jnp.result_type, jax.tree.leaves(params)))
     corrections = {dtype: [_bias_correction(decay, count, dtype) for decay in (b1, b2)] for dtype in dtypes}
 
     def step(rate: Array, param: Array, m: Array, v: Array) -> Array:
         # Rates have JAX's default dtype, which under x64 would promote float32 parameters.
-        rate = jnp.asarray(rate, param.dtype)
-        first, second = corrections[param.dtype]
+        dtype = jnp.result_type(param)
+        rate = jnp.asarray(rate, dtype)
+        first, second = corrections[dtype]
         root = jnp.sqrt(v) / jnp.sqrt(second)
         change: Array = rate / first * (m / (root + eps))
         return param - change

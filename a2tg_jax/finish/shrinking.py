@@ -29,6 +29,7 @@ from a2tg_jax.finish.compaction import loss_on_views
 from a2tg_jax.model import Model, check_is_model
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
+from a2tg_jax.render import background_array
 from a2tg_jax.renderer import plan_render
 from a2tg_jax.texture import BYTES_PER_TEXEL, NEUTRAL_TEXEL, Textures
 
@@ -157,7 +158,7 @@ def texel_weights(model: Model, cameras: Sequence[Camera], background: ArrayLike
     """Return h of every texel in some views over a background [3], in the layout of the model (host)."""
     assert model.textures is not None
     settings = plan_render(model, cameras)
-    background = jnp.asarray(background, model.gaussians.means.dtype)
+    background = background_array(background, model.gaussians)
     total = tuple(map(jnp.zeros_like, model.textures.buckets))
     jitted = jax.jit(_weights_in_view, static_argnums=(4,))
     for index, camera in enumerate(cameras):

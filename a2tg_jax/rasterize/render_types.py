@@ -7,7 +7,7 @@ from jax import Array
 
 from a2tg_jax.appearance import TextureOptions
 from a2tg_jax.core.cameras import Camera, resize_camera
-from a2tg_jax.core.checks import check_int, check_kind, check_number, short_repr
+from a2tg_jax.core.checks import check_int, check_kind, check_literal, check_number, short_repr
 from a2tg_jax.core.geometry import NEAR_PLANE
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.notebook_display import as_bytes, enlarged, png
@@ -58,6 +58,7 @@ class RenderSettings(NamedFields):
         """Refuse numbers out of range; convert numpy's integers to Python's, which are static for jit."""
         check_number("near_plane", self.near_plane, above=0)
         check_kind("texture", self.texture, TextureOptions)
+        check_literal("compositor", self.compositor, Wanted)
         if self.exchange is not None:
             check_kind("exchange", self.exchange, Exchange)
         for name, least, most in (("tile_size", 1, MAX_TILE_SIZE), ("sh_degree", 0, 3), ("supersample", 1, None)):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import warnings
 from typing import Any
 
 import jax
@@ -146,7 +147,29 @@ def with_capacity(
             "settings = plan_render(model, cameras) outside, then pass settings=settings"
         )
     pairs = pairs_to_draw(gaussians, camera, appearance, settings, num_live)
+    if pairs == 0 and has_rows(gaussians, num_live):
+        warn_of_empty("the camera")
     return dataclasses.replace(settings, capacity=capacity_for(pairs))
+
+
+class EmptyRenderWarning(UserWarning):
+    """Eager renders or planned views see no Gaussian at all: mostly, a camera's matrix follows another convention."""
+
+
+def has_rows(gaussians: Gaussians, num_live: Any) -> bool:
+    """Return whether there are Gaussians that exist (host)."""
+    return gaussians.num > 0 and (num_live is None or int(num_live) > 0)
+
+
+def warn_of_empty(cameras: str, stacklevel: int = 5) -> None:
+    """Warn that no Gaussian is visible from cameras, in words."""
+    warnings.warn(
+        f"no Gaussian is visible from {cameras}: viewmat must be world to camera (np.linalg.inv of camera to world), "
+        "with OpenCV axes, x right, y down, z forward (np.diag([1, -1, -1, 1]) @ viewmat of OpenGL or Blender), in the "
+        "world and the unit of the Gaussians; or all are fainter than 1/255",
+        EmptyRenderWarning,
+        stacklevel=stacklevel,
+    )
 
 
 def _primal_value(x: object) -> Any:

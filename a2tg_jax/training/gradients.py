@@ -10,7 +10,7 @@ from jax import Array
 
 from a2tg_jax.appearance import Appearance, check_is_appearance
 from a2tg_jax.core.cameras import Camera, check_camera
-from a2tg_jax.core.checks import check_kind, check_literal, short_repr
+from a2tg_jax.core.checks import check_literal, kind_of, short_repr
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.core.pytree import combine, partition
@@ -20,7 +20,7 @@ from a2tg_jax.parallel.exchange import value_and_grad_of_views
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.rasterize.views import render_traced, with_capacity
-from a2tg_jax.render import check_background
+from a2tg_jax.render import background_array
 from a2tg_jax.training.corrections import Correction, corrected_camera
 
 
@@ -93,15 +93,14 @@ def view_gradients(
     check_gaussians(model.gaussians, "model.gaussians")
     check_is_appearance(model.appearance, model.gaussians)
     check_camera(camera)
-    check_background(background)
-    dtype = model.gaussians.means.dtype
+    background = background_array(background, model.gaussians)
     settings = with_capacity(settings, model.gaussians, camera, model.appearance, model.num_live)
 
     def of_view(shown: Model, view: TracedView, output: RenderOutput) -> tuple[Array, RenderOutput]:
         return loss(shown, output), output
 
     found = differentiate(
-        of_view, model, TracedView(camera, jnp.asarray(background, dtype)), settings,
+        of_view, model, TracedView(camera, background), settings,
         has_geometry=has_geometry, sh_degree=sh_degree, statistic=statistic, has_probe=True,
     )  # fmt: skip
     statistics, is_visible = read_probe(found.probe, statistic, camera.width, camera.height)
@@ -110,37 +109,47 @@ def view_gradients(
     return ViewGradients(found.value, gradient, safe_norm(statistics), is_visible, found.auxiliary, found.num_pairs)
 
 
-def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callable[..., tuple[Any, Model]]:
-    """Return a function of a model that gives a loss and its gradient in all floats of the model.
+def value_and_grad(loss: Callable[..., Any], *, has_aux: bool = False) -> Callable[..., tuple[Any, Any]]:
+    """Return a function that gives a loss and its gradient in all floats of its first argument, such as a model.
 
-    `jax.value_and_grad` rejects a model with integers, such as the places of textures. The gradient is a model with
-    None for these: the floats of `partition(model)`, which an optimizer updates and `combine` puts back.
+    `jax.value_and_grad` rejects a model and textures, which have integers: places of textures. The gradient has None
+    for these: it has the form of the floats of `partition(model)`, which an optimizer updates and `combine` puts back.
 
     Args:
-      loss: of a model, and of any further arguments, which are not differentiated; a scalar.
+      loss: of a pytree with floats, such as a model or textures, and of any further arguments, which are not
+        differentiated; a scalar.
       has_aux: whether the loss returns (scalar, anything) instead.
 
     Returns:
-      A function of the loss's arguments that returns the loss's value and the gradient, a model. It raises ValueError
-      if its first argument is no model.
+      A function of the loss's arguments that returns the loss's value and the gradient, a pytree like the first
+      argument. It raises ValueError if the first argument has no floats.
 
     Examples:
       >>> brightness = lambda model: jnp.mean(model.render(camera).color)
       >>> value, gradient = a2tg.value_and_grad(brightness)(model)
       >>> gradient.gaussians.sh.shape
       (200, 4, 3)
+      >>> textures = a2tg.allocate_textures(np.full((gaussians.num, 2), 4))
+      >>> of_textures = lambda textures: jnp.mean(a2tg.render_image(gaussians, camera, textures).color)
+      >>> value, gradient = a2tg.value_and_grad(of_textures)(textures)
+      >>> gradient.buckets[0].shape[1:], gradient.bucket
+      ((4, 4, 4), None)
     """
 
-    def of_floats(floats: Model, rest: Model, *args: object, **kwargs: object) -> Any:
+    def of_floats(floats: Any, rest: Any, *args: object, **kwargs: object) -> Any:
         return loss(combine(floats, rest), *args, **kwargs)
 
     differentiate = jax.value_and_grad(of_floats, has_aux=has_aux)
 
-    def of_model(model: Model, *args: object, **kwargs: object) -> tuple[Any, Model]:
-        check_kind("model", model, Model, "jax.value_and_grad differentiates in arrays")
-        return differentiate(*partition(model), *args, **kwargs)
+    def of_pytree(tree: Any, *args: object, **kwargs: object) -> tuple[Any, Any]:
+        floats, rest = partition(tree)
+        if not jax.tree.leaves(floats):
+            raise ValueError(
+                f"the first argument of the loss must be a pytree with floats, such as a model; got {kind_of(tree)}"
+            )
+        return differentiate(floats, rest, *args, **kwargs)
 
-    return of_model
+    return of_pytree
 
 
 class TracedView(NamedTuple):
@@ -208,7 +217,7 @@ def differentiate(
         return value, (auxiliary, num_pairs)
 
     # Adds nothing to the render; the gradient at it is the statistic.
-    probe = jnp.zeros((model.gaussians.num, 4), model.gaussians.means.dtype) if has_probe else None
+    probe = jnp.zeros((model.gaussians.num, 4), jnp.result_type(model.gaussians.means)) if has_probe else None
     with_gradients = jax.value_and_grad(of_floats, argnums=(0, 1, 2, 3), has_aux=True)
     if settings.exchange is not None and settings.exchange.views_at_once > 1:
         # Axes of the views, for `jax.vmap`: they share the corrections, and the rays of the lens.

@@ -62,7 +62,8 @@ def _packed(settings: PassSettings, inputs: PassInputs, vector_bytes: int) -> tu
 def _registered(
     kernel: PassSettings, which: Literal["forward", "backward"], make_handler: Callable[[CompiledFunction], ffi.Handler]
 ) -> str:
-    return ffi.registered(f"{which} {kernel!r}", (which, kernel), lambda: make_handler(compiled_passes(kernel)[which]))
+    description = f"compositor=native {which} {kernel!r}"
+    return ffi.registered(description, (which, kernel), lambda: make_handler(compiled_passes(kernel)[which]))
 
 
 def _forward_handler(run: CompiledFunction) -> ffi.Handler:
@@ -213,7 +214,7 @@ def tile_lists(
     """List the splats of each tile, with the arguments and result of `rasterize.tiles.tile_lists`."""
     key = str(M.dtype), grid.tile_size, near_plane
     name = ffi.registered(
-        f"lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_functions(*key))
+        f"compositor=native lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_functions(*key))
     )
     results = ((capacity,), jnp.int32), ((grid.num + 1,), jnp.int32), ((), jnp.float32), ((), jnp.bool_)
     size = jnp.asarray([grid.columns, grid.width, grid.height if height is None else height], jnp.int32)

@@ -105,9 +105,10 @@ def registered(description: str, key: Hashable, make_handler: Callable[[], Handl
     """Return the name by which `call` reaches the handler for a key; make and register the handler if there is none.
 
     The same description gives the same name in every process, for XLA's compilation cache. If another key already has
-    that description, such as a function that was defined again, the name differs.
+    that description, such as a function that was defined again, the name differs. It begins with the first word of the
+    description, because errors of JAX print it, as for `jax.export`.
     """
-    name = f"a2tg_{hashlib.sha256(description.encode()).hexdigest()[:20]}"
+    name = f"a2tg_{description.split()[0]}_{hashlib.sha256(description.encode()).hexdigest()[:20]}"
     with _LOCK:
         while name in _entries and _entries[name][0] != key:
             name += "_"

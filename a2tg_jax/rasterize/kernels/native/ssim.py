@@ -86,7 +86,7 @@ def _registered(score: Score, dtype: str, which: Literal["score", "pull_back"]) 
 
         return handler
 
-    return ffi.registered(f"{which} {dtype} {function} {score.taps}", (which, dtype, score), make_handler)
+    return ffi.registered(f"ssim {which} {dtype} {function} {score.taps}", (which, dtype, score), make_handler)
 
 
 class _ImageRows(Writer):
