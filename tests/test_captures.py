@@ -57,6 +57,12 @@ def write_polycam(folder, prefix="corrected_"):
 def test_polycam(tmp_path, prefix):
     cameras = write_polycam(tmp_path, prefix)
     check_dots(load_scene(tmp_path), 0.1)
+    values = json.loads((cameras / "1.json").read_text())
+    (cameras / "1.json").write_text(json.dumps({key: str(value) for key, value in values.items()}))
+    check_dots(load_scene(tmp_path), 0.1)
+    (cameras / "1.json").write_text(json.dumps(values | {"fx": "wide"}))
+    with pytest.raises(ValueError, match=r"1\.json: fx must be a number; got 'wide'"):
+        load_scene(tmp_path)
     (cameras / "0.json").write_text("{}")
     with pytest.raises(ValueError, match=r"0\.json: lacks fx, a number of the camera"):
         load_scene(tmp_path)

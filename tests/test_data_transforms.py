@@ -492,10 +492,35 @@ def all_at_one_place(frames):
         frame["transform_matrix"] = frames[0]["transform_matrix"]
 
 
+def as_texts(value):
+    """The same JSON with texts for numbers."""
+    if isinstance(value, dict):
+        return {key: as_texts(item) for key, item in value.items()}
+    return [as_texts(item) for item in value] if isinstance(value, list) else str(value)
+
+
+@no_points
+def test_numbers_may_be_texts(tmp_path):
+    write_json(tmp_path, write_frames(tmp_path), k1=0.01, **FOCAL, **SIZE)
+    wanted = load_scene(tmp_path)
+    write_json(tmp_path, as_texts(write_frames(tmp_path)), k1="0.01", **as_texts(FOCAL), **as_texts(SIZE))
+    for view, other in zip(load_scene(tmp_path).train, wanted.train, strict=True):
+        np.testing.assert_array_equal(view.camera.K, other.camera.K)
+        np.testing.assert_array_equal(view.camera.viewmat, other.camera.viewmat)
+    write_json(tmp_path, as_texts(write_frames(tmp_path)), camera_angle_x="1.2", w="0", h="0")
+    assert load_scene(tmp_path).train[0].camera.width == WIDTH
+
+
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
         (lambda folder: (folder / "transforms.json").write_text("{"), ValueError, "cannot be read as JSON"),
+        (written(**FOCAL | {"cx": "left"}), ValueError, "images/00.png: cx must be a number; got 'left'"),
+        (written(**FOCAL | {"cx": "nan"}), ValueError, "images/00.png: cx must be a number; got 'nan'"),
+        (written(**FOCAL | {"cx": None}), ValueError, "images/00.png: cx must be a number; got None"),
+        (written(**FOCAL | {"cx": True}), ValueError, "images/00.png: cx must be a number; got True"),
+        (written(w="wide", h=9, **FOCAL), ValueError, "images/00.png: w must be a number; got 'wide'"),
+        (written(lambda frames: frames[1].update(transform_matrix="a"), **FOCAL), ValueError, "4x4 numbers; got a"),
         (lambda folder: write_json(folder, []), ValueError, "lists no frames"),
         (lambda folder: (folder / "images/03.png").unlink(), FileNotFoundError, "03.png: no such image"),
         (lambda folder: (folder / "sparse_pc.ply").unlink(), FileNotFoundError, "sparse_pc.ply: no such point file"),

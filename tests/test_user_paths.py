@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -188,3 +189,43 @@ def test_files_that_git_lfs_did_not_fetch(tmp_path, name, read):
     (tmp_path / name).write_bytes(POINTER)
     with pytest.raises(ValueError, match=r"pointer of git-lfs, .* run `git lfs pull`"):
         read(tmp_path / name)
+
+
+# Output folders of other programs
+
+
+@pytest.mark.parametrize(
+    ("program", "names", "newest"),
+    [
+        ("3DGS", ["point_cloud/iteration_7000/point_cloud.ply", "point_cloud/iteration_30000/point_cloud.ply"], 1),
+        ("gsplat", ["ckpts/ckpt_29999_rank0.pt", "ckpts/ckpt_6999_rank0.pt"], 0),
+        ("gsplat", ["ply/point_cloud_29999.ply", "ply/point_cloud_6999.ply"], 0),
+        ("nerfstudio", ["nerfstudio_models/step-000029999.ckpt"], 0),
+    ],
+)
+def test_what_other_programs_trained_is_named(tmp_path, capsys, monkeypatch, program, names, newest):
+    monkeypatch.chdir(tmp_path)
+    for name in names:
+        pathlib.Path("out", name).parent.mkdir(parents=True, exist_ok=True)
+        pathlib.Path("out", name).touch()
+    wanted = f"it is an output folder of {program}; give its model out{os.sep}{pathlib.Path(names[newest])}"
+    for words in (["view", "out"], ["convert", "out", "x.spz"], ["info", "out"], ["render", "out"], ["mesh", "out"]):
+        assert main(words) == 2
+        assert wanted in capsys.readouterr().err
+    for load in (a2tg.load_splats, a2tg.load_ply):
+        with pytest.raises((ValueError, FileNotFoundError), match=re.escape(wanted)):
+            load("out")
+    with pytest.raises(FileNotFoundError, match=rf"out: is an output folder of {program}.* the scene that it was made"):
+        a2tg.load_scene("out")
+    pathlib.Path("out/cfg_args").write_text("Namespace(eval=True, source_path='/data/truck', sh_degree=3)")
+    with pytest.raises(FileNotFoundError, match=r"to train, give its scene, /data/truck$"):
+        a2tg.load_scene("out")
+    with pytest.raises(ValueError, match=r"holds no photographs.* to train, give its scene, /data/truck"):
+        a2tg.run_sfm("out", "scene")
+
+
+def test_a_run_is_no_scene(tmp_path):
+    run = create_run(tmp_path / "run")
+    run.own(run.record).write_text("")
+    with pytest.raises(FileNotFoundError, match=r"run\.toml is the record of a run of a2tg train"):
+        a2tg.load_scene(run.path)

@@ -17,7 +17,7 @@ from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.decoding import picture_size, read_grey, read_pixels
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, map_in_threads
 from a2tg_jax.data.transforms import Frames, check_images, warn_of_others
-from a2tg_jax.host.json_text import MOST_BYTES, read_object
+from a2tg_jax.host.json_text import MOST_BYTES, number_of, read_object
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
 
@@ -64,13 +64,14 @@ def _polycam_frames(cameras: Path, images: Path) -> Frames:
             continue
         values = read_object(file)
         names = [*INTRINSICS.values(), *(name for row in POSE for name in row)]
-        missing = [name for name in names if not isinstance(values.get(name), int | float)]
+        missing = [name for name in names if values.get(name) is None]
         if missing:
             raise ValueError(f"{file}: lacks {missing[0]}, a number of the camera; export the raw data again")
+        values |= {name: number_of(values[name], f"{file}: {name}") for name in names}
         frame: dict[str, Any] = {key: values[name] for key, name in INTRINSICS.items()}
-        size = values.get("width"), values.get("height")  # Newer exports have none.
-        has_size = all(isinstance(side, int | float) and side > 0 for side in size)
-        frame["w"], frame["h"] = size if has_size else picture_size(image)
+        size = [number_of(values.get(side) or 0, f"{file}: {side}") for side in ("width", "height")]
+        # Newer exports have none.
+        frame["w"], frame["h"] = size if min(size) > 0 else picture_size(image)
         rows = [[values[name] for name in row] for row in POSE]
         frames.append({**frame, "file_path": f"{images.name}/{image.name}", "transform_matrix": rows})
     nothing = f"{cameras}: none of its cameras has an image of its name in {images}; export the raw data again"

@@ -18,6 +18,7 @@ import numpy as np
 
 from a2tg_jax.data.decoding import software_of, upright_thumbnail
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, map_in_threads
+from a2tg_jax.data.other_runs import other_run
 from a2tg_jax.host.regular_files import is_regular, names_in, read_regular
 from a2tg_jax.host.text import PROGRAM, as_argument, counted, first_names
 
@@ -55,6 +56,7 @@ SMALLER_TOLERANCE, EQUAL_TOLERANCE = 2.0, 0.5
 Copies at 1/4 differ by up to 1.2, neighbouring frames of six captures by at least 2.4.
 """
 FOUND_BY: tuple[tuple[str, str], ...] = (
+    ("run.toml", "is the record of a run of a2tg train, which --resume continues; to train again, give its scene"),
     ("*.psx", "is a project of Metashape: File > Export > Export Cameras as Agisoft XML, beside a folder images"),
     ("*.rcproj", "is a project of RealityCapture: export the registration as COLMAP, or as XMP beside the photographs"),
     ("*.rsproj", "is a project of RealityScan: export the registration as COLMAP, or as XMP beside the photographs"),
@@ -130,6 +132,8 @@ def find_photos(folder: Path, least: int = LEAST_PHOTOS, chosen: Sequence[Path] 
         found = f"{folder}: {held}" if chosen is None else f"{counted(len(photos), 'photograph')} of {folder} given"
         needed = f"{found}; at least {counted(least, 'photograph')} {'is' if least == 1 else 'are'} needed"
         skipped = [_skipped(folder, unread)] if unread else []
+        if chosen is None and other_run(folder) is not None:
+            skipped = [f"{folder} {capture_hint(folder)}"]
         raise ValueError(". ".join([needed, *([others_text] if others else []), *skipped]))
     if others:
         warnings.warn(f"{folder}: {others_text}", stacklevel=3)
@@ -170,6 +174,9 @@ def capture_hint(path: Path) -> str | None:
     if not path.is_dir():
         name = path.name.lower()
         return next((text for pattern, text in FOUND_BY if fnmatchcase(name, pattern)), None)
+    if (run := other_run(path)) is not None:
+        scene = "the scene that it was made from" if run.scene is None else f"its scene, {run.scene}"
+        return f"is an output folder of {run.program}, whose model is {run.model}; to train, give {scene}"
     names = names_in(path)
     for pattern, text in FOUND_BY:
         # Cameras write suffixes in capitals, but Python's glob tells these apart before 3.12.

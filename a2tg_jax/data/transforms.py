@@ -26,7 +26,7 @@ from a2tg_jax.data.lenses import Lens, LensUse, checked_lens
 from a2tg_jax.data.photo_reading import Counted, Options, Photo, read_photos
 from a2tg_jax.data.ply import read_ply_points
 from a2tg_jax.data.scene import Scene, scene_name
-from a2tg_jax.host.json_text import read_json
+from a2tg_jax.host.json_text import number_of, read_json
 from a2tg_jax.host.regular_files import is_regular, names_in
 from a2tg_jax.host.text import first_names, shortened
 
@@ -188,7 +188,7 @@ def _read_shots(
         path, images, what = folder / name, folder / "images", f"{file}: {name}"
         lens: Lens | Callable[[tuple[int, int]], Lens] = functools.partial(_lens, frame, what, options.lens)
         # Otherwise the lens needs the full image's size, once that is found.
-        if frame.get("w") and frame.get("h"):
+        if all(frame.get(side) and number_of(frame[side], f"{what}: {side}") for side in "wh"):
             lens = _lens(frame, what, options.lens, (0, 0))
         mask, depths = (folder / frame[key] if frame.get(key) else None for key in ("mask_path", "depth_file_path"))
         below = (images, path.relative_to(images).as_posix()) if path.is_relative_to(images) else None
@@ -197,7 +197,8 @@ def _read_shots(
         except (TypeError, ValueError, OverflowError):
             pose = np.empty(0)
         if pose.shape not in ((3, 4), (4, 4)):
-            raise ValueError(f"{what}: its transform_matrix must be 4x4 numbers; got shape {pose.shape}")
+            found = f"shape {pose.shape}" if pose.size else shortened(frame["transform_matrix"])
+            raise ValueError(f"{what}: its transform_matrix must be 4x4 numbers; got {found}")
         camera_to_world = np.eye(4)
         camera_to_world[:3] = pose[:3] * [1.0, -1.0, -1.0, 1.0]  # from OpenGL's camera to OpenCV's
         viewmat = np.linalg.inv(rigid_motion(camera_to_world, what))
@@ -211,13 +212,10 @@ def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int])
     """Return the camera of a frame; its size defaults to the full image's, the principal point to the centre."""
 
     def number(key: str, default: float) -> float:
-        value = frame.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError(f"{what}: {key} must be a number; got {shortened(value)}")
-        return float(value)
+        return number_of(frame.get(key, default), f"{what}: {key}")
 
     def side(key: str, default: int) -> int:
-        side = number(key, default) if frame.get(key) else default  # 0 and null mean the image's.
+        side = (number(key, default) if frame.get(key) else 0) or default  # 0 and null mean the image's.
         if not 1 <= side <= LONGEST_SIDE:  # False for NaN.
             raise ValueError(f"{what}: {key} must be in 1..{LONGEST_SIDE} pixels; got {side:g}")
         return int(side)
@@ -234,7 +232,8 @@ def _lens(frame: dict[str, Any], what: str, use: LensUse, full: tuple[int, int])
         raise ValueError(f"{what}: has no focal length; give fl_x above 0, or camera_angle_x between 0 and pi")
     fx, fy = lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))
     # nerfstudio's parameters of distortion have COLMAP's names and meaning.
-    model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else frame.get("camera_model", "OPENCV")
+    is_fisheye = str(frame.get("is_fisheye")).lower() in ("true", "1")  # It may be a text.
+    model = "OPENCV_FISHEYE" if is_fisheye else frame.get("camera_model", "OPENCV")
     terms = {key: number(key, 0.0) for key in PRISM_KEYS}
     if model in ("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"):
         distortion = [terms[key] for key in DISTORTION_KEYS[model]]

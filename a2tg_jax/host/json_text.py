@@ -84,6 +84,22 @@ def read_object(file: Path) -> dict[str, Any]:
     return values
 
 
+def number_of(value: object, what: str) -> float:
+    """Return a number in a file, which some programs write as a text, such as "105.6". ValueError, naming it `what`:
+    it is none."""
+    number = value
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            number = float(value)
+    if (
+        isinstance(number, bool)
+        or not isinstance(number, int | float)
+        or (number is not value and not math.isfinite(number))
+    ):
+        raise ValueError(f"{what} must be a number; got {shortened(repr(value))}")
+    return float(number)
+
+
 def parse_toml(data: bytes) -> dict[str, Any]:
     """Return the table of a TOML text.
 

@@ -106,7 +106,7 @@ def _edit_of(data: dict[str, Any]) -> Edit:
         raise ValueError(f"has the unknown entry {shortened(unknown[0])}")
     floaters = data.get("floaters", 0.0)
     if type(floaters) not in (int, float) or not 0 <= floaters <= 1:
-        raise ValueError(f"floaters must be a number from 0 to 1; got {shortened(floaters)}")
+        raise ValueError(f"floaters must be a number from 0 to 1; got {shortened(repr(floaters))}")
     crop, up, background = data.get("crop"), data.get("up"), data.get("background")
     if crop is not None:
         if not isinstance(crop, dict):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK
+from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.host.regular_files import expanded, is_regular
 from a2tg_jax.host.text import did_you_mean, shortened
 from a2tg_jax.io.compact import load_compact, save_compact
@@ -86,7 +87,8 @@ def format_of(path: str | os.PathLike[str]) -> FileFormat:
         if name.endswith(suffix):
             return found
     near = did_you_mean(Path(name).suffix, FORMATS)
-    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix{near}; known are {', '.join(FORMATS)}")
+    hint = model_hint(Path(path)) or f"{near}; known are {', '.join(FORMATS)}"
+    raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix{hint}")
 
 
 def writer_of(path: str | os.PathLike[str]) -> Writer:

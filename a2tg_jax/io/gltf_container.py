@@ -272,7 +272,7 @@ def _count(described: Mapping[str, object], name: str, what: str, default: int |
     value = described.get(name, default)
     # Not isinstance, for true is an int; 2^53 is where JSON's numbers stop being exact.
     if type(value) is not int or not 0 <= value < 1 << 53:
-        raise ValueError(f"{what}: {name} must be a whole number; got {shortened(value)}")
+        raise ValueError(f"{what}: {name} must be a whole number; got {shortened(repr(value))}")
     return value
 
 

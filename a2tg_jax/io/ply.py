@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.core.gaussians import SH_C0, Gaussians, rotation_matrices
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
+from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.data.ply import OFFSET, RGB, ROTATION, SH_DEGREE0, PlyFile, largest_color
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.regular_files import expanded, is_regular, open_regular
@@ -189,7 +190,7 @@ def load_ply_model(path: str | os.PathLike[str]) -> Model:
     """Return the Gaussians of `load_ply` as a model, with the offset of the positions, if any, in its origin."""
     path = expanded(path)
     if not is_regular(path):
-        raise FileNotFoundError(f"{path}: no such PLY file")
+        raise FileNotFoundError(f"{path}: no such PLY file{model_hint(path)}")
     with open_regular(path) as file:
         return decode_ply(file, path)
 

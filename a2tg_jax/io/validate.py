@@ -157,7 +157,7 @@ def check_count(name: str, value: object, most: int) -> None:
     """Raise ValueError unless a value is one integer in 0..most."""
     number = np.asarray(value)
     if number.shape or number.dtype.kind not in "iu" or not 0 <= int(number) <= most:
-        raise ValueError(f"{name} must be a whole number in 0..{most}; got {shortened(value)}")
+        raise ValueError(f"{name} must be a whole number in 0..{most}; got {shortened(repr(value))}")
 
 
 def check_like(name: str, tree: object, wanted: object) -> None:

@@ -33,6 +33,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.host.atomic import file_to_write, left_over, named_if_full, write_whole
 from a2tg_jax.host.machine import ALONE, Devices
 from a2tg_jax.host.operating_system import flush_folder, try_lock
@@ -214,7 +215,8 @@ def open_run(path: Path) -> RunFolder:
     """Return an existing run folder. Raises FileNotFoundError if there is none at `path`."""
     run = RunFolder(path)
     if not is_regular(run.record):
-        raise FileNotFoundError(f"{path} is not a run folder (it has no run.toml); a2tg train --out makes one")
+        hint = model_hint(path) or "; a2tg train --out makes one"
+        raise FileNotFoundError(f"{path} is not a run folder (it has no run.toml){hint}")
     return run
 
 

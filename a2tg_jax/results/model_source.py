@@ -12,6 +12,7 @@ import numpy as np
 
 from a2tg_jax.core.similarity import transform_gaussians
 from a2tg_jax.data.load import is_scene
+from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.data.scene import Scene, origin_of_scene
 from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.edit_file import apply_edit, load_edit
@@ -140,7 +141,8 @@ def _run_at(folder: Path) -> RunFolder:
         raise FileNotFoundError(f"{folder} is a scene that must be trained first: {shlex.join(command)}")
     runs = runs_in(folder)
     if not runs:
-        raise FileNotFoundError(f"{folder} is not a run folder (it has no run.toml); give {SHOWN}")
+        hint = model_hint(folder) or f"; give {SHOWN}"
+        raise FileNotFoundError(f"{folder} is not a run folder (it has no run.toml){hint}")
     listed = [shlex.quote(str(run.path)) for run in runs[:MOST_LISTED]] + ["…"] * (len(runs) > MOST_LISTED)
     raise FileNotFoundError(f"{folder} holds run folders; give one of them: {', '.join(listed)}")
 
@@ -156,7 +158,7 @@ def check_init(file: Path, out: Path, system: System) -> Model:
     """
     file = splats_at(file)
     if not is_regular(file):
-        raise ValueError(f"init: there is no file {file}")
+        raise ValueError(f"init: there is no file {file}{model_hint(file)}")
     format_of(file)
     if RunFolder(out).is_begun:
         raise ValueError(f"init begins a new run, and {out} holds one: choose another `out`")

@@ -223,7 +223,7 @@ def _checkpoint_of(header: dict[str, Any], arrays: dict[str, np.ndarray], option
     options.check()
     stages, index, is_ahead = options.all_stages(), header["stage"], header["is_ahead"]
     if type(index) is not int or not 0 <= index < len(stages):  # bool is an int
-        raise ValueError(f"stage must be a number in 0..{len(stages) - 1}; got {shortened(index)}")
+        raise ValueError(f"stage must be a number in 0..{len(stages) - 1}; got {shortened(repr(index))}")
     stage = stages[index]
     if not isinstance(is_ahead, list) or len(is_ahead) != len(stage.events) or {type(x) for x in is_ahead} - {bool}:
         raise ValueError(f"is_ahead must hold true or false for {len(stage.events)} events; got {shortened(is_ahead)}")
