@@ -105,3 +105,10 @@ def test_bytes_are_counted_without_padding():
     allocated = sum(bucket.nbytes for bucket in textures.buckets)
     model = Model(gaussians, Appearance(texture=Texture(textures)))
     assert model.num_padding_bytes == allocated - 16 * (67 + 33 * 8)
+
+
+def test_renders_may_exceed_one_in_places():
+    target = np.full((16, 16, 3), 0.5, np.float32)
+    bright = target.copy()
+    bright[0, 0] = 50.0
+    np.testing.assert_allclose(psnr(bright, target), -10 * np.log10(0.25 / 256), rtol=1e-5)

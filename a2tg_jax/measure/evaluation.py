@@ -154,11 +154,11 @@ def evaluate(
         if len(seconds) < NUM_TIMED:
             seconds.append(min(_seconds(renderer, view.camera) for _ in range(3)))
         mask = None if view.mask is None else jnp.asarray(view.mask.read())
-        # Not clipped here: the metrics clip both images.
+        # Not clipped here: the metrics under jit clip both images, and the fit of colours needs them.
         if fit_colors:
             image = exposed(jnp.asarray(color_fit(image, target, mask), image.dtype), image)
         decibels, similarity, flat = (float(figure) for figure in jax.jit(_figures_of)(image, target, mask))
-        distance = None if weights is None else float(lpips(image, target, weights, mask))
+        distance = None if weights is None else float(lpips(jnp.clip(image, 0, 1), target, weights, mask))
         per_view.append(ViewMetrics(view.name, decibels, similarity, distance, flat))
         if len(renders) < num_renders:
             renders.append(np.rint(255 * np.clip(np.asarray(image), 0, 1)).astype(np.uint8))

@@ -1,7 +1,8 @@
 """Metrics: PSNR, SSIM and LPIPS on images clipped to [0, 1], and the bytes of a model's parameters.
 
-Images are [H, W, 3] floats. A mask is [H, W] bool, True where a pixel counts; elsewhere both images are black. LPIPS
-takes its network from a weights file, which this package does not contain.
+Images are [H, W, 3] floats. Renders may exceed 1 in places; outside transformations of JAX, an image of a mean above 2,
+such as one in 0..255, is refused. A mask is [H, W] bool, True where a pixel counts; elsewhere both images are black.
+LPIPS takes its network from a weights file, which this package does not contain.
 """
 
 import dataclasses
@@ -40,7 +41,7 @@ def psnr(image: Array, target: Array, mask: Array | None = None) -> Array:
       A scalar in dB; higher is better.
 
     Raises:
-      ValueError: if the shapes differ.
+      ValueError: if the shapes differ, an image is in 0..255.
 
     Examples:
       >>> image, target = jnp.zeros((16, 16, 3)), jnp.full((16, 16, 3), 0.1)
@@ -65,7 +66,7 @@ def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
       A scalar in [-1, 1]; 1 for equal images.
 
     Raises:
-      ValueError: if the shapes differ or a side is shorter than 11 pixels.
+      ValueError: if the shapes differ, an image is in 0..255 or a side is shorter than 11 pixels.
 
     Examples:
       >>> photograph = jnp.asarray(a2tg.view_image(scene.test[0]))
@@ -125,7 +126,7 @@ def lpips(
       A scalar, 0 for equal images; lower is better.
 
     Raises:
-      ValueError: if the shapes differ or a side is too short, or as `load_lpips` does.
+      ValueError: if the shapes differ, an image is in 0..255 or a side is too short, or as `load_lpips` does.
 
     Examples:
       >>> photograph = jnp.asarray(a2tg.view_image(scene.test[0]))

@@ -5,6 +5,7 @@ Images are [H, W, 3], nominally in [0, 1] and never clipped here; a clip would k
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -37,7 +38,8 @@ def photometric_loss(image: Array, target: Array, *, ssim_weight: float | Array 
       The loss, a scalar; 0 for equal images.
 
     Raises:
-      ValueError: if one is no image, the shapes differ, a side is too short, or the weight is out of range.
+      ValueError: if one is no image or is in 0..255, the shapes differ, a side is too short, or the weight is out of
+        range.
 
     Examples:
       >>> photograph = jnp.asarray(a2tg.view_image(scene.test[0]))
@@ -143,8 +145,12 @@ def live_mean(values: Array, num_live: Array) -> Array:
     return jnp.sum(jnp.where(is_live, values, 0.0)) / jnp.maximum(num_live, 1).astype(values.dtype)
 
 
+LARGEST_MEAN = 2.0
+"""Largest mean of an image in [0, 1]: renders may exceed 1 in places, but images in 0..255 do on average."""
+
+
 def check_same_shape(image: Array, target: Array) -> None:
-    """Raise ValueError unless both are floats [H, W, 3] of one shape."""
+    """Raise ValueError unless both are floats [H, W, 3] of one shape; outside transformations, in [0, 1] on average."""
     for name, value in (("image", image), ("target", target)):
         hint = "use view_image(view, background)" if hasattr(value, "picture") else ""
         check_array(name, value, "use output.color" if hasattr(value, "color") else hint)
@@ -152,3 +158,10 @@ def check_same_shape(image: Array, target: Array) -> None:
         raise ValueError(f"image and target must both be [H, W, 3]; got {image.shape} and {target.shape}")
     if not (jnp.issubdtype(image.dtype, jnp.floating) and jnp.issubdtype(target.dtype, jnp.floating)):
         raise ValueError(f"image and target must be floats in [0, 1]; got {image.dtype} and {target.dtype}")
+    for name, value in (("image", image), ("target", target)):
+        if isinstance(value, jax.core.Tracer) or not value.size:
+            continue
+        # By NumPy: under jit, JAX would trace the mean of an array that is known.
+        mean = float(np.mean(jax.device_get(value)))
+        if mean > LARGEST_MEAN:
+            raise ValueError(f"{name} must be floats in [0, 1]; got a mean of {mean:.4g}: divide by 255")
