@@ -1,10 +1,11 @@
 """Panoramas are cut into perspective views that agree with direct renders of the built-in scene."""
 
+from contextlib import nullcontext
 from pathlib import PurePosixPath
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, PngImagePlugin
 from scipy.ndimage import map_coordinates
 from test_data_sfm import cameras_of, staged
 
@@ -12,7 +13,9 @@ from a2tg_jax.core.cameras import looking
 from a2tg_jax.data import synthetic
 from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.colmap_library import pycolmap
+from a2tg_jax.data.decoding import picture_facts
 from a2tg_jax.data.load import load_scene
+from a2tg_jax.data.panoramas import projection_of
 from a2tg_jax.data.staging import cut_view, directions, is_panorama, view_size
 
 CENTER = np.array([0.3, -1.2, 1.2])
@@ -85,10 +88,145 @@ def test_views_show_every_direction():
     assert is_seen.all()
 
 
-def test_panoramas_are_recognised_by_their_seam(panorama):
-    assert is_panorama(panorama)
-    assert not is_panorama(panorama[:, 1:])
-    assert not is_panorama(np.asarray(Image.fromarray(panorama[100:250, 100:400])))
+SIDE = WIDTH // 2
+ROWS, COLUMNS = np.mgrid[0:SIDE, 0:WIDTH]
+ABOVE, BELOW = (ROWS < 0.42 * SIDE)[..., None], (ROWS > 0.6 * SIDE)[..., None]
+FROM_MIDDLE = np.hypot(2 * COLUMNS / WIDTH - 1, 2 * ROWS / SIDE - 1)[..., None]
+"""Distance from the middle of a picture, in half sides."""
+ROUND = np.hypot(*(np.mgrid[0:SIDE, 0:SIDE] - SIDE / 2 + 0.5))[..., None] / SIDE
+"""Distance from the middle of half a picture, in its side."""
+
+
+def noisy(pixels, sigma=1.0):
+    pixels = pixels + np.random.default_rng(0).normal(0, sigma, pixels.shape)
+    return np.rint(np.clip(pixels, 0, 255)).astype(np.uint8)
+
+
+WHOLE = {
+    "as it is": lambda own: own,
+    "turned": lambda own: np.roll(own, 100, axis=1),
+    "small": lambda own: own[::4, ::4],
+    "large": lambda own: np.asarray(Image.fromarray(own).resize((2 * WIDTH, WIDTH))),
+    "plain sky": lambda own: np.where(ABOVE, [140, 180, 230], own),
+    "plain sky and floor": lambda own: np.where(ABOVE, [140, 180, 230], np.where(BELOW, 90, own)),
+    "sky with a gradient": lambda own: np.where(ABOVE, [140, 180, 230] - ROWS[..., None] / 4, own),
+    "black nadir": lambda own: np.where(ROWS[..., None] > 0.85 * SIDE, 0, own),
+    "noise": lambda own: noisy(own, 5.0),
+    "dark": lambda own: own / 3,
+    "with alpha": lambda own: np.dstack([own, np.full((SIDE, WIDTH), 255)]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_panoramas_are_recognised(panorama, name):
+    assert is_panorama(np.rint(WHOLE[name](panorama)).astype(np.uint8))
+
+
+def flat(own, left=100, top=80):
+    """A part of a panorama, as a photograph of its width shows it."""
+    return np.asarray(Image.fromarray(own[top : top + 160, left : left + 320]).resize((WIDTH, SIDE)))
+
+
+def product(own, behind):
+    return noisy(np.where(FROM_MIDDLE < 0.6, flat(own), behind))
+
+
+def fisheyes(own, radius=0.49, black=4):
+    halves = [np.where(radius > ROUND, flat(own, left, 155)[:, :SIDE], black) for left in (0, 150)]
+    return noisy(np.concatenate(halves, axis=1))
+
+
+def diptych(left, right):
+    return np.concatenate([left[:, :SIDE], right[:, :SIDE]], axis=1)
+
+
+OTHERS = {
+    "not twice as wide": (None, lambda own: own[:, 1:]),
+    "a photograph": ("photograph", flat),
+    "a landscape": (None, lambda own: np.where(ABOVE, [140, 180, 230], flat(own))),
+    "a product on white": ("unclear", lambda own: product(own, 245)),
+    "on black": ("unclear", lambda own: product(own, 8)),
+    "on a gradient": ("unclear", lambda own: product(own, 150 + ROWS[..., None] / 4)),
+    "on a table": ("unclear", lambda own: product(own, np.where(BELOW, 120, 220))),
+    "in a vignette": (None, lambda own: product(own, 240) * np.clip(1 - FROM_MIDDLE**2 / 2.2, 0, 1)),
+    "a dark vignette": (None, lambda own: flat(own) * np.clip(1.1 - FROM_MIDDLE**2, 0, 1)),
+    "a frame": (None, lambda own: np.pad(flat(own)[9:-9, 9:-9], ((9, 9), (9, 9), (0, 0)), constant_values=30)),
+    "wide bars": (None, lambda own: np.where(np.abs(ROWS - SIDE / 2)[..., None] > SIDE / 3, 0, flat(own))),
+    "a diptych": ("photograph", lambda own: diptych(flat(own), flat(own, 300))),
+    "a stereo pair": ("photograph", lambda own: diptych(flat(own), flat(own, 110))),
+    "in a mirror": (None, lambda own: np.concatenate([flat(own)[:, :SIDE], flat(own)[:, :SIDE][:, ::-1]], axis=1)),
+    "a cylinder": ("photograph", lambda own: np.asarray(Image.fromarray(own[80:240]).resize((WIDTH, SIDE)))),
+    "noise": (None, lambda own: noisy(np.full(own.shape, 128), 60)),
+    "fisheyes": ("fisheyes", fisheyes),
+    "small fisheyes": ("fisheyes", lambda own: fisheyes(own, 0.45, 0)),
+    "cut fisheyes": ("fisheyes", lambda own: fisheyes(own, 0.52, 16)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_pictures_are_not_taken_for_panoramas(panorama, name):
+    kind, change = OTHERS[name]
+    pixels = np.rint(change(panorama)).astype(np.uint8)
+    assert not is_panorama(pixels)
+    assert kind is None or projection_of(pixels) == kind
+
+
+XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {}</rdf:Description></rdf:RDF></x:xmpmeta>"""
+ATTRIBUTE = 'GPano:ProjectionType="equirectangular">'
+ELEMENTS = "><GPano:ProjectionType>equirectangular</GPano:ProjectionType>"
+CROPPED = (
+    "<GPano:FullPanoWidthPixels>9000</GPano:FullPanoWidthPixels>"
+    "<GPano:CroppedAreaImageWidthPixels>640</GPano:CroppedAreaImageWidthPixels>"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_whole"),
+    [
+        (ATTRIBUTE, True),
+        (ELEMENTS, True),
+        (ELEMENTS + CROPPED, False),
+        ('GPano:ProjectionType="cylindrical">', False),
+        (">", None),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_metadata_decide(tmp_path, text, is_whole, suffix):
+    """A white picture that says so is a panorama."""
+    xmp = XMP.format(text).encode()
+    info = PngImagePlugin.PngInfo()
+    info.add_itxt("XML:com.adobe.xmp", xmp.decode())
+    for index in range(3):
+        white = Image.new("RGB", (64, 32), "white")
+        white.save(tmp_path / f"{index}{suffix}", **({"pnginfo": info} if suffix == ".png" else {"xmp": xmp}))
+    assert picture_facts(tmp_path / f"0{suffix}").is_panorama == is_whole
+    with nullcontext() if is_whole is not None else pytest.warns(UserWarning, match="3 pictures twice as wide as high"):
+        found = staged([tmp_path], tmp_path / "work")
+    assert len(found.rigs) == bool(is_whole)
+
+
+def test_unclear_pictures_are_what_most_of_their_source_and_size_are(tmp_path, panorama):
+    small = panorama[::4, ::4]
+    pictures = {"a/0": small, "a/1": small, "a/2": np.full_like(small, 255), "b/0": small[::2, ::2]}
+    pictures["b/1"] = pictures["b/2"] = np.full_like(pictures["b/0"], 255)
+    for name, pixels in pictures.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.fromarray(pixels).save(tmp_path / f"{name}.png")
+    found = staged([tmp_path / "a", tmp_path / "b"], tmp_path / "work")
+    assert sorted(len(rig.groups[0].names) for rig in found.rigs) == [3, 3] and not found.groups
+    Image.fromarray(np.full((80, 160, 3), 255, np.uint8)).save(tmp_path / "b" / "3.png")
+    with pytest.warns(UserWarning, match=r"1 picture twice as wide as high, such as b/3.png: .* panorama='yes' cuts"):
+        found = staged([tmp_path / "a", tmp_path / "b"], tmp_path / "other")
+    assert [group.names for group in found.groups] == [("b/3.png",)]
+
+
+def test_fisheyes_are_refused(tmp_path, panorama):
+    for index in range(3):
+        Image.fromarray(fisheyes(panorama)).save(tmp_path / f"{index}.png")
+    with pytest.raises(ValueError, match=r"0\.png: shows two fisheyes side by side.*: stitch them first"):
+        staged([tmp_path], tmp_path / "work")
+    assert not staged([tmp_path], tmp_path / "other", "no").rigs
 
 
 @pytest.mark.parametrize("choice", ["auto", "no"])

@@ -50,8 +50,9 @@ class Sfm:
     frames: int = DEFAULT_FRAMES
     """Largest number of frames to take from each video."""
     panorama: Panorama = "auto"
-    """Pictures to cut into perspective views. auto: those twice as wide as high whose left and right edges join. yes:
-    all that are twice as wide as high. no: none."""
+    """Pictures to cut into perspective views. auto: those twice as wide as high whose metadata (GPano) say that they
+    are panoramas, or whose left and right edges join where there is texture. yes: all that are twice as wide as high.
+    no: none."""
 
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """Lens to estimate. OPENCV suits wide lenses, OPENCV_FISHEYE action cameras such as GoPro's."""

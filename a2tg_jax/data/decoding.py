@@ -7,6 +7,7 @@ library. Size and bits are checked before decoding. Pixels are uint8, [H, W, 3] 
 import functools
 import importlib
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
@@ -37,6 +38,9 @@ AS_STORED = {
 }  # fmt: skip
 """Turn from the upright picture to the stored one, by EXIF orientation."""
 LENS_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
+GPANO = re.compile(rb"""GPano:(\w+)(?:\s*=\s*["']|>)\s*([\w.]+)""")
+"""Name and value in the XMP of a panorama."""
+SIDES = (b"Width", b"Height")
 LONGEST_REASON = 200
 LARGEST_LEVEL = {"L": 255, "I;16": 65535, "I": 65535}
 """Largest level of grey, by Pillow's mode."""
@@ -93,6 +97,8 @@ class PictureFacts(NamedTuple):
     """Camera and focal length from EXIF."""
     is_transparent: bool
     """Whether some of its pixels are not opaque."""
+    is_panorama: bool | None
+    """Whether its XMP (GPano) says that it is a whole equirectangular panorama; None: it has none."""
 
 
 def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
@@ -108,7 +114,18 @@ def picture_facts(path: str | os.PathLike[str]) -> PictureFacts:
         lens = (*(exif.get(tag) for tag in LENS_TAGS), *(details.get(tag) for tag in LENS_TAGS))
         lens_facts = tuple(str(value) for value in lens if value)
         is_transparent = _has_alpha(image) and bool((np.asarray(image.convert("RGBA"))[..., 3] < 255).any())
-        return PictureFacts(size, turn in TURNED, image.format or "", lens_facts, is_transparent)
+        return PictureFacts(size, turn in TURNED, image.format or "", lens_facts, is_transparent, _is_panorama(image))
+
+
+def _is_panorama(image: Image.Image) -> bool | None:
+    # https://developers.google.com/streetview/spherical-metadata: attributes or elements of RDF.
+    xmp = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    found = dict(GPANO.findall(xmp.encode() if isinstance(xmp, str) else xmp))
+    if b"ProjectionType" not in found:
+        return None
+    sides = ((found.get(b"CroppedAreaImage%sPixels" % side), found.get(b"FullPano%sPixels" % side)) for side in SIDES)
+    is_whole = all(None in pair or pair[0] == pair[1] for pair in sides)
+    return is_whole and found[b"ProjectionType"].lower() == b"equirectangular"
 
 
 def _has_alpha(image: Image.Image) -> bool:

@@ -99,8 +99,9 @@ def run_sfm(
       camera_model: COLMAP's name of the camera model to estimate; the FISHEYE models are for action cameras.
       matching: pairs of photographs to match; "auto" takes all pairs of up to 200, and neighbours by name of more.
       frames: largest number of frames to take from each video. The sharpest are taken, evenly along the camera path.
-      panorama: pictures to cut into perspective views: "auto" takes those twice as wide as high whose edges join,
-        "yes" all that are twice as wide as high.
+      panorama: pictures to cut into perspective views: "auto" takes those twice as wide as high whose metadata
+        (GPano) say that they are panoramas, or whose edges join where there is texture, and warns if there is none;
+        "yes" takes all that are twice as wide as high.
       progress: show progress bars.
       on_note: function that receives lines about what was found among the photographs.
 

@@ -9,8 +9,8 @@ import itertools
 import os
 import shutil
 import warnings
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal, NamedTuple
 
@@ -21,13 +21,14 @@ from scipy.spatial.transform import Rotation
 
 from a2tg_jax.data.decoding import PictureFacts, picture_facts, read_pixels, save_upright
 from a2tg_jax.data.image_files import map_in_threads, on_disk
+from a2tg_jax.data.panoramas import Projection, projection_of
 from a2tg_jax.data.photo_folder import LEAST_PHOTOS, find_photos, is_video
 from a2tg_jax.data.photo_reading import HALF, MASKS, mask_names, read_mask, warn_of_grey
 from a2tg_jax.data.video import extract_frames
 from a2tg_jax.host.text import counted
 
 Panorama = Literal["auto", "yes", "no"]
-"""Whether pictures twice as wide as high are panoramas: those whose edges join (auto), all of them, or none."""
+"""Whether pictures twice as wide as high are panoramas: those that are seen to be (auto), all of them, or none."""
 COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP")
 """Formats that COLMAP reads as Pillow does. TIFF is not among them: with some compressions COLMAP reads black."""
 COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
@@ -39,8 +40,6 @@ FIELD_OF_VIEW = np.deg2rad(100.0)
 AROUND = 6
 """Number of views around the horizon; one view up and one down join them."""
 ROWS_AT_ONCE = 128  # Rays of a whole view would take many times its memory.
-SEAM_TOLERANCE, LEAST_SEAM = 2.0, 3.0
-"""Largest step of brightness over the seam, in steps of neighbouring columns and in grey levels above that."""
 
 
 class CameraGroup(NamedTuple):
@@ -92,7 +91,7 @@ class _Photo(NamedTuple):
     name: str
     """Path below the staging folder, before conversion."""
     facts: PictureFacts
-    is_panorama: bool
+    kind: Projection
     mask: Path | None
 
 
@@ -144,12 +143,21 @@ def stage(
 
     def look(source: int, file: Path, name: str) -> _Photo:
         facts = picture_facts(file)
-        is_double = facts.size[0] == 2 * facts.size[1]
-        is_cut = is_double and panorama != "no" and (panorama == "yes" or is_panorama(read_pixels(file)))
+        kind: Projection = "photograph"
+        if facts.size[0] == 2 * facts.size[1] and panorama != "no":
+            is_known = panorama == "yes" or facts.is_panorama
+            kind = (
+                "panorama"
+                if is_known
+                else "photograph"
+                if facts.is_panorama is False
+                else projection_of(read_pixels(file))
+            )
         names = dict.fromkeys([*mask_names(name), *mask_names(name.removeprefix(prefixes[source]))])
-        return _Photo(source, file, name, facts, is_cut, None if masks is None else on_disk(masks, *names))
+        return _Photo(source, file, name, facts, kind, None if masks is None else on_disk(masks, *names))
 
-    photos = map_in_threads(look, *zip(*files, strict=True))
+    videos = {number for number, source in enumerate(chosen) if is_video(source)}
+    photos = _decided(map_in_threads(look, *zip(*files, strict=True)), videos)
     lacking = [photo.name for photo in photos if photo.mask is None]
     if masks is not None and len(lacking) == len(photos):
         raise ValueError(f"{masks}: holds no mask of a photograph, called {lacking[0]}.png for {lacking[0]}")
@@ -157,14 +165,44 @@ def stage(
         message = f"{masks}: {len(lacking)} of {len(photos)} photographs have no mask, such as {lacking[0]}"
         warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
     grey: list[Path] = []
-    groups = _stage_flat([photo for photo in photos if not photo.is_panorama], folder, grey)
+    groups = _stage_flat([photo for photo in photos if photo.kind == "photograph"], folder, grey)
     tops = {name.partition("/")[0] for group in groups for name in group.names}
-    rigs = _stage_panoramas([photo for photo in photos if photo.is_panorama], folder, tops, tell, grey)
+    rigs = _stage_panoramas([photo for photo in photos if photo.kind == "panorama"], folder, tops, tell, grey)
     warn_of_grey(sorted(grey), [photo.mask for photo in photos if photo.mask is not None])
     num_turned = sum(photo.facts.is_turned for photo in photos)
     if num_turned:
         tell(f"{counted(num_turned, 'photograph')} turned as EXIF says")
     return Staged(folder, groups, rigs)
+
+
+def _decided(photos: Sequence[_Photo], videos: Container[int]) -> list[_Photo]:
+    """Return photographs that are panoramas or not: unclear ones, and frames of the sources `videos`, are what most of
+    their source and size are. ValueError: some are fisheyes."""
+    votes: dict[tuple[int, tuple[int, int]], Counter[Projection]] = defaultdict(Counter)
+    for photo in photos:
+        if photo.kind == "fisheyes":
+            raise ValueError(
+                f"{photo.file}: shows two fisheyes side by side, as 360° cameras take them: stitch them first, by "
+                "exporting equirectangular files with the camera's program; panorama='no' leaves such pictures whole"
+            )
+        votes[photo.source, photo.facts.size][photo.kind] += 1
+    decided, unclear = [], []
+    for photo in photos:
+        own = votes[photo.source, photo.facts.size]
+        kind = photo.kind
+        if kind == "unclear" or photo.source in videos:
+            kind = "panorama" if own["panorama"] > own["photograph"] else "photograph"
+        if photo.kind == "unclear" and kind == "photograph":
+            unclear.append(photo.name)
+        decided.append(photo._replace(kind=kind))
+    if unclear:
+        warnings.warn(
+            f"{counted(len(unclear), 'picture')} twice as wide as high, such as {unclear[0]}: nothing at the left and "
+            "right edges shows whether they join, so these are taken for photographs; panorama='yes' cuts them as "
+            "panoramas of 360° x 180°, panorama='no' leaves them whole without this warning",
+            stacklevel=4,
+        )
+    return decided
 
 
 def _prefixes(sources: Sequence[Path]) -> list[str]:
@@ -336,10 +374,5 @@ def cut_view(panorama: np.ndarray, direction: Direction) -> np.ndarray:
 
 
 def is_panorama(pixels: np.ndarray) -> bool:
-    """Return whether a picture [H, W, C] is twice as wide as high, and its right edge continues at its left edge."""
-    if pixels.shape[1] != 2 * pixels.shape[0]:
-        return False
-    # The first step is across the seam, the others are for comparison.
-    columns = pixels[:, [-1, 0, 1, 2, 3]].astype(np.float32)
-    steps = np.abs(np.diff(columns, axis=1)).mean(axis=(0, 2))
-    return bool(steps[0] <= SEAM_TOLERANCE * steps[1:].mean() + LEAST_SEAM)
+    """Return whether a picture [H, W, C] uint8 is seen to be a whole panorama, twice as wide as high."""
+    return pixels.shape[1] == 2 * pixels.shape[0] and projection_of(pixels) == "panorama"
