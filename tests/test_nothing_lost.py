@@ -117,7 +117,7 @@ def test_files_are_on_the_disk_before_they_are_renamed(tmp_path, monkeypatch):
 
 
 def test_left_over_partial_files_are_deleted_and_others_stay(tmp_path):
-    """A young partial file may belong to a living process."""
+    """A partial file may belong to a living process, or to a killed one whose number another process has."""
     run = filled(tmp_path / "run")
     left = run.checkpoint(NAME, 20).with_name(f".{run.checkpoint(NAME, 20).name}.123.partial")
     others = [run.path / ".notes.txt.123.partial", run.path / "models" / ".mine.npz.1.partial"]
@@ -127,8 +127,11 @@ def test_left_over_partial_files_are_deleted_and_others_stay(tmp_path):
         assert not left.exists() and all(path.is_file() for path in others)
     folder = tmp_path / "files"
     folder.mkdir()
-    old, young, other = (folder / f".{name}.partial" for name in ("a.npz.1", "a.npz.2", "a.npz.txt.1"))
-    for path in (old, young, other):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    names = f"a.npz.{os.getppid()}", f"a.npz.{os.getpid()}0", f"a.npz.{ended.pid}", "a.npz.txt.1"
+    young, old, killed, other = (folder / f".{name}.partial" for name in names)
+    for path in (young, old, killed, other):
         path.touch()
     for path in (old, other):
         os.utime(path, (0, 0))

@@ -10,9 +10,13 @@ import importlib
 import io
 import ipaddress
 import json
+import os
 import re
 import signal
 import socket
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -38,6 +42,7 @@ from a2tg_jax.results.model_source import Source, open_source
 from a2tg_jax.results.record import RunRecord, SceneSource, write_record
 from a2tg_jax.results.viewing import ServedPhotographs, export_comparison, export_web, routes_of
 from a2tg_jax.systems.a2tg import A2tg
+from a2tg_jax.web import server
 from a2tg_jax.web.page import viewer_html, viewer_html_with
 from a2tg_jax.web.server import ANY, Door, Route, application, lan_address, serve, served
 
@@ -81,6 +86,64 @@ def test_known_paths_are_answered():
 )
 def test_other_paths_hosts_and_methods_are_refused(status, requests):
     assert [ask(APP, **request)[0] for request in requests] == [status] * len(requests)
+
+
+@contextlib.contextmanager
+def connected(address, num=1):
+    """Open connections to a server on the loopback."""
+    port = int(address.rstrip("/").rpartition(":")[2])
+    with contextlib.ExitStack() as stack:
+        yield [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=20)) for _ in range(num)]
+
+
+@pytest.mark.parametrize("header", ["Content-Length: 300000000", "Transfer-Encoding: chunked"])
+def test_a_large_body_is_refused_before_it_is_read(header):
+    chunk = b"1000\r\n" + bytes(0x1000) + b"\r\n"
+    with served({"/": Route("text/plain", b"here")}) as address, connected(address) as (connection,):
+        connection.sendall(f"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n{header}\r\n\r\n".encode())
+        if "chunked" in header:  # Exactly as many bytes as are refused: those after them would reset the connection.
+            connection.sendall(chunk * (server.MOST_BODY_BYTES // len(chunk) + 1))
+        assert connection.recv(100).startswith(b"HTTP/1.1 413 ")
+
+
+def test_many_slow_connections_do_not_keep_the_page_from_answering():
+    with served({"/": Route("text/plain", b"here")}) as address, connected(address, 200) as slow:
+        for connection in slow:
+            connection.sendall(b"GET / HT")
+        with connected(address) as (other,):
+            other.settimeout(5)
+            other.sendall(f"GET / HTTP/1.0\r\nHost: {address.split('/')[2]}\r\n\r\n".encode())
+            assert other.recv(100).startswith(b"HTTP/1.0 200 OK")
+
+
+@pytest.mark.parametrize("is_dripping", [False, True])
+def test_a_connection_without_a_whole_request_is_closed(monkeypatch, is_dripping):
+    monkeypatch.setattr(server, "PATIENCE", 1)
+    with served({"/": Route("text/plain", b"here")}) as address, connected(address) as (connection,):
+        connection.settimeout(0.2)
+        for _ in range(50):
+            with contextlib.suppress(TimeoutError):
+                if is_dripping:
+                    connection.sendall(b"G")
+                assert connection.recv(1) == b""
+                return
+        pytest.fail("the connection stays open")
+
+
+# waitress leaves the temporary file of a dropped answer to the garbage collector.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_answer_that_nobody_reads_is_dropped(monkeypatch):
+    """Four such answers would keep all threads of the server waiting."""
+    monkeypatch.setattr(server, "PATIENCE", 1)
+    large = {"/": Route("text/plain", bytes(1 << 25)), "/small": Route("text/plain", b"here")}
+    with served(large) as address, connected(address, 4) as deaf:
+        host = address.split("/")[2]
+        for connection in deaf:
+            connection.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+        time.sleep(0.2)
+        with connected(address) as (other,):
+            other.sendall(f"GET /small HTTP/1.0\r\nHost: {host}\r\n\r\n".encode())
+            assert other.recv(100).startswith(b"HTTP/1.0 200 OK")
 
 
 def test_a_server_listens_on_the_loopback_alone():
@@ -319,6 +382,21 @@ def test_a_folder_and_a_single_file(tmp_path):
         export_web(source, tmp_path / "with", photographs=True)
     with pytest.raises(ValueError, match="leave out `single_file`"):
         export_web(source, tmp_path / "with.html", photographs=True)
+
+
+def test_an_export_deletes_what_a_killed_one_left(tmp_path):
+    """A web folder is uploaded as it is."""
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    site = tmp_path / "site"
+    (site / "photographs").mkdir(parents=True)
+    names = [".index.html", ".scene.a2tgz", ".photographs.json", "photographs/.7.jpg"]
+    left = [site / f"{name}.{ended.pid}.partial" for name in names]
+    others = [site / f".notes.txt.{ended.pid}.partial", site / f".index.html.{os.getppid()}.partial"]
+    for path in (*left, *others):
+        path.touch()
+    export_web(Source(textured(), "a"), site)
+    assert not any(path.exists() for path in left) and all(path.exists() for path in others)
 
 
 def test_a_page_compares_two_models_of_one_scene(tmp_path):

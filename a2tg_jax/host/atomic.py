@@ -9,12 +9,15 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
+
 from a2tg_jax.host.operating_system import flush_folder
 
 PARTIAL = re.compile(r"\.(.+)\.\d+\.partial")
 """Name of a partial file: the name of the final file, and the process."""
 STALE_SECONDS = 3600.0
-"""Seconds without a change after which a partial file counts as left over by a killed process."""
+"""Seconds without a change after which a partial file counts as left over, though its process seems to run: another
+process may have got the number."""
 NO_ROOM = frozenset({errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)})
 """Errors of a full disk and of an exceeded quota."""
 
@@ -25,7 +28,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     If the process is killed or the machine loses power, the old file or none is left, never half of one. Missing parent
     folders are made. A link stays, and the file that it leads to is written. Partial files of the same file that killed
-    processes left over are deleted after an hour.
+    processes left over are deleted.
 
     Raises:
       OSError: from the block, or if a link leads nowhere. The error of a full disk names the file.
@@ -34,7 +37,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(OSError):  # Another process may delete them; another user's cannot be deleted.
         for partial, whole in _left_over_once(path.absolute().parent).items():
-            if whole == path.absolute() and time.time() - partial.stat().st_mtime > STALE_SECONDS:
+            if whole == path.absolute() and is_left_over(partial):
                 partial.unlink()
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")  # os.replace cannot move between disks.
     try:
@@ -87,6 +90,12 @@ def left_over(folder: Path) -> dict[Path, Path]:
     """Return the partial files of a folder, with the files they were to become."""
     names = [PARTIAL.fullmatch(name) for name in os.listdir(folder)] if folder.is_dir() else []
     return {folder / name[0]: folder / name[1] for name in names if name}
+
+
+def is_left_over(partial: Path) -> bool:
+    """Return whether the process of a partial file no longer runs, or has not written to it for an hour."""
+    number = int(partial.name.split(".")[-2])
+    return not psutil.pid_exists(number) or time.time() - partial.stat().st_mtime > STALE_SECONDS
 
 
 # Once per folder and process: a folder of frames has thousands of entries.

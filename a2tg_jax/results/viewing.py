@@ -21,7 +21,7 @@ from PIL import Image
 
 from a2tg_jax.core.origin import BLACK, Color, Origin
 from a2tg_jax.data.scene import Scene, View, origin_of_scene, view_image
-from a2tg_jax.host.atomic import write_whole
+from a2tg_jax.host.atomic import is_left_over, left_over, write_whole
 from a2tg_jax.host.json_text import read_json
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.io.compact import decode_model
@@ -239,6 +239,7 @@ def export_web(
             check_new(path, "`web`", overwrite=overwrite)
         with contextlib.suppress(OSError, ValueError, TypeError):  # There may be no page.
             old = {out / photograph_name(int(index)) for index in read_json(out / PHOTOGRAPHS_NAME)}
+        drop_left_over_pages(out)
     # Nothing is written until all files are checked and all contents made.
     for path, content in files.items():
         write_whole(path, content)
@@ -255,6 +256,16 @@ def export_web(
         lines += [f"{loss_text(loss_of(again))}, {measure}" for measure, loss_of in measures.items()]
     others_text = f" with {counted(len(files) - 1, 'file')} next to it" if others else ""
     return "\n".join([*lines, f"{page}: {in_bytes(total)}{others_text}"])
+
+
+def drop_left_over_pages(out: Path) -> None:
+    """Delete partial files of a page that killed exports left in its folder, which may be uploaded as a whole."""
+    photographs = Path(photograph_name(0)).parent
+    for folder in (out, out / photographs):
+        for partial, whole in left_over(folder).items():
+            is_photograph = folder.name == photographs.name and whole.suffix == ".jpg"
+            if (is_photograph or whole.name in ("index.html", SCENE_NAME, PHOTOGRAPHS_NAME)) and is_left_over(partial):
+                partial.unlink(missing_ok=True)
 
 
 def export_comparison(sources: Sequence[Source], out: Path, *, overwrite: bool = False) -> str:

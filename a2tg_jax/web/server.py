@@ -22,6 +22,12 @@ from a2tg_jax.host.optional import optional
 LOOPBACK, ANY = "127.0.0.1", "0.0.0.0"
 ELSEWHERE = "192.0.2.1"
 """Address that no machine has (RFC 5737)."""
+MOST_BODY_BYTES = 1 << 16
+"""Bytes of a request's body from which it is refused; the page sends none. waitress would keep larger ones on disk."""
+MOST_CONNECTIONS = 500
+"""Open connections; further ones wait."""
+PATIENCE = 10
+"""Seconds in which a request must be complete, and without progress after which a connection is closed."""
 # Other sites can neither frame the page nor read the scene; browsers keep no copy of a changing one.
 HEADERS = (
     ("Cache-Control", "no-store"),
@@ -171,6 +177,18 @@ def served(routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0) 
         warnings.warn(f"the viewer's server ended early: {error}", stacklevel=3)
 
 
+def close_stalled(channels: Iterable[Any], before: float) -> None:
+    """Close waitress's channels without progress since a time, and those with a request that began before it.
+
+    waitress itself keeps a connection whose request comes byte by byte, or whose answer is not read.
+    """
+    for channel in channels:
+        is_idle = channel.last_activity < before and (not channel.requests or channel.total_outbufs_len > 0)
+        is_slow = channel.request is not None and channel.creation_time < before
+        if is_idle or is_slow:
+            channel.will_close = True
+
+
 @contextlib.contextmanager
 def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tuple[str, Future[None]]]:
     """Yield the URL of a server in a thread, and a future for its end or the error that ended it."""
@@ -190,8 +208,11 @@ def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tupl
     connections: dict[int, Any] = {}
     # An own socket map: waitress's default is global, and would mix servers of one process.
     server = waitress.create_server(
-        application(routes, door), map=connections, sockets=[listening], threads=4, ident=None
-    )
+        application(routes, door), map=connections, sockets=[listening], threads=4, ident=None,
+        max_request_body_size=MOST_BODY_BYTES, connection_limit=MOST_CONNECTIONS, cleanup_interval=1,
+        asyncore_use_poll=True,  # select takes no more than 1,024 connections.
+    )  # fmt: skip
+    server.maintenance = lambda now: close_stalled(server.active_channels.values(), now - PATIENCE)
     ended: Future[None] = Future()
 
     def run() -> None:
