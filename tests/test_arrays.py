@@ -224,6 +224,13 @@ def test_map_coordinates_in_float32_are_noticed(given, what):
     a2tg.scene_from_arrays(**{**given, **near})
 
 
+def test_gaussians_on_a_map_are_noticed(given):
+    colors = given["colors"] / 255.0
+    with pytest.warns(UserWarning, match=r"points are in map coordinates, where means of float32 have steps of 0\.5"):
+        a2tg.init_from_points(given["points"] + MAP, colors)
+    a2tg.init_from_points(given["points"] + 100, colors)
+
+
 def test_it_is_said_why_photographs_are_not_compared(given):
     few = {name: given[name] for name in ("viewmats", "Ks")}
     plain = [np.where(np.arange(30)[:, None, None] < 8, image, 90).astype(np.uint8) for image in given["images"]]

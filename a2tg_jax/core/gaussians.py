@@ -6,6 +6,7 @@ N is the number of Gaussians; quaternions are wxyz and need not be unit.
 import dataclasses
 import math
 import os
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +58,8 @@ def check_process() -> None:
 
 
 INITIAL_OPACITY = 0.1
+MOST_ROUNDING = 0.1
+"""Largest step of means in float32 without a warning, in units of the median scale."""
 NO_ROW_LOG_SCALE = -10.0  # an opacity of 4.5e-5, far below 1/255
 """Log-scales and opacity logit of spare rows."""
 COLOR_SLACK = 1e-3
@@ -218,7 +221,7 @@ def init_from_points(
       sh_degree: highest degree of spherical harmonics, 0 to 3.
 
     Returns:
-      float32 Gaussians, min(num, P) of them.
+      float32 Gaussians, min(num, P) of them. You are warned if float32 rounds their means coarsely, in map coordinates.
 
     Raises:
       ValueError: if the shapes disagree, there are fewer than two points, a number is not finite, colours are an array
@@ -254,6 +257,13 @@ def init_from_points(
     distances = cKDTree(points).query(points, k=neighbours + 1)[0][:, 1:]
     # 1e-7 as in 3DGS's program: points that coincide would get a scale of 0.
     scales = np.sqrt(np.maximum(np.mean(distances**2, axis=1), 1e-7))
+    rounding = float(np.spacing(np.abs(points).max().astype(np.float32)))
+    if rounding > MOST_ROUNDING * np.median(scales):
+        warnings.warn(
+            f"points are in map coordinates, where means of float32 have steps of {rounding:g}, "
+            f"{rounding / np.median(scales):.2g} of the Gaussians' size: subtract an offset from points and cameras",
+            stacklevel=2,
+        )
     count = len(points)
     # A normalised 4D normal is uniform over rotations.
     quats = rng.normal(size=(count, 4))

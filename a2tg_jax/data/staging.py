@@ -145,14 +145,10 @@ def stage(
         facts = picture_facts(file)
         kind: Projection = "photograph"
         if facts.size[0] == 2 * facts.size[1] and panorama != "no":
-            is_known = panorama == "yes" or facts.is_panorama
-            kind = (
-                "panorama"
-                if is_known
-                else "photograph"
-                if facts.is_panorama is False
-                else projection_of(read_pixels(file))
-            )
+            if panorama == "yes" or facts.is_panorama:
+                kind = "panorama"
+            elif facts.is_panorama is None:
+                kind = projection_of(read_pixels(file))
         names = dict.fromkeys([*mask_names(name), *mask_names(name.removeprefix(prefixes[source]))])
         return _Photo(source, file, name, facts, kind, None if masks is None else on_disk(masks, *names))
 
