@@ -216,7 +216,7 @@ def test_unclear_pictures_are_what_most_of_their_source_and_size_are(tmp_path, p
     found = staged([tmp_path / "a", tmp_path / "b"], tmp_path / "work")
     assert sorted(len(rig.groups[0].names) for rig in found.rigs) == [3, 3] and not found.groups
     Image.fromarray(np.full((80, 160, 3), 255, np.uint8)).save(tmp_path / "b" / "3.png")
-    with pytest.warns(UserWarning, match=r"1 picture twice as wide as high, such as b/3.png: .* panorama='yes' cuts"):
+    with pytest.warns(UserWarning, match=r"1 picture twice as wide as high, such as b/3.png: .* `panorama` yes cuts"):
         found = staged([tmp_path / "a", tmp_path / "b"], tmp_path / "other")
     assert [group.names for group in found.groups] == [("b/3.png",)]
 

@@ -179,7 +179,7 @@ def _decided(photos: Sequence[_Photo], videos: Container[int]) -> list[_Photo]:
         if photo.kind == "fisheyes":
             raise ValueError(
                 f"{photo.file}: shows two fisheyes side by side, as 360° cameras take them: stitch them first, by "
-                "exporting equirectangular files with the camera's program; panorama='no' leaves such pictures whole"
+                "exporting equirectangular files with the camera's program; with `panorama` no they stay whole"
             )
         votes[photo.source, photo.facts.size][photo.kind] += 1
     decided, unclear = [], []
@@ -194,8 +194,8 @@ def _decided(photos: Sequence[_Photo], videos: Container[int]) -> list[_Photo]:
     if unclear:
         warnings.warn(
             f"{counted(len(unclear), 'picture')} twice as wide as high, such as {unclear[0]}: nothing at the left and "
-            "right edges shows whether they join, so these are taken for photographs; panorama='yes' cuts them as "
-            "panoramas of 360° x 180°, panorama='no' leaves them whole without this warning",
+            "right edges shows whether they join, so these are taken for photographs; `panorama` yes cuts them as "
+            "panoramas of 360° x 180°, `panorama` no leaves them whole without this warning",
             stacklevel=4,
         )
     return decided
