@@ -272,6 +272,7 @@ def test_colours_without_their_factor_are_named(given):
     a2tg.scene_from_arrays(**{**given, "images": [*shares[:5], given["images"][5]]})
 
 
+@pytest.mark.filterwarnings("ignore:no Gaussian is visible")
 def test_a_transparent_photograph_is_compared_on_the_background_of_the_model():
     """The photograph shows nothing, and the Gaussians are hidden: on white, both are white."""
     cameras = [a2tg.look_at([x, -2, 0], [0, 0, 0], width=16, height=12) for x in (-0.5, 0.5)]
