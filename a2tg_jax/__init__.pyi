@@ -1,6 +1,12 @@
 """Public names, for type checkers and for `__init__.py`, which imports each at its first use."""
 
-from .adapt import Upscale as Upscale, next_sizes as next_sizes, reallocate as reallocate, select as select
+from .adapt import (
+    ReallocateResult as ReallocateResult,
+    Upscale as Upscale,
+    next_sizes as next_sizes,
+    reallocate as reallocate,
+    select as select,
+)
 from .appearance import (
     Appearance as Appearance,
     Bands as Bands,
@@ -14,7 +20,12 @@ from .core.bilinear import TextureRegion as TextureRegion
 from .core.camera_paths import look_at as look_at, path_through as path_through, smooth_path as smooth_path
 from .core.cameras import Camera as Camera, resize_camera as resize_camera
 from .core.gaussians import Gaussians as Gaussians, init_from_points as init_from_points
-from .core.optim import adam_init as adam_init, adam_update as adam_update, exponential_decay as exponential_decay
+from .core.optim import (
+    AdamState as AdamState,
+    adam_init as adam_init,
+    adam_update as adam_update,
+    exponential_decay as exponential_decay,
+)
 from .core.origin import Origin as Origin
 from .core.pytree import (
     combine as combine,
@@ -27,7 +38,7 @@ from .core.similarity import Similarity as Similarity, transform_gaussians as tr
 from .data.arrays import scene_from_arrays as scene_from_arrays
 from .data.assembly import with_validation_views as with_validation_views
 from .data.load import load_scene as load_scene
-from .data.photo_store import Mask as Mask, Picture as Picture
+from .data.photo_store import DepthMap as DepthMap, Mask as Mask, Picture as Picture
 from .data.scene import Scene as Scene, View as View, view_image as view_image
 from .data.sfm import run_sfm as run_sfm
 from .data.synthetic import synthetic_scene as synthetic_scene
@@ -46,6 +57,8 @@ from .events import (
     EventInfo as EventInfo,
     GradientStatistics as GradientStatistics,
     HostEvent as HostEvent,
+    Now as Now,
+    Seen as Seen,
     StepEvent as StepEvent,
     Times as Times,
     keep_rows as keep_rows,
@@ -72,14 +85,17 @@ from .io.usd import load_usd as load_usd, save_usd as save_usd
 from .mcmc import (
     FillingMcmc as FillingMcmc,
     Mcmc as Mcmc,
+    MoveInfo as MoveInfo,
+    MoveResult as MoveResult,
     Noise as Noise,
     grow as grow,
     perturb as perturb,
     relocate as relocate,
 )
 from .measure.alignment import align_poses as align_poses, color_fit as color_fit
-from .measure.evaluation import evaluate as evaluate
+from .measure.evaluation import Evaluation as Evaluation, ViewMetrics as ViewMetrics, evaluate as evaluate
 from .measure.metrics import (
+    LpipsWeights as LpipsWeights,
     load_lpips as load_lpips,
     lpips as lpips,
     parameter_bytes as parameter_bytes,
@@ -97,7 +113,7 @@ from .mesh.triangles import (
     surface_distance as surface_distance,
 )
 from .model import Model as Model, concatenate as concatenate
-from .rasterize.render_types import RenderOutput as RenderOutput, RenderSettings as RenderSettings
+from .rasterize.render_types import Geometry as Geometry, RenderOutput as RenderOutput, RenderSettings as RenderSettings
 from .rasterize.views import EmptyRenderWarning as EmptyRenderWarning
 from .render import (
     CapacityWarning as CapacityWarning,
@@ -153,5 +169,6 @@ from .training.gradients import (
     view_gradients as view_gradients,
 )
 from .training.losses import normal_consistency as normal_consistency, photometric_loss as photometric_loss
+from .training.stage import LossTerm as LossTerm
 
 __version__: str

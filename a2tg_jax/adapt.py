@@ -38,6 +38,7 @@ class ReallocateResult(NamedTuple):
     """Result of `reallocate`."""
 
     textures: Textures
+    """Textures of the new sizes."""
     moments: Any
     """Moments as given, their textures rebuilt as the texels were."""
 

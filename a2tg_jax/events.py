@@ -75,7 +75,7 @@ class Seen(NamedTuple):
     cameras: Camera
     """V cameras, stacked."""
     gradients: Array
-    """[V, N, 3] the event's statistic (`render.render_traced`), on the screen in units of half an image; 0 where a
+    """[V, N, 3] the event's statistic (`view_gradients`), on the screen in units of half an image; 0 where a
     Gaussian was not seen."""
     is_visible: Array
     """[V, N] whether the Gaussian was composited at one pixel at least."""
@@ -355,7 +355,7 @@ def read_probe(found: Array, statistic: str, width: int, height: int) -> tuple[A
     """Return the statistic of each Gaussian [..., N, 3], on the screen in units of half an image, and whether it was
     composited at one or more pixels [..., N].
 
-    The gradients [..., N, 4] of one view or several are those at a probe (`render.render_traced`). The statistic is of
+    The gradients [..., N, 4] of one view or several are those at a probe (`view_gradients`). The statistic is of
     the "position" in the world, or another one on the screen.
     """
     gradients = found[..., :3]

@@ -46,11 +46,13 @@ class MoveResult(NamedTuple):
     """Result of `relocate` and `grow`."""
 
     gaussians: Gaussians
+    """Rows after the moves."""
     moments: Any
     """Moments as given, with the rows of the hosts (and of the added) at zero; the count of Adam's state stays."""
     num_live: Array
-    """int32."""
+    """int32 number of rows in use."""
     info: MoveInfo
+    """Counts of the event."""
 
 
 def relocate(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int) -> MoveResult:

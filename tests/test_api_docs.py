@@ -4,6 +4,7 @@ import ast
 import doctest
 import inspect
 import re
+import typing
 from pathlib import Path
 
 import pytest
@@ -94,6 +95,35 @@ def test_every_argument_and_result_is_described(name):
     assert ("\nReturns:\n" in text) == (signature.return_annotation not in (None, "None"))
     if re.search(r"^    raise ", inspect.getsource(FUNCTIONS[name]), re.MULTILINE):
         assert "\nRaises:\n" in text
+
+
+INTERNAL = {
+    "BillboardOptions", "Clock", "CloneSplitPlan", "Coefficients", "Corrections", "Devices", "Event", "Exchange", "KernelRates",
+    "Machine", "RecordedViews", "RemotePath", "RestOfRun", "SfmSummary", "Shape", "SplitStatistics", "StageRun",
+    "TrainState", "Trial", "ViewDependence",
+}  # fmt: skip
+"""Types in public signatures whose values users only pass on, or give as mappings."""
+
+
+def named_classes(hint) -> set[str]:
+    """The classes of the package in an annotation."""
+    if isinstance(hint, type) and not typing.get_args(hint):
+        return {hint.__name__} if hint.__module__.startswith("a2tg_jax.") else set()
+    inner = hint if isinstance(hint, list | tuple) else typing.get_args(hint)
+    return set().union(*map(named_classes, inner))
+
+
+def test_types_in_public_signatures_are_public():
+    found = set()
+    for value in PUBLIC.values():
+        members = vars(value).values() if inspect.isclass(value) else ()
+        for own in [value, *members]:
+            own = getattr(own, "fget", None) or getattr(own, "__func__", own)
+            is_public = inspect.isclass(own) or not getattr(own, "__name__", "_").startswith("_")
+            if (inspect.isfunction(own) and is_public) or own is value:
+                for hint in typing.get_type_hints(own).values():
+                    found |= named_classes(hint)
+    assert found - PUBLIC.keys() == INTERNAL
 
 
 def test_every_field_is_described():

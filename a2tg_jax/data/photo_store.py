@@ -157,6 +157,7 @@ class DepthMap:
     shape: tuple[int, int]
     """(H, W)."""
     load: Callable[[], np.ndarray] = dataclasses.field(repr=False)
+    """Function that returns the map, [H, W] floats, NaN where unknown."""
 
     @staticmethod
     def of(values: "np.ndarray | DepthMap") -> "DepthMap":

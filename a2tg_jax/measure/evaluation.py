@@ -34,6 +34,7 @@ class ViewMetrics:
     """Quality of one view, its image clipped to [0, 1]."""
 
     name: str
+    """Name of the view."""
     psnr: float
     """dB, higher is better."""
     ssim: float
@@ -49,6 +50,7 @@ class Evaluation:
     """Quality of all views, and rendering speed."""
 
     per_view: tuple[ViewMetrics, ...]
+    """Quality of each view."""
     lpips_network: str | None
     """Network of the LPIPS figures, which are not comparable with another's; None without LPIPS."""
     frames_per_second: float
