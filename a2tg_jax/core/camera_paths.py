@@ -59,7 +59,8 @@ def nearest_point(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
 def distance_to_subject(viewmats: np.ndarray) -> float:
     """Return the median distance of cameras [V, 4, 4] from the point nearest to their optical axes; NaN if most do not
     look there, such as along a street."""
-    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
     offsets = nearest_point(centers, axes) - centers
     distances = np.linalg.norm(offsets, axis=1)
     facing = np.sum(offsets * axes, axis=1) / np.maximum(distances, 1e-12)
@@ -80,14 +81,16 @@ def outlying_cameras(viewmats: np.ndarray, distance_of: Callable[[np.ndarray], f
     """
     num = len(viewmats)
     is_outlying = np.zeros(num, bool)
-    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
     offsets = np.median(centers, axis=0) - centers
     distances = np.linalg.norm(offsets, axis=1)
     # |offset × axis| is the distance from the middle to the axis; behind a camera, the distance from the camera counts.
     misses = np.where(np.sum(offsets * axes, axis=1) > 0, np.linalg.norm(np.cross(offsets, axes), axis=1), distances)
     order = np.argsort(distances, kind="stable")
     for num_others in range(num - num // 3, num if num >= FEWEST_TO_COMPARE else 0):
-        others, rest = order[:num_others], order[num_others:]
+        others = order[:num_others]
+        rest = order[num_others:]
         extent = distances[others[-1]]
         # All others at one place, such as a panorama, have no extent to compare with.
         if not 0 < FAR * extent < distances[rest[0]]:

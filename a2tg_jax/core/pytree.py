@@ -121,7 +121,8 @@ def _are_equal(one: Any, other: Any) -> Any:
     if type(other) is not type(one):
         return NotImplemented
     names = [field.name for field in dataclasses.fields(one)]
-    own, others = ([getattr(instance, name) for name in names] for instance in (one, other))
+    own = [getattr(one, name) for name in names]
+    others = [getattr(other, name) for name in names]
     structure: Any = jax.tree.structure(own)
     if structure != jax.tree.structure(others):
         return False

@@ -164,7 +164,8 @@ def _mistakes(
             f"{height:g}. Multiply the first row of K by the ratio of the widths, the second by the ratio of the "
             "heights"
         )
-    if message := _likelier_poses(shots, None if points is None else points[are_somewhere(points)]):
+    message = _likelier_poses(shots, None if points is None else points[are_somewhere(points)])
+    if message:
         yield f"viewmats must be world to camera, x right, y down, z forward: {message}"
 
 
@@ -203,7 +204,8 @@ def _likelier_poses(shots: Sequence[Shot], points: np.ndarray | None) -> str:
 def _agree_on_subject(shots: Sequence[Shot], viewmats: np.ndarray) -> bool:
     """Return whether photographs agree around the point nearest to all optical axes, better than if they are exchanged
     among the cameras."""
-    shots, viewmats = evenly_chosen(shots, MOST_VIEWS), evenly_chosen(viewmats, MOST_VIEWS)
+    shots = evenly_chosen(shots, MOST_VIEWS)
+    viewmats = evenly_chosen(viewmats, MOST_VIEWS)
     looks = [Look(shot.picture, shot.mask, viewmat, shot.K) for shot, viewmat in zip(shots, viewmats, strict=True)]
     centers = camera_centers(viewmats)
     subject = nearest_point(centers, viewmats[:, 2, :3])

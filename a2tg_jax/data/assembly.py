@@ -152,12 +152,15 @@ def _warn_of_outlying(shots: Sequence[Shot], cloud: PointCloud | None, source: s
 
     def distance_of(indices: np.ndarray) -> float:
         """Return the median depth of what cameras see of the cloud."""
-        points = (
-            np.empty((0, 3)) if cloud is None else evenly_chosen(cloud.points[are_somewhere(cloud.points)], FIRST_LOOK)
-        )
-        sights = [Sight.of(shot.viewmat, shot.K, shot.picture.size, shot.rays) for shot in (shots[i] for i in indices)]
-        depths = [np.median(seen) for sight in sights if len(seen := sight.depths_seen(points, 0.0))]
-        return float(np.median(depths)) if depths else distance_to_subject(np.stack([s.viewmat for s in sights]))
+        depths = []
+        if cloud is not None:
+            points = evenly_chosen(cloud.points[are_somewhere(cloud.points)], FIRST_LOOK)
+            for index in indices:
+                shot = shots[index]
+                seen = Sight.of(shot.viewmat, shot.K, shot.picture.size, shot.rays).depths_seen(points, 0.0)
+                if len(seen):
+                    depths.append(np.median(seen))
+        return float(np.median(depths)) if depths else distance_to_subject(viewmats[indices])
 
     viewmats = np.stack([shot.viewmat for shot in shots])
     is_outlying = outlying_cameras(viewmats, distance_of)
@@ -177,7 +180,8 @@ def _start_without_points(
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Return points [P, 3] where photographs agree, their colours [P, 3] uint8, and ""; or random grey ones, and why
     there are no others. Each view sees some."""
-    random, obstacle = random_points(sights, object_axes), ""
+    random = random_points(sights, object_axes)
+    obstacle = ""
     looks = _compared_photographs(train, viewmats)
     points, colors = agreeing_points(looks, random, NUM_POINTS)
     if len(points) < 2:
@@ -185,10 +189,10 @@ def _start_without_points(
         obstacle = "the photographs agree nowhere"
         if not looks:
             obstacle = "photographs that keep a lens's distortion are not compared"
-        elif (share := plain_share(looks)) > MOST_PLAIN:
+        elif plain_share(looks) > MOST_PLAIN:
             obstacle = (
-                f"{share:.0%} of the photographs is plain, such as a wall or the sky, where they would agree anywhere: "
-                "give points of a reconstruction, such as a2tg sfm finds"
+                f"{plain_share(looks):.0%} of the photographs is plain, such as a wall or the sky, where they would "
+                "agree anywhere: give points of a reconstruction, such as a2tg sfm finds"
             )
     elif lost := unseeing(points, sights):
         # As many for each of them as for the others, at random.
@@ -312,7 +316,8 @@ def rigid_motion(motion: np.ndarray, what: str) -> np.ndarray:
     if np.abs(singular_values - 1).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
         raise ValueError(f"{what}: its pose is not a rigid motion; rotations must be orthonormal and right-handed")
     rigid = np.eye(4)
-    rigid[:3, :3], rigid[:3, 3] = left @ right, motion[:3, 3]
+    rigid[:3, :3] = left @ right
+    rigid[:3, 3] = motion[:3, 3]
     return rigid
 
 
@@ -356,7 +361,8 @@ def warn_of_rounding(what: str, positions: np.ndarray, transform: Similarity, so
     """
     steps = np.spacing(np.abs(positions).astype(np.float32)).astype(np.float64)
     is_coarse = steps * transform.scale > COARSEST
-    coarse, steps = positions[is_coarse], steps[is_coarse]
+    coarse = positions[is_coarse]
+    steps = steps[is_coarse]
     # Positions that come from inverting a matrix differ from float32 by rounding of float64.
     is_float32 = np.abs(coarse - coarse.astype(np.float32)) <= 1e-3 * steps
     is_whole = np.abs(coarse - np.rint(coarse)) <= 1e-3  # Such as a grid in metres, which lost nothing.

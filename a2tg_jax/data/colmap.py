@@ -175,7 +175,8 @@ def _between(viewmats: np.ndarray, others: np.ndarray) -> Similarity | None:
     rotation = left @ right
     centers = camera_centers(viewmats) @ rotation.T
     wanted = camera_centers(others)
-    around, wanted_around = centers - centers.mean(axis=0), wanted - wanted.mean(axis=0)
+    around = centers - centers.mean(axis=0)
+    wanted_around = wanted - wanted.mean(axis=0)
     if not around.any():
         return None
     scale = float((around * wanted_around).sum() / (around**2).sum())

@@ -225,7 +225,8 @@ def _read(path: Path, options: Options) -> Scene:
     if hint is not None:
         again = f"; or find cameras again: a2tg sfm {as_argument(path)} SCENE" if holds_photos(path) else ""
         raise FileNotFoundError(f"{path}: {hint}{again}")
-    if others := transforms_in(path):
+    others = transforms_in(path)
+    if others:
         raise FileNotFoundError(f"{path}: has no {NERFSTUDIO_FILE}, but {others[0].name}: give that file itself")
     # Such as scene/images, or a folder in it.
     scene = next((parent for parent in path.resolve().parents[:2] if _loader(parent) is not None), None)

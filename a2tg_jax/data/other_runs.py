@@ -36,7 +36,8 @@ def other_run(folder: Path) -> OtherRun | None:
             scene = None
             if is_regular(folder / ARGUMENTS):
                 text = read_regular(folder / ARGUMENTS, MOST_BYTES).decode(errors="replace")
-                scene = match[1] if (match := SOURCE_PATH.search(text)) else None
+                match = SOURCE_PATH.search(text)
+                scene = match[1] if match else None
             return OtherRun(program, models[-1], scene)
     return None
 

@@ -69,8 +69,13 @@ def _shows_fisheyes(grey: np.ndarray) -> bool:
     halves = grey[:, :height], grey[:, height:]
     black = np.quantile([half[radius > OUTSIDE] for half in halves], 0.9)
     is_rim = (radius > RING[0]) & (radius < RING[1])
-    rims = np.array([[np.median(half[is_rim & (eighth == number)]) for number in range(8)] for half in halves])
-    return bool(black <= DARK and ((rims > black + LIT).sum(axis=1) >= LEAST_LIT).all())
+    if black > DARK:
+        return False
+    for half in halves:
+        rims = np.array([np.median(half[is_rim & (eighth == number)]) for number in range(8)])
+        if (rims > black + LIT).sum() < LEAST_LIT:
+            return False
+    return True
 
 
 def _projection_by_seam(colors: np.ndarray) -> Projection:
@@ -85,17 +90,21 @@ def _projection_by_seam(colors: np.ndarray) -> Projection:
         steps = [np.abs(strip[:, distance:] - strip[:, :-distance]).mean(axis=(1, 2)) for strip in (left, right)]
         return np.mean(steps, axis=0)
 
-    near, far = difference(1), difference(reach + 1)
+    near = difference(1)
+    far = difference(reach + 1)
     has_texture = (far >= LEAST_TEXTURE) & (far >= LEAST_GROWTH * near)
     has_texture[: height // 12] = False  # Everything is smooth near the poles.
     has_texture[height - height // 12 :] = False
     if has_texture.sum() < max(4, LEAST_ROWS * height):
         return "unclear"
-    left, right = left[has_texture], right[has_texture]
-    base, unit = near[has_texture].mean(), (far - near)[has_texture].mean()
+    left = left[has_texture]
+    right = right[has_texture]
+    base = near[has_texture].mean()
+    unit = (far - near)[has_texture].mean()
     # Column k from the seam to the right, and to the left: 2k + 1 columns apart in a panorama.
     across = (np.abs(left - right[:, ::-1]).mean(axis=(0, 2)) - base) / unit
-    step, farther = across[0], across[reach // 4 : 3 * reach // 4 + 1].mean()
+    step = across[0]
+    farther = across[reach // 4 : 3 * reach // 4 + 1].mean()
     if step >= UNRELATED:
         return "photograph"
     parabolas = np.linalg.qr(np.vander(np.linspace(-1, 1, left.shape[1]), 3))[0]

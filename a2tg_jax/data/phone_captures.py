@@ -4,6 +4,7 @@ Polycam's raw data are keyframes with a JSON file each (<https://github.com/Poly
 named by number, next to metadata with all poses.
 """
 
+import functools
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from a2tg_jax.data.assembly import PointCloud
 from a2tg_jax.data.decoding import picture_size, read_grey, read_pixels
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, map_in_threads
-from a2tg_jax.data.transforms import Frames, check_images, warn_of_others
+from a2tg_jax.data.transforms import Frames, check_images, reading_one
 from a2tg_jax.host.json_text import MOST_BYTES, number_of, read_object
 from a2tg_jax.host.regular_files import is_regular, read_regular
 from a2tg_jax.host.text import shortened
@@ -46,12 +47,7 @@ def polycam(path: Path) -> Callable[[], Frames] | None:
         found += [pair for pair in pairs if pair[0].is_dir() and pair[1].is_dir() and any(pair[0].glob("*.json"))][:1]
     if not found:
         return None
-
-    def read() -> Frames:
-        warn_of_others(found[0][0], [cameras for cameras, _ in found])
-        return _polycam_frames(*found[0])
-
-    return read
+    return reading_one(found[0][0], [cameras for cameras, _ in found], functools.partial(_polycam_frames, *found[0]))
 
 
 def _polycam_frames(cameras: Path, images: Path) -> Frames:
@@ -125,12 +121,7 @@ def record3d(path: Path) -> Callable[[], Frames] | None:
     files = [file for file in files if b'"poses"' in read_regular(file, MOST_BYTES)]
     if not files:
         return None
-
-    def read() -> Frames:
-        warn_of_others(files[0], files)
-        return _record3d_frames(files[0])
-
-    return read
+    return reading_one(files[0], files, functools.partial(_record3d_frames, files[0]))
 
 
 def _record3d_frames(file: Path) -> Frames:

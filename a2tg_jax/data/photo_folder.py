@@ -174,7 +174,8 @@ def capture_hint(path: Path) -> str | None:
     if not path.is_dir():
         name = path.name.lower()
         return next((text for pattern, text in FOUND_BY if fnmatchcase(name, pattern)), None)
-    if (run := other_run(path)) is not None:
+    run = other_run(path)
+    if run is not None:
         scene = "the scene that it was made from" if run.scene is None else f"its scene, {run.scene}"
         return f"is an output folder of {run.program}, whose model is {run.model}; to train, give {scene}"
     names = names_in(path)

@@ -410,9 +410,10 @@ def _divided(levels: np.ndarray) -> MaskFile:
     """Divide the pixels of a mask [H, W] uint8 into black and white.
 
     White is the largest level: 255, or 1 in a mask of 0 and 1. Grey pixels on edges between black and white, as JPEG
-    and resizing make them, are what they are nearer to; in areas of their own they count.
+    and resizing make them, are what they are nearer to; in larger areas they count.
     """
-    white, black = int(levels.max()), int(levels.min())
+    white = int(levels.max())
+    black = int(levels.min())
     # Dark levels are numbers of classes, of which 0 is none.
     darkest = NEARLY_BLACK * white if white >= HALF else 0.0
     is_grey = (levels > darkest) & (levels <= white / 2)

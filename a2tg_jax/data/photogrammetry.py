@@ -6,6 +6,7 @@ fisheye) for a ray at the angle θ, then Brown's distortion. RealityScan (Realit
 each photograph.
 """
 
+import functools
 import re
 import warnings
 from collections import defaultdict
@@ -20,7 +21,7 @@ from a2tg_jax.data.assembly import PointCloud, rigid_motion
 from a2tg_jax.data.decoding import picture_size
 from a2tg_jax.data.image_files import PHOTO_SUFFIXES, find_image, warn_of_unposed
 from a2tg_jax.data.ply import read_ply_points
-from a2tg_jax.data.transforms import Frames, check_images, warn_of_others
+from a2tg_jax.data.transforms import Frames, check_images, reading_one
 from a2tg_jax.host.json_text import MOST_BYTES
 from a2tg_jax.host.regular_files import is_regular, names_in, open_regular, read_regular
 from a2tg_jax.host.text import shortened
@@ -67,12 +68,7 @@ def metashape(path: Path) -> Callable[[], Frames] | None:
     if not files:
         return None
     chosen = next((file for file in files if file.name.lower() == METASHAPE_FILE), files[0])
-
-    def read() -> Frames:
-        warn_of_others(chosen, files)
-        return _metashape_frames(chosen)
-
-    return read
+    return reading_one(chosen, files, functools.partial(_metashape_frames, chosen))
 
 
 def _metashape_frames(file: Path) -> Frames:
@@ -242,13 +238,9 @@ def realityscan(path: Path) -> Callable[[], Frames] | None:
             folders.append(files)
     if not folders:
         return None
-
-    def read() -> Frames:
-        # Files of another alignment may be left in one of the two.
-        warn_of_others(folders[0][0], [files[0] for files in folders])
-        return _realityscan_frames(path, folders[0])
-
-    return read
+    # Files of another alignment may be left in one of the two.
+    first_files = [files[0] for files in folders]
+    return reading_one(first_files[0], first_files, functools.partial(_realityscan_frames, path, folders[0]))
 
 
 def _realityscan_frames(path: Path, files: list[Path]) -> Frames:

@@ -154,7 +154,9 @@ def check_view(view: View) -> None:
     """Raise ValueError, naming the view, unless its photograph, mask and depth map have the size of its camera, and
     some pixels count."""
     check_camera(view.camera, f"view {view.name}: camera")
-    height, width, picture = view.camera.height, view.camera.width, view.picture
+    height = view.camera.height
+    width = view.camera.width
+    picture = view.picture
     if picture.shape not in ((height, width, 3), (height, width, 4)) or picture.dtype != np.uint8:
         raise ValueError(
             f"picture of view {view.name} must be uint8 {[height, width, 3]}, as large as its camera says, or have "

@@ -182,7 +182,8 @@ def _decided(photos: Sequence[_Photo], videos: Container[int]) -> list[_Photo]:
                 "exporting equirectangular files with the camera's program; with `panorama` no they stay whole"
             )
         votes[photo.source, photo.facts.size][photo.kind] += 1
-    decided, unclear = [], []
+    decided = []
+    unclear = []
     for photo in photos:
         own = votes[photo.source, photo.facts.size]
         kind = photo.kind

@@ -103,8 +103,18 @@ def load_frames(made: Frames, options: Options) -> Scene:
     return assemble_scene(name, *every_kth(shots, options.test_every), made.cloud, source=str(made.file))
 
 
+def reading_one(chosen: Path, files: Sequence[Path], read: Callable[[], Frames]) -> Callable[[], Frames]:
+    """Return a function that reads the chosen one of several files of cameras, with a warning that names the others."""
+
+    def read_one() -> Frames:
+        warn_of_others(chosen, files)
+        return read()
+
+    return read_one
+
+
 def warn_of_others(chosen: Path, files: Sequence[Path]) -> None:
-    """Warn of further files of cameras than the one that is read, such as a second export beside it."""
+    """Warn of further files of cameras than the one that is read, such as a second export next to it."""
     others = [file for file in files if file != chosen]
     if others:
         names = first_names([os.path.relpath(file, chosen.parent) for file in others])
@@ -116,7 +126,7 @@ def warn_of_others(chosen: Path, files: Sequence[Path]) -> None:
 
 
 def load_folder(folder: Path, options: Options) -> Scene:
-    """Read the transforms.json of a folder, with a warning if others are beside it."""
+    """Read the transforms.json of a folder, with a warning if others are next to it."""
     warn_of_others(folder / NERFSTUDIO_FILE, transforms_in(folder))
     return load_transforms(folder / NERFSTUDIO_FILE, options)
 

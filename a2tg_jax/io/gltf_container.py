@@ -181,7 +181,8 @@ class Document:
     def _within(self, view: Mapping[str, object], what: str) -> tuple[bytes, int, int]:
         """Return the buffer of a view, the view's first byte, and its length."""
         data = self._buffer(view.get("buffer"), what)
-        start, length = _count(view, "byteOffset", what, 0), _count(view, "byteLength", what)
+        start = _count(view, "byteOffset", what, 0)
+        length = _count(view, "byteLength", what)
         # Python's integers do not overflow, so sums of claimed numbers are safe to compare.
         if start + length > len(data):
             raise ValueError(f"{what} reaches beyond its buffer of {len(data)} bytes")

@@ -48,6 +48,8 @@ UNMOVED = Similarity(1.0, np.eye(3), np.zeros(3))
 LEVEL = math.cos(math.radians(3))
 """Cosine of the largest angle between the estimated vertical and an axis that counts as the vertical itself."""
 LEAST_SCALE, LEAST_OPACITY = 1e-30, 1e-6
+FILTER = "filter_3D"
+"""Name of the widths of Mip-Splatting's filter, in PLY files and checkpoints."""
 LEAST_LENGTH = 1e-9
 """Length of a quaternion below which, and above whose inverse, it is made a unit quaternion."""
 LEAST_THIRD_SCALE = math.exp(-20)
@@ -348,7 +350,8 @@ def drawable_rows(name: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     If there are none, all are returned, and the checks of a model fail. Of three log-scales the smallest may be −inf:
     `flattened` drops it.
     """
-    seen, is_good = {}, {}
+    seen = {}
+    is_good = {}
     for field, values in columns.items():
         is_scale = field == "log-scales"
         # NaN is sorted to the end.
@@ -387,8 +390,9 @@ def filtered(log_scales: np.ndarray, logits: np.ndarray, widths: np.ndarray) -> 
         log_opacities = np.minimum(log_opacities, np.log(LARGEST_OPACITY))
         fainter = log_opacities - np.log(-np.expm1(log_opacities))
     is_filtered = widths != 0
-    found = np.where(is_filtered[:, None], wider, log_scales), np.where(is_filtered, fainter, logits)
-    return found[0].astype(np.float32), found[1].astype(np.float32)
+    log_scales = np.where(is_filtered[:, None], wider, log_scales)
+    logits = np.where(is_filtered, fainter, logits)
+    return log_scales.astype(np.float32), logits.astype(np.float32)
 
 
 def flattened(quats: np.ndarray, log_scales: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -42,7 +42,7 @@ SCALES, QUATS = ("scale_0", "scale_1"), tuple(f"rot_{i}" for i in range(4))
 ATTRIBUTES = (*MEANS, *NORMALS, *SH_DEGREE0, *SH_REST, "opacity", *SCALES, *QUATS)
 NUM_REST = (0, 9, 24, 45, 72)
 """Number of attributes f_rest_* by degree of the spherical harmonics; some programs write degree 4."""
-THIRD_SCALE, FILTER = "scale_2", "filter_3D"
+THIRD_SCALE = "scale_2"
 UNSEEN = {*NORMALS, *RGB, "alpha"}
 """Attributes that change nothing that Gaussians show."""
 ANCHORS = "f_anchor_feat_0"
@@ -209,8 +209,8 @@ def decode_ply(file: BinaryIO, path: Path, *, is_flat: bool = False) -> Model:
     # float64 until the offset is subtracted: float32 would round map coordinates.
     means, quats = np.stack([vertices[name].astype(np.float64) for name in MEANS], axis=-1), _columns(vertices, QUATS)
     logits = _columns(vertices, ("opacity",))[:, 0]
-    if FILTER in (vertices.dtype.names or ()):
-        log_scales, logits = others.filtered(log_scales, logits, vertices[FILTER])
+    if others.FILTER in (vertices.dtype.names or ()):
+        log_scales, logits = others.filtered(log_scales, logits, vertices[others.FILTER])
     sh = _sh_of(vertices, path)
     means, quats, log_scales, logits, sh = others.flat_rows(str(path), means, quats, log_scales, logits, sh)
     inside = others.offset_for("ply", means, log_scales)  # Zeros where the file has float32.
@@ -231,7 +231,7 @@ def _vertices(ply: PlyFile) -> np.ndarray:
     of_networks = "; its networks make splats of these anchors: export them" if ANCHORS in fields else ""
     ply.require_vertices(wanted, f"a PLY of Gaussians{of_networks}")
     vertices = ply.read("vertex")
-    others.warn_of_unread({*fields} - {*wanted, THIRD_SCALE, FILTER, *UNSEEN}, ply.path)
+    others.warn_of_unread({*fields} - {*wanted, THIRD_SCALE, others.FILTER, *UNSEEN}, ply.path)
     if not has_colors:
         return vertices
     colors = np.stack([vertices[name].astype(np.float64) for name in RGB], axis=1)

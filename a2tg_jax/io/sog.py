@@ -124,7 +124,8 @@ def _read_archive(data: bytes) -> _Files:
             if len(headers) > 1 and HEADER not in headers:
                 raise ValueError(f"holds several scenes ({', '.join(headers[:3])}); unpack it, and give one folder")
             place = HEADER if HEADER in headers else headers[0]
-            header, folder = _checked_header(archive.read(place)), place.removesuffix(HEADER)
+            header = _checked_header(archive.read(place))
+            folder = place.removesuffix(HEADER)
             pictures = {}
             for name in _named_pictures(header):
                 if folder + name not in archive.namelist():

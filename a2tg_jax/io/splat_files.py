@@ -33,7 +33,9 @@ def encode_splat(placed: others.PlacedSplats) -> bytes:
     """Return splats as a *.splat, without spherical harmonics above degree 0."""
     splats = placed.splats
     rows = np.zeros(len(splats.means), SPLAT_ROW)
-    rows["means"], rows["scales"], rows["colors"] = splats.means, splats.scales, _color_bytes(splats)
+    rows["means"] = splats.means
+    rows["scales"] = splats.scales
+    rows["colors"] = _color_bytes(splats)
     rows["quats"] = np.rint(np.clip(128 * splats.quats + 128, 0, 255))
     return rows.tobytes()
 

@@ -259,7 +259,8 @@ def _turned(gaussians: Gaussians, axes: str, wanted: str) -> Gaussians:
     """Return Gaussians with these axes in a world with others."""
     if axes == wanted:
         return gaussians
-    own, other = (np.array([DIRECTIONS[letter] for letter in name], np.float64) for name in (axes, wanted))
+    own = np.array([DIRECTIONS[letter] for letter in axes], np.float64)
+    other = np.array([DIRECTIONS[letter] for letter in wanted], np.float64)
     # Columns of ownᵀ are the directions of the file's axes.
     matrix = other @ own.T
     if np.linalg.det(matrix) < 0:

@@ -27,6 +27,7 @@ from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.regular_files import expanded, is_regular, open_regular
 from a2tg_jax.host.text import shortened
 from a2tg_jax.io.other_programs import (
+    FILTER,
     World,
     degree_to_read,
     filtered,
@@ -55,8 +56,6 @@ PROTOCOL = 2
 """Version of pickles, as `torch.save` writes them."""
 GSPLAT = ("means", "quats", "scales", "opacities", "sh0", "shN")
 NERFSTUDIO = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
-FILTER = "filter_3D"
-"""Name of the widths of Mip-Splatting's filter."""
 TUPLE_2DGS = {"means": 1, "sh0": 2, "shN": 3, "scales": 4, "quats": 5, "opacities": 6}
 """Places of the parameters in the tuple that 3DGS and 2DGS save."""
 # 3DGS has active_sh_degree at place 0, then the parameters, then statistics and the optimiser.
@@ -126,7 +125,8 @@ def save_checkpoint_gaussians(
 def _by_gsplat(gaussians: Gaussians) -> dict[str, np.ndarray]:
     # Never write a file that cannot be read.
     check_model(Model(gaussians))
-    sh, log_scales = np.asarray(gaussians.sh), np.asarray(gaussians.log_scales)
+    sh = np.asarray(gaussians.sh)
+    log_scales = np.asarray(gaussians.log_scales)
     scales = np.concatenate([log_scales, third_log_scales(log_scales)], axis=1)
     arrays = (gaussians.means, gaussians.quats, scales, gaussians.logit_opacities, sh[:, :1], sh[:, 1:])
     # Copies, because PyTorch warns of arrays that cannot be written to.
@@ -313,7 +313,7 @@ def _tensors_of(value: object) -> tuple[dict[str, _Tensor], set[str]]:
             if isinstance(node, _Tensor):
                 own[name] = node
             elif isinstance(node, Mapping):
-                unread |= _beside_means(node)
+                unread |= _next_to_means(node)
         # Nerfstudio's names differ in the SH only.
         wanted = GSPLAT if any(name.endswith("sh0") for name in own) else NERFSTUDIO
         found = {name: own[key] for name, key in zip((*GSPLAT, FILTER), (*wanted, FILTER), strict=True) if key in own}
@@ -331,8 +331,8 @@ def _shows(part: object) -> bool:
     return isinstance(part, _Tensor) or (isinstance(part, Mapping) and "param_groups" not in part)
 
 
-def _beside_means(node: Mapping[Any, object]) -> set[str]:
-    """Return the names of the tensors that a dictionary has beside "means", such as "gauss_params.means"."""
+def _next_to_means(node: Mapping[Any, object]) -> set[str]:
+    """Return the names of the tensors that a dictionary has next to "means", such as "gauss_params.means"."""
     names = {key for key, own in node.items() if isinstance(key, str) and isinstance(own, _Tensor)}
     folders = [name.removesuffix("means") for name in names if name.rpartition(".")[2] == "means"]
     return {name.removeprefix(folder) for folder in folders for name in names if name.startswith(folder)}

@@ -177,7 +177,8 @@ def _model_of(field: Mapping[str, Any], arrays: Mapping[str, np.ndarray], prefix
         raise ValueError(f"its particle field {shortened(field['path'])} must have a kernel of Gaussians")
     # Missing attributes have the schema's defaults.
     means = arrays.get(f"{prefix}positions", np.zeros((0, 3), np.float32))
-    num, degree = len(means), field["degree"]
+    num = len(means)
+    degree = field["degree"]
     if f"{prefix}sh" in arrays:
         sh = arrays[f"{prefix}sh"].reshape(num, (degree + 1) ** 2, 3)
         sh = sh[:, : NUM_BASES[others.degree_to_read(degree, str(path))]]

@@ -167,7 +167,8 @@ def fit(
       array([10, 20])
     """
     _check_arguments(scene, system, start, resume, checkpoint_every)
-    stages, first = system.all_stages(), 0
+    stages = system.all_stages()
+    first = 0
     if resume is not None:
         if start is not None:
             raise ValueError("start and resume are both given, but a checkpoint has its own model: leave out start")

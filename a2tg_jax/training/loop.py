@@ -183,7 +183,9 @@ class StageRun:
         stages = system.all_stages()
         self.stage = stages[index]
         own = resume if resume is not None and resume.stage == index else None
-        self.num_restored = (own.num_restored if own else 0) if num_restored is None else num_restored
+        if num_restored is None:
+            num_restored = own.num_restored if own else 0
+        self.num_restored = num_restored
         self._earlier = own.history if own else History.empty()
         self._rows: list[dict[str, float]] = []
         """Rows of the history since then."""

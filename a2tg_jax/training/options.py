@@ -179,7 +179,8 @@ class System(NamedFields):
         """Number of Gaussians that fit into the memory budget, in words, if they are few; else empty."""
         if self.budget_bytes is None:
             return ""
-        size, shared = self.initial_bytes, self.stages()[0].shared_bytes
+        size = self.initial_bytes
+        shared = self.stages()[0].shared_bytes
         left = self.budget_bytes - shared
         if left >= FEW_GAUSSIANS * size:
             return ""

@@ -153,8 +153,11 @@ def given_start(start: Model, scene: Scene, system: System, index: int) -> Model
     """
     with fields_of("start"):
         check_model(start)
-    stages, start = system.all_stages(), start.live
-    stage, degree, num = stages[index], system.initial_sh_degree, start.num
+    start = start.live
+    stages = system.all_stages()
+    stage = stages[index]
+    degree = system.initial_sh_degree
+    num = start.num
     if num < LEAST_LEFT:
         raise ValueError(f"start must have at least {LEAST_LEFT} Gaussians; got {num}")
     if index == 0:
@@ -207,7 +210,8 @@ def given_start(start: Model, scene: Scene, system: System, index: int) -> Model
 def left_out(model: Model, degree: int, template: Appearance | None) -> list[str]:
     """Return in words what is dropped of a model that gets spherical harmonics of a degree, and an appearance of the
     template's options, in which only the shapes of kernels are kept; None: it keeps its own."""
-    shown, lost = model.appearance, []
+    shown = model.appearance
+    lost = []
     has_shapes = shown.exponents is not None
     if has_shapes and template is not None and template.exponents is None:
         lost.append("the shapes of its kernels (the nearest Gaussians replace them)")

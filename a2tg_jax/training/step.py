@@ -227,7 +227,8 @@ def attempt(
     statistic = jnp.zeros_like(colors), jnp.zeros(colors.shape[:2], bool)
     if found.statistic is not None and stage.statistic is not None:
         statistic = read_probe(found.statistic, stage.statistic, width, height)
-    at, length = clock.scheduled(iteration), jnp.asarray(clock.num_iterations)
+    at = clock.scheduled(iteration)
+    length = jnp.asarray(clock.num_iterations)
     now = Now(keys[1:], at, stage.cooled(rate, progress), length, scene_scale)
     change, events = _events(
         settings.due, stage, clock, iteration, now, Seen(cameras, *statistic, colors), model, moments, state.events
