@@ -1,4 +1,4 @@
-"""Training that goes on: further iterations at the rates where a stage ended, and training from a given model."""
+"""Continued training: further iterations at the rates where a stage ended, and training from a given model."""
 
 import dataclasses
 
@@ -351,5 +351,5 @@ def test_a_damaged_record_of_the_views_is_named(middle, tmp_path, name):
 
 @pytest.mark.parametrize("call", [lambda: a2tg.fit(SCENE, START), lambda: fit_stage(SCENE, START, 0)])
 def test_training_is_not_traced(call):
-    with pytest.raises(ValueError, match=r"^fit reads values and compiles steps of its own, so it cannot be traced"):
+    with pytest.raises(ValueError, match=r"^fit reads values and compiles its own steps, so it cannot be traced"):
         jax.jit(lambda x: x * call().model.gaussians.means)(2.0)

@@ -76,7 +76,7 @@ def outlying_cameras(viewmats: np.ndarray, distance_of: Callable[[np.ndarray], f
 
     Args:
       viewmats: world-to-camera matrices.
-      distance_of: function from indices of cameras to the distance at which these see their subject, or NaN if it is
+      distance_of: function from indices of cameras to their distance from their subject, or NaN if it is
         unknown; None: `distance_to_subject`.
     """
     num = len(viewmats)

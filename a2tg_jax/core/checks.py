@@ -51,7 +51,7 @@ def check_untraced(call: str) -> None:
     # Under jit, arrays of constants are tracers too.
     if isinstance(jnp.zeros(()), jax.core.Tracer):
         raise ValueError(
-            f"{call} reads values and compiles steps of its own, so it cannot be traced: call it outside jax.jit, scan "
+            f"{call} reads values and compiles its own steps, so it cannot be traced: call it outside jax.jit, scan "
             "and other transformations"
         )
 

@@ -36,7 +36,7 @@ def _check_call(cls: Any, args: tuple[object, ...], values: dict[str, object]) -
         return
     _, *parameters = inspect.signature(cls.__init__).parameters
     if set(parameters) != set(names):
-        return  # A constructor of its own.
+        return  # The class has a custom constructor.
     if unknown and unknown[0] in inspect.get_annotations(cls):
         raise FieldError(
             f"{cls.__name__} does not take {unknown[0]}: decorate the class with "

@@ -104,7 +104,7 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
         # Through `__dict__`, because fields of a frozen dataclass cannot be assigned.
         node.__dict__.update(zip(dynamic, children, strict=True))
         for name in common:
-            # Anything else is a stand-in of JAX, not from `flatten`.
+            # JAX also passes placeholders, which are not from `flatten`.
             if isinstance(node.__dict__[name], Shared):
                 node.__dict__[name] = node.__dict__[name].tree
         node.__dict__.update(zip(fixed, values, strict=True))

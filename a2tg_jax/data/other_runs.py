@@ -19,7 +19,7 @@ MOST_BYTES = 1 << 20
 
 
 class OtherRun(NamedTuple):
-    """What another program trained."""
+    """Model that another program trained."""
 
     program: str
     model: Path
@@ -29,7 +29,7 @@ class OtherRun(NamedTuple):
 
 
 def other_run(folder: Path) -> OtherRun | None:
-    """Return what another program wrote into a folder, or None."""
+    """Return the newest model that another program wrote into a folder, or None."""
     for program, pattern in MODELS:
         models = sorted(folder.glob(pattern), key=lambda path: (_iteration_of(path.relative_to(folder)), str(path)))
         if models:

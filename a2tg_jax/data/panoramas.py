@@ -1,4 +1,4 @@
-"""Which pictures twice as wide as high are panoramas of 360° × 180°, judged by their pixels.
+"""Detection of panoramas of 360° × 180° among pictures twice as wide as high, by their pixels.
 
 In such a panorama the right edge continues at the left one, and each pole is one point, which the first or the last row
 shows all along. Plain edges join as well, and so do the edges of vignettes and of mirrored pictures. So the edges must

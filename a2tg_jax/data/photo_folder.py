@@ -180,7 +180,7 @@ def capture_hint(path: Path) -> str | None:
         return f"is an output folder of {run.program}, whose model is {run.model}; to train, give {scene}"
     names = names_in(path)
     for pattern, text in FOUND_BY:
-        # Cameras write suffixes in capitals, but Python's glob tells these apart before 3.12.
+        # Cameras write suffixes in capitals, but Python's glob is case-sensitive before 3.12.
         found = [name for name in names if fnmatchcase(name.lower(), pattern)]
         if "/" in pattern:
             found = sorted(file.relative_to(path).as_posix() for file in path.glob(pattern))

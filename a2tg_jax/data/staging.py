@@ -28,7 +28,7 @@ from a2tg_jax.data.video import extract_frames
 from a2tg_jax.host.text import counted
 
 Panorama = Literal["auto", "yes", "no"]
-"""Whether pictures twice as wide as high are panoramas: those that are seen to be (auto), all of them, or none."""
+"""Whether pictures twice as wide as high are panoramas: those that are recognised (auto), all of them, or none."""
 COLMAP_FORMATS = ("JPEG", "MPO", "PNG", "BMP")
 """Formats that COLMAP reads as Pillow does. TIFF is not among them: with some compressions COLMAP reads black."""
 COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
@@ -371,5 +371,5 @@ def cut_view(panorama: np.ndarray, direction: Direction) -> np.ndarray:
 
 
 def is_panorama(pixels: np.ndarray) -> bool:
-    """Return whether a picture [H, W, C] uint8 is seen to be a whole panorama, twice as wide as high."""
+    """Return whether a picture [H, W, C] uint8 is recognised as a whole panorama, twice as wide as high."""
     return pixels.shape[1] == 2 * pixels.shape[0] and projection_of(pixels) == "panorama"

@@ -17,7 +17,7 @@ MOST_ARRAY_BYTES = 1 << 34
 LARGEST_RATIO, FREE_ROOM = 64, 1 << 20
 """Largest growth of an untrusted file that is unpacked: a multiple of its size, and bytes that any file may have."""
 LFS_POINTER, MOST_POINTER_BYTES = b"version https://git-lfs.github.com/spec/", 1024
-"""Beginning and size limit of the text that stands for a file of git-lfs (https://github.com/git-lfs/git-lfs, spec)."""
+"""Beginning and size limit of the text that git-lfs leaves for a file (https://github.com/git-lfs/git-lfs, spec)."""
 READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """Flags to open a file for reading bytes, without waiting for a pipe's writer or changing newlines."""
 
@@ -74,7 +74,7 @@ def open_regular(path: str | os.PathLike[str], most_bytes: int = MOST_ARRAY_BYTE
     if os.fstat(file.fileno()).st_size < MOST_POINTER_BYTES and file.peek().startswith(LFS_POINTER):
         file.close()
         raise ValueError(
-            f"{path}: is a pointer of git-lfs, a text that stands for the file; run `git lfs pull` in its repository"
+            f"{path}: is a pointer of git-lfs, a text that replaces the file; run `git lfs pull` in its repository"
         )
     return file
 

@@ -201,7 +201,7 @@ def _model_of(document: Document, primitive: Mapping[str, Any]) -> Model:
     inside = primitive["extensions"] | described.get("extensions", {})
     for name in SPZ:
         if name in inside:
-            # Cesium and others take the axes of the SPZ for those of glTF, as its default axes are.
+            # Cesium and others read the axes of the SPZ as glTF's, which are its default axes.
             return spz_model(document.view(inside[name]["bufferView"], name), document.path, GLTF_AXES)
     splats = _splats(document, primitive["attributes"])
     for name in ("kernel", "colorSpace"):

@@ -37,7 +37,7 @@ Up = Literal["y", "z"]
 World = Literal["upright", "original"]
 """World of a file: the original one, or that one turned until −y is up, as other programs show it."""
 Kind = str
-"""Name of a format: its suffix without the dot, such as "spz"; "ply" stands for all with float32 positions."""
+"""Name of a format: its suffix without the dot, such as "spz"; "ply" means all with float32 positions."""
 UPRIGHT: Mapping[Up, np.ndarray] = {
     # (x, y, z) → (x, z, −y): a quarter turn about x.
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),

@@ -48,7 +48,7 @@ LARGEST_INDEX_0 = 252
 CODEBOOK = 256
 ENTRIES_A_ROW = 64
 MOST_ENTRIES = 2**16
-"""Largest number of sets of spherical harmonics that labels of 16 bits can tell apart."""
+"""Largest number of sets of spherical harmonics that labels of 16 bits can distinguish."""
 COEFFICIENTS = tuple(num - 1 for num in NUM_BASES)
 """Number of coefficients above degree 0, by degree."""
 
@@ -115,7 +115,7 @@ def _read_archive(data: bytes) -> _Files:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > room_of(len(data)):
                 raise ValueError("it unpacks to more than 64 times its size")
-            # Desktops zip a folder together with its name, and macOS adds another of its own.
+            # Desktops zip a folder together with its name, and macOS adds a second folder.
             headers = [
                 name for name in archive.namelist() if PurePosixPath(name).name == HEADER and name.count("/") < 2
             ]

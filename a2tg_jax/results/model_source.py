@@ -167,7 +167,7 @@ def check_init(file: Path, out: Path, system: System) -> Model:
         system.check_given_number(splats.num)
     except ValueError as error:
         raise ValueError(f"init: {file}: {error}") from error
-    # The first stage begins with an appearance of its own.
+    # The first stage begins with its own appearance.
     lost = left_out(splats, degree, system.stages()[0].appearance)
     if lost:
         warnings.warn(f"`init` {file} leaves out {' and '.join(lost)}", stacklevel=2)
