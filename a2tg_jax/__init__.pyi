@@ -40,7 +40,7 @@ from .data.assembly import with_validation_views as with_validation_views
 from .data.load import load_scene as load_scene
 from .data.photo_store import DepthMap as DepthMap, Mask as Mask, Picture as Picture
 from .data.scene import Scene as Scene, View as View, view_image as view_image
-from .data.sfm import run_sfm as run_sfm
+from .data.sfm import SfmSummary as SfmSummary, run_sfm as run_sfm
 from .data.synthetic import synthetic_scene as synthetic_scene
 from .densify.clone_split import (
     CloneSplitPrune as CloneSplitPrune,
@@ -64,6 +64,7 @@ from .events import (
     keep_rows as keep_rows,
 )
 from .finish.compaction import (
+    Trial as Trial,
     loss_beside_renders as loss_beside_renders,
     loss_on_views as loss_on_views,
     measure_choices as measure_choices,
@@ -124,6 +125,7 @@ from .renderer import Renderer as Renderer, plan_render as plan_render
 from .systems.a2tg import A2tg as A2tg
 from .systems.baselines import (
     BBSplat as BBSplat,
+    BillboardOptions as BillboardOptions,
     Gaussians2d as Gaussians2d,
     Gaussians2dMcmc as Gaussians2dMcmc,
     SuperGaussians as SuperGaussians,
@@ -169,6 +171,7 @@ from .training.gradients import (
     view_gradients as view_gradients,
 )
 from .training.losses import normal_consistency as normal_consistency, photometric_loss as photometric_loss
+from .training.options import Corrections as Corrections
 from .training.stage import LossTerm as LossTerm
 
 __version__: str

@@ -64,6 +64,7 @@ class SfmSummary(NamedTuple):
     num_registered: int
     """Number of photographs with a pose."""
     num_points: int
+    """Number of points of the reconstruction."""
     mean_error: float
     """Mean reprojection error of the points, in pixels."""
     longest_side: int

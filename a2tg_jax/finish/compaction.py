@@ -52,9 +52,13 @@ class Trial:
     """A file, measured."""
 
     choices: CompactChoices
-    num_bytes: int  # On disk.
-    losses: tuple[float, ...]  # dB, by each measure of loss.
-    group: str = ""  # Group that is coarser than the rest, if any.
+    """Precisions of the file."""
+    num_bytes: int
+    """Size on disk."""
+    losses: tuple[float, ...]
+    """Loss in dB, by each measure of loss."""
+    group: str = ""
+    """Group that is coarser than the rest, if any."""
 
     @property
     def precision(self) -> Precision:

@@ -89,8 +89,11 @@ class Corrections(NamedFields):
     """Exposure of a photograph: an affine map of its colours, or also a bilateral grid of such maps, which follows
     vignettes and local tone mapping."""
     affine: Exposure = Exposure()
+    """Learning rate of affine maps, and its fall."""
     grid: BilateralGrid = BilateralGrid()
+    """Size, learning rate and smoothness of bilateral grids."""
     pose: PoseRefinement = PoseRefinement(final_factor=0.1)
+    """Learning rate of poses, and its fall."""
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the path of the field, if a number is out of range."""
