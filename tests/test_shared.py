@@ -296,3 +296,38 @@ def test_weights_for_pruning_are_those_of_plain_splats():
     found, wanted = (shown_in(each, scene.train).weights for each in (with_gain(model, -3.0), plain))
     assert wanted.max() > 1
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("parts", [{"texture": a2tg.Texture()}, {"exponents": a2tg.Exponents()}, {"max_alpha": 0.9}])
+@pytest.mark.parametrize("cap", [NUM, NUM + 20])
+def test_a_stage_with_other_parts_keeps_the_arrays_of_the_class(parts, cap):
+    model = with_gain(some_model(), 0.5)
+    stage = dataclasses.replace(Own().stages()[0], appearance=Painted(**parts), events=(a2tg.Mcmc(cap=cap),))
+    found = padded(model, stage, Own()).appearance
+    np.testing.assert_array_equal(found.codes[:NUM], model.appearance.codes)
+    assert found.codes.shape == (cap, 2) and not found.codes[NUM:].any()
+    assert_same(found.network, model.appearance.network)
+    assert found.max_alpha == parts.get("max_alpha")
+    assert (found.textures is not None) == ("texture" in parts)
+
+
+def test_a_stage_keeps_parts_of_the_same_options():
+    """Of a model with textures and shapes, also if the stage's class is another."""
+    model = some_model()
+    textures = a2tg.allocate_textures(np.full((NUM, 2), 2), rgb=0.25)
+    shown = a2tg.Appearance(texture=a2tg.Texture(textures), max_alpha=0.8)
+    template = Painted(texture=a2tg.Texture(), exponents=a2tg.Exponents())
+    stage = dataclasses.replace(Own().stages()[0], appearance=template)
+    found = padded(dataclasses.replace(model, appearance=shown), stage, Own()).appearance
+    assert_same(found.textures, textures)
+    assert found.codes.shape == (NUM, 2) and found.shapes.shape == (NUM,)
+
+
+def test_arrays_of_other_shapes_are_begun_again_with_a_warning():
+    model = some_model()
+    shown = dataclasses.replace(model.appearance, codes=jnp.ones((NUM, 3)))
+    stage = dataclasses.replace(Own().stages()[0], appearance=Painted(texture=a2tg.Texture()))
+    with pytest.warns(UserWarning, match=r"stage 'painted' begins with new Painted\.codes"):
+        found = padded(dataclasses.replace(model, appearance=shown), stage, Own()).appearance
+    assert found.codes.shape == (NUM, 2)
+    assert_same(found.network, model.appearance.network)

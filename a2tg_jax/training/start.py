@@ -3,6 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,15 +11,15 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.appearance import Appearance, allocate_appearance, template_of
-from a2tg_jax.appearance.base import check_appearance, join_rows
-from a2tg_jax.appearance.parts import nearest_gaussians
+from a2tg_jax.appearance.base import check_appearance, join_rows, without_arrays
+from a2tg_jax.appearance.parts import Part, nearest_gaussians
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import fields_of
 from a2tg_jax.core.gaussians import INITIAL_OPACITY, Gaussians, init_from_points, no_rows
 from a2tg_jax.core.geometry import FILTER_VARIANCE, pixel_sizes
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.core.table import Table, map_rows
+from a2tg_jax.core.table import Table, is_table, map_rows
 from a2tg_jax.data.assembly import Sight, unseeing
 from a2tg_jax.data.scene import Scene, View, check_view
 from a2tg_jax.events import LEAST_LEFT, Event
@@ -268,9 +269,10 @@ def initial_number(scene: Scene, system: System, first: Stage) -> int:
 def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> Model:
     """Return the model with the appearance of a stage and with spare rows for its events.
 
-    If the model's appearance has the stage's options, its arrays are kept; otherwise new ones are allocated, except
-    the shapes of kernels. A stage without shapes takes the nearest Gaussians, with a warning. The number of devices
-    divides the number of rows. ValueError: if Gaussians would be added to a model whose textures have grown.
+    Arrays of the model's appearance are kept where the stage has a part of the same options, or the same array of the
+    same class. Others are allocated, with a warning if only their shapes differ. A stage without shapes of kernels
+    takes the nearest Gaussians, with a warning. The number of devices divides the number of rows. ValueError: if
+    Gaussians would be added to a model whose textures have grown.
     """
     gaussians, shapes, num = model.gaussians, model.appearance.shapes, model.gaussians.num
     for event in stage.events:
@@ -292,27 +294,69 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
         spare = no_rows(room - num, gaussians.sh.shape[1], gaussians.means.dtype)
         gaussians = join_rows([gaussians, spare])
     appearance = model.appearance
-    is_same = template_of(appearance) == stage.appearance
-    if not is_same or room > num:
-        appearance = new_appearance(stage.appearance, gaussians, system)
-        if shapes is not None and appearance.shapes is not None:
-            appearance = appearance.with_shapes(appearance.shapes.at[:num].set(shapes))
-    if is_same and room > num:
-        grown = f"stage {stage.name!r} would add Gaussians to a model whose textures or degrees have grown already"
-
-        def with_spare(few: Array, more: Array) -> Array:
-            if more.shape[1:] != few.shape[1:] or len(more) < len(few):
-                raise ValueError(grown)
-            return more.at[:num].set(few[:num])
-
-        def with_spare_blocks(few: Table, more: Table) -> Table:
-            if more.bucket_sizes != few.bucket_sizes:
-                raise ValueError(grown)
-            return dataclasses.replace(more, buckets=tuple(map(with_spare, few.buckets, more.buckets)))
-
-        appearance = map_rows(with_spare, with_spare_blocks, model.appearance, appearance)
+    if template_of(appearance) != stage.appearance or room > num:
+        allocated = new_appearance(stage.appearance, gaussians, system)
+        appearance = dataclasses.replace(allocated, **_kept_fields(appearance, allocated, stage))
+        if room > num:
+            appearance = _with_spare_rows(appearance, allocated, num, stage)
     check_appearance(appearance, gaussians)
     return Model(gaussians, appearance, jnp.asarray(num, jnp.int32))
+
+
+def _kept_fields(before: Appearance, allocated: Appearance, stage: Stage) -> dict[str, Any]:
+    """Return the parts and arrays of the appearance before a stage that fit the one that the stage allocates, by field.
+
+    Parts fit if their options are equal, arrays that both classes have if their shapes are, but for the number of rows.
+    Warns of other arrays.
+    """
+    is_related = isinstance(before, type(allocated)) or isinstance(allocated, type(before))
+    is_same = template_of(before) == stage.appearance
+    kept: dict[str, Any] = {}
+    for field in dataclasses.fields(allocated):
+        name = field.name
+        old, new = getattr(before, name, None), getattr(allocated, name)
+        if old is None or new is None or field.metadata.get("static"):
+            continue
+        if is_same or (isinstance(old, Part) and _options(old) == _options(new)):
+            kept[name] = old
+        elif not isinstance(old, Part) and is_related:
+            first = 0 if field.metadata.get("shared") else 1
+            if _shapes(old, first) == _shapes(new, first):
+                kept[name] = old
+            else:
+                warnings.warn(
+                    f"stage {stage.name!r} begins with new {type(allocated).__name__}.{name}: the shape of the model's "
+                    "does not fit",
+                    stacklevel=3,
+                )
+    return kept
+
+
+def _shapes(tree: Any, first: int) -> Any:
+    """Return the structure of a tree and the shapes of its arrays from an axis on; tables may have any blocks."""
+    leaves, structure = jax.tree.flatten(tree, is_leaf=is_table)
+    return structure, [None if is_table(leaf) else jnp.shape(leaf)[first:] for leaf in leaves]
+
+
+def _with_spare_rows(kept: Appearance, allocated: Appearance, num: int, stage: Stage) -> Appearance:
+    """Return an appearance with the first `num` rows of one and the further rows of a larger one."""
+    grown = f"stage {stage.name!r} would add Gaussians to a model whose textures or degrees have grown already"
+
+    def with_spare(few: Array, more: Array) -> Array:
+        if more.shape[1:] != few.shape[1:] or len(more) < len(few):
+            raise ValueError(grown)
+        return more.at[:num].set(few[:num])
+
+    def with_spare_blocks(few: Table, more: Table) -> Table:
+        if more.bucket_sizes != few.bucket_sizes:
+            raise ValueError(grown)
+        return dataclasses.replace(more, buckets=tuple(map(with_spare, few.buckets, more.buckets)))
+
+    return map_rows(with_spare, with_spare_blocks, kept, allocated)
+
+
+def _options(part: Part) -> Part:
+    return without_arrays(part, lambda path: None)
 
 
 def new_appearance(template: Appearance, gaussians: Gaussians, system: System) -> Appearance:
