@@ -293,7 +293,6 @@ def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
         (["efficiency", "--scale", "small", "--scenes", "nowhere"], "nowhere"),
         (["fixed_memory", "--only", "legoo"], "no scene 'legoo' at this scale; did you mean lego?"),
         (["nowhere/mine.toml"], "no grid file nowhere/mine.toml"),
-        (["fixed_memory", "--plan", "--scenes", "nowhere"], "no folder --scenes nowhere"),
         (["fixed_memory", "--plan", "--jobs", "0"], "--jobs must be at least 1; got 0"),
         (
             ["fixed_memory", "--plan", "--memory-gb", "nan"],
@@ -485,3 +484,11 @@ def test_a_random_start_is_grey_points_in_the_cube_of_an_object(tmp_path):
     job = Job("lego", 2, a2tg.Gaussians2d(), 0)
     random = dataclasses.replace(job, random_start=True)
     assert random.key != job.key != dataclasses.replace(job, fold=1).key
+
+
+def test_a_plan_needs_no_photographs(tmp_path, capsys):
+    """The scenes of the paper are 20 GB."""
+    places = ["--scenes", str(tmp_path / "nowhere"), "--work", str(tmp_path), "--out", str(tmp_path)]
+    main(["ablation", "--scale", "full", "--plan", *places])
+    printed = capsys.readouterr().out
+    assert "Mip-NeRF 360/garden" in printed and "since not all scenes are below --scenes" in printed

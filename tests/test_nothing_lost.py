@@ -460,7 +460,9 @@ def test_restoring_has_an_end(scene, tmp_path):
 # Signals
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGUSR1, 128 + signal.SIGUSR1)]
+)
 def test_a_signal_outside_training_ends_with_one_line(monkeypatch, capsys, number, code):
     monkeypatch.setattr(runs.Info, "run", lambda self: os.kill(os.getpid(), number))
     before = signal.getsignal(number)

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: orderly shutdown of a program.
+"""Ctrl-C, SIGTERM, SIGHUP and SIGUSR1: orderly shutdown of a program.
 
 Python ignores exceptions in callbacks of the garbage collector and of weak references, and in `__del__`; JAX has many
 of them. A signal whose exception was ignored is therefore sent again.
@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 CTRL_C = signal.SIGINT
-ENDING = (CTRL_C, *(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)))
-"""Signals that end a process; Windows has no SIGHUP."""
+ENDING = (CTRL_C, *(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)))
+"""Signals that end a process; Windows has neither SIGHUP nor SIGUSR1, which Slurm sends before a job's time limit."""
 SOON = 0.02
 """Seconds after which a signal is sent again."""
 
@@ -42,7 +42,7 @@ class Stopped(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def raised() -> Iterator[None]:
-    """Within the block, SIGTERM and SIGHUP raise `Stopped`, as Ctrl-C raises KeyboardInterrupt."""
+    """Within the block, SIGTERM, SIGHUP and SIGUSR1 raise `Stopped`, as Ctrl-C raises KeyboardInterrupt."""
 
     def stop(number: int, frame: object) -> None:
         raise KeyboardInterrupt if number == CTRL_C else Stopped(number)

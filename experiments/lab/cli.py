@@ -242,7 +242,7 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
         if old := versions.as_text(lab.records_of(list(grids.values()))):
             print(f"Runs from before: {old}. --renew trains them again.", flush=True)
         if args.plan:
-            lab.check_inputs(list(grids.values()))
+            check_systems(list(grids.values()), lab.records)
             print(plan_of(list(grids.values()), lab.records, lab.folders, lab.machine()))
             return None
         errors = lab.run(list(grids.values()))

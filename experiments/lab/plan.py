@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 import a2tg_jax as a2tg
+from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.events import HostEvent
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.training.cost import forecast_stages
@@ -23,9 +24,10 @@ COMPILE_SECONDS, OTHER_SECONDS = 5.0, 4.0
 """Seconds on one core to compile a program of training, and to load, measure and save a stage."""
 MOST_ROWS = 40
 """Largest number of cells in the table."""
-FINISHED, GPU, CPU = (
+FINISHED, GPU, MISSING, CPU = (
     "the steps of finished stages of the same size",
     "the paper's program on its GPU, since none has been timed here",
+    "the paper's program on its GPU, since not all scenes are below --scenes",
     "a very rough figure of CPUs, which may be wrong by a factor of two",
 )
 
@@ -128,6 +130,10 @@ class Forecaster:
             self._chains[last] = [stage.seconds for stage in forecast_stages(self._scene(job), job.system)]
         return self._chains[last][job.stage]
 
+    def has_scene(self, job: Job) -> bool:
+        """Return whether the scene of a stage is there."""
+        return job.scene == SYNTHETIC or (self._folders.scenes / job.scene).is_dir()
+
     def _scene(self, job: Job) -> a2tg.Scene:
         place = job.scene, job.downscale, job.fold, job.validation
         if place not in self._scenes:
@@ -143,6 +149,8 @@ def _estimate(job: Job, records: Mapping[str, Record], machine: Machine, forecas
         return Estimate(0.0, job.iterations * pace + compiling, FINISHED)
     if machine.has_gpu:
         return Estimate(0.0, job.iterations * gpu_pace(job), GPU)
+    if not forecaster.has_scene(job):
+        return Estimate(job.iterations * gpu_pace(job), compiling, MISSING)
     return Estimate(forecaster.seconds(job), compiling, CPU)
 
 
