@@ -76,8 +76,8 @@ def outlying_cameras(viewmats: np.ndarray, distance_of: Callable[[np.ndarray], f
 
     Args:
       viewmats: world-to-camera matrices.
-      distance_of: function from indices of cameras to their distance from their subject, or NaN if it is
-        unknown; None: `distance_to_subject`.
+      distance_of: function from indices of cameras to their distance from their subject, or NaN if it is unknown;
+        None: `distance_to_subject`.
     """
     num = len(viewmats)
     is_outlying = np.zeros(num, bool)

@@ -28,7 +28,7 @@ LEAST_MOTION = 0.005
 ONLY_VIDEOS = {"format_whitelist": "mov,matroska,webm,avi,mpegts,mpeg,asf,flv,ogg", "protocol_whitelist": "file"}
 """Options that keep FFmpeg from playlists, which name further files and addresses."""
 STILLS = 1 << 10 | 1 << 11 | 1 << 20
-"""FFmpeg's dispositions of streams that are pictures in addition to a video: attached_pic, timed_thumbnails, still_image."""
+"""FFmpeg's dispositions of streams that are pictures, such as a cover: attached_pic, timed_thumbnails, still_image."""
 ENOUGH_FRAMES = 10
 """Number of frames of one stream by which another one has its second, or is a picture."""
 QUALITY = 95

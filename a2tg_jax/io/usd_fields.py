@@ -1,8 +1,8 @@
 """Program that reads the particle fields of an OpenUSD file, `python usd_fields.py FILE OUT.npz`, for `load_usd`.
 
 A damaged file can end the process of usd-core (26.11 does so for one changed *.usdc in a thousand), so usd-core runs in
-a separate process, with NumPy and without this package. OUT has the arrays of each field and, as JSON in bytes, the rest.
-Errors go to the standard error, with status 3.
+a separate process, with NumPy and without this package. OUT has the arrays of each field and, as JSON in bytes, the
+rest. Errors go to the standard error, with status 3.
 """
 
 import json

@@ -153,7 +153,7 @@ def with_capacity(
 
 
 class EmptyRenderWarning(UserWarning):
-    """No Gaussian is visible in an eager render or planned views: mostly, a camera's matrix follows another convention."""
+    """An eager render or planned views show no Gaussian: mostly, a camera's matrix follows another convention."""
 
 
 def has_rows(gaussians: Gaussians, num_live: Any) -> bool:
