@@ -117,8 +117,8 @@ def render_appearance(
             raise ValueError(f"num_live must be an integer, 0 to {num}; got {num_live}")
     planned = with_capacity(settings, gaussians, camera, appearance, num_live)
     output, num_pairs = jitted_render()(gaussians, camera, appearance, background, planned, num_live=num_live)
-    # A capacity planned here suffices; one from the caller may not.
-    if settings.capacity is not None:
+    # A capacity planned here suffices; one from the caller may not. Under jit and vmap there is nothing to read.
+    if settings.capacity is not None and not isinstance(num_pairs, jax.core.Tracer):
         kind = settings, camera.width, camera.height, gaussians.num
         _watch(_Watched(output.overflow, num_pairs, settings.capacity, has_rows(gaussians, num_live)), kind)
     return output
@@ -141,14 +141,11 @@ class _Watched(NamedTuple):
 
 
 def _watch(rendered: _Watched, kind: Hashable) -> None:
-    """Warn if this render, or one before it that is done by now, has overflowed or is empty; do nothing under jit and
-    vmap.
+    """Warn if this eager render, or one before it that is done by now, has overflowed or is empty.
 
     The first render of a kind (settings, image size and number of Gaussians) is waited for; later ones are read once
     they are done, so that rendering stays asynchronous.
     """
-    if isinstance(rendered.num_pairs, jax.core.Tracer):
-        return
     with _watch_lock:
         _pending.append(rendered)
     if kind not in _watched_kinds:

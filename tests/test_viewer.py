@@ -130,6 +130,21 @@ def test_a_connection_without_a_whole_request_is_closed(monkeypatch, is_dripping
         pytest.fail("the connection stays open")
 
 
+def test_a_kept_connection_may_be_older_than_its_request(monkeypatch):
+    monkeypatch.setattr(server, "PATIENCE", 2)
+    with served({"/": Route("text/plain", b"here")}) as address, connected(address) as (connection,):
+        request = f"GET / HTTP/1.1\r\nHost: {address.split('/')[2]}\r\n\r\n".encode()
+        for _ in range(3):
+            connection.sendall(request[:9])
+            time.sleep(1.2)
+            connection.sendall(request[9:])
+            answer = b""
+            while not answer.endswith(b"here"):
+                received = connection.recv(1000)
+                assert received, "closed"
+                answer += received
+
+
 # waitress leaves the temporary file of a dropped answer to the garbage collector.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_answer_that_nobody_reads_is_dropped(monkeypatch):

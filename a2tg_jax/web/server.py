@@ -177,14 +177,16 @@ def served(routes: Mapping[str, Route], *, host: str = LOOPBACK, port: int = 0) 
         warnings.warn(f"the viewer's server ended early: {error}", stacklevel=3)
 
 
-def close_stalled(channels: Iterable[Any], before: float) -> None:
-    """Close waitress's channels without progress since a time, and those with a request that began before it.
+def close_stalled(channels: Iterable[Any], now: float) -> None:
+    """Close waitress's channels without progress for `PATIENCE`, and those whose request takes longer to arrive.
 
     waitress itself keeps a connection whose request comes byte by byte, or whose answer is not read.
     """
+    before = now - PATIENCE
     for channel in channels:
         is_idle = channel.last_activity < before and (not channel.requests or channel.total_outbufs_len > 0)
-        is_slow = channel.request is not None and channel.creation_time < before
+        # The channel may be older: a connection is kept for further requests.
+        is_slow = channel.request is not None and vars(channel.request).setdefault("first_seen", now) < before
         if is_idle or is_slow:
             channel.will_close = True
 
@@ -212,7 +214,7 @@ def _running(routes: Mapping[str, Route], host: str, port: int) -> Iterator[tupl
         max_request_body_size=MOST_BODY_BYTES, connection_limit=MOST_CONNECTIONS, cleanup_interval=1,
         asyncore_use_poll=True,  # select takes no more than 1,024 connections.
     )  # fmt: skip
-    server.maintenance = lambda now: close_stalled(server.active_channels.values(), now - PATIENCE)
+    server.maintenance = lambda now: close_stalled(server.active_channels.values(), now)
     ended: Future[None] = Future()
 
     def run() -> None:
