@@ -21,6 +21,7 @@ from scenes_random import (
     render_scene,
 )
 
+import a2tg_jax as a2tg
 from a2tg_jax import Camera, RenderSettings, combine, partition, render_image
 
 SCENE = draw_scene(1, num=4, width=8, height=8)
@@ -275,6 +276,14 @@ def test_autodiff_has_the_gradient_of_the_other_compositors():
         return jax.jit(jax.grad(loss))(as_gaussians(scene, "float64"))
 
     assert_all_close(gradient("autodiff"), gradient("native"), 1e-7, 1e-9)
+
+
+def test_a_model_with_spare_rows_is_an_argument_of_a_jitted_render():
+    model = a2tg.Model(some_gaussians())
+    settings = a2tg.plan_render(model, [CAMERA])
+    spare = dataclasses.replace(model, num_live=jnp.int32(5))
+    color = jax.jit(lambda model: model.render(CAMERA, settings=settings).color)
+    np.testing.assert_allclose(color(spare), color(model[:5]), rtol=0, atol=1e-6)
 
 
 @pytest.mark.long
