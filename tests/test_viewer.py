@@ -146,7 +146,7 @@ def test_a_kept_connection_may_be_older_than_its_request(monkeypatch):
 
 
 # waitress leaves the temporary file of a dropped answer to the garbage collector.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 def test_an_answer_that_nobody_reads_is_dropped(monkeypatch):
     """Four such answers would keep all threads of the server waiting."""
     monkeypatch.setattr(server, "PATIENCE", 1)
