@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from a2tg_jax.core.budget import number_to_reach
-from a2tg_jax.core.checks import check_number, check_shape
+from a2tg_jax.core.checks import check_int, check_number, check_shape
 from a2tg_jax.core.gaussians import DEAD_OPACITY, MAX_SHARES, Gaussians, check_gaussians, rotation_matrices, share
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.pytree import pytree, static
@@ -104,7 +104,7 @@ def grow(key: Array, gaussians: Gaussians, moments: Any, num_live: Array | int, 
       scalars `num_dead`, `num_added` and `has_hosts`.
 
     Raises:
-      ValueError: if a cap that is not traced exceeds N, or a leaf of `moments` has another leading axis.
+      ValueError: if a count or a cap that is not traced exceeds N, or a leaf of `moments` has another leading axis.
 
     Examples:
       >>> state = a2tg.adam_init(gaussians)
@@ -205,9 +205,10 @@ def perturb(
       (200, 3)
     """
     check_gaussians(gaussians)
-    check_shape("num_live", num_live, ())
+    _check_num_live(gaussians, num_live)
     check_shape("lr", lr, ())
     scales = gaussians.scales if scales is None else scales
+    check_shape("scales", scales, (gaussians.num, 3 if np.shape(scales)[1:] == (3,) else 2))
     means, dtype = gaussians.means, gaussians.means.dtype
     noise = jax.random.normal(key, means.shape, dtype)
     axes = rotation_matrices(gaussians.quats)[:, :, : scales.shape[1]]
@@ -271,10 +272,16 @@ def _moved(gaussians: Gaussians, moments: Any, num_live: Array, moves: Moves) ->
     return MoveResult(copied, moments, num_live + moves.info.num_added, moves.info)
 
 
+def _check_num_live(gaussians: Gaussians, num_live: Array | int) -> None:
+    check_shape("num_live", num_live, ())
+    if not isinstance(num_live, jax.core.Tracer):
+        check_int("num_live", np.asarray(num_live).item(), 0, gaussians.num)
+
+
 def _check_moments(gaussians: Gaussians, moments: object, num_live: Array | int) -> None:
     """Raise ValueError unless the Gaussians are well formed and every leaf has one row for each of them."""
     check_gaussians(gaussians)
-    check_shape("num_live", num_live, ())
+    _check_num_live(gaussians, num_live)
     rows = (moments.mu, moments.nu) if isinstance(moments, AdamState) else moments
     for path, leaf in jax.tree_util.tree_leaves_with_path(rows):
         if np.ndim(leaf) == 0 or np.shape(leaf)[0] != gaussians.num:

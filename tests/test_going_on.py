@@ -225,6 +225,7 @@ def test_an_invalid_model_is_refused_before_training(result):
         r"^start\.gaussians\.quats must": changed(quats=gaussians.quats[:5]),
         r"^start\.gaussians\.means must be finite; 1 of 110": changed(means=gaussians.means.at[3].set(jnp.nan)),
         "^start must have at least 2 Gaussians; got 1": model[:1],
+        r"^start\.gaussians\.means: no training view sees any": changed(means=gaussians.means + 1e4),
     }
     for message, start in wrong.items():
         with pytest.raises(ValueError, match=message):

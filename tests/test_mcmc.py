@@ -182,6 +182,11 @@ def test_bad_arguments_are_named():
             step(KEY, gaussians, {"count": jnp.zeros(())}, 4)
         with pytest.raises(ValueError, match=r"got moments\[0\].means of shape \[9, 3\]"):
             step(KEY, gaussians, adam_init(random_gaussians(9)), 4)
+        for num_live in (-1, 9, 4.5):
+            with pytest.raises(ValueError, match=f"num_live must be an int, 0 to 8; got {num_live}"):
+                step(KEY, gaussians, (), num_live)
+    with pytest.raises(ValueError, match=r"scales must be \[8, 2\]; got \[3\]"):
+        perturb(KEY, gaussians, 8, 1e-4, jnp.ones(3))
 
 
 @pytest.mark.parametrize("step", [relocate, lambda *args: grow(*args, NUM)], ids=["relocate", "grow"])

@@ -574,6 +574,8 @@ CALLS = {
     "trained(events=(made(HostEvent, iterations=lambda self, num: (1,), apply=nothing_left),))": (
         "Mine.apply … is_kept … at least 2 … 0 of 50"
     ),
+    "TextureOptions(uv='texel-center')": "uv must be one of texel-centre, align-corners; got 'texel-center'",
+    "trained(events=(Upscale(select='most'),))": "Upscale.select … fraction, threshold, budget; got 'most'",
     "trained(losses=(Term(each_pixel),))": "'each_pixel' … scalar … jnp.mean(…) … float32[16, 16, 3]",
     "trained(corrections=(made(Exposure, camera=lambda self, row, camera: row),))": "Mine.camera … structure",
     "trained(corrections=(made(Exposure, color=lambda self, row, c: c.mean((0, 1))),))": "Mine.color … [16, 16, 3]",

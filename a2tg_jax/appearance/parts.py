@@ -16,7 +16,7 @@ from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.bilinear import TextureRegion
-from a2tg_jax.core.checks import check_number
+from a2tg_jax.core.checks import check_literals, check_number
 from a2tg_jax.core.gaussians import LARGEST_OPACITY, Gaussians, logit
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import Integer, within
@@ -83,6 +83,10 @@ class TextureOptions(NamedFields):
     clipped to [0, 1] when shown."""
     max_alpha: float = 0.99
     """Upper limit of a splat's alpha."""
+
+    def __post_init__(self) -> None:
+        """Check the conventions."""
+        check_literals(self)
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a number is out of range."""

@@ -16,7 +16,7 @@ from jax import Array
 from a2tg_jax.appearance import Appearance, allocate_appearance, count_floats, in_words
 from a2tg_jax.appearance.base import check_appearance
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
-from a2tg_jax.core.checks import check_kind, check_number, fields_of, kind_of
+from a2tg_jax.core.checks import check_kind, check_literals, check_number, fields_of, kind_of
 from a2tg_jax.core.gaussians import Gaussians, no_rows
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import BLACK, WHITE, Color
@@ -183,6 +183,7 @@ class Stage(NamedFields):
         parts: tuple[Event | Correction, ...] = (*self.events, *self.corrections)
         for part in parts:
             with fields_of(f"{where} {type(part).__name__}"):
+                check_literals(part)
                 part.check_options()
         for event in self.events:
             name = f"{where} {type(event).__name__}"

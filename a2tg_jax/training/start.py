@@ -106,17 +106,22 @@ def _largest_sizes(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarra
 def check_start(scene: Scene, system: System) -> None:
     """Raise ValueError, naming the options to change, if no training view sees any point, or the events of the first
     stage cannot work with the initial number of Gaussians."""
-    points, first = np.asarray(scene.points), system.stages()[0]
-    if np.isfinite(points).all():  # `init_from_points` names others.
-        sights = [Sight.of_camera(view.camera) for view in scene.train]
-        if len(unseeing(points, sights)) == len(sights):
-            raise ValueError(
-                f"scene.points: no training view sees any of the {len(points):,} points: they must be in the "
-                "world of the views' cameras; scene.transform.apply leads there from the original world"
-            )
+    first = system.stages()[0]
+    _check_seen("scene.points", np.asarray(scene.points), scene)
     num = initial_number(scene, system, first)
     _rows_needed(first, num, system)
     system.check_number(num)
+
+
+def _check_seen(name: str, points: np.ndarray, scene: Scene) -> None:
+    if not np.isfinite(points).all():
+        return  # `init_from_points` and `check_model` name them.
+    sights = [Sight.of_camera(view.camera) for view in scene.train]
+    if len(unseeing(points, sights)) == len(sights):
+        raise ValueError(
+            f"{name}: no training view sees any of the {len(points):,} points: they must be in the world of the views' "
+            "cameras; scene.transform leads there from the original world"
+        )
 
 
 def check_loss_data(views: tuple[View, ...], stages: Sequence[Stage]) -> None:
@@ -186,6 +191,7 @@ def given_start(start: Model, scene: Scene, system: System, index: int) -> Model
             "start.transform(start.origin.transform.inverse().then(scene.transform))",
             stacklevel=3,
         )
+    _check_seen("start.gaussians.means", np.asarray(start.gaussians.means), scene)
     shown = template_of(start.appearance)
     # What the stage before ends with is meant to be replaced, such as textures by others.
     is_expected = shown == stage.appearance or (index > 0 and shown == stages[index - 1].appearance)
