@@ -49,6 +49,28 @@ def test_the_version_is_one():
     assert re.findall(r"^## \[(\d.*?)\] - \d{4}-\d\d-\d\d$", changes, re.MULTILINE)[:1] == [version]
 
 
+def test_extras_that_pages_install_exist():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    installed = set()
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        # In small letters: NAME is a placeholder.
+        for names in re.findall(r"pip install[^\n]*?(?:\.|/src|a2tg-jax)\[([a-z0-9,]+)\]", text):
+            installed.update(names.split(","))
+    assert {"viewer", "video", "cuda13"} <= installed <= extras.keys()
+
+
+def test_supported_versions_of_python_are_the_same_everywhere():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    versions = re.findall(r"Python :: (3\.\d+)", " ".join(project["classifiers"]))
+    workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
+    (tested,) = re.findall(r"python: \[(.*)\]", workflow)
+    assert re.findall(r"3\.\d+", tested) == versions
+    assert project["requires-python"] == f">={versions[0]}"
+    for name in ("README.md", "CONTRIBUTING.md", "docs/install.md", "docs/tutorial.md"):
+        assert f"Python {versions[0]} to {versions[-1]}" in (ROOT / name).read_text(encoding="utf-8"), name
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_named_files_exist(page):
     if page.name == "CHANGELOG.md":  # It names what has gone, too.

@@ -74,8 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
       argv: arguments without the program's name; None: arguments of the process.
 
     Returns:
-      The exit code: 0, 2 after a user's error (on stderr), 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP, 141
-      if the pipe that reads the output is closed.
+      The exit code: 0, 2 after a user's error (on stderr), 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP, 138
+      after SIGUSR1, 141 if the pipe that reads the output is closed.
     """
     name, *arguments = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
     if name not in (*COMMANDS, "-h", "--help", "--version"):
