@@ -77,6 +77,23 @@ def test_a_folder_its_header_and_a_zipped_folder_are_read(tmp_path, capsys):
         load_splats(tmp_path / "a.sog")
 
 
+def test_a_folder_zipped_with_backslashes_is_read(tmp_path):
+    """As old programs on Windows zip it."""
+    (tmp_path / "a.sog").write_bytes(zipped({f"scene\\{name}": data for name, data in entries().items()}))
+    assert load_splats(tmp_path / "a.sog") == load_splats(SCENE)
+
+
+def test_what_to_read_of_streamed_sog_and_of_a_zip(tmp_path):
+    folder = tmp_path / "streamed"
+    folder.mkdir()
+    (folder / "lod-meta.json").write_text('{"lodLevels": 2}')
+    with pytest.raises(ValueError, match=r"lod-meta\.json: is streamed SOG.*read one of them, such as 0_0"):
+        load_splats(folder)
+    (tmp_path / "a.zip").write_bytes(SCENE.read_bytes())
+    with pytest.raises(ValueError, match=r"unknown suffix; if it is SOG, rename it to \*\.sog"):
+        load_splats(tmp_path / "a.zip")
+
+
 def test_pictures_of_a_folder_that_git_lfs_did_not_fetch(tmp_path):
     folder = unpacked(tmp_path / "scene")
     pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 123456\n"
@@ -267,7 +284,7 @@ def of_headers() -> dict[str, tuple[bytes, str]]:
     changes = {
         "no count": (lambda h: h.pop("count"), "lacks 'count'"),
         "version 3": (lambda h: h.update(version=3), "is SOG of version 3"),
-        "version text": (lambda h: h.update(version="2"), "is SOG of version '?2"),
+        "version text": (lambda h: h.update(version="2"), "is SOG of version '2'; versions 1 and 2"),
         "version 1 with codebooks": (lambda h: h.update(version=1), "lacks 'shape'"),
         "no means": (lambda h: h.pop("means"), "describes no means"),
         "no scales": (lambda h: h.pop("scales"), "describes no scales"),
@@ -283,6 +300,10 @@ def of_headers() -> dict[str, tuple[bytes, str]]:
             "gaussians.means must be finite",
         ),
         "short codebook": (lambda h: h["scales"].update(codebook=[0.0] * 9), "scales.codebook of meta.json has 9"),
+        "codebook of nulls": (
+            lambda h: h["sh0"].update(codebook=[None] * 256),
+            "sh0.codebook of meta.json must be fin",
+        ),
         "no codebook": (lambda h: h["sh0"].pop("codebook"), "sh0.codebook of meta.json must be a list"),
         "empty codebook": (lambda h: h["sh0"].update(codebook=[]), "sh0.codebook of meta.json must be a list"),
         "text codebook": (lambda h: h["sh0"].update(codebook="x" * 256), "sh0.codebook of meta.json must be a list"),
@@ -320,6 +341,7 @@ def of_archives() -> dict[str, tuple[bytes, str]]:
         "other ZIP": (zipped({"other.txt": b""}), r"is not SOG: it has no meta\.json"),
         "empty header": (zipped(entries() | {"meta.json": b""}), "meta.json cannot be read as JSON"),
         "streamed": (zipped({"lod-meta.json": b"", "meta.json": b'{"lodLevels": 2}'}), "is streamed SOG"),
+        "streamed only": (zipped({"scene/lod-meta.json": b'{"lodLevels": 2}'}), "is streamed SOG"),
         "list as header": (zipped(entries() | {"meta.json": b"[]"}), "is not SOG: meta.json describes no means"),
         "deep header": (zipped(entries() | {"meta.json": b"[" * 10**5}), "meta.json cannot be read as JSON"),
         "labels beyond the sets": (with_picture("shN_labels.webp", lying_labels()), "refers to set 65,535 .* of 64"),

@@ -126,6 +126,29 @@ def test_a_link_that_leads_nowhere_is_an_error(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"unmounted is a link to .*new\.txt, but there is no folder"):
         write_whole(tmp_path / "unmounted", "")
     assert not (tmp_path / "disk").exists()
+    (tmp_path / "disk-link").symlink_to("disk")
+    with pytest.raises(FileNotFoundError, match=r"disk-link is a link to disk, which does not exist: make it first"):
+        write_whole(tmp_path / "disk-link/new.txt", "")
+
+
+def test_links_in_a_circle_are_an_error(tmp_path, capsys):
+    a2tg.save_splats(tmp_path / "a.ply", some_model(a2tg.Gaussians2d(sh_degree=0)))
+    (tmp_path / "circle.ply").symlink_to("circle.ply")
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "circle.ply")]) == 2
+    assert "Too many levels of symbolic links" in capsys.readouterr().err
+
+
+def test_a_device_is_not_replaced(tmp_path, capsys):
+    a2tg.save_splats(tmp_path / "a.ply", some_model(a2tg.Gaussians2d(sh_degree=0)))
+    pipe = tmp_path / "pipe.ply"
+    os.mkfifo(pipe)
+    (tmp_path / "link.ply").symlink_to(pipe)
+    for path in (pipe, tmp_path / "link.ply"):
+        with pytest.raises(FileExistsError, match="is a device, pipe or socket, or a link to one"):
+            write_whole(path, "")
+        assert main(["convert", str(tmp_path / "a.ply"), str(path), "--overwrite"]) == 2
+        assert "give the path of a file" in capsys.readouterr().err
+    assert pipe.is_fifo()
 
 
 @pytest.mark.parametrize("suffix", ["ply", "splat", "npz", "glb", "a2tgz"])

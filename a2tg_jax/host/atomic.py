@@ -31,7 +31,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     processes left over are deleted.
 
     Raises:
-      OSError: from the block, or if a link leads nowhere. The error of a full disk names the file.
+      OSError: from the block, or if `file_to_write` refuses the path. The error of a full disk names the file.
     """
     path = file_to_write(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,17 +55,25 @@ def file_to_write(path: str | os.PathLike[str]) -> Path:
     """Return the path itself or, if it is a link, the file that it leads to, which need not exist.
 
     Raises:
-      OSError: if links lead in a circle, or to a folder that does not exist, such as on a disk that is not mounted.
+      OSError: if links lead in a circle, to a device, a pipe or a socket, which renaming would replace, or to a folder
+        that does not exist, such as on a disk that is not mounted.
     """
     path = Path(path)
-    if not path.is_symlink():
-        return path
-    # Unlike Path.resolve, realpath accepts circular links, and returns one of them.
-    target = Path(os.path.realpath(path))
-    if target.is_symlink():
-        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), os.fspath(path))
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"{path} is a link to {target}, but there is no folder {target.parent}: make it first")
+    for folder in path.parents:
+        if folder.is_symlink() and not folder.exists():
+            raise FileNotFoundError(f"{folder} is a link to {os.readlink(folder)}, which does not exist: make it first")
+    target = path
+    if path.is_symlink():
+        # Unlike Path.resolve, realpath accepts circular links, and returns one of them.
+        target = Path(os.path.realpath(path))
+        if target.is_symlink():
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), os.fspath(path))
+        if not target.parent.is_dir():
+            raise FileNotFoundError(
+                f"{path} is a link to {target}, but there is no folder {target.parent}: make it first"
+            )
+    if target.exists() and not target.is_file() and not target.is_dir():
+        raise FileExistsError(f"{path} is a device, pipe or socket, or a link to one: give the path of a file")
     return target
 
 

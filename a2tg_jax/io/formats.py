@@ -16,7 +16,7 @@ from a2tg_jax.io.gltf_container import buffer_files
 from a2tg_jax.io.model_file import load_model, save_model
 from a2tg_jax.io.other_programs import World, cut_numbers, writer_as
 from a2tg_jax.io.ply import encode_packed_ply, load_ply_model, save_ply
-from a2tg_jax.io.sog import HEADER, encode_sog, load_sog, sog_files
+from a2tg_jax.io.sog import HEADER, STREAMED_HEADER, encode_sog, load_sog, sog_files
 from a2tg_jax.io.splat_files import encode_ksplat, encode_splat, load_ksplat, load_splat
 from a2tg_jax.io.spz import encode_spz, load_spz
 from a2tg_jax.io.torch_checkpoint import load_checkpoint_gaussians, save_checkpoint_gaussians
@@ -87,6 +87,8 @@ def format_of(path: str | os.PathLike[str]) -> FileFormat:
         if name.endswith(suffix):
             return found
     near = did_you_mean(Path(name).suffix, FORMATS)
+    if name.endswith(".zip"):
+        near = "; if it is SOG, rename it to *.sog; otherwise unpack it"
     hint = model_hint(Path(path)) or f"{near}; known are {', '.join(FORMATS)}"
     raise ValueError(f"{shortened(os.fspath(path))}: unknown suffix{hint}")
 
@@ -104,7 +106,9 @@ def writer_of(path: str | os.PathLike[str]) -> Writer:
 
 def splats_at(path: Path) -> Path:
     """Return the file of splats at a path: the meta.json of a folder that is SOG, or else the path."""
-    return path / HEADER if path.is_dir() and is_regular(path / HEADER) else path
+    # Reading the header of streamed SOG fails with what to read instead.
+    headers = [path / name for name in (HEADER, STREAMED_HEADER) if path.is_dir() and is_regular(path / name)]
+    return headers[0] if headers else path
 
 
 def load_splats(path: str | os.PathLike[str]) -> Model:

@@ -37,6 +37,8 @@ from a2tg_jax.io.validate import existing_bytes, reading
 from a2tg_jax.model import Model
 
 HEADER = "meta.json"
+STREAMED_HEADER = "lod-meta.json"
+STREAMED = "is streamed SOG, which has its splats in folders: unpack it, and read one of them, such as 0_0"
 FLAT = "2dgs"
 VERSION = 2
 PICTURES = {"means": 2, "quats": 1, "scales": 1, "sh0": 1, "shN": 2}
@@ -115,22 +117,23 @@ def _read_archive(data: bytes) -> _Files:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > room_of(len(data)):
                 raise ValueError("it unpacks to more than 64 times its size")
+            # Some programs on Windows write backslashes.
+            names = {name.replace("\\", "/"): name for name in archive.namelist()}
             # Desktops zip a folder together with its name, and macOS adds a second folder.
-            headers = [
-                name for name in archive.namelist() if PurePosixPath(name).name == HEADER and name.count("/") < 2
-            ]
+            headers = [name for name in names if PurePosixPath(name).name == HEADER and name.count("/") < 2]
             if not headers:
-                raise ValueError(f"is not SOG: it has no {HEADER}")
+                is_streamed = any(PurePosixPath(name).name == STREAMED_HEADER for name in names)
+                raise ValueError(STREAMED if is_streamed else f"is not SOG: it has no {HEADER}")
             if len(headers) > 1 and HEADER not in headers:
                 raise ValueError(f"holds several scenes ({', '.join(headers[:3])}); unpack it, and give one folder")
             place = HEADER if HEADER in headers else headers[0]
-            header = _checked_header(archive.read(place))
+            header = _checked_header(archive.read(names[place]))
             folder = place.removesuffix(HEADER)
             pictures = {}
             for name in _named_pictures(header):
-                if folder + name not in archive.namelist():
+                if folder + name not in names:
                     raise ValueError(f"lacks the picture {folder + name}, which its {HEADER} names")
-                pictures[name] = archive.read(folder + name)
+                pictures[name] = archive.read(names[folder + name])
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError) as error:
         raise ValueError(f"is damaged or no SOG file: {shortened(str(error))}") from error
     return _Files(header, pictures, len(data))
@@ -142,12 +145,12 @@ def _checked_header(data: bytes) -> dict[str, Any]:
     except ValueError as error:
         raise ValueError(f"{HEADER} cannot be read as JSON ({error})") from error
     if isinstance(header, dict) and "lodLevels" in header:
-        raise ValueError("is streamed SOG, which has its splats in folders: read one of them, such as 0_0")
+        raise ValueError(STREAMED)
     if not isinstance(header, dict) or not isinstance(header.get("means"), dict):
         raise ValueError(f"is not SOG: {HEADER} describes no means")
     version = header.get("version", 1)
     if version not in (1, VERSION):
-        raise ValueError(f"is SOG of version {shortened(version)}; versions 1 and 2 are read")
+        raise ValueError(f"is SOG of version {shortened(repr(version))}; versions 1 and 2 are read")
     return header
 
 
@@ -236,7 +239,9 @@ def _rest(files: _Files, places: np.ndarray, *, is_first: bool) -> np.ndarray:
 
 def _count(value: object, what: str) -> int:
     if type(value) is not int or value < 1:
-        raise ValueError(f"{HEADER} must have a count of {what}, at least 1; got {shortened(value)}")
+        raise ValueError(
+            f"{HEADER} must have a count of {what}, a whole number of at least 1; got {shortened(repr(value))}"
+        )
     return value
 
 
@@ -286,6 +291,7 @@ def _decoded(described: Mapping[str, Any], group: str, codes: np.ndarray, *, is_
         return low + codes / 255 * (high - low)
     codebook = described.get("codebook")
     if isinstance(codebook, list) and len(codebook) == CODEBOOK and codebook[0] is None:
+        _checked_numbers(codebook[1:], f"{group}.codebook")
         # Early programs left the first number out: https://github.com/playcanvas/engine reads it as one more step.
         codebook = [codebook[1] + (codebook[1] - codebook[-1]) / (CODEBOOK - 1), *codebook[1:]]
     book = _checked_numbers(codebook, f"{group}.codebook")

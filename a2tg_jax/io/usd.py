@@ -6,6 +6,7 @@ the first two axes. It cannot hold textures. The library usd-core reads and writ
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -163,6 +164,8 @@ def _read_apart(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         done = subprocess.run(command, env=environment, capture_output=True, check=False)
         if done.returncode:
             reason = done.stderr.decode(errors="replace")
+            # usd-core names lines of its own sources before each reason.
+            reason = "; ".join(re.findall(r" in file \S+ : '(.*)'$", reason, re.MULTILINE)) or reason
             if done.returncode != usd_fields.REFUSED:
                 reason = f"usd-core ended with status {done.returncode}"
             raise ValueError(f"is not a USD file, or is damaged ({shortened(' '.join(reason.split()))})")

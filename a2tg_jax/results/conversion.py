@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import math
+import os
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -102,11 +103,12 @@ def check_conversion(
             f"`world` has no effect on {out}, which also holds the way to the original world: leave it out"
         )
     # A *.gltf is several files, none of which may be both read and written.
-    sources = {file.resolve() for file in files_of(source)}
+    # Not Path.resolve, which raises RuntimeError for links in a circle before Python 3.13.
+    sources = {os.path.realpath(file) for file in files_of(source)}
     for file in files_written(out):
         if file.is_dir():
             raise ValueError(f"{file} is a folder; give the path of a file")
-        if file.resolve() in sources:
+        if os.path.realpath(file) in sources:
             whole = "the source" if file == out else f"part of the source and would be written together with {out}"
             raise ValueError(f"{file} is {whole}: choose another name")
         check_new(file, "OUT", overwrite=overwrite)

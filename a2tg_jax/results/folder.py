@@ -376,7 +376,8 @@ def check_output(path: Path) -> None:
 def check_apart(out: Path, other: Path) -> None:
     """Raise ValueError if one of two paths, at least one of which is written, is in the other."""
     # Links resolved: names alone do not show an overlap.
-    one, two = out.resolve(), other.resolve()
+    one = Path(os.path.realpath(out))
+    two = Path(os.path.realpath(other))
     if one.is_relative_to(two) or two.is_relative_to(one):
         raise ValueError(f"{out} and {other} overlap: choose an output folder outside it")
 
@@ -395,13 +396,13 @@ def check_new(path: Path, option: str, *, overwrite: bool) -> None:
 
 def check_export(path: Path, default: Path, option: str, *, overwrite: bool) -> None:
     """Call `check_new`, unless the path is the default and an earlier call wrote it into a run folder."""
-    if path.resolve() != default.resolve() or _run_that_wrote(path) is None:
+    if os.path.realpath(path) != os.path.realpath(default) or _run_that_wrote(path) is None:
         check_new(path, option, overwrite=overwrite)
 
 
 def _run_that_wrote(path: Path) -> Path | None:
     """Return the folder of the run that lists a file as its own, or None."""
-    path = path.resolve()
+    path = Path(os.path.realpath(path))
     names = {folder: path.relative_to(folder).as_posix() for folder in path.parents}
     return next((folder for folder, name in names.items() if name in RunFolder(folder).written()), None)
 
