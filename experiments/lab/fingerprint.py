@@ -11,6 +11,9 @@ import a2tg_jax as a2tg
 from a2tg_jax.results.record import common_options, is_equal
 
 PACKAGE = "a2tg_jax"
+LATER_FIELDS = {"continues"}
+"""Fields that came after the first records, which keep their keys: at their default they are no part of a fingerprint.
+"""
 
 
 def is_same_so_far(made: a2tg.System, wanted: a2tg.System, index: int) -> bool:
@@ -37,8 +40,12 @@ def _described(value: Any) -> Any:
     if value is None or isinstance(value, str | bool | int | float):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        wording = tuple((field.name, _described(getattr(value, field.name))) for field in dataclasses.fields(value))
-        return _name_of(type(value)), wording
+        fields = [
+            field
+            for field in dataclasses.fields(value)
+            if field.name not in LATER_FIELDS or getattr(value, field.name) != field.default
+        ]
+        return _name_of(type(value)), tuple((field.name, _described(getattr(value, field.name))) for field in fields)
     if isinstance(value, tuple | list):
         return _name_of(type(value)), *map(_described, value)
     if isinstance(value, Mapping):
