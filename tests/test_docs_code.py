@@ -38,7 +38,11 @@ def untrained(*args, **kwargs):
     appearance = system.stages()[-1].appearance
     appearance = a2tg.allocate_appearance(appearance, jax.random.key(0), gaussians)
     model = a2tg.Model(gaussians, appearance, origin=origin_of_scene(scene))
-    return SimpleNamespace(model=model)
+
+    def more(scene, iterations):
+        return untrained(scene, dataclasses.replace(system, more=(*system.more, iterations)))
+
+    return SimpleNamespace(model=model, stages=[SimpleNamespace(model=model)], more=more)
 
 
 def test_the_code_of_the_readme_runs():

@@ -319,7 +319,8 @@ def test_what_a_first_stage_cannot_take_of_a_file_is_refused_or_told(tmp_path):
     save_model(tmp_path / "a.npz", textured())
     with pytest.warns(UserWarning, match="leaves out what its splats show besides Gaussians"):
         check_init(tmp_path / "a.npz", tmp_path / "run", A2tg(sh_degree=3))
-    save_ply(tmp_path / "a.ply", init_from_points(np.eye(4, 3), np.eye(4, 3), sh_degree=2))
+    gaussians = init_from_points(np.eye(4, 3), np.eye(4, 3), sh_degree=2)
+    save_ply(tmp_path / "a.ply", dataclasses.replace(gaussians, sh=gaussians.sh.at[0, 4:].set(0.5)))
     with pytest.warns(UserWarning, match="its spherical harmonics above degree 1"):
         check_init(tmp_path / "a.ply", tmp_path / "run", A2tg(sh_degree=1))
     with pytest.raises(ValueError, match=r"room for 3 Gaussians of 148 bytes .*, and 4 are given"):
