@@ -172,6 +172,14 @@ def test_masks_that_are_neither_black_nor_white_are_named(tmp_path, mask_as):
         load_scene(tmp_path, mask_as=mask_as)
 
 
+@pytest.mark.parametrize("folder", ["mask", "Masks", "object_mask"])
+def test_masks_in_a_folder_of_another_name_are_noticed(tmp_path, folder):
+    write_scene(tmp_path)
+    write_mask(tmp_path / folder / NAMES[3], left_half())
+    with pytest.warns(UserWarning, match=f"{folder}: not read; if it holds masks, rename it to masks"):
+        load_scene(tmp_path)
+
+
 def test_what_is_wrong_with_masks(tmp_path):
     write_scene(tmp_path)
     write_mask(tmp_path / "masks" / "other.png", left_half())

@@ -174,6 +174,10 @@ def read_photos(
         for folder in filter(is_folder, folders):
             message = f"{folder}: holds no mask of a photograph of the scene, called NAME.jpg.png or NAME.png: not used"
             warnings.warn(message, stacklevel=3)
+        for root in {folder.parent for folder in folders if isinstance(folder, Path)}:
+            for folder in sorted(root.glob("*[mM]ask*/")):
+                if not folder.name.startswith(MASKS):
+                    warnings.warn(f"{folder}: not read; if it holds masks, rename it to {MASKS}", stacklevel=3)
     elif lacking:
         message = f"{place}: {len(lacking)} of {len(shots)} photographs have no mask, such as {lacking[0]}"
         warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
