@@ -15,6 +15,7 @@ from .appearance import (
     Texture as Texture,
     TextureOptions as TextureOptions,
     allocate_appearance as allocate_appearance,
+    project_appearance as project_appearance,
 )
 from .core.bilinear import TextureRegion as TextureRegion
 from .core.camera_paths import look_at as look_at, path_through as path_through, smooth_path as smooth_path

@@ -19,7 +19,7 @@ from a2tg_jax.appearance import (
     appearance_for,
     count_floats,
     in_words,
-    projected,
+    project_appearance,
     template_of,
 )
 from a2tg_jax.appearance.base import clear_rows
@@ -132,7 +132,7 @@ def test_billboards_end_one_texel_beyond_the_border(side):
 @pytest.mark.parametrize("name", ["plain", "movable kernels", "billboards", "shaped"])
 def test_limited_opacities(name):
     gaussians, appearance = allocated(APPEARANCES[name])
-    appearance = projected(moved(appearance))
+    appearance = project_appearance(moved(appearance))
     before = appearance.opacities(gaussians)
     most = jnp.median(before)
     gaussians, appearance = appearance.limit_opacities(gaussians, most)
@@ -143,17 +143,27 @@ def test_limited_opacities(name):
         np.testing.assert_allclose(after, np.minimum(before, most), rtol=1e-4)
 
 
+def test_only_appearances_are_allocated_and_only_allocated_ones_projected():
+    gaussians, appearance = allocated(TEXTURED, num=2)
+    with pytest.raises(ValueError, match="template must be an Appearance; got Model"):
+        allocate_appearance(Model(gaussians, appearance), KEY, gaussians)
+    with pytest.raises(ValueError, match="appearance must be an Appearance; got Model"):
+        project_appearance(Model(gaussians, appearance))
+    with pytest.raises(ValueError, match="this appearance is a template, without arrays"):
+        project_appearance(TEXTURED)
+
+
 def test_what_is_trained_is_projected():
     _, appearance = allocated(MovableKernels())
-    assert projected(moved(appearance)).sharpness.min() == 0
+    assert project_appearance(moved(appearance)).sharpness.min() == 0
     _, appearance = allocated(Billboards())
-    (bucket,) = projected(moved(appearance)).pictures.buckets
+    (bucket,) = project_appearance(moved(appearance)).pictures.buckets
     assert bucket[..., 3].min() == 0 and bucket[..., 3].max() == jnp.float32(0.99) and bucket[..., :3].min() < -3
 
 
 def test_copies_of_a_billboard_show_what_one_did():
     gaussians, appearance = allocated(Billboards(side=3))
-    appearance = projected(moved(appearance))
+    appearance = project_appearance(moved(appearance))
     num_shares = jnp.arange(40, dtype=jnp.int32) % 4 + 1
     same, shared = appearance.share(gaussians, num_shares)
     assert same is gaussians
@@ -191,7 +201,7 @@ def test_official_texels_are_kept_where_clips_have_a_gradient():
     raw = moved(appearance)
     rgb, alpha = np.split(np.asarray(raw.textures.buckets[0]), [3], axis=-1)
     kept = np.concatenate([np.clip(rgb, 0, 1), np.maximum(alpha, 0)], axis=-1)
-    np.testing.assert_array_equal(projected(raw).textures.buckets[0], kept)
+    np.testing.assert_array_equal(project_appearance(raw).textures.buckets[0], kept)
     texels, _ = raw.atlas()
     assert texels.min() == 0 and 0.999 < texels[:, 3].max() <= 1
 

@@ -17,7 +17,7 @@ from a2tg_jax.appearance import (
     Texture,
     TextureOptions,
     allocate_appearance,
-    projected,
+    project_appearance,
 )
 from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT
 from a2tg_jax.core.gaussians import SH_C0
@@ -132,16 +132,18 @@ def test_texels_on_their_bounds_can_leave_them_and_projection_keeps_the_image(op
     if options.alpha == "projected":
         texels[..., 3] = 0.7
     appearance = with_texels(texels, options)
-    images = [a2tg.render_appearance(one_splat(), CAMERA, one).color for one in (appearance, projected(appearance))]
+    images = [
+        a2tg.render_appearance(one_splat(), CAMERA, one).color for one in (appearance, project_appearance(appearance))
+    ]
     np.testing.assert_allclose(images[0], images[1], atol=1e-6)
-    assert (gradient_of_texels(projected(appearance), one_splat())[..., :3] != 0).all()
+    assert (gradient_of_texels(project_appearance(appearance), one_splat())[..., :3] != 0).all()
 
 
 def test_alphas_at_their_cap_can_fade():
     """Texels of pictures, whose alpha takes the place of opacity and Gaussian, are projected onto the cap."""
     gaussians = one_splat()
     floats, places = partition(allocate_appearance(Billboards(), jax.random.key(0), gaussians))
-    floats, _ = partition(projected(combine(jax.tree.map(lambda x: jnp.full_like(x, 5.0), floats), places)))
+    floats, _ = partition(project_appearance(combine(jax.tree.map(lambda x: jnp.full_like(x, 5.0), floats), places)))
     assert floats.pictures.buckets[0][..., 3].max() == jnp.float32(0.99)
 
     def mean_of_picture(floats):

@@ -10,18 +10,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_notebooks import internal_names
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.scene import origin_of_scene
 
 DOCS = Path(__file__).parent.parent / "docs"
+ALSO_STABLE = {"a2tg_jax.parallel.sharded_rows.on_host", "a2tg_jax.parallel.sharded_rows.placed_like"}
+"""Names outside `a2tg_jax` itself that the reference allows and pages use."""
 REAL_FIT = inspect.signature(a2tg.fit)
+
+
+def blocks_of(page: Path) -> list[str]:
+    """The blocks of Python of a page."""
+    return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
 def run(page: str, names: dict, replaced: dict[str, str] | None = None) -> dict:
     """Values of the names after the last block of Python of a page, of which the README is one."""
-    text = ((DOCS.parent if page == "README" else DOCS) / f"{page}.md").read_text(encoding="utf-8")
-    for number, block in enumerate(re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)):
+    file = (DOCS.parent if page == "README" else DOCS) / f"{page}.md"
+    for number, block in enumerate(blocks_of(file)):
         for old, new in (replaced or {}).items():
             block = block.replace(old, new)
         exec(compile(block, f"{page}.md, block {number}", "exec"), names)
@@ -43,6 +51,15 @@ def untrained(*args, **kwargs):
         return untrained(scene, dataclasses.replace(system, more=(*system.more, iterations)))
 
     return SimpleNamespace(model=model, stages=[SimpleNamespace(model=model)], more=more)
+
+
+def test_code_uses_public_names():
+    found = set()
+    for page in (DOCS.parent / "README.md", *DOCS.rglob("*.md")):
+        found |= set().union(*map(internal_names, blocks_of(page)))
+    assert found == ALSO_STABLE
+    reference = (DOCS / "api" / "index.md").read_text(encoding="utf-8")
+    assert all(f"`{name.rpartition('.')[2]}`" in reference for name in ALSO_STABLE)
 
 
 def test_the_code_of_the_readme_runs():

@@ -13,7 +13,6 @@ from scenes_random import CAPACITY, as_camera, as_gaussians, as_textures, draw_s
 
 import a2tg_jax as a2tg
 from a2tg_jax import Appearance, Model, RenderSettings, Texture, view_gradients
-from a2tg_jax.appearance import projected
 from a2tg_jax.events import Seen, read_probe
 from a2tg_jax.rasterize.views import render_traced
 
@@ -105,7 +104,7 @@ def test_a_loop_by_hand_learns_and_upscales():
         floats, rest = a2tg.partition(model)
         update = a2tg.adam_update(floats, found.gradient, moments, 0.005)
         model = a2tg.combine(update.params, rest)
-        model = dataclasses.replace(model, appearance=projected(model.appearance))
+        model = dataclasses.replace(model, appearance=a2tg.project_appearance(model.appearance))
         return model, update.state, statistics.observe(found.norms, found.is_visible), found.value
 
     def train(model, moments):

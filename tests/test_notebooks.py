@@ -1,5 +1,6 @@
 """The notebooks run from top to bottom, at a small size, and are committed with the outputs of a whole run."""
 
+import ast
 import json
 import sys
 import types
@@ -33,6 +34,23 @@ SMALL = {
 MOST_BYTES = 400_000
 MOST_LINES, MOST_COLUMNS = 25, 100
 """Size of a cell; wider lines are cut off where notebooks are read."""
+PUBLIC = {"a2tg_jax", "a2tg_jax as a2tg", *(f"a2tg_jax.{name}" for name in dir(a2tg))}
+
+
+def internal_names(source: str) -> set[str]:
+    """The names of the package in Python code that are not public, and private attributes of any value."""
+    used = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            used |= {ast.unparse(alias) for alias in node.names if alias.name.split(".")[0] == "a2tg_jax"}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "a2tg_jax":
+            used |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Attribute):
+            if isinstance(node.value, ast.Name) and node.value.id in ("a2tg", "a2tg_jax"):
+                used.add(f"a2tg_jax.{node.attr}")
+            elif node.attr.startswith("_") and not node.attr.endswith("__"):
+                used.add(ast.unparse(node))
+    return used - PUBLIC
 
 
 def code_cells(name: str) -> list[dict]:
@@ -144,6 +162,26 @@ def test_outputs_are_committed_and_small(name):
     outputs = [output for cell in cells for output in cell["outputs"]]
     assert not any(output["output_type"] == "error" for output in outputs)
     assert any("image/png" in output.get("data", {}) for output in outputs)
+
+
+def test_names_that_are_not_public_are_found():
+    internal = {
+        "from a2tg_jax.appearance import Appearance": "a2tg_jax.appearance.Appearance",
+        "from a2tg_jax import render": "a2tg_jax.render",
+        "import a2tg_jax.core.sh": "a2tg_jax.core.sh",
+        "import a2tg_jax as splats": "a2tg_jax as splats",
+        "a2tg.core.sh.sh_sum(x)": "a2tg_jax.core",
+        "a2tg.Model(gaussians)._rows": "a2tg.Model(gaussians)._rows",
+    }
+    assert {source: internal_names(source) for source in internal} == {
+        source: {name} for source, name in internal.items()
+    }
+    assert not internal_names("import a2tg_jax as a2tg\nfrom a2tg_jax import Model\na2tg.A2tg.preset, np.core.sh")
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_code_uses_public_names(name):
+    assert not set().union(*(internal_names("".join(cell["source"])) for cell in code_cells(name)))
 
 
 @pytest.mark.parametrize("name", SMALL)

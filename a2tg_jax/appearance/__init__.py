@@ -11,7 +11,7 @@ from a2tg_jax.appearance.base import (
     count_floats as count_floats,
     gaussian_cutoff as gaussian_cutoff,
     in_words as in_words,
-    projected as projected,
+    project_appearance as project_appearance,
     template_of as template_of,
 )
 from a2tg_jax.appearance.billboards import Billboards as Billboards

@@ -37,7 +37,7 @@ from a2tg_jax.appearance.parts import (
 )
 from a2tg_jax.core.bilinear import TextureRegion
 from a2tg_jax.core.cameras import Camera
-from a2tg_jax.core.checks import FLOATS, check_shape, described
+from a2tg_jax.core.checks import FLOATS, check_kind, check_shape, described
 from a2tg_jax.core.gaussians import Gaussians, logit, share
 from a2tg_jax.core.geometry import homographies
 from a2tg_jax.core.named_fields import NamedFields
@@ -400,12 +400,27 @@ def allocate_appearance(template: A, key: Array, gaussians: Gaussians) -> A:
     Raises:
       ValueError: if it is no appearance, or makes arrays that do not fit its options.
     """
+    check_kind("template", template, Appearance)
     parts: Any = {name: part.allocate(gaussians) for name, part in _parts_of(template).items()}
     return dataclasses.replace(template, **parts).allocate(key, gaussians)
 
 
-def projected(appearance: A) -> A:
-    """Return the appearance with all numbers projected onto their ranges after an update; traceable."""
+def project_appearance(appearance: A) -> A:
+    """Return the appearance with all numbers projected onto their ranges; call it after each update. Traceable.
+
+    A texture's alpha factors, for example, are clamped to [0, 1].
+
+    Args:
+      appearance: an appearance with its arrays, such as `model.appearance`.
+
+    Returns:
+      An appearance of the same class, with arrays of the same shapes.
+
+    Raises:
+      ValueError: if it is no appearance, or has no arrays yet.
+    """
+    check_kind("appearance", appearance, Appearance)
+    check_arrays_given(appearance)
     parts: Any = {name: part.project() for name, part in _parts_of(appearance).items()}
     return dataclasses.replace(appearance, **parts).project()
 

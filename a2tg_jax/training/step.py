@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from a2tg_jax.appearance import Appearance, projected
+from a2tg_jax.appearance import Appearance, project_appearance
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import SH_C0, Gaussians
 from a2tg_jax.core.optim import AdamState, OptStep, adam_init, adam_update
@@ -216,7 +216,7 @@ def attempt(
     step = optimized(stage, state, grads, rate, progress)
     moments: AdamState = step.state
     model = combine(step.params, partition(model)[1])
-    model = dataclasses.replace(model, appearance=projected(model.appearance))
+    model = dataclasses.replace(model, appearance=project_appearance(model.appearance))
 
     height, width = batch.images.shape[1:3]
     cameras = Camera(batch.viewmats, batch.Ks, width, height)
