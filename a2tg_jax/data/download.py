@@ -14,9 +14,7 @@ import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tqdm import tqdm
-
-from a2tg_jax.host.progress_bars import progress_over
+from a2tg_jax.host.progress_bars import new_bar, progress_over
 from a2tg_jax.host.regular_files import sha256_of
 
 CHUNK_BYTES = 1 << 20
@@ -158,7 +156,7 @@ def _receive(url: str, partial: Path, version: Path, progress: bool) -> int | No
             else:
                 version.write_text(etag, encoding="ascii")
             name = partial.name.removesuffix(".partial")
-            bar = tqdm(desc=name, initial=start, total=total, unit="B", unit_scale=True, disable=not progress)
+            bar = new_bar(desc=name, initial=start, total=total, unit="B", unit_scale=True, disable=not progress)
             with open(partial, "ab" if start else "wb") as opened, bar:
                 while chunk := response.read(CHUNK_BYTES):
                     opened.write(chunk)

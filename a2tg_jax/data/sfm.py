@@ -15,7 +15,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
-from tqdm import tqdm
 
 from a2tg_jax.core.camera_paths import upright_rotation, vertical_of
 from a2tg_jax.core.checks import check_literal
@@ -29,7 +28,7 @@ from a2tg_jax.data.photo_reading import HALF, MASKS
 from a2tg_jax.data.staging import Panorama, Staged, directions, stage
 from a2tg_jax.data.video import DEFAULT_FRAMES
 from a2tg_jax.host.machine import num_threads
-from a2tg_jax.host.progress_bars import counting, has_terminal
+from a2tg_jax.host.progress_bars import counting, has_terminal, new_bar
 from a2tg_jax.host.regular_files import expanded
 from a2tg_jax.host.text import counted, first_names
 
@@ -418,7 +417,7 @@ def _clock(phase: str, progress: bool) -> Iterator[None]:
     if progress and not has_terminal():
         print(f"{phase} …", file=sys.stderr, flush=True)
         progress = False
-    with tqdm(desc=phase, bar_format="{desc}: {elapsed}", disable=not progress) as bar, _ticking(bar.refresh):
+    with new_bar(desc=phase, bar_format="{desc}: {elapsed}", disable=not progress) as bar, _ticking(bar.refresh):
         yield
 
 

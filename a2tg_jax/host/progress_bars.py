@@ -1,11 +1,13 @@
-"""Progress over items: a bar on a terminal; elsewhere plain lines, at most one per tenth and per three seconds."""
+"""Progress over items: a bar on a terminal, and in a notebook as one output of its cell; elsewhere plain lines, at most
+one per tenth and per three seconds."""
 
 import datetime
+import io
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -16,8 +18,37 @@ Item = TypeVar("Item")
 
 
 def has_terminal() -> bool:
-    """Return whether stderr can redraw a line: it is a terminal or a notebook."""
-    return sys.stderr.isatty() or type(sys.stderr).__module__.startswith("ipykernel")
+    """Return whether a line can be redrawn: stderr is a terminal or a notebook."""
+    return sys.stderr.isatty() or _is_notebook()
+
+
+def _is_notebook() -> bool:
+    return type(sys.stderr).__module__.startswith("ipykernel")
+
+
+def new_bar(**options: Any) -> tqdm:
+    """Return a bar with options of tqdm, for a terminal or a notebook."""
+    return NotebookBar(**options, file=io.StringIO(), ascii=False) if _is_notebook() else tqdm(**options)
+
+
+class NotebookBar(tqdm):  # type: ignore[misc]
+    """Bar in one output of a notebook's cell.
+
+    Each line that tqdm writes to stderr would be a further output of a saved notebook.
+    """
+
+    _shown: Any = None
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
+        """Show the line instead of the last one; its place among other lines, `pos`, does not apply."""
+        from IPython.display import display
+
+        line = {"text/plain": str(self) if msg is None else msg}
+        if self._shown is None:
+            self._shown = display(line, raw=True, display_id=True)
+        else:
+            self._shown.update(line, raw=True)
+        return True
 
 
 def progress_over(items: Sequence[Item], title: str, unit: str, *, is_shown: bool = True) -> Iterator[Item]:
@@ -41,7 +72,7 @@ def counting(title: str, total: int | None, unit: str, *, is_shown: bool = True)
     if is_shown and not has_terminal():
         yield PlainCounter(title, total)
         return
-    with tqdm(total=total, desc=title, unit=unit, disable=not is_shown) as bar:
+    with new_bar(total=total, desc=title, unit=unit, disable=not is_shown) as bar:
         yield bar
 
 

@@ -16,11 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from tqdm import tqdm
 
 from a2tg_jax.data.scene import View, view_image
 from a2tg_jax.events import Change, HostEvent, StepEvent
-from a2tg_jax.host.progress_bars import has_terminal, is_line_due
+from a2tg_jax.host.progress_bars import has_terminal, is_line_due, new_bar
 from a2tg_jax.host.text import counted, in_bytes
 from a2tg_jax.parallel.sharded_rows import on_host
 from a2tg_jax.training.batches import BatchOrder
@@ -101,7 +100,7 @@ class ProgressBar:
         after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
     ):  # fmt: skip
         is_bar = is_shown and has_terminal()
-        self._bar = tqdm(
+        self._bar = new_bar(
             desc=f"{title} (compiling)", initial=done, total=total, disable=not is_bar, unit="it",
             dynamic_ncols=True, mininterval=0.5, bar_format=BAR,
         )  # fmt: skip
