@@ -129,12 +129,12 @@ class Upscale(HostEvent):
         return bytes_of(self.budget_mb)
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
-        if self.select == "budget":
-            return max(num_bytes, self._budget_bytes)
-        # Most of those that grow have grown before; how many will pass a threshold is unknown.
-        share = self.fraction if self.select == "fraction" else USUAL_SHARE
         # Each time doubles both sides at most.
         texels = min(4.0 ** len(self.iterations(num_iterations)), self.cap**2)
+        if self.select == "budget":
+            return max(num_bytes, min(self._budget_bytes, num_bytes + BYTES_PER_TEXEL * num * texels))
+        # Most of those that grow have grown before; how many will pass a threshold is unknown.
+        share = self.fraction if self.select == "fraction" else USUAL_SHARE
         return num_bytes + BYTES_PER_TEXEL * num * share * (texels - 1)
 
     def with_room(

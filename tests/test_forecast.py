@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import io
 import re
 import sys
 from types import SimpleNamespace
@@ -19,11 +20,10 @@ from a2tg_jax.core.cameras import resize_camera
 from a2tg_jax.data.photo_store import Picture
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.host import machine, progress_bars
+from a2tg_jax.host.machine import allowed_memory
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.results import forecast
 from a2tg_jax.results.forecast import (
     RunForecast,
-    allowed_memory,
     doubts_about,
     forecast_run,
     print_forecast,
@@ -32,9 +32,9 @@ from a2tg_jax.results.forecast import (
     time_after,
 )
 from a2tg_jax.results.record import RunRecord, SceneSource, plan_run
-from a2tg_jax.training import SYSTEMS, cost, reports
+from a2tg_jax.training import SYSTEMS, cost, fitting, reports
 from a2tg_jax.training.corrections import BilateralGrid, sliced
-from a2tg_jax.training.cost import Bytes, forecast_stages, stage_bytes
+from a2tg_jax.training.cost import Bytes, check_rows_fit, forecast_stages, stage_bytes
 from a2tg_jax.training.loop import StageRun
 from a2tg_jax.training.options import Corrections
 from a2tg_jax.training.reports import Pace, RestOfRun
@@ -213,7 +213,7 @@ def test_a_system_names_its_own_limit(system, option):
     ],
 )
 def test_the_forecast_of_a_long_run_has_quicker_flags(monkeypatch, capsys, tmp_path, preset, size, flags):
-    monkeypatch.setattr(forecast, "memory_limit", lambda: 10**12)
+    monkeypatch.setattr(machine, "memory_limit", lambda: 10**12)
     record = RunRecord(SceneSource("fox", downscale=2), "a2tg", a2tg.A2tg.preset(preset), preset=preset)
     print_forecast(scene_of(*size), record, None, out=tmp_path)
     assert (f"\nquicker on CPUs: {flags} takes minutes\n" in capsys.readouterr().out) == (flags is not None)
@@ -233,26 +233,27 @@ def test_a_forecast_is_two_lines_of_text(capsys, monkeypatch):
         f"memory: about 1.50 GB at the peak ({parts}); 8.00 GB may be used",
         "disk: about 3.00 MB in the run folder",
     ]
-    monkeypatch.setattr(forecast, "memory_limit", lambda: 64 * 10**9)
+    monkeypatch.setattr(machine, "memory_limit", lambda: 64 * 10**9)
     print_forecast(SMALL, RunRecord(SceneSource("synthetic"), "a2tg", a2tg.A2tg.preset("smoke")), None)
     assert "64.0 GB may be used\ndisk: about " in capsys.readouterr().out
 
 
 def test_on_an_accelerator_its_own_memory_counts(monkeypatch):
     class Device:
+        platform = "gpu"
+
         def memory_stats(self):
             return {"bytes_limit": 6 * 10**9}
 
     scene, system = scene_of(600, 400), a2tg.Gaussians2dMcmc()
-    monkeypatch.setattr(forecast, "default_platform", lambda: "gpu")
-    monkeypatch.setattr(forecast, "default_device", Device)
+    monkeypatch.setattr(machine, "default_device", Device)
     found = run_of(scene, system)
     assert allowed_memory(None) == 6e9 and allowed_memory(5e9) == 5e9
     assert found.peak[1].program == 0
 
 
 def test_the_model_must_fit_on_one_of_several_devices(monkeypatch):
-    monkeypatch.setattr(forecast, "memory_limit", lambda: 10**12)
+    monkeypatch.setattr(machine, "memory_limit", lambda: 10**12)
     scene, capped = SMALL, a2tg.Mcmc(cap=10**6)
     pruned = a2tg.Gaussians2dMcmc(densify=capped, prune=Prune(share=0.1, at=(0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)))
     record, found = RunRecord(SceneSource("synthetic"), "gaussians-2d-mcmc", pruned), run_of(scene, pruned)
@@ -267,6 +268,76 @@ def test_the_model_must_fit_on_one_of_several_devices(monkeypatch):
     with pytest.raises(ValueError, match="must fit on one device"):
         print_forecast(scene, record, 2 * 10**8, 2)
     print_forecast(scene, record, 2 * 10**8)
+
+
+BEYOND_ANY_MACHINE = 10**9  # MB, 10^15 bytes
+TOO_MANY = dict(memory_budget=BEYOND_ANY_MACHINE), dict(densify=a2tg.CloneSplitPrune(cap=10**12))
+
+
+@pytest.mark.parametrize("options", TOO_MANY)
+def test_rows_beyond_the_machine_are_refused_before_they_are_allocated(monkeypatch, options):
+    monkeypatch.setattr(fitting, "StageRun", lambda *args: pytest.fail("the stage began"))
+    scene, (name,) = a2tg.synthetic_scene(), options
+    kind = a2tg.A2tg if name == "memory_budget" else a2tg.Gaussians2d
+    system, wanted = kind.preset("smoke", **options), "memory_budget of 1,000,000,000 MB is too large for this machine "
+    if name == "densify":
+        wanted = "densify.cap is too large for this machine "
+    start = initial_model(scene, kind.preset("smoke"))
+    for train in (
+        lambda: a2tg.fit(scene, system, progress=False),
+        lambda: a2tg.fit(scene, system, start=start, progress=False),
+        lambda: a2tg.fit_stage(scene, system, 0, progress=False),
+    ):
+        with pytest.raises(ValueError, match=f"^{wanted}.*Gaussians of 232 bytes, and 4 copies .* may be used: lower"):
+            train()
+
+
+def test_a_later_stage_beyond_the_machine_is_refused_before_the_first(monkeypatch):
+    """The first stage takes 232 of the 312 bytes that the budget allows per Gaussian."""
+    scene, system = a2tg.synthetic_scene(), a2tg.A2tg.preset("smoke", memory_budget=1)
+    limits = {first: 4 * forecast.model_bytes for first, forecast in enumerate(forecast_stages(scene, system))}
+    assert limits[0] < limits[1] == 4 * MB
+    monkeypatch.setattr(machine, "memory_limit", lambda: limits[1])
+    check_rows_fit(scene, system, 0, None, machine.ALONE)
+    monkeypatch.setattr(machine, "memory_limit", lambda: limits[1] - 1)
+    for first, num_start in ((0, None), (1, 3205)):
+        with pytest.raises(ValueError, match=r"stage 'textures' trains up to 3,205 .* at least 4.00 MB"):
+            check_rows_fit(scene, system, first, num_start, machine.ALONE)
+    check_rows_fit(scene, system, 0, None, machine.ALONE, max_memory=limits[1])
+    check_rows_fit(scene, system, 0, None, machine.Devices(1, 2))  # Other machines' memory is not known.
+
+
+def test_the_start_is_named_if_it_is_too_large(monkeypatch):
+    monkeypatch.setattr(machine, "memory_limit", lambda: 10**6)
+    system = a2tg.Gaussians2dMcmc.preset("smoke", densify=a2tg.Mcmc(cap=0))
+    with pytest.raises(ValueError, match=r"^start is too large .* up to 2,000 Gaussians"):
+        check_rows_fit(SMALL, system, 0, 2000, machine.ALONE)
+
+
+def test_max_memory_allows_what_a_machine_does_not_report(monkeypatch):
+    monkeypatch.setattr(machine, "memory_limit", lambda: 10**5)
+    scene, system = a2tg.synthetic_scene(num_views=4), a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=2)
+    with pytest.raises(ValueError, match=r"densify\.cap is too large .* allow more with max_memory"):
+        a2tg.fit_stage(scene, system, 0, progress=False)
+    assert a2tg.fit_stage(scene, system, 0, progress=False, max_memory=10**8).model.num > 1
+
+
+@pytest.mark.parametrize("group", ["texture", "view_dependence"])
+def test_a_budget_that_an_event_cannot_reach_is_no_need(group):
+    """Textures grow twice, to 16 texels at most, and 16 harmonics have 48 numbers."""
+    num, events = 100, dict(
+        texture=a2tg.Upscale(select="budget", budget_mb=BEYOND_ANY_MACHINE, at=(0.1, 0.2)),
+        view_dependence=a2tg.AdaptDegrees(budget_mb=BEYOND_ANY_MACHINE),
+    )  # fmt: skip
+    room = dict(texture=16 * 16 * num, view_dependence=4 * 48 * num)
+    assert events[group].most_bytes(1000.0, num, 100) == 1000 + room[group]
+
+
+def test_the_command_refuses_a_budget_beyond_the_machine(capsys, tmp_path):
+    args = ["train", "synthetic", "--preset", "smoke", "--memory-budget", f"{BEYOND_ANY_MACHINE}MB"]
+    assert cli.main([*args, "--out", str(tmp_path / "run")]) == 2
+    assert re.search(r"the run would need about .* change --memory-budget", capsys.readouterr().err)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(("batch_size", "at_once"), [(4, 4), (6, 2), (3, 1)])
@@ -292,7 +363,7 @@ def test_an_event_holds_the_old_state_and_the_new_one():
 
 
 def test_on_a_cpu_the_memory_that_is_free_counts(monkeypatch):
-    monkeypatch.setattr(forecast, "memory_limit", lambda: 123 * MB)
+    monkeypatch.setattr(machine, "memory_limit", lambda: 123 * MB)
     assert allowed_memory(None) == 123 * MB and allowed_memory(1.0) == 1
     assert machine.memory_limit() > MB
     assert room_for_photographs(8 * 10**9) == 2 * 10**9  # A quarter of what is allowed.
@@ -428,3 +499,27 @@ def test_without_a_terminal_tenths_are_plain_lines(capsys, monkeypatch):
             bar.update(info, None)
     lines = capsys.readouterr().err.splitlines()
     assert lines[:2] == ["a-stage: compiling", "a-stage: 2 of 20, loss 0.5000, 20.00 dB"] and len(lines) == 11
+
+
+def test_in_a_notebook_a_bar_is_one_output(capsys, monkeypatch):
+    """Each output of a cell that is shown, with all lines that replaced one another."""
+    outputs = []
+
+    def display(line, *, raw, display_id):
+        assert raw and display_id
+        outputs.append([line["text/plain"]])
+        return SimpleNamespace(update=lambda line, raw, place=outputs[-1]: place.append(line["text/plain"]))
+
+    monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=display))
+    stream = type("OutStream", (io.StringIO,), {"__module__": "ipykernel.iostream"})()
+    monkeypatch.setattr(sys, "stderr", stream)
+    assert list(progress_bars.progress_over([1, 2, 3], "frames", "frame")) == [1, 2, 3]
+    info = SimpleNamespace(loss=0.5, psnr=20.0)
+    with reports.ProgressBar("a-stage", 0, 20, is_shown=True) as bar:
+        for _ in range(20):
+            bar.update(info, None)
+    frames, stage = outputs
+    assert "| 0/3 " in frames[0] and "| 3/3 " in frames[-1]
+    assert "a-stage (compiling)" in stage[0] and "a-stage: 100%" in stage[-1] and "| 20/20 " in stage[-1]
+    assert list(progress_bars.progress_over([1], "frames", "frame", is_shown=False)) == [1]
+    assert len(outputs) == 2 and not stream.getvalue() and not capsys.readouterr().out

@@ -87,7 +87,8 @@ class AdaptDegrees(HostEvent):
         return 0  # Tables have room, unless degrees may take more than half of the budget.
 
     def most_bytes(self, num_bytes: float, num: int, num_iterations: int) -> float:
-        return max(num_bytes, bytes_of(self.budget_mb))
+        of_bands = BYTES_PER_FLOAT * 3 * NUM_BASES[self.highest] * num
+        return max(num_bytes, min(bytes_of(self.budget_mb), num_bytes + of_bands))
 
     def with_room(
         self, model: Model, moments: AdamState, num_bytes: float, num_iterations: int

@@ -130,6 +130,15 @@ def memory_limit(root: Path = Path("/")) -> int:
     return int(process.memory_info().rss) + max(0, min(left))
 
 
+def allowed_memory(max_memory: int | None, num_devices: int = 1) -> int:
+    """Return the bytes a run may use: the given limit, or what the machine or its accelerators have available."""
+    if max_memory is not None:
+        return max_memory
+    # CPUs have no such figures.
+    stats = default_device().memory_stats() or {}
+    return num_devices * stats.get("bytes_limit", 0) or memory_limit()
+
+
 @functools.cache
 def check_ulimits() -> None:
     """Check `ulimit` before JAX starts, which would end the process without a message.

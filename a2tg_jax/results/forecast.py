@@ -10,7 +10,7 @@ from pathlib import Path
 from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.data.scene import Scene
-from a2tg_jax.host.machine import default_device, default_platform, memory_limit
+from a2tg_jax.host.machine import allowed_memory, default_platform
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.results.record import MEMORY_OF_FILE, RunPlan, RunRecord
 from a2tg_jax.training.cost import (
@@ -245,15 +245,6 @@ def quick_flags(longest_side: int, downscale: int = 1) -> str:
     """Return the flags of a quick training with photographs of this longer side, already downscaled by a factor."""
     downscale *= max(1, math.ceil(longest_side / QUICK_SIDE))
     return "--preset quick" + (f" --downscale {downscale}" if downscale > 1 else "")
-
-
-def allowed_memory(max_memory: int | None, num_devices: int = 1) -> int:
-    """Return the bytes a run may use: the given limit, or what the machine or its accelerators have available."""
-    if max_memory is not None:
-        return max_memory
-    # CPUs have no such figures.
-    stats = default_device().memory_stats() or {}
-    return num_devices * stats.get("bytes_limit", 0) or memory_limit()
 
 
 def room_for_photographs(max_memory: int | None) -> int | None:

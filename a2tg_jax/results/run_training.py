@@ -233,7 +233,13 @@ def train_run(
     """
     record = read_record(run)
     fit = functools.partial(
-        fit_stage, scene, progress=options.progress, is_stopped=is_stopped, watch=watch, session=options.session
+        fit_stage,
+        scene,
+        progress=options.progress,
+        is_stopped=is_stopped,
+        watch=watch,
+        session=options.session,
+        max_memory=options.max_memory,
     )
     num_given = None if record.init is None else number_in_file(run.model(record.plan.main[0]))
     to_train = [name for name in record.plan.names if not run.model(name).is_file()]

@@ -14,11 +14,12 @@ from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.data.scene import Scene, View, ray_bytes
 from a2tg_jax.events import HostEvent, StepEvent
-from a2tg_jax.host.machine import default_platform, num_threads
+from a2tg_jax.host.machine import Devices, allowed_memory, default_platform, num_threads
+from a2tg_jax.host.text import in_bytes
 from a2tg_jax.training.batches import plan_batches, view_bytes
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Stage
-from a2tg_jax.training.start import initial_number
+from a2tg_jax.training.start import initial_number, rows_needed
 
 MB = 10**6
 PROCESS = 300 * MB
@@ -96,21 +97,29 @@ class StageForecast:
 
 
 def forecast_stages(
-    scene: Scene, system: System, num_given: int | None = None, num_devices: int = 1
+    scene: Scene,
+    system: System,
+    num_given: int | None = None,
+    num_devices: int = 1,
+    first: int = 0,
+    num_start: int | None = None,
 ) -> Iterator[StageForecast]:
     """Yield the forecast of each stage of a system (host; nothing is compiled).
 
     If a file gives Gaussians instead of the first stage, `num_given` is their number. Bytes are of all devices that
-    train together.
+    train together. Stages before `first` are left out; that one starts from `num_start` Gaussians, or, if it is None,
+    from Gaussians at the scene's points.
     """
     stages = system.all_stages()
     mean_pixels = sum(view.camera.width * view.camera.height for view in scene.train) / len(scene.train)
-    num, floats, shared, shown = initial_number(scene, system, stages[0]), 0.0, 0, None
+    num = initial_number(scene, system, stages[0]) if num_start is None else num_start
+    stages = stages[first:]
+    floats, shared, shown = 0.0, 0, None
     if num_given is not None:
         num, stages = num_given, stages[1:]
         yield StageForecast(Bytes(), system.initial_bytes * num, num, num_programs=0, seconds=0, whole_bytes=0)
     for stage in stages:
-        num = max([num, *(event.num_rows(num, stage.iterations) for event in stage.events)])
+        num = rows_needed(stage, num, system)
         if stage.appearance != shown:
             floats, shown = stage.floats_shown(system.initial_sh_degree), stage.appearance
             shared = stage.shared_bytes
@@ -127,6 +136,41 @@ def forecast_stages(
         yield StageForecast(needed, model_bytes, num, programs, seconds / num_threads(), whole)
         for event in stage.events:
             num = event.num_after(num, stage.iterations)
+
+
+def check_rows_fit(
+    scene: Scene, system: System, first: int, num_start: int | None, devices: Devices, max_memory: int | None = None
+) -> None:
+    """Check that a system's stages from `first` on can be held in memory, before rows are allocated.
+
+    Only parameters, moments and gradients count, so that nothing is refused that would fit. Several processes are not
+    checked, because each knows the memory of its own machine alone.
+
+    Raises:
+      ValueError: if it exceeds `max_memory` bytes, or, if that is None, the memory of the machine or the GPU, naming
+        the options to change.
+    """
+    if devices.processes > 1:
+        return
+    limit = allowed_memory(max_memory, devices.each)
+    copies = STATES + 1
+    forecasts = forecast_stages(scene, system, first=first, num_start=num_start)
+    for stage, found in zip(system.all_stages()[first:], forecasts, strict=True):
+        needed = copies * found.model_bytes
+        if needed <= limit:
+            continue
+        names = " or ".join(system.limits())
+        if system.memory_budget is not None:
+            names += f" of {system.memory_budget:,.15g} MB"
+        elif num_start is not None and found.num_rows == num_start:
+            names = "start"
+        place = "this machine (its container and ulimit included)" if default_platform() == "cpu" else "the GPU"
+        raise ValueError(
+            f"{names} is too large for {place}: stage {stage.name!r} trains up to {found.num_rows:,} Gaussians of "
+            f"{found.model_bytes / found.num_rows:,.0f} bytes, and {copies} copies of them (parameters, gradients and "
+            f"two moments) take at least {in_bytes(needed)} of memory, but {in_bytes(limit)} may be used: lower it, to "
+            f"a model of less than {in_bytes(limit / copies)}, or allow more with max_memory"
+        )
 
 
 def stage_bytes(

@@ -18,6 +18,7 @@ from a2tg_jax.model import Model
 from a2tg_jax.parallel.sharded_rows import on_host
 from a2tg_jax.training.checkpoint import Checkpoint, History, check_resume
 from a2tg_jax.training.corrections import corrected_origin
+from a2tg_jax.training.cost import check_rows_fit
 from a2tg_jax.training.loop import IsStopped, OnCheckpoint, OnLog, Session, StageRun, Watch, never, unwatched
 from a2tg_jax.training.options import System
 from a2tg_jax.training.reports import RestOfRun
@@ -129,6 +130,7 @@ def fit(
     progress: bool = True,
     is_stopped: IsStopped = never,
     session: Session | None = None,
+    max_memory: int | None = None,
 ) -> FitResult:
     """Train all stages of a system on a scene, each from the result of the one before.
 
@@ -149,6 +151,8 @@ def fit(
       is_stopped: called between steps and after the last. If it returns True, `on_checkpoint` is called once more and
         `Interrupted` is raised. The first Ctrl-C does the same, unless the program handles it.
       session: what trainings of this process share, compiled shapes and devices; None: a new one.
+      max_memory: bytes that the parameters, gradients and moments of all rows may take; None: what the machine or the
+        GPU has available. Training that needs more is refused before it begins.
 
     Returns:
       The trained model, `result.model`, and what its stages logged.
@@ -156,7 +160,8 @@ def fit(
     Raises:
       Interrupted: if training is stopped; a KeyboardInterrupt with the `checkpoint` to resume from.
       DivergedError: if the loss or a gradient is not finite, or the loss explodes; the error holds the state before.
-      ValueError: if options contradict each other, the scene or the checkpoint.
+      ValueError: if options contradict each other, the scene or the checkpoint, or allow more Gaussians than
+        `max_memory` can hold.
 
     Examples:
       >>> system = a2tg.Gaussians2dMcmc.preset("smoke", stage1_iterations=20)
@@ -183,6 +188,8 @@ def fit(
         start = given_start(start, scene, system, 0)
     check_loss_data(scene.train, stages[first:])
     session = session or Session()
+    if resume is None:
+        check_rows_fit(scene, system, 0, None if start is None else start.num, session.devices, max_memory)
     results: list[StageResult] = []
     with signals.noted((signals.CTRL_C,)) as is_interrupted:
         for index in range(first, len(stages)):
@@ -256,6 +263,7 @@ def fit_stage(
     watch: Watch = unwatched,
     session: Session | None = None,
     after: RestOfRun = RestOfRun(),  # noqa: B008 - immutable
+    max_memory: int | None = None,
 ) -> StageResult:
     """Train one stage of a system.
 
@@ -277,6 +285,7 @@ def fit_stage(
         waited, which do not count as training time.
       session: as in `fit`.
       after: what follows the stage, for the remaining time that is shown.
+      max_memory: as in `fit`.
 
     Returns:
       The model after the stage, and its history.
@@ -299,6 +308,9 @@ def fit_stage(
         check_resume(resume, system, index)
     elif start is not None:
         start = given_start(start, scene, system, index)
+    session = session or Session()
+    if resume is None:
+        check_rows_fit(scene, system, index, None if start is None else start.num, session.devices, max_memory)
     run = StageRun(scene, system, index, start, resume, num_restored, session)
     run.train(on_checkpoint, checkpoint_every, progress, title, is_stopped, watch, on_log, after)
     return _result_of(run, scene, is_last=index == len(stages) - 1)

@@ -109,7 +109,7 @@ def check_start(scene: Scene, system: System) -> None:
     first = system.stages()[0]
     _check_seen("scene.points", np.asarray(scene.points), scene)
     num = initial_number(scene, system, first)
-    _rows_needed(first, num, system)
+    rows_needed(first, num, system)
     system.check_number(num)
 
 
@@ -248,7 +248,7 @@ def _limit_of(event: Event, system: System) -> str:
     return f"{system.path_of(event)}.{event.limited_by}" if system.memory_budget is None else "memory_budget"
 
 
-def _rows_needed(stage: Stage, num: int, system: System) -> int:
+def rows_needed(stage: Stage, num: int, system: System) -> int:
     """Return the rows that a stage allocates for `num` Gaussians. ValueError: naming the options to change, if an event
     cannot reach its number."""
     rows = num
@@ -289,7 +289,7 @@ def padded(model: Model, stage: Stage, system: System, num_devices: int = 1) -> 
                 f"{most:,}: none is added",
                 stacklevel=2,
             )
-    room = -(-_rows_needed(stage, num, system) // num_devices) * num_devices
+    room = -(-rows_needed(stage, num, system) // num_devices) * num_devices
     if shapes is not None and stage.appearance.exponents is None:
         warnings.warn(
             f"stage {stage.name!r} has no shapes of kernels: it takes the Gaussians nearest to the model's kernels",
