@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import platform
 import re
 import shutil
 import signal
@@ -129,15 +130,18 @@ def test_left_over_partial_files_are_deleted_and_others_stay(tmp_path):
     folder.mkdir()
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    names = f"a.npz.{os.getppid()}", f"a.npz.{os.getpid()}0", f"a.npz.{ended.pid}", "a.npz.txt.1"
-    young, old, killed, other = (folder / f".{name}.partial" for name in names)
-    for path in (young, old, killed, other):
+    names = (
+        f"a.npz.{os.getppid()}", f"a.npz.{os.getpid()}0", f"a.npz.{ended.pid}", f"a.npz.{ended.pid}@{platform.node()}",
+        f"a.npz.{ended.pid}@another", "a.npz.txt.1",
+    )  # fmt: skip
+    young, old, _, _, elsewhere, other = paths = [folder / f".{name}.partial" for name in names]
+    for path in paths:
         path.touch()
     for path in (old, other):
         os.utime(path, (0, 0))
     with replacing(folder / "a.npz") as temporary:
         temporary.touch()
-    assert {path.name for path in folder.iterdir()} == {"a.npz", young.name, other.name}
+    assert {path.name for path in folder.iterdir()} == {"a.npz", young.name, elsewhere.name, other.name}
 
 
 @pytest.mark.parametrize("name", ["iterdir", "unlink"])

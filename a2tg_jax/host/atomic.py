@@ -4,6 +4,7 @@ import contextlib
 import errno
 import functools
 import os
+import platform
 import re
 import time
 from collections.abc import Iterator
@@ -13,8 +14,9 @@ import psutil
 
 from a2tg_jax.host.operating_system import flush_folder
 
-PARTIAL = re.compile(r"\.(.+)\.\d+\.partial")
-"""Name of a partial file: the name of the final file, and the process."""
+PARTIAL = re.compile(r"\.(.+)\.(\d+)(?:@([^@]*))?\.partial")
+"""Name of a partial file: the name of the final file, the process, and its machine, because disks may be shared.
+Earlier files lack the machine."""
 STALE_SECONDS = 3600.0
 """Seconds without a change after which a partial file counts as left over, though its process seems to run: another
 process may have got the number."""
@@ -39,7 +41,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         for partial, whole in _left_over_once(path.absolute().parent).items():
             if whole == path.absolute() and is_left_over(partial):
                 partial.unlink()
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")  # os.replace cannot move between disks.
+    # In the same folder, because os.replace cannot move between disks.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}@{platform.node()}.partial")
     try:
         with named_if_full(path):
             yield temporary
@@ -101,9 +104,13 @@ def left_over(folder: Path) -> dict[Path, Path]:
 
 
 def is_left_over(partial: Path) -> bool:
-    """Return whether the process of a partial file no longer runs, or has not written to it for an hour."""
-    number = int(partial.name.split(".")[-2])
-    return not psutil.pid_exists(number) or time.time() - partial.stat().st_mtime > STALE_SECONDS
+    """Return whether the process of a partial file no longer runs, as far as this machine knows, or has not written to
+    it for an hour."""
+    name = PARTIAL.fullmatch(partial.name)
+    assert name is not None, "one of `left_over`"
+    is_here = name[3] in (None, platform.node())
+    has_ended = is_here and not psutil.pid_exists(int(name[2]))
+    return has_ended or time.time() - partial.stat().st_mtime > STALE_SECONDS
 
 
 # Once per folder and process: a folder of frames has thousands of entries.
