@@ -13,6 +13,7 @@ from jax import Array
 from jax.typing import DTypeLike
 
 from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_number, check_numeric, check_shape
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.host.text import shortened
 
@@ -24,7 +25,7 @@ with warnings.catch_warnings():
 
 
 @pytree
-class AdamState:
+class AdamState(NamedFields):
     """State of Adam; `mu` and `nu` have the structure, shapes and dtypes of the parameters."""
 
     mu: Any

@@ -151,7 +151,7 @@ class Mask(NamedFields):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class DepthMap:
+class DepthMap(NamedFields):
     """A depth map of a view, loaded each time it is read."""
 
     shape: tuple[int, int]

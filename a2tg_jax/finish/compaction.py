@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from a2tg_jax.core.cameras import Camera
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import Color
 from a2tg_jax.data.scene import View, check_are_views, view_image
 from a2tg_jax.host.progress_bars import progress_over
@@ -48,7 +49,7 @@ LEAST_LOSS = 1e-4
 
 
 @dataclasses.dataclass(frozen=True)
-class Trial:
+class Trial(NamedFields):
     """A file, measured."""
 
     choices: CompactChoices

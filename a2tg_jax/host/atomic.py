@@ -104,8 +104,8 @@ def left_over(folder: Path) -> dict[Path, Path]:
 
 
 def is_left_over(partial: Path) -> bool:
-    """Return whether the process of a partial file no longer runs, as far as this machine knows, or has not written to
-    it for an hour."""
+    """Return whether the process of a partial file was one of this machine and has ended, or has not written to it for
+    an hour."""
     name = PARTIAL.fullmatch(partial.name)
     assert name is not None, "one of `left_over`"
     is_here = name[3] in (None, platform.node())

@@ -12,6 +12,7 @@ from jax import Array
 
 from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.gaussians import Gaussians, check_gaussians
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.origin import Color
 from a2tg_jax.data.scene import View, check_are_views, view_image
 from a2tg_jax.host.text import counted
@@ -30,7 +31,7 @@ NUM_TIMED = 8
 
 
 @dataclasses.dataclass(frozen=True)
-class ViewMetrics:
+class ViewMetrics(NamedFields):
     """Quality of one view, its image clipped to [0, 1]."""
 
     name: str
@@ -46,7 +47,7 @@ class ViewMetrics:
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluation:
+class Evaluation(NamedFields):
     """Quality of all views, and rendering speed."""
 
     per_view: tuple[ViewMetrics, ...]

@@ -19,6 +19,7 @@ from jax import Array
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.checks import check_kind, check_shape, plain_array
 from a2tg_jax.core.gaussians import Gaussians
+from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.host.npz import read_npz
 from a2tg_jax.host.regular_files import expanded, is_regular
@@ -86,7 +87,7 @@ def ssim(image: Array, target: Array, mask: Array | None = None) -> Array:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class LpipsWeights:
+class LpipsWeights(NamedFields):
     """A feature network and the linear layers that weight its channels (LPIPS v0.1)."""
 
     network: str

@@ -86,7 +86,7 @@ class RenderSettings(NamedFields):
 
 
 @pytree
-class Geometry:
+class Geometry(NamedFields):
     """Depth, normal and distortion of a view: weighted sums, not divided by alpha, without the background."""
 
     depth: Array
