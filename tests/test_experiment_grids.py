@@ -30,7 +30,7 @@ NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("
 @pytest.mark.parametrize(
     ("name", "scale"),
     [
-        pytest.param(name, scale, marks=pytest.mark.long if scale in ("full", "long") else ())
+        pytest.param(name, scale, marks=pytest.mark.long if scale in ("full", "long", "paper160") else ())
         for name, scale in itertools.product(NAMES, SCALES)
         if has_scale(name, scale) and (name, scale) != ("bytewise", "protocol")  # It needs choices.
     ],

@@ -13,7 +13,7 @@ from a2tg_jax.io.config_json import config_from_dict
 
 GRIDS = Path(__file__).resolve().parents[1] / "grids"
 SUFFIX = ".toml"
-SCALES = ("full", "long", "protocol", "protocol160", "small", "smoke")
+SCALES = ("full", "long", "paper160", "protocol", "protocol160", "small", "smoke")
 ONE_BYTE = 1e-6
 """A byte in MB."""
 LEAST = {
@@ -75,6 +75,7 @@ class GridFile:
     variants: dict[str, Any] = dataclasses.field(default_factory=dict)
     full: dict[str, Any] | None = None
     long: dict[str, Any] | None = None
+    paper160: dict[str, Any] | None = None
     protocol: dict[str, Any] | None = None
     protocol160: dict[str, Any] | None = None
     small: dict[str, Any] | None = None

@@ -221,7 +221,7 @@ def _training_facts(job: Job, scene: a2tg.Scene, result: a2tg.StageResult) -> Re
         "published_mb": result.model.num_published_bytes / 1e6, "sizes": texture_sizes(result.model),
         "seconds": result.seconds, "ms_per_step": milliseconds(result.history),
         "step_seconds": step_seconds(result.history), "seed": job.system.seed, "views": job.views,
-        "commit": source_commit(), "threads": num_threads(),
+        "commit": source_commit(), "device": jax.devices()[0].device_kind, "threads": num_threads(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         **({"random_start": True} if job.random_start else {}),
     }  # fmt: skip

@@ -90,6 +90,8 @@ STANDARD = (
     table_experiment("degree_0", "The paper's claim with every method at degree 0 (PROTOCOL.md)."),
     table_experiment("degree_1", "The paper's claim with every method at degree 1 (PROTOCOL.md)."),
     table_experiment("degree_3", "The paper's claim with every method at degree 3 (PROTOCOL.md)."),
+    table_experiment("paper_degree_3", "The paper's comparison at its length, at degree 3 (PROTOCOL.md)."),
+    table_experiment("paper_degree_0", "The paper's comparison at its length, at degree 0 (PROTOCOL.md)."),
     table_experiment("bytewise", "bytewise against the best plain method of each scene (PROTOCOL.md)."),
     table_experiment("parts", "What each part of bytewise brings (PROTOCOL.md)."),
 )
