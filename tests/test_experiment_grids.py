@@ -24,13 +24,14 @@ import a2tg_jax as a2tg
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.training.terms import Term
 
+LARGE_SCALES = ("full", "full_size", "half_size", "long", "paper160")
 NAMES = sorted(path.stem for path in GRIDS.glob("*.toml") if path.stem not in ("methods", "scales"))
 
 
 @pytest.mark.parametrize(
     ("name", "scale"),
     [
-        pytest.param(name, scale, marks=pytest.mark.long if scale in ("full", "long", "paper160") else ())
+        pytest.param(name, scale, marks=pytest.mark.long if scale in LARGE_SCALES else ())
         for name, scale in itertools.product(NAMES, SCALES)
         if has_scale(name, scale) and (name, scale) != ("bytewise", "protocol")  # It needs choices.
     ],
@@ -122,6 +123,25 @@ def test_all_experiments_of_a_scale_are_those_whose_grids_have_it():
     assert {"fixed_memory", "ablation"} <= names < set(known)
     everywhere = {found.name for found in chosen(known, parse_arguments(known, ["all", "--scale", "smoke"]))}
     assert everywhere == set(known)
+
+
+@pytest.mark.parametrize("name", ["paper_degree_3", "paper_degree_0"])
+def test_the_papers_size_runs_in_the_order_of_the_protocol(name):
+    whole, half = (read_grid(name, scale) for scale in ("full_size", "half_size"))
+    sizes = [(cell.gaussians, cell.scene.path) for cell in whole.cells]
+    assert sizes == list(itertools.product((100_000, 300_000), ("snowmiku", "herz_jesus_p25", "fox")))
+    assert sizes == [(cell.gaussians, cell.scene.path) for cell in half.cells]
+    assert {(cell.scene.downscale, cell.iterations) for cell in whole.cells} == {(1, (10_000, 10_000))}
+    assert {(cell.scene.downscale, cell.iterations) for cell in half.cells} == {(2, (10_000, 10_000))}
+    assert not {cell.scene.label for cell in whole.cells} & {cell.scene.label for cell in half.cells}
+    first = next(whole.jobs({}))
+    runs = list(whole.runs({first.key: record(mb=31.5)}))[:5]
+    systems = ["a2tg", "gaussians-2d-mcmc", "gaussians-2d-mcmc", "textured-gaussians", "bytewise"]
+    assert [run.job.system.name for run in runs] == systems
+    assert {(run.job.scene, run.job.system.tile_size) for run in runs} == {("snowmiku", 16)}
+    assert [run.job.all_iterations for run in runs][1:3] == [(10_000, 10_000), (10_000,)]
+    assert {run.job.system.sh_degree for run in runs[:4]} == {int(name[-1])}
+    assert runs[4].job.system.memory_budget == 31.5, "its Gaussians differ in size"
 
 
 def test_scenes_are_chosen():
