@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-EXTENT = 3.0
-"""A texture covers this many standard deviations on each side of the mean."""
 MIN_ALPHA = 1 / 255
 MIN_TRANSMITTANCE = 1e-4
 
@@ -48,6 +46,7 @@ class Rules(NamedTuple):
     rgb: str = "signed"
     alpha: str = "projected"
     max_alpha: float = 0.99
+    extent: float = 3.0  # A texture covers this many standard deviations on each side of the mean.
 
 
 OFFICIAL = Rules(uv="align-corners", outside="identity", rgb="unit", alpha="global-maximum", max_alpha=0.999)
@@ -156,8 +155,8 @@ def lookup(texture: Float, u: Float, v: Float, rules: Rules) -> tuple[Float, Flo
     if rules.outside == "clamp":
         return texel, np.full(u.shape, np.inf), np.minimum(kink_x, kink_y)
     largest = np.maximum(abs(u), abs(v))
-    texel = np.where((largest > EXTENT)[..., None], [0.0, 0.0, 0.0, 1.0], texel)
-    return texel, abs(largest / EXTENT - 1), np.minimum(kink_x, kink_y)
+    texel = np.where((largest > rules.extent)[..., None], [0.0, 0.0, 0.0, 1.0], texel)
+    return texel, abs(largest / rules.extent - 1), np.minimum(kink_x, kink_y)
 
 
 def shown_texture(scene: Scene, i: int, rules: Rules) -> Float:
@@ -175,7 +174,7 @@ def shown_texture(scene: Scene, i: int, rules: Rules) -> Float:
 
 def texel_position(u: Float, size: int, rules: Rules) -> tuple[Float, Float]:
     """Position in [0, size - 1] along one axis of a texture, and its distance in texels from a change of slope."""
-    unit = (u / EXTENT + 1) / 2
+    unit = (u / rules.extent + 1) / 2
     free = unit * (size - 1) if rules.uv == "align-corners" else unit * size - 0.5
     if size == 1:
         return np.zeros_like(u), np.full(u.shape, np.inf)

@@ -263,7 +263,7 @@ def as_settings(rules: Rules = DEFAULT_RULES, **changes: Any) -> RenderSettings:
     if changes.get("compositor") == "native" and jax.default_backend() == "gpu":
         changes["compositor"] = "cuda"
     plain = RenderSettings()
-    options = {name: getattr(rules, name) for name in ("uv", "outside", "rgb", "alpha", "max_alpha")}
+    options = {name: getattr(rules, name) for name in ("uv", "outside", "rgb", "alpha", "max_alpha", "extent")}
     texture = dataclasses.replace(plain.texture, **options)
     return dataclasses.replace(plain, near_plane=rules.near, sh_degree=rules.sh_degree, texture=texture, **changes)
 

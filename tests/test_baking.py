@@ -70,12 +70,14 @@ def psnr(model: Model, other: Model) -> float:
     return float(-10 * np.log10(np.mean((found - wanted) ** 2)))
 
 
+CONVENTIONS = [TextureOptions(), TextureOptions("align-corners")]
+
+
 @pytest.mark.parametrize(
-    ("num", "convention"),
-    [(1, "texel-centre"), *itertools.product((2, 4, 8), ("texel-centre", "align-corners"))],
+    ("num", "options"), [(1, TextureOptions()), *itertools.product((2, 4, 8), CONVENTIONS)], ids=str
 )
-def test_kernels_add_up_to_the_gaussian(num, convention):
-    means, scales = kernels(num, convention)
+def test_kernels_add_up_to_the_gaussian(num, options):
+    means, scales = kernels(num, options)
     u = np.linspace(-4, 4, 401)
     each = np.exp(-0.5 * ((u[:, None] - means) / scales) ** 2)
     peaks = np.linalg.lstsq(each, np.exp(-0.5 * u * u), rcond=None)[0]
@@ -99,7 +101,7 @@ def test_a_splat_per_texel_looks_like_the_texture(split):
 def test_small_splats_are_as_opaque_as_the_kernel_at_their_centres(shape):
     """Their optical depths add up to those of the kernel, but at corners, where some would have to be negative."""
     parent = dataclasses.replace(some_gaussians(1), logit_opacities=jnp.asarray([1.0]))
-    means, scales = axis = kernels(4, "texel-centre")
+    means, scales = axis = kernels(4, TextureOptions())
     found = baking._grid(parent, np.asarray([shape]), np.ones((1, 4, 4, 4)), axis, axis)
     mixed = np.exp(-0.5 * ((means[:, None] - means[None]) / scales[None]) ** 2)
     depths = mixed @ -np.log1p(-np.asarray(found.opacities, np.float64)).reshape(4, 4) @ mixed.T

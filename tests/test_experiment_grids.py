@@ -427,6 +427,9 @@ def test_a_fingerprint_is_of_what_decides_the_result():
     assert fingerprint(quick, 1) != fingerprint(other, 1)
     assert fingerprint(quick, 0) == fingerprint(a2tg.find_system("gaussians-2d-mcmc").preset("quick"), 0)
     assert fingerprint(quick, 0) != fingerprint(dataclasses.replace(quick, seed=1), 0)
+    # Records from before the extent keep their keys; another extent has another.
+    narrow = dataclasses.replace(quick, lookup=a2tg.TextureOptions(extent=1.5))
+    assert "extent" not in fingerprint(quick, 1) and fingerprint(quick, 1) != fingerprint(narrow, 1)
 
 
 KEYS = """

@@ -291,7 +291,8 @@ def test_several_meshes_make_one_model(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "is_kept"), [({}, True), ({"uv": "align-corners"}, False), ({"maxAlpha": 0.5}, False)]
+    ("changes", "is_kept"),
+    [({}, True), ({"uv": "align-corners"}, False), ({"extent": 1.5}, False), ({"maxAlpha": 0.5}, False)],
 )
 def test_the_extension_counts_more_than_the_extras(tmp_path, saved, changes, is_kept):
     """Options of training come back unless a program has changed how textures are shown."""
@@ -302,6 +303,7 @@ def test_the_extension_counts_more_than_the_extras(tmp_path, saved, changes, is_
     assert (template_of(appearance) == template_of(textured().appearance)) is is_kept
     options = appearance.texture_options
     assert (options.uv, options.max_alpha) == (changes.get("uv", "texel-centre"), changes.get("maxAlpha", 0.95))
+    assert options.extent == changes.get("extent", 3.0)
 
 
 @pytest.mark.parametrize("wrong", [np.full(50, np.nan), np.full(50, 4.0), np.zeros(49)])
@@ -387,7 +389,9 @@ CHANGES = [
     (extended(sizes=0), "sizes must be VEC2"),
     (extended(uv="elsewhere"), "A2TG_splat_textures.uv must be"),
     (extended(maxAlpha=2.0), "maxAlpha must be"),
-    (extended(extent=2.0), "extent must be 3.0"),
+    (extended(extent=0), "m.glb: extent must be at least 0.001"),
+    (extended(extent=1e9), "m.glb: extent must be at least 0.001"),
+    (extended(extent="wide"), "A2TG_splat_textures.extent must be float"),
     (extended(texelRanges={"rgb": [0, 1e300], "alpha": [0, 1]}), "must be two numbers"),
     (extended(texelRanges=3), "damaged"),
     (extended(degrees=1), "degrees must be SCALAR"),
@@ -505,7 +509,7 @@ def test_the_schema_knows_what_is_written(saved):
     for name, field in gltf.OPTIONS.items():
         described = schema["properties"][name]
         assert described["default"] == getattr(TextureOptions(), field)
-        assert name == "maxAlpha" or tuple(described["enum"]) == typing.get_args(hints[field])
+        assert name in ("extent", "maxAlpha") or tuple(described["enum"]) == typing.get_args(hints[field])
     written = set(extension_of(saved[0])) | {"texelRanges", "degrees", "baseDegree", "shapes"}
     assert written == set(schema["properties"])
     for name, wanted in schema["dependentRequired"].items():

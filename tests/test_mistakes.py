@@ -574,6 +574,8 @@ CALLS = {
     "trained(events=(made(HostEvent, iterations=lambda self, num: (1,), apply=nothing_left),))": (
         "Mine.apply … is_kept … at least 2 … 0 of 50"
     ),
+    "TextureOptions(extent=0)": "extent must be at least 0.001 and at most 1000; got 0",
+    "TextureOptions(extent=np.nan)": "extent must be at least 0.001 and at most 1000; got nan",
     "TextureOptions(uv='texel-center')": "uv must be one of texel-centre, align-corners; got 'texel-center'",
     "trained(events=(Upscale(select='most'),))": "Upscale.select … fraction, threshold, budget; got 'most'",
     "trained(losses=(Term(each_pixel),))": "'each_pixel' … scalar … jnp.mean(…) … float32[16, 16, 3]",

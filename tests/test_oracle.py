@@ -72,6 +72,10 @@ def test_a_mean_nearer_than_the_near_plane_is_skipped():
         (Rules(uv="align-corners"), -3.0, 0.0),
         (Rules(outside="identity"), -2.9, 0.0),
         (Rules(outside="identity"), -3.1, 1.0),
+        (Rules(extent=1.5), -0.75, 0.0),
+        (Rules(extent=1.5), 0.375, 0.75),
+        (Rules(uv="align-corners", extent=1.5), -0.75, 0.25),
+        (Rules(outside="identity", extent=1.5), -1.6, 1.0),
     ],
 )
 def test_lookup_along_two_texels(rules, u, expected):

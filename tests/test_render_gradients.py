@@ -185,6 +185,15 @@ def test_every_leaf_against_differences(seed, compositor):
     assert_leaves_match(gradient, expected_by_default(seed))
 
 
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("compositor", quick_then_long(["native"], ["xla", "cuda"]))
+def test_textures_of_another_extent_against_differences(compositor):
+    rules = Rules(extent=1.5)
+    scene = smooth_scene(SMOOTH_SEEDS[0], rules)
+    _, gradient = package_gradient(scene, "float64", as_settings(rules, compositor=compositor))
+    assert_leaves_match(gradient, expected_gradient(scene, rules))
+
+
 @long
 @pytest.mark.usefixtures("x64")
 def test_official_gradients_stop_at_the_lookup_and_textures_may_be_missing():

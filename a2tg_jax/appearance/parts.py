@@ -60,8 +60,8 @@ Shading = tuple[Residual, Factor] | tuple[Residual, Factor, Tint]
 # stores textures, `core.bilinear` interpolates them. The renderer gets all of them one after the other as texels
 # [T, 4], each row by row.
 
-EXTENT = 3.0
-"""Half the side of a texture, in standard deviations."""
+LEAST_EXTENT, MOST_EXTENT = 1e-3, 1e3
+"""Range of half the side of a texture: float32 keeps lookups exact in it, and no kernel is as wide as its end."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,9 +69,9 @@ class TextureOptions(NamedFields):
     """Conventions of textures. The defaults follow the paper's text, `official()` the authors' program."""
 
     uv: Literal["texel-centre", "align-corners"] = "texel-centre"
-    """Place of the texels: centres at half-texel offsets over ±3σ, or the outer ones exactly at ±3σ."""
+    """Place of the texels: centres at half-texel offsets over ±extent, or the outer ones exactly at ±extent."""
     outside: Literal["clamp", "identity"] = "clamp"
-    """Texture beyond ±3σ: the edge texel continues, or nothing shows (RGB 0, alpha 1)."""
+    """Texture beyond ±extent: the edge texel continues, or nothing shows (RGB 0, alpha 1)."""
     rgb: Literal["signed", "unit"] = "signed"
     """RGB residuals of either sign, or clipped to [0, 1]."""
     uv_gradient: bool = True
@@ -83,10 +83,13 @@ class TextureOptions(NamedFields):
     clipped to [0, 1] when shown."""
     max_alpha: float = 0.99
     """Upper limit of a splat's alpha."""
+    extent: float = 3.0
+    """Half the side of a texture in standard deviations, 0.001 to 1000; the paper's is 3."""
 
     def __post_init__(self) -> None:
-        """Check the conventions."""
+        """Check the conventions and the extent."""
         check_literals(self)
+        check_number("extent", self.extent, least=LEAST_EXTENT, most=MOST_EXTENT)
 
     def check_options(self) -> None:
         """Raise ValueError, beginning with the name of the field, if a number is out of range."""
@@ -207,22 +210,23 @@ class Texture(Part):
         if not self.options.uv_gradient:
             u, v = jax.lax.stop_gradient((u, v))
         width, height = region.width.astype(u.dtype), region.height.astype(v.dtype)
-        return texel_coordinates(u, width, self.options.uv), texel_coordinates(v, height, self.options.uv)
+        return texel_coordinates(u, width, self.options), texel_coordinates(v, height, self.options)
 
     def shade(self, values: tuple[Array, ...], u: Array, v: Array) -> tuple[Residual, Factor]:
         """Return colour residual and alpha factor at (u, v), from the four values looked up there."""
         red, green, blue, alpha = values
         if self.options.outside == "identity":
-            is_inside = (jnp.abs(u) <= EXTENT) & (jnp.abs(v) <= EXTENT)
+            extent = self.options.extent
+            is_inside = (jnp.abs(u) <= extent) & (jnp.abs(v) <= extent)
             red, green, blue = (jnp.where(is_inside, channel, 0.0) for channel in (red, green, blue))
             alpha = jnp.where(is_inside, alpha, 1.0)
         return (red, green, blue), alpha
 
 
-def texel_coordinates(u: Array, size: Array, convention: str) -> Array:
+def texel_coordinates(u: Array, size: Array, options: TextureOptions) -> Array:
     """Return the position of u, in standard deviations, among the `size` texels of its axis, in [0, size − 1]."""
-    unit = (u * (1 / EXTENT) + 1) * 0.5
-    x = unit * (size - 1) if convention == "align-corners" else unit * size - 0.5
+    unit = (u * (1 / options.extent) + 1) * 0.5
+    x = unit * (size - 1) if options.uv == "align-corners" else unit * size - 0.5
     return jnp.clip(x, 0.0, size - 1)
 
 

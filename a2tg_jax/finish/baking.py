@@ -18,7 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from a2tg_jax.appearance.parts import MAX_DEGREE, curves_of, falloff_of, nearest_gaussians, texel_coordinates
+from a2tg_jax.appearance.parts import (
+    MAX_DEGREE,
+    TextureOptions,
+    curves_of,
+    falloff_of,
+    nearest_gaussians,
+    texel_coordinates,
+)
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.camera_paths import without_outlying
 from a2tg_jax.core.cameras import Camera
@@ -101,14 +108,14 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
     weights = texel_weights(model, cameras, model.background)
     tables = fewest_texels(model.appearance.texture.shown(), weights, most)
     whole = dataclasses.replace(model.gaussians, sh=jnp.asarray(model.sh[:, : NUM_BASES[degree]]))
-    pieces, shapes, uv = [], model.appearance.shapes, options.uv
+    pieces, shapes = [], model.appearance.shapes
     for ids, texels in tables:
         parents, own, size = whole[ids], None if shapes is None else np.asarray(shapes)[ids], texels.shape[1:3]
         # A single splat cannot imitate a kernel by a grid: it takes the nearest Gaussian.
         if own is not None and size == (1, 1):
             parents, own = nearest_gaussians(parents, own), None
-        axes = [kernels(side, uv) for side in size]
-        at_centers = [_weights(means, side, uv) for (means, _), side in zip(axes, size, strict=True)]
+        axes = [kernels(side, options) for side in size]
+        at_centers = [_weights(means, side, options) for (means, _), side in zip(axes, size, strict=True)]
         pieces.append(_grid(parents, own, np.einsum("ntsc,tv,su->nvuc", texels, *at_centers), *axes))
     joined: Gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *pieces)
     # Fainter splats are skipped by every renderer, and would only take bytes.
@@ -138,20 +145,20 @@ Kernels = tuple[np.ndarray, np.ndarray]
 
 
 @functools.cache
-def kernels(num: int, convention: str) -> Kernels:
+def kernels(num: int, options: TextureOptions) -> Kernels:
     """Return the Gaussians along an axis for `num` texels."""
     # A sum over steps of 1/400: exp(−u²/2) is below 2·10⁻⁸ beyond ±6.
     u = np.linspace(-6, 6, 4801)
-    weights = _weights(u, num, convention) * np.exp(-0.5 * u * u)
+    weights = _weights(u, num, options) * np.exp(-0.5 * u * u)
     masses = weights.sum(axis=1)
     means = weights @ u / masses
     # Variance: E[u²] − E[u]².
     return means, np.sqrt(weights @ (u * u) / masses - means**2)
 
 
-def _weights(u: np.ndarray, num: int, convention: str) -> np.ndarray:
+def _weights(u: np.ndarray, num: int, options: TextureOptions) -> np.ndarray:
     """Return the bilinear weights [num, Q] of texels at points of an axis."""
-    place = np.asarray(texel_coordinates(jnp.asarray(u), jnp.asarray(float(num)), convention), np.float64)
+    place = np.asarray(texel_coordinates(jnp.asarray(u), jnp.asarray(float(num)), options), np.float64)
     # Clamped coordinates give the outer texels all of the edge, so that the weights add up to 1.
     return np.maximum(0.0, 1 - np.abs(place[None] - np.arange(num)[:, None]))
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from a2tg_jax.appearance import Appearance, TextureOptions, appearance_for
 from a2tg_jax.appearance.base import PARTS
-from a2tg_jax.appearance.parts import EXTENT, MAX_DEGREE, log_exponents_of, shapes_of
+from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
 from a2tg_jax.core.gaussians import SH_C0
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.host.regular_files import expanded
@@ -47,7 +47,14 @@ DESCRIBED = {
 OWN = "a2tg"
 """Key in the extras of splats for what belongs to their model."""
 TexelKind = Literal["float32", "uint8"]
-OPTIONS = {"uv": "uv", "outside": "outside", "rgb": "rgb", "alpha": "alpha", "maxAlpha": "max_alpha"}
+OPTIONS = {
+    "extent": "extent",
+    "uv": "uv",
+    "outside": "outside",
+    "rgb": "rgb",
+    "alpha": "alpha",
+    "maxAlpha": "max_alpha",
+}
 """Names of the options of the texture lookup, and their fields."""
 RANGES = {"rgb": slice(0, 3), "alpha": slice(3, 4)}
 """Columns of texels that share ends."""
@@ -139,8 +146,7 @@ def _extension_of(builder: Builder, model: Model, kind: TexelKind) -> dict[str, 
     described: dict[str, Any] = {}
     rows, appearance = rows_of_model(model), model.appearance
     if appearance.texture_options is not None and rows.sizes is not None and rows.texels is not None:
-        options = {name: getattr(appearance.texture_options, field) for name, field in OPTIONS.items()}
-        described |= {"extent": EXTENT} | options
+        described |= {name: getattr(appearance.texture_options, field) for name, field in OPTIONS.items()}
         described["sizes"] = builder.add(rows.sizes.astype(np.uint8), is_attribute=False)
         if len(rows.texels) and kind == "float32":
             described["texels"] = builder.add(rows.texels.astype(np.float32), is_attribute=False)
@@ -292,8 +298,6 @@ def _shown(document: Document, described: Mapping[str, Any], splats: others.Elli
 
 def _texels(document: Document, described: Mapping[str, Any], count: int) -> np.ndarray:
     """Return the `count` texels [T, 4] of all textures."""
-    if described.get("extent", EXTENT) != EXTENT:
-        raise ValueError(f"{EXTENSION}.extent must be {EXTENT}; got {shortened(described['extent'])}")
     texels = np.zeros((0, 4), np.float32)
     if "texels" in described:
         texels = document.numbers(described["texels"], "VEC4", f"{EXTENSION}.texels")
@@ -323,6 +327,8 @@ def _kept_appearance(kept: Mapping[str, Any], shown: Appearance, *, is_described
     is_same = all((getattr(appearance, part) is None) == (getattr(shown, part) is None) for part in PARTS)
     if is_described:
         is_same &= appearance.alpha_limit == shown.alpha_limit and all(
-            getattr(own, field, None) == getattr(there, field, None) for field in ("uv", "outside", "rgb", "alpha")
+            getattr(own, field, None) == getattr(there, field, None)
+            for field in OPTIONS.values()
+            if field != "max_alpha"
         )
     return appearance if appearance.is_portable and is_same else shown

@@ -18,12 +18,12 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse, Rectangle
 
 import a2tg_jax as a2tg
-from a2tg_jax.appearance.parts import EXTENT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.rasterize.pixel import absorb
 from a2tg_jax.texture import BYTES_PER_TEXEL
 
 BLUE, ORANGE, GREEN, GREY, PURPLE = "#3b6fb6", "#e07b39", "#4f9d5d", "#8a8a8a", "#8c6bb1"
+EXTENT = a2tg.TextureOptions().extent
 
 
 def main(folder: pathlib.Path, dpi: int = 100) -> None:
