@@ -42,7 +42,7 @@ from .data.load import load_scene as load_scene
 from .data.photo_store import DepthMap as DepthMap, Mask as Mask, Picture as Picture
 from .data.scene import Scene as Scene, View as View, view_image as view_image
 from .data.sfm import SfmSummary as SfmSummary, run_sfm as run_sfm
-from .data.synthetic import synthetic_scene as synthetic_scene
+from .data.synthetic import cells_scene as cells_scene, synthetic_scene as synthetic_scene
 from .densify.clone_split import (
     CloneSplitPrune as CloneSplitPrune,
     FillingDensity as FillingDensity,

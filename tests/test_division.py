@@ -18,7 +18,7 @@ from test_pictures import KINDS, write_scene
 from a2tg_jax import load_scene
 from a2tg_jax.data import decoding, load, photo_reading, photo_store
 from a2tg_jax.data.division import Division, sharing_errors
-from a2tg_jax.data.load import SYNTHETIC, SceneSource
+from a2tg_jax.data.load import SceneSource
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*sparse points")
 
@@ -254,7 +254,7 @@ def test_processes_must_have_the_same_options(tmp_path, together):
 def test_processes_of_a_run_must_have_the_same_options(tmp_path, together):
     folder = str(write_scene(tmp_path / "scene"))
     for path, changes, difference in (
-        (SYNTHETIC, {}, "scene=synthetic, not scene=from files"),
+        ("synthetic", {}, "scene=synthetic, not scene=from files"),
         (folder, {"validation": True}, "validation=True, not validation=False"),
         (folder, {"alpha": "mask"}, "alpha=mask, not alpha=transparency"),
     ):

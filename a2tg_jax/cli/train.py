@@ -18,7 +18,7 @@ from tyro.conf import arg
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli.arguments import LpipsWeights, check_path
 from a2tg_jax.core.budget import budget_in_bytes
-from a2tg_jax.data.load import SYNTHETIC, SceneSource
+from a2tg_jax.data.load import SceneSource
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.host.machine import tidy_memory
 from a2tg_jax.host.operating_system import has_display
@@ -85,7 +85,7 @@ class Demo:
         if self.resume:
             resume(self.out, options)
             return
-        record = RunRecord(SceneSource(SYNTHETIC), A2tg.name, DEMO_SYSTEM, (BASELINE,))
+        record = RunRecord(SceneSource("synthetic"), A2tg.name, DEMO_SYSTEM, (BASELINE,))
         print_result(begin_run(record, self.out, options), self.out)
 
 
@@ -93,7 +93,7 @@ class Demo:
 class Train:
     """Train a scene, evaluate the model and write a report.
 
-      SCENE                  scene folder with photographs and cameras, its URL, or "synthetic"
+      SCENE                  scene folder with photographs and cameras, its URL, or built in: "synthetic", "cells"
       --out RUN              run folder for models, checkpoints, metrics, pictures and report.html
       --system NAME          method: bytewise (default; the best picture for its bytes), a2tg (the paper's), ...
       --preset NAME          paper (default), quick (minutes on two cores) or smoke (half a minute)

@@ -20,7 +20,7 @@ from a2tg_jax.data.photo_reading import AlphaMeaning, MaskMeaning, Options
 from a2tg_jax.data.photo_store import Shelf
 from a2tg_jax.data.photogrammetry import metashape, realityscan
 from a2tg_jax.data.scene import Scene, scene_name, warn_of_lenses
-from a2tg_jax.data.synthetic import synthetic_scene
+from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.data.transforms import (
     BLENDER_FILES,
     NERFSTUDIO_FILE,
@@ -35,10 +35,6 @@ from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.host.remote_files import RemotePath, check_reachable, is_remote, is_url, located
 from a2tg_jax.host.text import as_argument
 
-SYNTHETIC = "synthetic"
-"""Name of the built-in scene."""
-SYNTHETIC_SIZE = (208, 156)
-"""Its width and height in runs, small enough to train in minutes on two cores."""
 HeldOut = Literal["test", "validation"]
 OTHER_PROGRAMS: tuple[Callable[[Path], Callable[[], Frames] | None], ...] = (polycam, record3d, metashape, realityscan)
 """Functions that recognise a folder of another program, in order of preference, and return what reads its frames."""
@@ -49,8 +45,8 @@ class SceneSource:
     """Source of a scene: what `a2tg train` parses, what run.toml keeps, and what `load` needs."""
 
     path: Annotated[Positional[str], arg(metavar="SCENE")] = ""
-    """Scene folder with photographs and cameras, its URL such as s3://bucket/scene, or "synthetic"; not needed with
-    --config or --resume."""
+    """Scene folder with photographs and cameras, its URL such as s3://bucket/scene, or a built-in scene, "synthetic" or
+    "cells"; not needed with --config or --resume."""
     downscale: int = 1
     """Factor k by which images are downscaled."""
     test_every: int = 8
@@ -71,17 +67,22 @@ class SceneSource:
         return "validation" if self.validation else "test"
 
     @property
+    def is_built_in(self) -> bool:
+        """Whether the path names a built-in scene and no folder."""
+        return self.path in BUILT_IN
+
+    @property
     def name(self) -> str:
         """Name of the scene in titles."""
-        if self.path == SYNTHETIC:
-            return SYNTHETIC
+        if self.is_built_in:
+            return self.path
         # os.path, because Path would make one slash of the two in a URL.
         folder = os.path.dirname(self.path) if Path(self.path).suffix in (".json", ".xml") else self.path
         return scene_name(folder if is_url(folder) else Path(folder))
 
     def load(self, room: int | None = None, *, is_divided: bool = False) -> Scene:
-        """Return the scene, which may be the built-in one. Same arguments and errors as `load_scene`."""
-        return _load(self, room, is_divided, is_built_in=self.path == SYNTHETIC)
+        """Return the scene, which may be a built-in one. Same arguments and errors as `load_scene`."""
+        return _load(self, room, is_divided, is_built_in=self.is_built_in)
 
 
 def load_scene(
@@ -150,7 +151,7 @@ def _load(source: SceneSource, room: int | None, is_divided: bool, is_built_in: 
     division = among_processes() if is_divided else None
     with sharing_errors(division):
         if division is not None:
-            given = [f"scene={SYNTHETIC if is_built_in else 'from files'}"]
+            given = [f"scene={source.path if is_built_in else 'from files'}"]
             # Machines may have the scene at different paths.
             given += [f"{name}={value}" for name, value in vars(source).items() if name != "path"]
             division.check_same(given, "options of the scene")
@@ -167,9 +168,7 @@ def _load(source: SceneSource, room: int | None, is_divided: bool, is_built_in: 
         if room is not None and room < 0:
             raise ValueError(f"room must be at least 0 bytes; got {room}")
         if is_built_in:
-            width, height = SYNTHETIC_SIZE
-            k, every = source.downscale, source.test_every
-            scene = synthetic_scene(width=width, height=height, downscale=k, test_every=every)
+            scene = BUILT_IN[source.path](downscale=source.downscale, test_every=source.test_every)
         else:
             shelf = Shelf(room)
             try:
@@ -193,7 +192,7 @@ def _read(path: Path, options: Options) -> Scene:
     """Read the scene at a path, or raise FileNotFoundError that says what is there instead."""
     is_here = not is_remote(path)
     if is_here and not path.exists():
-        built_in = "; the built-in scene is synthetic_scene()" if str(path) == SYNTHETIC else ""
+        built_in = f"; the built-in scene is {path}_scene()" if str(path) in BUILT_IN else ""
         raise FileNotFoundError(f"{path}: no such scene folder{built_in}")
     is_json = path.suffix.lower() == ".json"
     if is_here:

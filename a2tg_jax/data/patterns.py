@@ -1,4 +1,4 @@
-"""Procedural colours for the synthetic scene: float32 images [rows, columns, 3] in [0, 1], made by numpy alone.
+"""Procedural colours for the built-in scenes: float32 images [rows, columns, 3] in [0, 1], made by numpy alone.
 
 Sizes are in texels. The palette is soft and the details are even on purpose. They are finer than a Gaussian but not
 finer than its texels, so that a short training shows the benefit of textures.
@@ -112,6 +112,12 @@ def checks(rows: int, columns: int, first: np.ndarray, second: np.ndarray, *, te
     """Return a checked band of rows × columns squares, each `texels` wide."""
     row, column = np.indices((rows * texels, columns * texels)) // texels
     return mix(first, second, (row + column) % 2)
+
+
+def cells(rng: np.random.Generator, rows: int, columns: int, *, texels: int) -> np.ndarray:
+    """Return a grid of rows × columns squares of random colours, each `texels` wide."""
+    colors = rng.uniform(0.2, 0.85, (rows, columns, 3)).astype(np.float32)
+    return colors.repeat(texels, axis=0).repeat(texels, axis=1)
 
 
 def barber_pole(rng: np.random.Generator, rows: int, columns: int) -> np.ndarray:

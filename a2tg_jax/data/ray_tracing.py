@@ -1,4 +1,4 @@
-"""Surfaces of the synthetic scene: shapes that rays can hit, with an image on them, and the light on them.
+"""Surfaces of the built-in scenes: shapes that rays can hit, with an image on them, and the light on them.
 
 Vectors are float32 with their components first, [3, P], which makes numpy several times faster. Rays are origin +
 t·direction, directions not necessarily unit; t is infinite if a ray misses. (u, v) in [0, 1] run along the columns and

@@ -1,10 +1,13 @@
-"""The built-in scene: a still life in a round brick room, ray-traced by numpy at exact cameras.
+"""The built-in scenes, ray-traced by numpy at exact cameras: a still life in a round brick room, and a box on a floor,
+both covered with coloured cells.
 
-Its patterns have details of about 4 to 10 pixels, finer than one or two thousand Gaussians can show without textures.
+The patterns of the still life have details of about 4 to 10 pixels, finer than one or two thousand Gaussians can show
+without textures. The cells are 2 to 4 pixels wide.
 """
 
+import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,12 +31,16 @@ from a2tg_jax.data.ray_tracing import (
 from a2tg_jax.data.scene import Scene
 
 TARGET = np.array([0.0, 0.1, 0.45])
-"""Point that all cameras look at."""
+"""Point of the still life that all cameras look at."""
 DOWN = np.array([0.0, 0.0, -1.0])
 DISTANCE = 2.4
 """Distance of the cameras from the target."""
 FIELD_OF_VIEW = np.deg2rad(58.0)
-"""Field of view across the longer side of the image."""
+"""Field of view across the longer side of an image of the still life."""
+BOX_TARGET = np.array([0.0, 0.0, 0.12])
+FLOOR_RADIUS, BOX_SIDE = 1.0, 0.72
+CELLS_A_METRE = 24
+TEXELS_A_CELL = 16
 SAMPLE_OFFSETS = np.array([[-0.375, -0.125, 0.125, 0.375], [0.125, -0.375, 0.375, -0.125]])
 """Places [2, S] of a pixel's rays around its centre: a turned square, all different along x and along y."""
 
@@ -70,30 +77,87 @@ def synthetic_scene(
       >>> len(scene.train), len(scene.test), scene.test[0].image.shape
       (10, 2, (36, 48, 3))
     """
+    return _made("synthetic", seed, num_views, (width, height), num_points, downscale, test_every)
+
+
+def cells_scene(
+    seed: int = 0,
+    *,
+    num_views: int = 32,
+    width: int = 160,
+    height: int = 160,
+    num_points: int = 2500,
+    downscale: int = 1,
+    test_every: int = 8,
+) -> Scene:
+    """Make the built-in scene that needs textures: pinhole views from all around a box on a round floor, both covered
+    with square cells of random colours, and points on the surfaces they see.
+
+    A cell is 2 to 4 pixels wide at the default size, so that a texel shows it for far fewer bytes than a Gaussian. The
+    background is black, the default of `RenderSettings`.
+
+    Args:
+      seed: random seed for colours, light and points; the arrangement is always the same.
+      num_views: number of views, at least 2.
+      width: width of the images in pixels, before `downscale`.
+      height: height of the images in pixels, likewise.
+      num_points: points sampled evenly over the images, instead of a sparse reconstruction; at least 2. Pixels of the
+        background give none.
+      downscale: k >= 1; images have 1/k of the size.
+      test_every: every k-th view is a test view; 0 keeps none.
+
+    Returns:
+      The scene in its normalised world. The default takes a second on one core.
+
+    Raises:
+      ValueError: if an argument is out of its range.
+
+    Examples:
+      >>> scene = a2tg.cells_scene(width=48, height=48, num_views=12)
+      >>> len(scene.train), len(scene.test), scene.test[0].image.shape
+      (10, 2, (48, 48, 3))
+    """
+    return _made("cells", seed, num_views, (width, height), num_points, downscale, test_every)
+
+
+def _made(
+    name: str,
+    seed: int,
+    num_views: int,
+    full_size: tuple[int, int],
+    num_points: int,
+    downscale: int,
+    test_every: int,
+) -> Scene:
+    """Return a built-in scene. Arguments as of `synthetic_scene`."""
+    width, height = full_size
     if num_views < 2 or num_points < 2 or downscale < 1 or min(width, height) < downscale:
         raise ValueError(
-            f"the synthetic scene needs at least 2 views, 2 points and images of a pixel; "
+            f"the {name} scene needs at least 2 views, 2 points and images of a pixel; "
             f"got num_views={num_views}, num_points={num_points}, {width}x{height}, downscale={downscale}"
         )
     check_test_every(test_every)
+    arrangement = ARRANGEMENTS[name]
     rng = np.random.default_rng(seed)
-    surfaces, rng.bit_generator.state = _lit_surfaces(seed)
+    surfaces, rng.bit_generator.state = _lit_surfaces(name, seed)
     size = round(width / downscale), round(height / downscale)
-    K = intrinsics(*size, FIELD_OF_VIEW)
-    viewmats = [looking(center, TARGET - center, DOWN) for center in camera_path(num_views)]
+    K = intrinsics(*size, arrangement.field_of_view)
+    centers = arrangement.camera_path(num_views)
+    viewmats = [looking(center, arrangement.target - center, DOWN) for center in centers]
     shots = [
         Shot(f"view_{index:03d}.png", viewmat, K, Picture.of(render(surfaces, viewmat, K, *size)))
         for index, viewmat in enumerate(viewmats)
     ]
     cloud = sample_points(surfaces, shots, num_points, rng)
-    return assemble_scene("synthetic", *every_kth(shots, test_every), cloud, source="the synthetic scene")
+    return assemble_scene(name, *every_kth(shots, test_every), cloud, source=f"the {name} scene")
 
 
 @functools.lru_cache(maxsize=1)
-def _lit_surfaces(seed: int) -> tuple[tuple[Surface, ...], Any]:
-    """Return the surfaces of a seed, and the state of its generator after them; neither depends on size or views."""
+def _lit_surfaces(name: str, seed: int) -> tuple[tuple[Surface, ...], Any]:
+    """Return the surfaces of a built-in scene, and the state of its generator after them; neither depends on size or
+    views."""
     rng = np.random.default_rng(seed)
-    return tuple(light(still_life(rng), rng)), rng.bit_generator.state
+    return tuple(light(ARRANGEMENTS[name].surfaces(rng), rng)), rng.bit_generator.state
 
 
 def still_life(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.ndarray]]:
@@ -118,13 +182,64 @@ def still_life(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.nda
     ]
 
 
+def celled_box(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.ndarray]]:
+    """Return a floor and a box on it, and their colours."""
+    floor_cells, box_cells = round(2 * FLOOR_RADIUS * CELLS_A_METRE), round(BOX_SIDE * CELLS_A_METRE)
+    return [
+        (Disc((0, 0, 0), FLOOR_RADIUS), patterns.cells(rng, floor_cells, floor_cells, texels=TEXELS_A_CELL)),
+        (
+            # A few millimetres above the floor, which it would otherwise not shade under itself.
+            Block((0, 0, BOX_SIDE / 2 + 0.005), BOX_SIDE / 2, 0.3),
+            patterns.cells(rng, box_cells, 5 * box_cells, texels=TEXELS_A_CELL),
+        ),
+    ]
+
+
 def camera_path(num_views: int) -> np.ndarray:
     """Return camera centres [V, 3] evenly along a closed figure of eight in front of the target, above its height."""
     phase = 2 * np.pi * (np.arange(num_views) + 0.5) / num_views  # half a step off the crossing
     azimuth = -0.5 * np.pi + np.deg2rad(40.0) * np.sin(phase)
     elevation = np.deg2rad(26.0) + np.deg2rad(11.0) * np.sin(2 * phase + 0.6)
+    return _on_sphere(TARGET, azimuth, elevation)
+
+
+def circular_path(num_views: int) -> np.ndarray:
+    """Return camera centres [V, 3] evenly around the box, which rise and sink twice a turn."""
+    azimuth = 2 * np.pi * (np.arange(num_views) + 0.5) / num_views
+    elevation = np.deg2rad(42.0) + np.deg2rad(10.0) * np.sin(2 * azimuth + 0.6)
+    return _on_sphere(BOX_TARGET, azimuth, elevation)
+
+
+def _on_sphere(target: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
+    """Return points [V, 3] at DISTANCE from the target."""
     outward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    return TARGET + DISTANCE * np.stack(outward, axis=-1)
+    return target + DISTANCE * np.stack(outward, axis=-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Arrangement:
+    """What a built-in scene shows, and from where."""
+
+    surfaces: Callable[[np.random.Generator], list[tuple[ParametricSurface, np.ndarray]]]
+    """Function that returns shapes and their colours; only these depend on the generator."""
+    camera_path: Callable[[int], np.ndarray]
+    """Function that returns the centres [V, 3] of so many cameras."""
+    target: np.ndarray
+    """Point that all cameras look at."""
+    field_of_view: float
+    """Across the longer side of an image, in radians."""
+
+
+ARRANGEMENTS: Mapping[str, Arrangement] = {
+    "synthetic": Arrangement(still_life, camera_path, TARGET, FIELD_OF_VIEW),
+    "cells": Arrangement(celled_box, circular_path, BOX_TARGET, np.deg2rad(49.0)),
+}
+BUILT_IN: Mapping[str, Callable[..., Scene]] = {
+    # Small enough to train in minutes on two cores.
+    "synthetic": functools.partial(synthetic_scene, width=208, height=156),
+    "cells": cells_scene,
+}
+"""Built-in scenes by their names as the path of a scene, in the size of runs."""
 
 
 def render(surfaces: Sequence[Surface], viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -163,10 +278,11 @@ def sample_points(surfaces: Sequence[Surface], shots: list[Shot], count: int, rn
 
 
 def exact_points(scene: Scene) -> np.ndarray:
-    """Return the points [P, 3] on the exact surfaces that the training views of a synthetic scene see, in the original
+    """Return the points [P, 3] on the exact surfaces that the training views of a built-in scene see, in the original
     world.
     """
-    shapes = [shape for shape, _ in still_life(np.random.default_rng(0))]  # Only patterns depend on the seed.
+    # Only colours depend on the seed.
+    shapes = [shape for shape, _ in ARRANGEMENTS[scene.name].surfaces(np.random.default_rng(0))]
     inverse, points = scene.transform.inverse(), []
     for camera in (view.camera for view in scene.train):
         viewmat = inverse.apply_to_viewmat(np.asarray(camera.viewmat, np.float64))

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.photo_store import SHARE_OF_MEMORY
 from a2tg_jax.data.scene import Scene
 from a2tg_jax.host.machine import allowed_memory, default_platform
@@ -211,8 +210,8 @@ def doubts_about(scene: Scene, record: RunRecord) -> list[str]:
     """Return why a run would show little or take long, with better values: a small or huge memory budget, or a
     downscale that leaves few pixels."""
     found, downscale = [], record.scene.downscale
-    # The built-in scene is drawn as small as tests need it.
-    is_captured = record.scene.path != SYNTHETIC
+    # Built-in scenes are drawn as small as tests need it.
+    is_captured = not record.scene.is_built_in
     pixels, budget = sum(view.camera.width * view.camera.height for view in scene.train), record.options.budget_bytes
     one = record.options.initial_bytes
     # A file budget without a memory budget sets that as well.

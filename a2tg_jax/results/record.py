@@ -2,7 +2,7 @@
 
 The record is kept as run.toml. A configuration file has the same keys; missing ones have the command line's defaults:
 
-    scene = "../scenes/fox"              # relative to the file's folder; or s3://bucket/fox, or "synthetic"
+    scene = "../scenes/fox"              # relative to the file's folder; or s3://bucket/fox, or built in: "cells"
     downscale = 2
     system = "a2tg"                      # or package.module:NAME
     preset = "quick"
@@ -30,7 +30,7 @@ import tomli_w
 from tyro.conf import Fixed, Suppress, UseAppendAction, arg
 
 from a2tg_jax.core.budget import MEGABYTE, budget_in_bytes, megabytes_of
-from a2tg_jax.data.load import SYNTHETIC, SceneSource
+from a2tg_jax.data.load import SceneSource
 from a2tg_jax.host.atomic import write_whole
 from a2tg_jax.host.json_text import MOST_TOML_BYTES, parse_toml, read_json
 from a2tg_jax.host.regular_files import is_regular, read_regular
@@ -143,7 +143,7 @@ class RunRecord:
     def placed(self, folder: Path = Path()) -> "RunRecord":
         """Return the record with full paths; relative ones start from a folder. Raises as `scene_place`."""
         path = self.scene.path
-        path = path if path in ("", SYNTHETIC) else scene_place(path, folder)
+        path = path if path == "" or self.scene.is_built_in else scene_place(path, folder)
         init = None if self.init is None else os.path.realpath(folder / os.path.expanduser(self.init))
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, path=path), init=init)
 

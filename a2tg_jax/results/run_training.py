@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from a2tg_jax.data.load import SYNTHETIC
 from a2tg_jax.data.scene import Scene, views_by_kind
 from a2tg_jax.finish.tuning import ITERATIONS
 from a2tg_jax.host import signals
@@ -119,7 +118,7 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     record.check()
     check_weights(options.lpips_weights)
     # Neither is a folder here.
-    if record.scene.path != SYNTHETIC and not is_url(record.scene.path):
+    if not record.scene.is_built_in and not is_url(record.scene.path):
         check_apart(out, Path(record.scene.path))
     # Cheap checks come before the scene is loaded.
     check_free(out, overwrite=options.overwrite)

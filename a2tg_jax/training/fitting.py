@@ -12,6 +12,7 @@ from a2tg_jax.core.checks import check_kind, check_untraced, kind_of
 from a2tg_jax.core.gaussians import Gaussians, check_process
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.data.scene import Scene, check_scene, origin_of_scene
+from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.host import signals
 from a2tg_jax.host.text import counted, in_bytes, shortened
 from a2tg_jax.model import Model
@@ -217,7 +218,7 @@ def _check_arguments(
     example = ""
     if isinstance(scene, is_path):
         path = os.fspath(scene)
-        example = "use synthetic_scene()" if path == "synthetic" else f"use load_scene({path!r})"
+        example = f"use {path}_scene()" if path in BUILT_IN else f"use load_scene({path!r})"
     check_kind("scene", scene, Scene, example)
     if not isinstance(system, System):
         found, example = kind_of(system), ""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import a2tg_jax as a2tg
-from a2tg_jax.data.load import SYNTHETIC
+from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.host.atomic import replacing
 from a2tg_jax.host.machine import cpu_quota, memory_limit
 from a2tg_jax.host.operating_system import num_cores
@@ -161,7 +161,7 @@ class Lab:
     def check_inputs(self, grids: Sequence[Grid]) -> None:
         """Raise if a scene is missing or an option invalid, before anything is trained."""
         check_systems(grids, self.records)
-        for path in {cell.scene.path for grid in grids for cell in grid.cells} - {SYNTHETIC}:
+        for path in {cell.scene.path for grid in grids for cell in grid.cells} - BUILT_IN.keys():
             if not Path(path).is_absolute() and not self.folders.scenes.is_dir():
                 raise ValueError(f"there is no folder --scenes {self.folders.scenes}")
             if not (self.folders.scenes / path).is_dir():

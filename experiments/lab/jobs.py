@@ -23,6 +23,7 @@ from a2tg_jax.core.origin import WHITE
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.assembly import with_validation_views
 from a2tg_jax.data.load import SceneSource
+from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.host.json_text import read_json
 from a2tg_jax.host.machine import num_threads, tidy_memory
 from a2tg_jax.host.source_commit import source_commit
@@ -49,7 +50,7 @@ class Job:
     """One stage to train."""
 
     scene: str
-    """Path below the folder of scenes, absolute path, or "synthetic"."""
+    """Path below the folder of scenes, absolute path, or the name of a built-in scene."""
     downscale: int
     system: a2tg.System
     stage: int
@@ -155,7 +156,7 @@ class Folders:
 
     def load_scene(self, job: Job, room: int | None = None) -> a2tg.Scene:
         """Return a job's scene; `room` as in `SceneSource.load`."""
-        is_folder = job.scene != "synthetic"
+        is_folder = job.scene not in BUILT_IN
         path = str(self.scenes / job.scene) if is_folder else job.scene
         scene = SceneSource(path, job.downscale).load(room)
         scene = scene if job.fold is None else few_views(scene, job.fold)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 import a2tg_jax as a2tg
-from a2tg_jax.data.load import SYNTHETIC
+from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.events import HostEvent
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.training.cost import forecast_stages
@@ -132,7 +132,7 @@ class Forecaster:
 
     def has_scene(self, job: Job) -> bool:
         """Return whether the scene of a stage is there."""
-        return job.scene == SYNTHETIC or (self._folders.scenes / job.scene).is_dir()
+        return job.scene in BUILT_IN or (self._folders.scenes / job.scene).is_dir()
 
     def _scene(self, job: Job) -> a2tg.Scene:
         place = job.scene, job.downscale, job.fold, job.validation

@@ -9,7 +9,7 @@ import numpy as np
 
 import a2tg_jax as a2tg
 from a2tg_jax.data.assembly import GREY, NUM_POINTS, Sight, random_points, unseeing
-from a2tg_jax.data.load import SYNTHETIC
+from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.host.text import did_you_mean
 from lab.grid_file import Block, table_as
 
@@ -123,7 +123,7 @@ def check_downscale(name: str, downscale: int) -> None:
 
 def _placed(path: str, folder: Path | None) -> str:
     """Return the path of a scene, absolute if it starts from a given folder."""
-    if folder is None or path == SYNTHETIC:
+    if folder is None or path in BUILT_IN:
         return path
     return (folder / Path(path).expanduser()).resolve().as_posix()
 
