@@ -448,6 +448,7 @@ CALLS = {
     "load_model('flat.ply')": "flat.ply … *.npz … load_ply",
     "load_model('/')": "folder … file",
     "load_scene('synthetic')": "synthetic … no such scene folder … synthetic_scene()",
+    "load_scene('cells')": "cells … no such scene folder … cells_scene()",
     # Points
     "started(num=3.5)": "num … int, at least 2 … 3.5",
     "started(sh_degree=4)": "sh_degree … int, 0 to 3 … 4",

@@ -394,6 +394,12 @@ def test_a_configuration_file_may_be_partial_and_its_paths_start_from_its_folder
     assert all(isinstance(number, float) for number in (record.options.texture.k_a, *record.options.texture.at))
     file.write_text(f'scene = "synthetic"\ninit = "{tmp_path / "b.ply"}"\n')
     assert (read_run_file(file).scene.path, read_run_file(file).init) == ("synthetic", str(tmp_path / "b.ply"))
+    (tmp_path / "files/cells").mkdir()
+    file.write_text('scene = "./cells"\n')
+    assert read_run_file(file).scene.path == str(tmp_path / "files/cells")
+    file.write_text('scene = "cells"\n')
+    with pytest.warns(UserWarning, match=r"cells is the built-in scene; give \./cells for the folder"):
+        assert read_run_file(file).scene.path == "cells"
 
 
 @pytest.mark.parametrize(

@@ -101,8 +101,7 @@ def cells_scene(
       num_views: number of views, at least 2.
       width: width of the images in pixels, before `downscale`.
       height: height of the images in pixels, likewise.
-      num_points: points sampled evenly over the images, instead of a sparse reconstruction; at least 2. Pixels of the
-        background give none.
+      num_points: points sampled evenly over the surfaces in the images, instead of a sparse reconstruction; at least 2.
       downscale: k >= 1; images have 1/k of the size.
       test_every: every k-th view is a test view; 0 keeps none.
 
@@ -264,17 +263,20 @@ def render(surfaces: Sequence[Surface], viewmat: np.ndarray, K: np.ndarray, widt
 
 def sample_points(surfaces: Sequence[Surface], shots: list[Shot], count: int, rng: np.random.Generator) -> PointCloud:
     """Return surface points under `count` random pixels of the shots, with the colours of those pixels."""
-    shares = np.bincount(rng.integers(len(shots), size=count), minlength=len(shots))
-    points, colors = [], []
-    for shot, share in zip(shots, shares, strict=True):
-        pixels = shot.picture.read()
-        height, width = shot.picture.size
-        column, row = rng.integers(width, size=share), rng.integers(height, size=share)
-        directions = _directions(shot.viewmat, shot.K, column + 0.5, row + 0.5)
-        points.append(trace_rays(surfaces, _center(shot.viewmat), directions)[1].T)
-        colors.append(pixels[row, column])
-    is_hit = np.isfinite(np.concatenate(points)).all(axis=1)
-    return PointCloud(np.concatenate(points)[is_hit], np.concatenate(colors)[is_hit])
+    points, colors, missing = [], [], count
+    while missing:
+        shares = np.bincount(rng.integers(len(shots), size=missing), minlength=len(shots))
+        for shot, share in zip(shots, shares, strict=True):
+            pixels = shot.picture.read()
+            height, width = shot.picture.size
+            column, row = rng.integers(width, size=share), rng.integers(height, size=share)
+            directions = _directions(shot.viewmat, shot.K, column + 0.5, row + 0.5)
+            found = trace_rays(surfaces, _center(shot.viewmat), directions)[1].T
+            is_hit = np.isfinite(found).all(axis=1)  # Instead of pixels of the background, others are drawn.
+            points.append(found[is_hit])
+            colors.append(pixels[row, column][is_hit])
+            missing -= int(np.count_nonzero(is_hit))
+    return PointCloud(np.concatenate(points), np.concatenate(colors))
 
 
 def exact_points(scene: Scene) -> np.ndarray:

@@ -19,6 +19,7 @@ import dataclasses
 import math
 import os
 import shlex
+import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -141,8 +142,11 @@ class RunRecord:
         return plain if plain.budgeted() == self else self
 
     def placed(self, folder: Path = Path()) -> "RunRecord":
-        """Return the record with full paths; relative ones start from a folder. Raises as `scene_place`."""
+        """Return the record with full paths; relative ones start from a folder. Warns if a folder has the name of a
+        built-in scene. Raises as `scene_place`."""
         path = self.scene.path
+        if self.scene.is_built_in and (folder / path).exists():
+            warnings.warn(f"{path} is the built-in scene; give ./{path} for the folder of that name", stacklevel=2)
         path = path if path == "" or self.scene.is_built_in else scene_place(path, folder)
         init = None if self.init is None else os.path.realpath(folder / os.path.expanduser(self.init))
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, path=path), init=init)
