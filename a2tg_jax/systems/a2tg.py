@@ -48,6 +48,9 @@ class A2tg(TwoStages):
     single_texel_rate: float | None = None
     """Adam's learning rate of textures of one texel, which only add a colour and opacity to their Gaussian; None:
     texel_rate; 0: constant until they grow."""
+    empty_textures: bool = False
+    """Whether Gaussians have no texture, which takes no bytes, until they are chosen to get more texels; off: all begin
+    with one texel."""
     lookup: TextureOptions = TextureOptions()
     """Options of the texture lookup."""
 
@@ -62,14 +65,22 @@ class A2tg(TwoStages):
             # Thresholds belong to another rule, and custom ones would be rejected.
             texture = dataclasses.replace(texture, select="budget", threshold=None, budget_mb=budget)
         # Up to half of the largest texture, if there is a time to grow.
-        texels = min(BUDGET_TEXELS, (1 + texture.cap**2) / 2) if texture.iterations(self.stage2_iterations) else 1
+        least = self._initial_side**2
+        grows = texture.iterations(self.stage2_iterations)
+        texels = min(BUDGET_TEXELS, (least + texture.cap**2) / 2) if grows else least
         growth = grown_by_mcmc(self.densify, self.budget_cap(FLOATS_PER_TEXEL * texels))
         first = self.growing_stage(growth, Appearance(max_alpha=self.lookup.max_alpha))
         events = (*([Noise()] if self.noise_in_stage2 else []), texture)
         single = self.texel_rate if self.single_texel_rate is None else self.single_texel_rate
         rates = {"texture": TexelRates(self.texel_rate, single)}
-        textured = Appearance(texture=Texture(None, (1, 1), self.lookup))
+        side = self._initial_side
+        textured = Appearance(texture=Texture(None, (side, side), self.lookup))
         return first, self.later_stage("textures", textured, events, rates)
+
+    @property
+    def _initial_side(self) -> int:
+        """Side of every texture when the second stage begins."""
+        return 0 if self.empty_textures else 1
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
@@ -85,6 +96,18 @@ class A2tg(TwoStages):
         check_number("texel_rate", self.texel_rate, least=0)
         if self.single_texel_rate is not None:
             check_number("single_texel_rate", self.single_texel_rate, least=0)
+        if self.empty_textures:
+            check_number("texture.cap", self.texture.cap, least=2)
+            # A rate of 0, as in short presets, holds nothing still.
+            for name, value in (
+                ("single_texel_rate", self.single_texel_rate),
+                ("lookup.initial_rgb", self.lookup.initial_rgb),
+            ):
+                if value:
+                    raise ValueError(
+                        f"{name} has no effect with empty_textures, which grow to more than one texel at once, of RGB "
+                        f"0: leave it out; got {value}"
+                    )
 
     def check_number(self, num: int) -> None:
         """Check that the texture budget has room for the Gaussians of the first stage."""
@@ -103,9 +126,10 @@ class A2tg(TwoStages):
     def _check_budget(self, num: int, remedy: str) -> None:
         if self.texture.budget_mb is None:
             return
-        needed = num * bytes_per_gaussian(self.sh_degree, FLOATS_PER_TEXEL) / MEGABYTE
+        needed = num * bytes_per_gaussian(self.sh_degree, FLOATS_PER_TEXEL * self._initial_side**2) / MEGABYTE
         if self.texture.budget_mb < needed:
+            textures = "without textures" if self.empty_textures else "of one texel each"
             raise ValueError(
-                f"texture.budget_mb is {self.texture.budget_mb}, but {num:,} Gaussians of one texel each take "
-                f"{needed:.3f} MB: {remedy}"
+                f"texture.budget_mb is {self.texture.budget_mb}, but {num:,} Gaussians {textures} take {needed:.3f} "
+                f"MB: {remedy}"
             )
