@@ -296,7 +296,7 @@ def concatenate(models: Sequence[Model]) -> Model:
       The model of all Gaussians that exist; its origin is the first one.
 
     Raises:
-      ValueError: if there are no models, or they differ in their appearance or dtype.
+      ValueError: if there are no models, or they differ in their appearance, the extent of textures or dtype.
     """
     if not isinstance(models, Sequence) or not models:
         raise ValueError("concatenate needs at least one model, in a list")
@@ -306,6 +306,12 @@ def concatenate(models: Sequence[Model]) -> Model:
     models = [model.live for model in models]
     first, words = models[0], [in_words(model.appearance) for model in models]
     for model, shown in zip(models, words, strict=True):
+        options, others = first.appearance.texture_options, model.appearance.texture_options
+        if options is not None and others is not None and options.extent != others.extent:
+            raise ValueError(
+                f"models must have textures of one extent; got {options.extent:g} and {others.extent:g}: train them "
+                "with the same lookup.extent, or bake them first (a2tg convert --bake)"
+            )
         if template_of(model.appearance) != template_of(first.appearance):
             why = f"{words[0]} and {shown}" if shown != words[0] else f"{shown} of different options"
             raise ValueError(f"models must have one appearance; got {why}")

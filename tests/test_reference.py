@@ -41,7 +41,7 @@ def test_the_reference_reader_finds_what_this_library_finds(reference, name):
 def test_what_is_read_is_drawn_as_this_library_draws_it(reference, tmp_path, has_shapes):
     """It follows the rules of the page alone."""
     read_model, draw = reference
-    model, options = shaped_model() if has_shapes else reference_model(), {"outside": "identity"}
+    model, options = shaped_model() if has_shapes else reference_model(), {"outside": "identity", "extent": 1.5}
     texture = dataclasses.replace(model.appearance.texture, options=TextureOptions(**options))
     model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=texture))
     for name in ("m.npz", "m.glb"):
@@ -77,6 +77,8 @@ def test_the_kept_files_hold_the_model():
 def test_scenes_for_browsers_are_still_written_so():
     """All but what zlib codes."""
     (found, _), (wanted, _) = map(unframed, (encode_web_scene(reference_model(), title="reference"), KEPT.read_bytes()))
+    # The kept file was written before textures had an extent.
+    wanted["appearance"]["parts"]["texture"]["options"]["extent"] = 3.0
     for header in (found, wanted):
         header["parts"] = [name for name, *_ in header["parts"]]
     assert found == wanted

@@ -104,7 +104,9 @@ def test_the_page_shows_what_the_renderer_shows(node, tmp_path):
         cloud = open_source(ellipsoids(tmp_path.parent / "cloud.ply"))
     write_case(tmp_path / "3dgs", cloud, cameras_around(5.0))
     # Noise in all that there is, which rounding changes; the page must show what is left all the more exactly.
-    for name, options in (("noise", a2tg.TextureOptions()), ("official", a2tg.TextureOptions.official())):
+    narrow = a2tg.TextureOptions(outside="identity", extent=1.5)
+    conventions = {"noise": a2tg.TextureOptions(), "official": a2tg.TextureOptions.official(), "narrow": narrow}
+    for name, options in conventions.items():
         write_case(tmp_path / name, Source(small_model(options), name), cameras_around(4.0), of=["the file"])
     shaped = Source(shaped_model(), "shaped")
     write_case(tmp_path / "shaped", shaped, cameras_around(4.0), ("full", "depth", "normals"), of=["the file"])

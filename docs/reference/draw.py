@@ -5,7 +5,9 @@ import numpy as np
 NEAR_PLANE, LEAST_ALPHA, LEAST_TRANSMITTANCE = 0.2, 1 / 255, 1e-4
 
 
-def draw(model, viewmat, K, width, height, background=(0, 0, 0), max_alpha=0.99, uv="texel-centre", outside="clamp"):
+def draw(
+    model, viewmat, K, width, height, background=(0, 0, 0), max_alpha=0.99, uv="texel-centre", outside="clamp", extent=3
+):
     """Return an image [height, width, 3] from a camera: world to camera [4, 4], and camera to pixels [3, 3].
 
     The texels are as shown: `rgb` "signed" and `alpha` "projected".
@@ -26,9 +28,9 @@ def draw(model, viewmat, K, width, height, background=(0, 0, 0), max_alpha=0.99,
         texel = np.array([0.0, 0.0, 0.0, 1.0])
         if starts is not None and starts[i + 1] > starts[i]:
             texture = model["texels"][starts[i] : starts[i + 1]].reshape(*model["sizes"][i], 4)
-            texel = looked_up(texture, u, v, uv)
+            texel = looked_up(texture, u / extent, v / extent, uv)
             if outside == "identity":
-                texel = np.where((np.maximum(abs(u), abs(v)) > 3)[..., None], [0.0, 0.0, 0.0, 1.0], texel)
+                texel = np.where((np.maximum(abs(u), abs(v)) > extent)[..., None], [0.0, 0.0, 0.0, 1.0], texel)
         kernel = falloff(rho, model["exponents"][i] if "exponents" in model else 1.0)
         alpha = model["opacities"][i] * kernel[..., None] * texel[..., 3:]
         alpha = np.where(alpha < LEAST_ALPHA, 0, np.minimum(alpha, max_alpha))
@@ -71,10 +73,10 @@ def intersected(homography, x, y):
 
 
 def looked_up(texture, u, v, uv):
-    """Return values [..., 4] of a texture [Tv, Tu, 4]."""
+    """Return values [..., 4] of a texture [Tv, Tu, 4] from -1 to 1."""
     places = []
     for coordinate, size in ((v, texture.shape[0]), (u, texture.shape[1])):
-        unit = (coordinate / 3 + 1) / 2
+        unit = (coordinate + 1) / 2
         place = np.clip(unit * (size - 1) if uv == "align-corners" else unit * size - 0.5, 0, size - 1)
         low = np.floor(place).astype(int)
         places.append((low, np.minimum(low + 1, size - 1), (place - low)[..., None]))

@@ -17,7 +17,7 @@ const LARGEST_RATIO = 64;
 const FREE_ROOM = 1 << 20;
 const LARGEST_SIDE = 16;
 /** Values of files that do not name them. */
-const [NEAR_PLANE, MAX_ALPHA] = [0.2, 0.99];
+const [NEAR_PLANE, MAX_ALPHA, EXTENT] = [0.2, 0.99, 3];
 
 /** An error whose message is shown to the user as it is. */
 export class SceneError extends Error {
@@ -80,6 +80,8 @@ export interface FileHeader {
   readonly hasFloaters: boolean;
   readonly nearPlane: number;
   readonly maxAlpha: number;
+  /** Half the side of a texture, in standard deviations. */
+  readonly extent: number;
   readonly uv: "texel-centre" | "align-corners";
   readonly outside: "clamp" | "identity";
   readonly meanBits: number;
@@ -158,6 +160,7 @@ export function parseHeader(text: Uint8Array, head: Head): FileHeader {
     hasFloaters: parts.some(({ name }) => name === FLOATERS),
     nearPlane: page?.between("near_plane", 0, 1e9) ?? NEAR_PLANE,
     maxAlpha: own?.between("max_alpha", 0, 1) ?? MAX_ALPHA,
+    extent: texture?.has("extent") === true ? texture.between("extent", 0, 1e9) : EXTENT,
     uv: texture?.oneOf("uv", ["texel-centre", "align-corners"]) ?? "texel-centre",
     outside: texture?.oneOf("outside", ["clamp", "identity"]) ?? "clamp",
     meanBits: bitsOf(choices, "means", 16),

@@ -130,6 +130,7 @@ export class Renderer {
     gl.uniform1f(splat.at("peak"), header.numTexels === 0 ? 1 : Math.max(1, texel_alphas.high));
     gl.uniform1f(splat.at("nearPlane"), header.nearPlane);
     gl.uniform1f(splat.at("maxAlpha"), header.maxAlpha);
+    gl.uniform1f(splat.at("extent"), header.extent);
     gl.uniform1i(splat.at("widthBits"), splats.widthBits);
     gl.uniform4fv(splat.at("projection"), projection(pose, lens).flat());
     gl.uniform3fv(splat.at("center"), pose.position);

@@ -286,12 +286,12 @@ flat in uvec3 region;
 flat in vec3 own;
 flat in vec3 curve;
 
-uniform float nearPlane, maxAlpha;
+uniform float nearPlane, maxAlpha, extent;
 
 out vec4 fragment;
 
 vec4 textureAt(vec2 uv) {
-  vec2 sides = vec2(region.yz), unit = (uv * (1.0 / 3.0) + 1.0) * 0.5;
+  vec2 sides = vec2(region.yz), unit = (uv / extent + 1.0) * 0.5;
   vec2 place = isCentred ? unit * sides - 0.5 : unit * (sides - 1.0);
   place = clamp(place, vec2(0.0), sides - 1.0);
   ivec2 low = ivec2(place);
@@ -320,7 +320,7 @@ void main() {
   if (isTextured && region.y > 0u) {
     vec2 uv = isHit ? hit / q : vec2(0.0);
     vec4 texel = textureAt(uv);
-    if (!isClamped && any(greaterThan(abs(uv), vec2(3.0)))) texel = vec4(0.0, 0.0, 0.0, 1.0);
+    if (!isClamped && any(greaterThan(abs(uv), vec2(extent)))) texel = vec4(0.0, 0.0, 0.0, 1.0);
     if (mode == FULL || mode == TEXTURE) color += texel.rgb;
     alpha *= texel.a;
   }

@@ -161,6 +161,11 @@ test("every changed byte is detected", async () => {
 
 const { page, ends, choices, appearance } = FIELDS;
 const parts = FIELDS.parts as [string, string, number][];
+const described = appearance as { parts: { texture: { options: Fields } } };
+const withTextures = (options: Fields): Fields => {
+  const texture = { ...described.parts.texture, options: { ...described.parts.texture.options, ...options } };
+  return { ...described, parts: { ...described.parts, texture } };
+};
 test.each([
   { num: 1 << 24 },
   { num: -1 },
@@ -192,6 +197,9 @@ test.each([
   { origin: { names: [] } },
   { appearance: { ...appearance, parts: {} } },
   { appearance: { ...appearance, options: { max_alpha: 2 } } },
+  { appearance: withTextures({ extent: 0 }) },
+  { appearance: withTextures({ extent: "3" }) },
+  { appearance: withTextures({ extent: null }) },
   { page: { ...page, near_plane: 0 } },
   { page: { ...page, title: 3 } },
   { page: { ...page, note: null } },
@@ -204,6 +212,12 @@ test.each([
   { parts: parts.map(([name, coder, length]) => [name, coder, name === "quats" ? -1 : length]) },
 ])("headers that the file contradicts are rejected: %o", async (changes) => {
   await expect(read(changed(changes))).rejects.toThrow(SceneError);
+});
+
+test("textures have the extent that the header says, 3 without", async () => {
+  expect(described.parts.texture.options).not.toHaveProperty("extent");
+  expect((await read(SMALL)).header.extent).toBe(3);
+  expect((await read(changed({ appearance: withTextures({ extent: 1.5 }) }))).header.extent).toBe(1.5);
 });
 
 test("headers may leave out what the viewer does without", async () => {
