@@ -1,4 +1,4 @@
-"""The tables and the chart of docs/results.md, and the table of earlier versions of `bytewise` in NOTEBOOK.md."""
+"""The tables and the chart of docs/results.md, and the comparisons in NOTEBOOK.md that this page leaves out."""
 
 import dataclasses
 import itertools
@@ -8,6 +8,7 @@ import numpy as np
 from lab import tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid, read_grid
+from lab.jobs import Record
 from lab.kept import read_kept
 from lab.statistics import Comparison, bootstrap, compare, differences, holm
 from lab.tables import EQUAL_BYTES, Result
@@ -15,14 +16,24 @@ from matplotlib.figure import Figure
 
 from a2tg_jax.results.figures import save_figure
 
+A2TG = "A²TG"
+IMPROVED = "A²TG, improved"
+"""A²TG without the handicaps of earlier `quick`: its name in tables, and its label in grids (", degree 0" follows)."""
+EARLIER = "A²TG of earlier `quick`"
+"""Name of the A²TG of E1, whose textures of one texel stay neutral and whose new texels begin without moments."""
+PLACES = {"paper160": "at the paper's length", "full_size": "at the paper's size", "half_size": "at half that size"}
+"""Scales of the paper's comparison, E5 and E4, in the words of the table."""
+QUICK, QUICK_SIZE, SIZE = "in `quick`", 60, "bytes a pixel"
+"""Name of E1's place in the table, and its bytes per pixel; rows in NOTEBOOK.md name their size."""
 DENSE, FEW = "dense", "few views"
-BEST, MCMC = "Best plain method", "2DGS*-MCMC"
+BEST, MCMC, TEXTURED = "Best plain method", "2DGS*-MCMC", "Textured Gaussians*"
 BYTEWISE, SECOND, FIRST = "Bytewise", "Bytewise, second version", "Bytewise, first version"
 VERSIONS = {BYTEWISE: "bytewise", SECOND: "bytewise 2", FIRST: "bytewise 1"}
 """Names in the table of `bytewise` and of its earlier versions: the second places no Gaussians by errors of pictures,
 and the first has textures and no weight on opacities either."""
 EQUAL_TIME = ", equal time"
 PRIMARY = f"{VERSIONS[FIRST]} − best plain method, 0.3 MB"
+REGISTERED = ", the registered endpoint"
 SECONDARY = {
     "equal time": (PRIMARY + EQUAL_TIME, "psnr"),
     "SSIM": (PRIMARY, "ssim"),
@@ -60,6 +71,21 @@ class Row:
     results: Sequence[Result]
     label: str
     other: str
+    num_scenes: int | None = None
+    """Number of scenes of its grid, if some may not be finished."""
+    place: str = ""
+    """Length, size and degree of all its methods, if the name lacks them."""
+
+    @property
+    def text(self) -> str:
+        """Return its name, with a note if scenes are missing."""
+        num = len(self.differences("psnr"))
+        return f"{self.name} ({num} of {self.num_scenes} scenes)" if num < (self.num_scenes or 0) else self.name
+
+    @property
+    def whole_text(self) -> str:
+        """Return its name, with its place and a note if scenes are missing."""
+        return ", ".join(filter(None, [self.text, self.place]))
 
     def differences(self, figure: str) -> dict[str, list[np.ndarray]]:
         return differences(self.results, self.label, self.other, figure)
@@ -104,22 +130,63 @@ def rows_of_parts(results: Sequence[Result]) -> list[Row]:
     return [*rows, Row("plain, pruned: shapes of kernels, 0.3 MB", results, f"{pruned}, with shapes", pruned)]
 
 
-def rows_of_degrees(results: Mapping[int, Sequence[Result]]) -> list[Row]:
-    """Return the comparisons of A²TG with methods of its degree, and of plain degrees 0 and 3, by bytes per pixel.
+def rows_against(grid: Grid, results: Sequence[Result], own: Mapping[str, str], place: str) -> list[Row]:
+    """Return the comparisons of kinds of A²TG with the other methods of a grid, which fill its bytes.
 
-    The results are by the degree of A²TG, whose bytes the others of a grid fill.
+    Args:
+      grid: a grid whose methods have one degree.
+      results: its runs of one size.
+      own: names of the kinds of A²TG by label.
+      place: size or length in the words of the table.
     """
+    degree = degree_of(grid)
+    plain = suffixed(MCMC, degree)
+    others = {
+        plain: "plain",
+        f"{plain}, first stage": "plain, first stage",
+        suffixed(TEXTURED, degree): "textures of one size",
+    }
+    num_scenes = len({cell.scene.label for cell in grid.cells})
+    place = f"{place}, degree {degree}"
+    return [
+        Row(f"{name} − {wording}", results, label, other + EQUAL_BYTES, num_scenes, place)
+        for (label, name), (other, wording) in itertools.product(own.items(), others.items())
+    ]
+
+
+def degree_of(grid: Grid) -> int:
+    """Return the degree of all methods of a grid, with which its name ends."""
+    return int(grid.name[-1])
+
+
+def suffixed(label: str, degree: int) -> str:
+    """Return the label of a method at a degree; 3 is not named."""
+    return label if degree == 3 else f"{label}, degree {degree}"
+
+
+def rows_at_length(grid: Grid, records: Mapping[str, Record], place: str) -> list[Row]:
+    """Return the comparisons of A²TG as the paper has it, of the improved one, and of `bytewise`, by size."""
+    improved = suffixed(IMPROVED, degree_of(grid)) + EQUAL_BYTES
+    own = {grid.reference.label: A2TG, improved: IMPROVED}
     rows = []
-    for size in sorted({bytes_per_pixel(result) for own in results.values() for result in own}):
-        at_size = {degree: [one for one in own if bytes_per_pixel(one) == size] for degree, own in results.items()}
-        place = f"{size} bytes a pixel"
-        for degree, own in at_size.items():
-            suffix = "" if degree == 3 else f", degree {degree}"
-            for label, wording in ((MCMC, "plain"), ("Textured Gaussians*", "textures of one size")):
-                name = f"A²TG − {wording}, degree {degree}, {place}"
-                rows.append(Row(name, own, f"A²TG, degree {degree}", label + suffix + EQUAL_BYTES))
-        name = f"plain: degree 0 − degree 3, {place}"
-        rows.append(Row(name, at_size[3], f"{MCMC}, degree 0{EQUAL_BYTES}", MCMC + EQUAL_BYTES))
+    for num, results in tables.grouped(tables.results_of(grid, records), lambda result: result.run.cell.gaussians):
+        at_size = place if place == PLACES["paper160"] else f"{place}, {num:,} Gaussians"
+        rows += rows_against(grid, results, own, at_size)
+        name = f"{VERSIONS[BYTEWISE]} − {A2TG}"
+        rows.append(dataclasses.replace(rows[-1], name=name, label=BYTEWISE + EQUAL_BYTES, other=grid.reference.label))
+    return rows
+
+
+def rows_of_quick(grid: Grid, records: Mapping[str, Record]) -> list[Row]:
+    """Return the comparisons of E1 at a degree by size, and plain degree 0 with degree 3 where both were run."""
+    improved = suffixed(IMPROVED, degree_of(grid)) + EQUAL_BYTES
+    own = {improved: IMPROVED, grid.reference.label: EARLIER}
+    zero, three = (suffixed(MCMC, degree) + EQUAL_BYTES for degree in (0, 3))
+    rows = []
+    for size, results in tables.grouped(tables.results_of(grid, records), bytes_per_pixel):
+        place = f"{size} {SIZE}"
+        rows += rows_against(grid, results, own, QUICK if size == QUICK_SIZE else place)
+        rows.append(Row("plain: degree 0 − degree 3", results, zero, three, rows[-1].num_scenes, place))
     return rows
 
 
@@ -130,7 +197,7 @@ def bytes_per_pixel(result: Result) -> int:
 
 
 def table_of(rows: Sequence[Row]) -> str:
-    """Return the table of the comparisons that have runs."""
+    """Return the table of the comparisons that have runs, with all intervals."""
     lines = []
     for row in rows:
         found = {figure: row.compared(figure) for figure in tables.QUALITY}
@@ -139,16 +206,34 @@ def table_of(rows: Sequence[Row]) -> str:
             continue
         low, high = bootstrap(row.differences("psnr"))
         lines.append([
-            row.name, with_interval(psnr, "psnr"), "–" if np.isnan(low) else f"{low:+.2f} to {high:+.2f}",
-            with_interval(found["ssim"], "ssim"), with_interval(found["lpips"], "lpips"),
-            f"{psnr.num_won} of {len(psnr.by_scene)}", tables.number(psnr.p_value, 3),
+            row.whole_text, with_interval(psnr, "psnr"), "–" if np.isnan(low) else f"{low:+.2f} to {high:+.2f}",
+            with_interval(found["ssim"], "ssim"), with_interval(found["lpips"], "lpips"), *tests_of(psnr),
         ])  # fmt: skip
     return tables.markdown(["", "ΔPSNR, dB", "bootstrap", "ΔSSIM", "ΔLPIPS", "scenes won", "p"], lines)
 
 
+def short_table(rows: Sequence[Row]) -> str:
+    """Return the table of the comparisons that have runs, below their place, with the intervals of PSNR alone."""
+    header = ["", "ΔPSNR, dB", "ΔSSIM", "ΔLPIPS", "scenes won", "p"]
+    lines = []
+    for place, block in tables.grouped([row for row in rows if row.differences("psnr")], lambda row: row.place):
+        if place:
+            lines.append([f"**{place}**", *[""] * (len(header) - 1)])
+        for row in block:
+            psnr, ssim, lpips = (row.compared(figure) for figure in tables.QUALITY)
+            means = [emphasized(tables.signed(one.over_scenes.mean, 3), one) for one in (ssim, lpips)]
+            lines.append([row.text, with_interval(psnr, "psnr"), *means, *tests_of(psnr)])
+    return tables.markdown(header, lines)
+
+
+def tests_of(found: Comparison) -> list[str]:
+    """Return the scenes won and the p-value for a table."""
+    return [f"{found.num_won} of {len(found.by_scene)}", tables.number(found.p_value, 3)]
+
+
 def scenes_table(rows: Sequence[Row]) -> str:
     """Return ΔPSNR of each scene in the comparisons that have runs."""
-    found = {row.name: row.compared("psnr").by_scene for row in rows}
+    found = {row.whole_text: row.compared("psnr").by_scene for row in rows}
     found = {name: by_scene for name, by_scene in found.items() if by_scene}
     scenes = dict.fromkeys(scene for by_scene in found.values() for scene in by_scene)
     lines = [
@@ -159,8 +244,12 @@ def scenes_table(rows: Sequence[Row]) -> str:
 
 
 def with_interval(found: Comparison, figure: str) -> str:
-    """Return a mean with its t interval, in bold if the interval excludes 0."""
-    text = found.over_scenes.as_text(tables.DIGITS[figure])
+    """Return a mean with its t interval for a table."""
+    return emphasized(found.over_scenes.as_text(tables.DIGITS[figure]), found)
+
+
+def emphasized(text: str, found: Comparison) -> str:
+    """Return a text in bold if the t interval of its comparison excludes 0."""
     return f"**{text}**" if found.is_decided else text
 
 
@@ -177,55 +266,81 @@ def endpoints(rows: Sequence[Row]) -> str:
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Write the table and the chart, from the records of this scale and of the other one beside it."""
+    """Write the tables and the chart, from the records of this scale and of those beside it."""
     bytewise, equal_time, parts = (tables.results_of(grid, lab.records) for grid in grids)
+    of_bytewise = rows_of_bytewise(bytewise, equal_time)
+    of_a2tg = rows_of_a2tg(lab)
+    shown = [row for row in of_a2tg if SIZE not in row.place]
+    others = [row for row in of_a2tg if SIZE in row.place]
+    lab.write("paper", f"# The paper's comparison\n\n{short_table(shown)}", has_old_rows=False)
+    lab.write("matched_degree", f"# Other rows of E1\n\n{table_of(others)}", has_old_rows=False)
+
+    own = shown_of_bytewise(of_bytewise)
+    earlier = [row for row in of_bytewise if row not in own]
+    lab.write(EXPERIMENT.name, f"# Findings\n\n{short_table(own)}")
+    lab.write("parts_of_bytewise", f"# Parts of bytewise 1\n\n{table_of(rows_of_parts(parts))}")
+    lab.write("earlier_versions", f"# Earlier versions of bytewise\n\n{table_of(earlier)}\n{endpoints(of_bytewise)}")
+
+    at_length = [row for row in shown if row.place.startswith(PLACES["paper160"])]
+    dense = [row for row in own if row.name.endswith(("0.3 MB", EQUAL_TIME))]
+    by_scene = [scenes_table(rows) for rows in (at_length, dense) if any(row.differences("psnr") for row in rows)]
+    lab.write("details", "\n".join(["# Details of the findings\n", table_of([*shown, *own]), *by_scene]))
+    # Differences from 3DGS of degree 3 are several times as large as the others.
+    charted = {A2TG: shown, VERSIONS[BYTEWISE]: [row for row in own if row.other != "3DGS-MCMC, degree 3"]}
+    found = {title: [row for row in rows if row.differences("psnr")] for title, rows in charted.items()}
+    if all(found.values()):
+        save_figure(lab.pages / f"{EXPERIMENT.name}.png", forest(found))
+
+
+def rows_of_a2tg(lab: Lab) -> list[Row]:
+    """Return the comparisons of A²TG at the paper's length and size, then those of E1."""
+    rows = []
+    for scale, place in ({"smoke": PLACES["paper160"]} if lab.is_smoke else PLACES).items():
+        records = read_kept(lab.out.parent / scale / "records.json")
+        for degree in (3, 0):
+            rows += rows_at_length(read_grid(f"paper_degree_{degree}", scale), records, place)
     scale = "smoke" if lab.is_smoke else "protocol160"
     records = read_kept(lab.out.parent / scale / "records.json")
-    degrees = {degree: tables.results_of(read_grid(f"degree_{degree}", scale), records) for degree in (3, 1, 0)}
-    of_bytewise = rows_of_bytewise(bytewise, equal_time)
-    newest = newest_of(of_bytewise)
-    rows = [*newest, *rows_of_parts(parts), *rows_of_degrees(degrees)]
-    at_size = [row for row in newest if "0.3 MB" in row.name and FEW not in row.name]
-    lab.write(EXPERIMENT.name, f"# Findings\n\n{table_of(rows)}\n{scenes_table(at_size)}")
-    shown = {row.name for row in newest}
-    earlier = [row for row in of_bytewise if row.name not in shown]
-    lab.write("earlier_versions", f"# Earlier versions of bytewise\n\n{table_of(earlier)}\n{endpoints(of_bytewise)}")
-    charted: dict[str, tuple[Sequence[float], float, float]] = {}
+    for degree in (3, 1, 0):
+        rows += rows_of_quick(read_grid(f"degree_{degree}", scale), records)
+    return rows
+
+
+def shown_of_bytewise(rows: Sequence[Row]) -> list[Row]:
+    """Return the present comparisons with the best plain method and with 3DGS, and the registered one."""
+    found = []
     for row in rows:
-        # Differences from 3DGS of degree 3 are several times as large as the others.
-        if (one := row.compared("psnr")).by_scene and row.other != "3DGS-MCMC, degree 3":
-            charted[row.name] = list(one.by_scene.values()), one.over_scenes.mean, one.over_scenes.half_width
-    if charted:
-        save_figure(lab.pages / f"{EXPERIMENT.name}.png", forest(charted))
+        is_plain = row.other.startswith(BEST)
+        is_3dgs = row.other.startswith("3DGS") and FEW not in row.name
+        if row.label == BYTEWISE and (is_plain or is_3dgs):
+            found.append(row)
+    registered = [dataclasses.replace(row, name=row.name + REGISTERED) for row in rows if row.name == PRIMARY]
+    return [*found, *registered]
 
 
-def newest_of(rows: Sequence[Row]) -> list[Row]:
-    """Return the comparisons of `bytewise` with other methods and its second version, each of the newest version that
-    has runs."""
-    found: dict[str, Row] = {}
-    for row in rows:
-        if row.compared("psnr").by_scene and row.other != FIRST and UNSEEN not in row.name:
-            # The rest of the name is the same for all versions, and the newest comes first.
-            found.setdefault(row.name.partition(" − ")[2], row)
-    return list(found.values())
-
-
-def forest(found: Mapping[str, tuple[Sequence[float], float, float]]) -> Figure:
-    """Return a row for each comparison: the values of its scenes, and their mean with its interval.
+def forest(found: Mapping[str, Sequence[Row]]) -> Figure:
+    """Return a panel for each group of comparisons with a row for each: the values of its scenes, and their mean with
+    its interval.
 
     Args:
-      found: values, mean and half-width of the interval by name; the first is drawn on top.
+      found: comparisons by the panel's title; the first is drawn on top.
     """
-    figure = Figure(figsize=(8.0, 0.8 + 0.26 * len(found)), layout="constrained")
-    axes = figure.add_subplot()
-    for place, (values, mean, half_width) in enumerate(found.values()):
-        axes.plot(values, [place] * len(values), "o", color="#4477aa", alpha=0.35, markersize=4, markeredgewidth=0)
-        axes.errorbar(mean, place, xerr=np.nan_to_num(half_width), fmt="D", color="#000000", markersize=4, capsize=3)
-    axes.axvline(0.0, color="#888888", linewidth=0.8)
-    axes.set_yticks(range(len(found)), list(found), fontsize=8)
-    axes.set_ylim(len(found) - 0.4, -0.6)  # The first on top.
-    axes.set_xlabel("difference of PSNR, dB")
-    axes.grid(alpha=0.25, axis="x")
+    heights = [1.5 + len(rows) for rows in found.values()]
+    figure = Figure(figsize=(8.0, 0.8 + 0.26 * sum(heights)), layout="constrained")
+    panels = figure.subplots(len(found), squeeze=False, height_ratios=heights)[:, 0]
+    for axes, (title, rows) in zip(panels, found.items(), strict=True):
+        for place, row in enumerate(rows):
+            psnr = row.compared("psnr")
+            values = list(psnr.by_scene.values())
+            axes.plot(values, [place] * len(values), "o", color="#4477aa", alpha=0.35, markersize=4, markeredgewidth=0)
+            interval = {"xerr": np.nan_to_num(psnr.over_scenes.half_width), "capsize": 3}
+            axes.errorbar(psnr.over_scenes.mean, place, fmt="D", color="#000000", markersize=4, **interval)
+        axes.axvline(0.0, color="#888888", linewidth=0.8)
+        axes.set_yticks(range(len(rows)), [row.whole_text.replace("`", "") for row in rows], fontsize=8)
+        axes.set_ylim(len(rows) - 0.4, -0.6)  # The first on top.
+        axes.set_title(title, fontsize=9)
+        axes.grid(alpha=0.25, axis="x")
+    panels[-1].set_xlabel("difference of PSNR, dB")
     return figure
 
 

@@ -87,7 +87,7 @@ class Bytewise(TwoStages):
     """Adam's learning rate of the coefficients above base_degree."""
     view_dependence: AdaptDegrees = AdaptDegrees()
     """Spherical harmonics above base_degree, in the second stage."""
-    texture_share: float = 0.0  # 0.02 gains nothing at 0.3 MB (docs/results.md)
+    texture_share: float = 0.0  # 0.02 gains nothing at 0.3 MB (experiments/NOTEBOOK.md)
     """Share of the bytes for textures, such as 0.02; 0: none."""
     texel_rate: float = 2.5e-3
     """Adam's learning rate of the texels; textures of one texel are not trained."""
