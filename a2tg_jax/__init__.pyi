@@ -132,7 +132,8 @@ from .systems.baselines import (
     SuperGaussians as SuperGaussians,
     TexturedGaussians as TexturedGaussians,
 )
-from .systems.bytewise import Bytewise as Bytewise, LimitExponents as LimitExponents
+from .systems.bytewise import Bytewise as Bytewise
+from .systems.two_stages import LimitExponents as LimitExponents
 from .texture import (
     Textures as Textures,
     allocate_textures as allocate_textures,

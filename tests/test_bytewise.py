@@ -18,7 +18,8 @@ from a2tg_jax.densify.view_dependence import AdaptDegrees
 from a2tg_jax.events import HostEvent
 from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.results.record import compared_system
-from a2tg_jax.systems.bytewise import Bytewise, LimitExponents
+from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.systems.two_stages import LimitExponents
 from a2tg_jax.training import LossConfig
 from a2tg_jax.training.checkpoint import load_checkpoint, save_checkpoint
 from a2tg_jax.training.start import initial_model, padded

@@ -1,20 +1,24 @@
 """A²TG: plain Gaussians first, then textures that grow where the gradient is large (arXiv 2026, §3)."""
 
 import dataclasses
+import math
 from typing import Any, ClassVar, Self
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.appearance import Appearance, TexelRates, Texture, TextureOptions
 from a2tg_jax.core.budget import MEGABYTE, bytes_per_gaussian, megabytes_of
 from a2tg_jax.core.checks import check_number
+from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.mcmc import Mcmc, Noise
 from a2tg_jax.systems.two_stages import (
     FLOATS_PER_TEXEL,
     QUICK_CAP,
     QUICK_TEXELS,
     SMOKE_CAP,
+    LimitExponents,
     TwoStages,
     grown_by_mcmc,
+    kernels_of,
 )
 from a2tg_jax.training.stage import Stage
 
@@ -51,6 +55,13 @@ class A2tg(TwoStages):
     empty_textures: bool = False
     """Whether Gaussians have no texture, which takes no bytes, until they are chosen to get more texels; off: all begin
     with one texel."""
+    texture_share: float | None = None
+    """Share of a memory_budget for textures, which decides the number of Gaussians; None: as many bytes as 5 texels per
+    Gaussian take, or half of the largest texture if that is less."""
+    kernel_rate: float | None = None
+    """Adam's learning rate of the kernels' shapes; None or 0: all kernels are Gaussians, as in the paper."""
+    exponents: LimitExponents = LimitExponents()
+    """Lower limit of the exponents of kernels; 0: no limit."""
     lookup: TextureOptions = TextureOptions()
     """Options of the texture lookup."""
 
@@ -64,23 +75,41 @@ class A2tg(TwoStages):
             budget = megabytes_of(self.memory_budget)
             # Thresholds belong to another rule, and custom ones would be rejected.
             texture = dataclasses.replace(texture, select="budget", threshold=None, budget_mb=budget)
-        # Up to half of the largest texture, if there is a time to grow.
-        least = self._initial_side**2
-        grows = texture.iterations(self.stage2_iterations)
-        texels = min(BUDGET_TEXELS, (least + texture.cap**2) / 2) if grows else least
-        growth = grown_by_mcmc(self.densify, self.budget_cap(FLOATS_PER_TEXEL * texels))
-        first = self.growing_stage(growth, Appearance(max_alpha=self.lookup.max_alpha))
-        events = (*([Noise()] if self.noise_in_stage2 else []), texture)
+        kernels = kernels_of(self.kernel_rate, self.exponents)
+        growth = grown_by_mcmc(self.densify, self.budget_cap(self._floats_in_budget()))
+        plain = Appearance(exponents=kernels.part, max_alpha=self.lookup.max_alpha)
+        first = self.growing_stage((*growth, *kernels.limits), plain, kernels.rates or None)
+        events = (*([Noise()] if self.noise_in_stage2 else []), texture, *kernels.limits)
         single = self.texel_rate if self.single_texel_rate is None else self.single_texel_rate
-        rates = {"texture": TexelRates(self.texel_rate, single)}
-        side = self._initial_side
-        textured = Appearance(texture=Texture(None, (side, side), self.lookup))
+        rates = kernels.rates | {"texture": TexelRates(self.texel_rate, single)}
+        textured = Appearance(texture=Texture(None, self._start, self.lookup), exponents=kernels.part)
         return first, self.later_stage("textures", textured, events, rates)
 
     @property
-    def _initial_side(self) -> int:
-        """Side of every texture when the second stage begins."""
-        return 0 if self.empty_textures else 1
+    def _start(self) -> tuple[int, int]:
+        """Size of every texture when the second stage begins."""
+        return (0, 0) if self.empty_textures else (1, 1)
+
+    def _floats(self, texels: float) -> float:
+        """Return the floats of a Gaussian's kernel and of its texels."""
+        return bool(self.kernel_rate) + FLOATS_PER_TEXEL * texels
+
+    def _floats_in_budget(self) -> float:
+        """Return the floats of kernel and texels that a Gaussian has on average in a full memory budget."""
+        least, most = math.prod(self._start), self.texture.cap**2
+        if not self.texture.iterations(self.stage2_iterations):
+            return self._floats(least)
+        if self.texture_share is None:
+            # Up to half of the largest texture.
+            return self._floats(min(BUDGET_TEXELS, (least + most) / 2))
+        own = floats_per_gaussian(self.sh_degree) + self._floats(0)
+        if self.texture_share > (limit := 1 - own / (own + FLOATS_PER_TEXEL * most)):
+            raise ValueError(
+                f"texture_share must be at most {limit:.3g}, the share of textures of {self.texture.cap} × "
+                f"{self.texture.cap} texels; got {self.texture_share}: lower it, or raise texture.cap"
+            )
+        # Such that the Gaussians' own floats are the rest of all; the texels that all begin with count.
+        return max(self._floats(least), self._floats(0) + own * self.texture_share / (1 - self.texture_share))
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
@@ -96,6 +125,10 @@ class A2tg(TwoStages):
         check_number("texel_rate", self.texel_rate, least=0)
         if self.single_texel_rate is not None:
             check_number("single_texel_rate", self.single_texel_rate, least=0)
+        if self.texture_share is not None:
+            check_number("texture_share", self.texture_share, least=0, below=1)
+        if self.kernel_rate is not None:
+            check_number("kernel_rate", self.kernel_rate, least=0)
         if self.empty_textures:
             check_number("texture.cap", self.texture.cap, least=2)
             # A rate of 0, as in short presets, holds nothing still.
@@ -126,7 +159,7 @@ class A2tg(TwoStages):
     def _check_budget(self, num: int, remedy: str) -> None:
         if self.texture.budget_mb is None:
             return
-        needed = num * bytes_per_gaussian(self.sh_degree, FLOATS_PER_TEXEL * self._initial_side**2) / MEGABYTE
+        needed = num * bytes_per_gaussian(self.sh_degree, self._floats(math.prod(self._start))) / MEGABYTE
         if self.texture.budget_mb < needed:
             textures = "without textures" if self.empty_textures else "of one texel each"
             raise ValueError(

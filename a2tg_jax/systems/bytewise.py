@@ -4,48 +4,19 @@ import dataclasses
 import math
 from typing import Any, ClassVar, Self
 
-import jax.numpy as jnp
-
 from a2tg_jax.adapt import Upscale
-from a2tg_jax.appearance import Appearance, Bands, Exponents, TexelRates, Texture, TextureOptions
-from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MOST_SHARE
+from a2tg_jax.appearance import Appearance, Bands, TexelRates, Texture, TextureOptions
 from a2tg_jax.core.budget import MEGABYTE, bytes_of, bytes_per_gaussian
 from a2tg_jax.core.checks import check_number
-from a2tg_jax.core.optim import AdamState
-from a2tg_jax.core.pytree import pytree
 from a2tg_jax.densify.placing import PlaceByError
 from a2tg_jax.densify.pruning import Prune
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.densify.view_dependence import AdaptDegrees
-from a2tg_jax.events import Change, Event, Now, StepEvent
+from a2tg_jax.events import Event
 from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import Noise, densify_times
-from a2tg_jax.model import Model
-from a2tg_jax.systems.two_stages import PRUNING, TwoStages, pruned
+from a2tg_jax.systems.two_stages import PRUNING, LimitExponents, TwoStages, kernels_of, pruned
 from a2tg_jax.training.stage import Stage
-
-
-@pytree
-class LimitExponents(StepEvent):
-    """Lower limit of the exponents of kernels (`Appearance.exponents`), after every iteration."""
-
-    least: float = 0.6  # an opaque kernel reaches 5.7σ, and 11.7σ at 1/e (experiments/NOTEBOOK.md)
-    """Smallest exponent of a kernel, 0 to 1. Smaller ones have longer tails, which take longer to draw; up to 1/e it
-    limits nothing."""
-
-    num_keys = 0
-
-    def check_options(self) -> None:
-        check_number("least", self.least, least=0, most=1)
-
-    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
-        if (shapes := model.appearance.shapes) is None:
-            raise ValueError("LimitExponents needs kernels with exponents, such as Appearance(exponents=Exponents())")
-        share = jnp.log(jnp.asarray(self.least, shapes.dtype)) / LARGEST_LOG_EXPONENT
-        least = jnp.arctanh(jnp.clip(share, -MOST_SHARE, MOST_SHARE))
-        appearance = model.appearance.with_shapes(jnp.maximum(shapes, least))
-        return Change(dataclasses.replace(model, appearance=appearance), moments, state)
-
 
 QUICK_CAP, SMOKE_CAP = 40_000, 2_000
 
@@ -104,21 +75,20 @@ class Bytewise(TwoStages):
         return self.base_degree
 
     def stages(self) -> tuple[Stage, ...]:
-        most = self.lookup.max_alpha
-        plain = Appearance(exponents=Exponents() if self.kernel_rate else None, max_alpha=most)
-        kernels: dict[str, Any] = {"exponents": self.kernel_rate} if self.kernel_rate else {}
-        limits = (self.exponents,) if self.kernel_rate and self.exponents.least else ()
+        kernels = kernels_of(self.kernel_rate, self.exponents)
+        plain = Appearance(exponents=kernels.part, max_alpha=self.lookup.max_alpha)
         # Growth fills all bytes; the end of the first stage makes room for details.
         grow = dataclasses.replace(self.densify, cap=self._num_gaussians())
         pruning = pruned(self.prune, self.stage1_iterations, densify_times)
         placing = (dataclasses.replace(self.place, cap=grow.cap),) if self.place.share else ()
         last = (Prune(keep=self._num_kept()),) if self._share else ()
-        first = self.growing_stage((Noise(), grow, *pruning, *placing, *last, *limits), plain, kernels or None)
+        growth = (Noise(), grow, *pruning, *placing, *last, *kernels.limits)
+        first = self.growing_stage(growth, plain, kernels.rates or None)
         fading = dataclasses.replace(self.loss, opacity_weight=self.loss.opacity_weight + self.fading_weight)
         first = dataclasses.replace(first, losses=fading.terms())
         # Degrees rise up to their share of the bytes; textures, empty at first, take the rest.
         events: list[Event] = []
-        rates = kernels | {"bands": self.view_dependence_rate}
+        rates = kernels.rates | {"bands": self.view_dependence_rate}
         detailed = dataclasses.replace(plain, bands=Bands())
         if self.view_dependence_share:
             budget, highest = self._megabytes_before_texels(), min(self.sh_degree, self.view_dependence.highest)
@@ -129,7 +99,7 @@ class Bytewise(TwoStages):
             rates |= {"texture": TexelRates(self.texel_rate, 0.0)}
             # Without texels at first: one texel would add to the Gaussian's colour and opacity only.
             detailed = dataclasses.replace(detailed, texture=Texture(None, (0, 0), self.lookup), max_alpha=None)
-        return first, self.later_stage("details", detailed, (*events, *limits), rates)
+        return first, self.later_stage("details", detailed, (*events, *kernels.limits), rates)
 
     @property
     def _share(self) -> float:

@@ -2,14 +2,21 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
-from a2tg_jax.appearance import Appearance
+import jax.numpy as jnp
+
+from a2tg_jax.appearance import Appearance, Exponents
+from a2tg_jax.appearance.parts import LARGEST_LOG_EXPONENT, MOST_SHARE
+from a2tg_jax.core.checks import check_number
+from a2tg_jax.core.optim import AdamState
+from a2tg_jax.core.pytree import pytree
 from a2tg_jax.densify.clone_split import CloneSplitPrune, FillingDensity
 from a2tg_jax.densify.pruning import Prune, PruneFloaters, during_growth
-from a2tg_jax.events import Event, StepEvent, Times
+from a2tg_jax.events import Change, Event, Now, StepEvent, Times
 from a2tg_jax.host.text import shortened
 from a2tg_jax.mcmc import FillingMcmc, Mcmc, Noise
+from a2tg_jax.model import Model
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import LearningRates, Stage
 
@@ -88,6 +95,46 @@ class TwoStages(System):
         if not self.stage2_iterations:
             return (first,)
         return first, self.later_stage("continued", first.appearance, appearance_rate=first.appearance_rate)
+
+
+@pytree
+class LimitExponents(StepEvent):
+    """Lower limit of the exponents of kernels (`Appearance.exponents`), after every iteration."""
+
+    least: float = 0.6  # an opaque kernel reaches 5.7σ, and 11.7σ at 1/e (experiments/NOTEBOOK.md)
+    """Smallest exponent of a kernel, 0 to 1. Smaller ones have longer tails, which take longer to draw; up to 1/e it
+    limits nothing."""
+
+    num_keys = 0
+
+    def check_options(self) -> None:
+        check_number("least", self.least, least=0, most=1)
+
+    def apply(self, now: Now, model: Model, moments: AdamState, state: tuple[()]) -> Change:
+        if (shapes := model.appearance.shapes) is None:
+            raise ValueError("LimitExponents needs kernels with exponents, such as Appearance(exponents=Exponents())")
+        share = jnp.log(jnp.asarray(self.least, shapes.dtype)) / LARGEST_LOG_EXPONENT
+        least = jnp.arctanh(jnp.clip(share, -MOST_SHARE, MOST_SHARE))
+        appearance = model.appearance.with_shapes(jnp.maximum(shapes, least))
+        return Change(dataclasses.replace(model, appearance=appearance), moments, state)
+
+
+class Kernels(NamedTuple):
+    """What kernels with exponents add to every stage; nothing if all kernels are Gaussians."""
+
+    part: Exponents | None
+    """Part of the appearance."""
+    rates: dict[str, Any]
+    """Learning rate of the part, by its name."""
+    limits: tuple[Event, ...]
+    """Events after all others."""
+
+
+def kernels_of(rate: float | None, exponents: LimitExponents) -> Kernels:
+    """Return what kernels add that are trained at a rate; 0 or None: they are Gaussians."""
+    if not rate:
+        return Kernels(None, {}, ())
+    return Kernels(Exponents(), {"exponents": rate}, (exponents,) if exponents.least else ())
 
 
 def grown_by_mcmc(densify: Mcmc, budget_cap: int | None) -> tuple[Event, ...]:

@@ -8,8 +8,8 @@ from a2tg_jax.appearance import Exponents
 from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.mcmc import FillingMcmc, densify_times
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
-from a2tg_jax.systems.bytewise import Bytewise, LimitExponents
-from a2tg_jax.systems.two_stages import grown_by_mcmc, pruned
+from a2tg_jax.systems.bytewise import Bytewise
+from a2tg_jax.systems.two_stages import LimitExponents, grown_by_mcmc, pruned
 from a2tg_jax.training.stage import Stage
 
 
