@@ -14,6 +14,7 @@ do and about how long it takes. docs/sweeps.md says how to write a grid file of 
 import argparse
 import contextlib
 import importlib
+import os
 import shlex
 import sys
 import textwrap
@@ -125,5 +126,7 @@ def interruptible() -> Iterator[None]:
 
 if __name__ == "__main__":
     with interruptible():
+        # Jobs take what they need of a GPU's memory, and leave the rest to each other and to this process.
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
         configure_cpu()
         main()

@@ -318,6 +318,8 @@ def test_tables_of_a_budget_show_the_gaussians_of_the_runs():
             ["fixed_memory", "--plan", "--memory-gb", "nan"],
             "--memory-gb must be a finite number larger than 0; got nan",
         ),
+        (["fixed_memory", "--plan", "--minutes", "0"], "--minutes must be a finite number larger than 0; got 0.0"),
+        (["fixed_memory", "--minutes", "9", "--cluster", "slurm"], "--minutes has no effect on jobs of --cluster"),
         (["fixed_memory", "--plan", "--downscale", "2"], "--downscale is that of --scene: add --scene"),
         (["fixed_memory", "--plan", "--scene", ".", "--downscale", "0"], "--downscale must be at least 1; got 0"),
         (["fixed_memory", "--plan", "--scene", ".", "--only", "fox"], "--only chooses scenes of the scale"),

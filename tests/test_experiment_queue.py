@@ -3,6 +3,7 @@
 import concurrent.futures
 import dataclasses
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -25,13 +26,19 @@ class FakeJob:
 class FakePool:
     """Runs jobs at once, or fails them; writes down in which order."""
 
+    shares_devices = False
+
     def __init__(self, folders, slots=2, memory=np.inf, outcomes=None):
+        self.limit, self.num_aborted = queue.TimeLimit(), 0
         self.slots, self.memory, self.folders = slots, memory, folders
         self.outcomes, self.order, self.most = outcomes or {}, [], 0
         self.running, self.failures, self.record = [], [], record()
 
     def is_death(self, error):
         return isinstance(error, concurrent.futures.BrokenExecutor)
+
+    def abort(self):
+        self.num_aborted += 1
 
     def submit(self, job, folders):
         self.order.append(job.key)
@@ -137,6 +144,74 @@ def test_a_job_that_leaves_no_model_has_failed(folders):
     pool.submit = forget
     (failure,) = run_queue(pool, folders, {}, [lost])
     assert "left no model" in failure.reason
+
+
+def test_after_a_time_limit_nothing_starts_and_what_runs_is_ended(folders):
+    pool, records = FakePool(folders), {}
+    pool.limit = queue.TimeLimit(time.monotonic() + 100.0, spare=40.0)
+    assert run_queue(pool, folders, records) == [] and pool.order == [] and records == {}, "80 s before the end"
+    pool.limit = queue.TimeLimit(time.monotonic() + 1.5)
+    pool.submit = lambda job, folders: pool.order.append(job.key) or concurrent.futures.Future()  # It never ends.
+    assert run_queue(pool, folders, records) == []
+    assert len(pool.order) == 2 and pool.num_aborted == 1 and records == {}
+
+
+def test_a_training_that_stopped_at_the_limit_has_no_record_and_no_failure(folders):
+    pool, records = FakePool(folders), {}
+    pool.record = None
+    submit = pool.submit
+
+    def until_the_limit(job, folders):
+        pool.limit = queue.TimeLimit(time.monotonic())
+        return submit(job, folders)
+
+    pool.submit = until_the_limit
+    assert run_queue(pool, folders, records) == [] and pool.order == ["first"] and records == {}
+
+
+def test_a_limit_keeps_time_for_checkpoints():
+    before = time.monotonic()
+    limit, short = queue.TimeLimit.of_minutes(9.0), queue.TimeLimit.of_minutes(0.5)
+    assert 540.0 <= limit.end - before < 545.0 and limit.stop == limit.end - 30.0 and short.spare == 3.0
+    assert not limit.is_too_late and not queue.TimeLimit().is_too_late and not queue.TimeLimit().is_over
+
+
+@pytest.mark.parametrize("shares", [False, True])
+def test_jobs_that_run_on_the_same_devices_are_noted(folders, shares):
+    """Also the one that ran first; the note lasts until a record is there."""
+    pool = FakePool(folders)
+    pool.shares_devices, noted = shares, {}
+    jobs = [FakeJob("one"), FakeJob("two"), FakeJob("last")]
+    submit = pool.submit
+
+    def submit_and_look(job, folders):
+        noted[job.key] = {one.key for one in jobs if folders.shared(one).is_file()}
+        return submit(job, folders)
+
+    pool.submit = submit_and_look
+    run_queue(pool, folders, {}, jobs)
+    both = {"one", "two"} if shares else set()
+    assert noted == {"one": set(), "two": both, "last": set()}
+    assert not any(folders.shared(one).is_file() for one in jobs)
+
+
+def test_processes_share_the_memory_of_a_gpu(monkeypatch):
+    for name in ("CUDA_VISIBLE_DEVICES", *queue.MEMORY_FRACTIONS):
+        monkeypatch.delenv(name, raising=False)
+    assert queue.gpu_variables(3, 4, num_gpus=4) == {"CUDA_VISIBLE_DEVICES": "3"}
+    found = [queue.gpu_variables(index, 3, num_gpus=2) for index in range(3)]
+    assert [one["CUDA_VISIBLE_DEVICES"] for one in found] == ["0", "1", "0"]
+    assert {one["XLA_CLIENT_MEM_FRACTION"] for one in found} == {"0.400"}
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.2")
+    assert queue.gpu_variables(1, 4, num_gpus=2) == {"CUDA_VISIBLE_DEVICES": "7"}, "the user's own share is kept"
+
+
+def test_pools_know_whether_jobs_share_devices():
+    cores = len(queue.LocalPool(1, np.inf)._cores or [0])
+    assert not queue.LocalPool(cores, np.inf).shares_devices and queue.LocalPool(cores + 1, np.inf).shares_devices
+    assert queue.LocalPool(2, np.inf, num_gpus=1).shares_devices
+    assert not queue.LocalPool(2, np.inf, num_gpus=2).shares_devices
 
 
 @pytest.mark.parametrize("memory, most", [(np.inf, 2), (1.5, 1), (0.1, 1)])

@@ -14,7 +14,7 @@ from experiment_records import record
 from lab import queue, versions
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.grid import read_grid
-from lab.jobs import Folders, Job, _load_checkpoint, milliseconds, model_bytes
+from lab.jobs import TIMES, Folders, Job, _load_checkpoint, milliseconds, model_bytes, run_job
 from lab.plan import Machine, duration, finished_pace, plan_of
 from lab.progress import Progress
 from lab.stages import stages_of
@@ -36,6 +36,56 @@ def test_a_stage_stopped_under_one_system_goes_on_under_another(tmp_path):
     assert fit_stage(scene, textured, 0, resume=resumed, progress=False).model.num > 0
     with pytest.raises(ValueError, match="made with other numbers"):
         _load_checkpoint(path, Job("synthetic", 1, dataclasses.replace(textured, seed=5), 0))
+
+
+def test_a_stage_stops_at_its_time_and_is_timed_only_if_it_ran_alone(tmp_path, monkeypatch):
+    scene = a2tg.synthetic_scene(num_views=3, width=24, height=16, num_points=30)
+    monkeypatch.setattr(Folders, "load_scene", lambda self, job: scene)
+    system = a2tg.find_system("gaussians-2d-mcmc").preset("smoke", stage1_iterations=20, stage2_iterations=0)
+    job, folders = Job("synthetic", 1, system, 0), Folders(tmp_path, tmp_path)
+    assert run_job(job, folders, stop_at=time.monotonic()) is None
+    assert folders.checkpoint(job).is_file() and not folders.model(job).is_file() and not folders.record(job).is_file()
+    alone = run_job(job, folders)
+    assert alone["alone"] and alone["device"] and all(alone[name] is not None for name in TIMES)
+    assert not folders.checkpoint(job).is_file()
+    again = dataclasses.replace(job, system=dataclasses.replace(system, seed=1))
+    folders.shared(again).parent.mkdir()
+    folders.shared(again).touch()
+    shared = run_job(again, folders)
+    assert not shared["alone"] and [shared[name] for name in TIMES] == [None] * 4 and shared["psnr"] > 0
+    assert shared.keys() == alone.keys() and json.loads(folders.record(again).read_text()) == shared
+    folders.shared(job).touch()
+    measured = run_job(job, folders)
+    assert measured == {**alone, "fps": None}, "measured again beside others: the time of its training stays"
+
+
+def test_after_the_time_limit_what_is_left_is_named(tmp_path, capsys):
+    given = ["fixed_memory", "--scale", "smoke", "--out", str(tmp_path), "--work", str(tmp_path), "--minutes", "1e-6"]
+    main(given)
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == (
+        "the time limit of 1e-06 minutes is over: 6 of 6 stages are left, first built-in 1/2, A²TG, stage gaussians, "
+        "400 Gaussians, seed 0; the same command continues, --plan lists them"
+    )
+    main([*given, "--tables-only"])
+    assert "time limit" not in capsys.readouterr().out
+
+
+def test_models_that_nothing_left_starts_from_can_be_dropped(tmp_path):
+    grid, folders = read_grid("fixed_memory", "smoke"), Folders(tmp_path, tmp_path)
+    lab = Lab(parse_arguments(experiments(), ["fixed_memory", "--scale", "smoke", "--work", str(tmp_path)]))
+    first = next(grid.jobs({}))
+    lab.records = {first.start.key: record()}
+    path, start = folders.model(first), folders.model(first.start)
+    path.parent.mkdir()
+    other = path.with_name("other.npz")
+    for one in (path, start, other):
+        one.touch()
+    lab._drop_models([grid])
+    assert start.is_file(), "the second stage needs it"
+    lab.records[first.key] = record()
+    lab._drop_models([grid])
+    assert [*path.parent.iterdir()] == [other], "models of other sweeps stay"
 
 
 def call(name, *arguments, **options):
@@ -198,6 +248,7 @@ def test_progress_names_stages_in_words(tmp_path, capsys):
     progress.start(job.start)
     progress.done(job.start, record(seconds=3.0))
     progress.done(job.start, record(seconds=3.0, ms_per_step=None))
+    progress.done(job.start, record(seconds=None, ms_per_step=None))
     records[job.key] = record(mb=0.1)
     last = list(grid.jobs(records))[-1]
     progress.start(last)
@@ -207,12 +258,13 @@ def test_progress_names_stages_in_words(tmp_path, capsys):
     assert printed[1] == "1 of 6 start: built-in 1/2, A²TG, stage gaussians, 400 Gaussians, seed 0"
     assert printed[2].startswith("1 of 6 done: built-in 1/2, A²TG, ") and "25.00 dB" in printed[2]
     assert printed[2].endswith("; 3 s, 10 ms a step") and printed[3].endswith("; 3 s"), "a short stage has no pace"
-    assert printed[4].startswith(
+    assert printed[4].endswith("25.00 dB"), "a stage beside others has no time"
+    assert printed[5].startswith(
         "2 of 6 start: built-in 1/2, Textured Gaussians*, stage textures, bytes of 400 Gaussians"
     )
-    assert printed[5].startswith("2 of 6 FAILED: ") and printed[5].endswith(": no room")
+    assert printed[6].startswith("2 of 6 FAILED: ") and printed[6].endswith(": no room")
     log = (tmp_path / "log.txt").read_text(encoding="utf-8").splitlines()
-    assert len(log) == 6 and all(line.endswith(shown) for line, shown in zip(log, printed, strict=True))
+    assert len(log) == 7 and all(line.endswith(shown) for line, shown in zip(log, printed, strict=True))
 
 
 def test_arguments_have_defaults():

@@ -175,6 +175,8 @@ def test_the_report_names_the_commit(tmp_path, monkeypatch):
         found = SimpleNamespace(read_text=lambda _, note=note: json.dumps(note))
         monkeypatch.setattr("a2tg_jax.host.source_commit.distribution", lambda _, found=found: found)
         assert source_commit() == commit
+    monkeypatch.setenv("A2TG_COMMIT", "of a copy")
+    assert source_commit() == "of a copy"
 
 
 # Pictures of a model

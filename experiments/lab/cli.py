@@ -26,9 +26,9 @@ from lab.jobs import Folders, Job, Record
 from lab.kept import read_figures, read_kept
 from lab.plan import Machine, plan_of
 from lab.progress import Progress
-from lab.queue import LocalPool, Pool, SubmititPool, run_all
+from lab.queue import LocalPool, Pool, SubmititPool, TimeLimit, run_all
 from lab.scenes import SceneAt, own_scene
-from lab.stages import check_systems
+from lab.stages import check_systems, stages_of
 from lab.tables import Result
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
@@ -49,6 +49,7 @@ class Lab:
     def __init__(self, args: argparse.Namespace):
         check_arguments(args)
         self.args = args
+        self.limit = TimeLimit() if args.minutes is None else TimeLimit.of_minutes(args.minutes)
         self.scale: str = args.scale
         self.out: Path = args.out or self._default_out()
         self.work: Path = args.work or RUNS / "experiments" / args.scale
@@ -97,8 +98,13 @@ class Lab:
         def keep(job: Job, record: Record) -> None:
             self._save()
             progress.done(job, record)
+            if self.args.drop_models:
+                self._drop_models(grids)
 
         with contextlib.closing(self._pool()) as pool:
+            if pool.shares_devices and any(grid.at_equal_time for grid in grids):
+                print("Stages that share a GPU or cores are not timed, so runs of equal time are left out. --jobs 1 "
+                      "times them.", flush=True)  # fmt: skip
             progress.begin(pool.slots)
             try:
                 failures = run_all(jobs, self.folders, pool, self.records, keep, progress.failed, progress.start)
@@ -106,6 +112,25 @@ class Lab:
                 pool.abort()
                 raise
         return [f"{progress.as_text(failure.job)}: {failure.reason}" for failure in failures]
+
+    def _drop_models(self, grids: Sequence[Grid]) -> None:
+        """Delete the models of finished stages that no unfinished one starts from."""
+        stages = stages_of(grids, self.records)
+        starts = [stage.job.start for key, stage in stages.items() if key not in self.records]
+        needed = {start.key for start in starts if start is not None}
+        for key in self.records.keys() & stages.keys() - needed:
+            self.folders.model(stages[key].job).unlink(missing_ok=True)
+
+    def rest_text(self, grids: Sequence[Grid]) -> str:
+        """Return what is left after the time limit; empty if nothing is, or without a limit."""
+        stages = stages_of(grids, self.records)
+        left = [stage for key, stage in stages.items() if key not in self.records]
+        if not left or not self.limit.is_too_late or self.args.tables_only:
+            return ""
+        return (
+            f"the time limit of {self.args.minutes:g} minutes is over: {len(left)} of {len(stages)} stages are left, "
+            f"first {left[0]}; the same command continues, --plan lists them"
+        )
 
     @property
     def is_partial(self) -> bool:
@@ -199,7 +224,7 @@ class Lab:
             is_here = args.cluster == "local"
             slots = args.jobs or (default_jobs() if is_here else MOST_SENT)
             return SubmititPool(args.cluster, self.work / "submitit", slots, memory if is_here else inf, **parameters)
-        return LocalPool(args.jobs or default_jobs(), memory, num_gpus())
+        return LocalPool(args.jobs or default_jobs(), memory, num_gpus(), self.limit)
 
 
 @functools.cache
@@ -257,6 +282,9 @@ def run_experiments(experiments: Sequence[Experiment], args: argparse.Namespace)
     if errors:
         wording = "\n".join(f"  {error}" for error in errors)
         sys.exit(f"error: some jobs failed, and what needs them is missing. Call again to retry:\n{wording}")
+    rest = lab.rest_text(list(grids.values()))
+    if rest:
+        print(rest, flush=True)
     return lab
 
 
@@ -299,7 +327,11 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
         "default: experiments/results/SCALE, or runs/results/SCALE for --scale smoke and grid files")  # fmt: skip
     add("--work", type=Path, help="folder of models and checkpoints; default: runs/experiments/SCALE")
     add("--lpips-weights", type=Path, help="weights of LPIPS (AlexNet); without them LPIPS is left out")
-    add("--jobs", type=int, help="number of jobs at a time; default: one a GPU, else one a core")
+    add("--jobs", type=int,
+        help="number of jobs at a time; default: one a GPU, else one a core. More share a GPU's memory")  # fmt: skip
+    add("--minutes", type=float, help="time limit of this call; the next one continues what was cut off")
+    add("--drop-models", action="store_true",
+        help="delete each model that no unfinished run starts from; --work then has only what continues")  # fmt: skip
     add(
         "--memory-gb",
         type=float,
@@ -324,6 +356,10 @@ def check_arguments(args: argparse.Namespace) -> None:
         raise ValueError(f"--jobs must be at least 1; got {args.jobs}")
     if args.memory_gb is not None and not 0 < args.memory_gb < math.inf:
         raise ValueError(f"--memory-gb must be a finite number larger than 0; got {args.memory_gb}")
+    if args.minutes is not None and not 0 < args.minutes < math.inf:
+        raise ValueError(f"--minutes must be a finite number larger than 0; got {args.minutes}")
+    if args.minutes is not None and args.cluster:
+        raise ValueError("--minutes has no effect on jobs of --cluster: set timeout_min with --cluster-parameter")
     if args.downscale is not None and not args.scene:
         raise ValueError("--downscale is that of --scene: add --scene, or set downscale in a grid file of your own")
     if args.only and args.scene:

@@ -9,6 +9,7 @@ import datetime
 import functools
 import hashlib
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,8 @@ MOST_TRAIN_VIEWS = 16
 """Largest number of training views that are measured, evenly chosen."""
 DEFAULT_GAUSSIANS = 100_000
 """Assumed number of Gaussians of a system that sets no limit."""
+TIMES = ("seconds", "ms_per_step", "step_seconds", "fps")
+"""Figures that count for a job that had its GPU or its cores to itself; None for others."""
 Record = dict[str, Any]
 """Figures of a finished job, in JSON."""
 
@@ -154,6 +157,10 @@ class Folders:
     def checkpoint(self, job: Job) -> Path:
         return self.work / "checkpoints" / f"{job.key}.npz"
 
+    def shared(self, job: Job) -> Path:
+        """Return the file whose presence says that others ran on the job's GPU or cores, also in an earlier call."""
+        return self.work / "shared" / job.key
+
     def load_scene(self, job: Job, room: int | None = None) -> a2tg.Scene:
         """Return a job's scene; `room` as in `SceneSource.load`."""
         is_folder = job.scene not in BUILT_IN
@@ -164,25 +171,41 @@ class Folders:
         return with_validation_views(scene) if job.validation else scene
 
 
-def run_job(job: Job, folders: Folders) -> Record:
+def run_job(job: Job, folders: Folders, stop_at: float = math.inf) -> Record | None:
     """Train a job, from its checkpoint if it was stopped, and measure its model (host).
 
     A job that was trained before, but measured without LPIPS or with another network's, is only measured again.
+
+    Args:
+      job: the job.
+      folders: its folders.
+      stop_at: time of `time.monotonic` at which training writes a checkpoint and stops.
+
+    Returns:
+      The record, or None if training was stopped.
     """
     scene = folders.load_scene(job)
     path, model = folders.record(job), folders.model(job)
     if path.is_file() and model.is_file() and not is_from_before(read_json(path)):
+        times: tuple[str, ...] = ("fps",)
         record = {**read_json(path), **_quality(scene, a2tg.load_model(model), folders)}
     else:
-        result = _train(job, folders, scene)
+        try:
+            result = _train(job, folders, scene, stop_at)
+        except a2tg.Interrupted:
+            return None
         a2tg.save_model(_ready(model), result.model)
+        times = TIMES
         record = {**_training_facts(job, scene, result), **_quality(scene, result.model, folders)}
+        record["alone"] = not folders.shared(job).is_file()
+    if folders.shared(job).is_file():
+        record |= dict.fromkeys(times)
     write_json(_ready(path), record)
     folders.checkpoint(job).unlink(missing_ok=True)
     return record
 
 
-def _train(job: Job, folders: Folders, scene: a2tg.Scene) -> a2tg.StageResult:
+def _train(job: Job, folders: Folders, scene: a2tg.Scene, stop_at: float) -> a2tg.StageResult:
     path = _ready(folders.checkpoint(job))
     start = None if job.start is None else a2tg.load_model(folders.model(job.start))
     return fit_stage(
@@ -194,6 +217,7 @@ def _train(job: Job, folders: Folders, scene: a2tg.Scene) -> a2tg.StageResult:
         on_checkpoint=lambda checkpoint: a2tg.save_checkpoint(path, checkpoint),
         checkpoint_every=max(500, job.iterations // 10),
         progress=False,
+        is_stopped=lambda: time.monotonic() >= stop_at,
         session=_session(),
     )
 

@@ -33,10 +33,11 @@ class Progress:
 
     def done(self, job: Job, record: Record) -> None:
         """Tell the figures of a finished stage."""
-        pace = record["ms_per_step"]
+        seconds, pace = (record[name] for name in ("seconds", "ms_per_step"))
         self._tell(
             f"{self._place(job)} done: {self.as_text(job)}: {record['num']:,} Gaussians, {record['mb']:.2f} MB, "
-            f"{record['psnr']:.2f} dB; {record['seconds']:.0f} s{'' if pace is None else f', {pace:.0f} ms a step'}"
+            f"{record['psnr']:.2f} dB{'' if seconds is None else f'; {seconds:.0f} s'}"
+            f"{'' if pace is None else f', {pace:.0f} ms a step'}"
         )
 
     def failed(self, failure: Failure) -> None:

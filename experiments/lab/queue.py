@@ -12,6 +12,7 @@ import collections
 import concurrent.futures
 import contextlib
 import dataclasses
+import math
 import multiprocessing
 import os
 import re
@@ -32,6 +33,13 @@ BASE_BYTES = 4.0e9
 """Bytes of a process that trains: libraries, a small scene, and the compiled programs of a hundred jobs."""
 COPIES = 12
 """Copies of a trained number: itself, gradients, Adam's moments, sums of threads."""
+GPU_SHARE = 0.8
+"""Share of a GPU's memory for all processes that train on it; the rest is for their programs and for this process."""
+MEMORY_FRACTIONS = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
+"""Variables with the share of a GPU's memory for a process: JAX's present one and its former one. JAX refuses both
+together."""
+SPARE_SHARE, MOST_SPARE = 0.1, 30.0
+"""Time before a limit at which trainings stop, to write their checkpoints: a share of the limit, and seconds."""
 
 Records = Mapping[str, Record]
 Ask = Callable[[Records], Iterable[Job]]
@@ -46,31 +54,68 @@ class Failure:
     reason: str
 
 
+@dataclasses.dataclass(frozen=True)
+class TimeLimit:
+    """Time limit of a call. Times are those of `time.monotonic`, which the processes of a machine share."""
+
+    end: float = math.inf
+    """Time at which jobs that still run are ended."""
+    spare: float = 0.0
+    """Seconds before the end at which trainings stop."""
+
+    @classmethod
+    def of_minutes(cls, minutes: float) -> "TimeLimit":
+        """Return the limit of a call that begins now."""
+        return cls(time.monotonic() + 60 * minutes, min(MOST_SPARE, SPARE_SHARE * 60 * minutes))
+
+    @property
+    def stop(self) -> float:
+        """Time at which trainings write their checkpoints and stop."""
+        return self.end - self.spare
+
+    @property
+    def is_too_late(self) -> bool:
+        """Whether a job that starts now would have no time to train."""
+        return time.monotonic() >= self.stop - 2 * self.spare
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the end has come."""
+        return time.monotonic() >= self.end
+
+
 class LocalPool:
     """Processes of this machine, each with its share of the cores and GPUs.
 
     They stay for one job after another, so that compiled programs are used again.
     """
 
-    def __init__(self, slots: int, memory: float, num_gpus: int = 0):
-        self.slots, self.memory, self._num_gpus = slots, memory, num_gpus
+    def __init__(self, slots: int, memory: float, num_gpus: int = 0, limit: TimeLimit = TimeLimit()):
+        self.slots, self.memory, self.limit = slots, memory, limit
+        self._num_gpus = num_gpus
+        self._cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
         self._executor = self._new_executor()
+
+    @property
+    def shares_devices(self) -> bool:
+        """Whether jobs that run at the same time may be on one GPU or on the same cores."""
+        return self.slots > (self._num_gpus or len(self._cores) or os.cpu_count() or 1)
 
     def _new_executor(self) -> concurrent.futures.ProcessPoolExecutor:
         context = multiprocessing.get_context("spawn")
-        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
         shares = context.Queue()
         for index in range(self.slots):
-            shares.put((cores[index :: self.slots] or cores, index % self._num_gpus if self._num_gpus else None))
+            gpu = gpu_variables(index, self.slots, self._num_gpus) if self._num_gpus else {}
+            shares.put((self._cores[index :: self.slots] or self._cores, gpu))
         return concurrent.futures.ProcessPoolExecutor(self.slots, context, _begin_worker, (shares,))
 
     def submit(self, job: Job, folders: Folders) -> concurrent.futures.Future:
         with _interrupts_ignored():  # The processes that begin here leave Ctrl-C to this one.
             try:
-                return self._executor.submit(run_job, job, folders)
+                return self._executor.submit(run_job, job, folders, self.limit.stop)
             except concurrent.futures.BrokenExecutor:
                 self._executor = self._new_executor()
-                return self._executor.submit(run_job, job, folders)
+                return self._executor.submit(run_job, job, folders, self.limit.stop)
 
     def is_death(self, error: Exception) -> bool:
         """Return whether an error means that a job's process died, not that the job failed."""
@@ -110,10 +155,24 @@ def _begin_worker(shares: Any) -> None:
     cores, gpu = shares.get()
     if cores:
         os.sched_setaffinity(0, cores)
-    if gpu is not None:
-        given = os.environ.get("CUDA_VISIBLE_DEVICES")
-        os.environ["CUDA_VISIBLE_DEVICES"] = given.split(",")[gpu] if given else str(gpu)
+    os.environ |= gpu
     a2tg_jax.configure_cpu()
+
+
+def gpu_variables(index: int, slots: int, num_gpus: int) -> dict[str, str]:
+    """Return the environment of a process that trains on a GPU: which one, and its share of the memory.
+
+    JAX reads these variables when it first uses a device. By default each process would take three quarters of the
+    memory at once (https://docs.jax.dev/en/latest/gpu_memory_allocation.html). The share is an upper bound if
+    XLA_PYTHON_CLIENT_PREALLOCATE is false, as `run.py` sets it.
+    """
+    gpu = index % num_gpus
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    variables = {"CUDA_VISIBLE_DEVICES": given.split(",")[gpu] if given else str(gpu)}
+    together = math.ceil(slots / num_gpus)
+    if together > 1 and not any(name in os.environ for name in MEMORY_FRACTIONS):
+        variables[MEMORY_FRACTIONS[0]] = f"{GPU_SHARE / together:.3f}"
+    return variables
 
 
 def _end_with_parent() -> None:
@@ -142,7 +201,8 @@ class SubmititPool:
             import submitit
         except ImportError as error:
             raise ValueError("--cluster needs submitit: pip install 'a2tg-jax[experiments]'") from error
-        self.slots, self.memory = slots, memory
+        self.slots, self.memory, self.limit = slots, memory, TimeLimit()
+        self.shares_devices = cluster == "local" and slots > 1
         # Pickled jobs name this package, which their processes must find.
         paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
@@ -173,7 +233,7 @@ Pool = LocalPool | SubmititPool
 class Elsewhere:
     """Call of submitit's that runs a job; if it is preempted or out of time it is queued again, and continues."""
 
-    def __call__(self, job: Job, folders: Folders) -> Record:
+    def __call__(self, job: Job, folders: Folders) -> Record | None:
         import a2tg_jax
 
         a2tg_jax.configure_cpu()
@@ -222,7 +282,8 @@ def run_all(
       on_start: called with each job when it starts.
 
     Returns:
-      The failed jobs. Jobs that need their results are not run.
+      The failed jobs. Jobs that need their results are not run. At the pool's time limit, running jobs have left
+      checkpoints.
     """
     running: dict[str, tuple[Job, Any]] = {}
     failures: dict[str, Failure] = {}
@@ -237,7 +298,9 @@ def run_all(
         for job in _ready(wanted, folders, records):
             others = [other for other, _ in running.values()]
             is_open = job.key not in running and job.key not in failures
-            if is_open and _fits(job, others, pool, deaths):
+            if is_open and _fits(job, others, pool, deaths) and not pool.limit.is_too_late:
+                if pool.shares_devices and others:
+                    _mark_shared([*others, job], folders)
                 on_start(job)
                 running[job.key] = job, pool.submit(job, folders)
         if not running:
@@ -257,13 +320,19 @@ def run_all(
                 else:
                     deaths[key] += 1
             else:
+                if record is None:
+                    continue  # Its time was over, and it left a checkpoint.
                 if folders.model(job).is_file():
+                    folders.shared(job).unlink(missing_ok=True)
                     records[key] = record
                     on_record(job, record)
                 else:
                     fail(job, f"it was run, but left no model at {folders.model(job)}")
         if ended:
             wanted = list(ask(records))
+        elif pool.limit.is_over:
+            pool.abort()
+            return list(failures.values())
         else:
             time.sleep(POLL_SECONDS)
 
@@ -275,6 +344,14 @@ def _fits(job: Job, others: list[Job], pool: Pool, deaths: Mapping[str, int]) ->
     if len(others) >= pool.slots or any(deaths.get(one.key) for one in [*others, job]):
         return False
     return sum(map(estimated_bytes, [*others, job])) <= pool.memory
+
+
+def _mark_shared(jobs: Iterable[Job], folders: Folders) -> None:
+    """Note that jobs run at the same time on the same devices."""
+    for job in jobs:
+        path = folders.shared(job)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
 
 
 def _ready(jobs: Iterable[Job], folders: Folders, records: Records) -> list[Job]:
