@@ -21,8 +21,13 @@ IMPROVED = "A²TG, improved"
 """A²TG without the handicaps of earlier `quick`: its name in tables, and its label in grids (", degree 0" follows)."""
 EARLIER = "A²TG of earlier `quick`"
 """Name of the A²TG of E1, whose textures of one texel stay neutral and whose new texels begin without moments."""
-PLACES = {"paper160": "at the paper's length", "full_size": "at the paper's size", "half_size": "at half that size"}
-"""Scales of the paper's comparison, E5 and E4, in the words of the table."""
+PLACES = {
+    "paper160": "at the paper's length",
+    "long": "at the paper's length, an earlier series",
+    "full_size": "at the paper's size",
+    "half_size": "at half that size",
+}
+"""Scales of the paper's comparison (E5, a series before the protocol, E4) in the words of the table."""
 QUICK, QUICK_SIZE, SIZE = "in `quick`", 60, "bytes a pixel"
 """Name of E1's place in the table, and its bytes per pixel; rows in NOTEBOOK.md name their size."""
 DENSE, FEW = "dense", "few views"
@@ -130,16 +135,16 @@ def rows_of_parts(results: Sequence[Result]) -> list[Row]:
     return [*rows, Row("plain, pruned: shapes of kernels, 0.3 MB", results, f"{pruned}, with shapes", pruned)]
 
 
-def rows_against(grid: Grid, results: Sequence[Result], own: Mapping[str, str], place: str) -> list[Row]:
-    """Return the comparisons of kinds of A²TG with the other methods of a grid, which fill its bytes.
+def rows_against(grid: Grid, degree: int, results: Sequence[Result], own: Mapping[str, str], place: str) -> list[Row]:
+    """Return the comparisons of kinds of A²TG with the methods that fill its bytes.
 
     Args:
-      grid: a grid whose methods have one degree.
-      results: its runs of one size.
+      grid: a grid whose reference is A²TG.
+      degree: degree of A²TG and of the other methods.
+      results: runs of one size.
       own: names of the kinds of A²TG by label.
       place: size or length in the words of the table.
     """
-    degree = degree_of(grid)
     plain = suffixed(MCMC, degree)
     others = {
         plain: "plain",
@@ -154,38 +159,35 @@ def rows_against(grid: Grid, results: Sequence[Result], own: Mapping[str, str], 
     ]
 
 
-def degree_of(grid: Grid) -> int:
-    """Return the degree of all methods of a grid, with which its name ends."""
-    return int(grid.name[-1])
-
-
 def suffixed(label: str, degree: int) -> str:
     """Return the label of a method at a degree; 3 is not named."""
     return label if degree == 3 else f"{label}, degree {degree}"
 
 
-def rows_at_length(grid: Grid, records: Mapping[str, Record], place: str) -> list[Row]:
+def rows_at_length(grid: Grid, degree: int, records: Mapping[str, Record], place: str) -> list[Row]:
     """Return the comparisons of A²TG as the paper has it, of the improved one, and of `bytewise`, by size."""
-    improved = suffixed(IMPROVED, degree_of(grid)) + EQUAL_BYTES
-    own = {grid.reference.label: A2TG, improved: IMPROVED}
+    own = {grid.reference.label: A2TG, suffixed(IMPROVED, degree) + EQUAL_BYTES: IMPROVED}
+    has_sizes = len({cell.gaussians for cell in grid.cells}) > 1
     rows = []
     for num, results in tables.grouped(tables.results_of(grid, records), lambda result: result.run.cell.gaussians):
-        at_size = place if place == PLACES["paper160"] else f"{place}, {num:,} Gaussians"
-        rows += rows_against(grid, results, own, at_size)
+        rows += rows_against(grid, degree, results, own, f"{place}, {num:,} Gaussians" if has_sizes else place)
+        if degree == 3:
+            zero = suffixed(MCMC, 0) + EQUAL_BYTES
+            name = f"{A2TG} − plain of degree 0"
+            rows.append(dataclasses.replace(rows[-1], name=name, label=grid.reference.label, other=zero))
         name = f"{VERSIONS[BYTEWISE]} − {A2TG}"
         rows.append(dataclasses.replace(rows[-1], name=name, label=BYTEWISE + EQUAL_BYTES, other=grid.reference.label))
     return rows
 
 
-def rows_of_quick(grid: Grid, records: Mapping[str, Record]) -> list[Row]:
+def rows_of_quick(grid: Grid, degree: int, records: Mapping[str, Record]) -> list[Row]:
     """Return the comparisons of E1 at a degree by size, and plain degree 0 with degree 3 where both were run."""
-    improved = suffixed(IMPROVED, degree_of(grid)) + EQUAL_BYTES
-    own = {improved: IMPROVED, grid.reference.label: EARLIER}
+    own = {suffixed(IMPROVED, degree) + EQUAL_BYTES: IMPROVED, grid.reference.label: EARLIER}
     zero, three = (suffixed(MCMC, degree) + EQUAL_BYTES for degree in (0, 3))
     rows = []
     for size, results in tables.grouped(tables.results_of(grid, records), bytes_per_pixel):
         place = f"{size} {SIZE}"
-        rows += rows_against(grid, results, own, QUICK if size == QUICK_SIZE else place)
+        rows += rows_against(grid, degree, results, own, QUICK if size == QUICK_SIZE else place)
         rows.append(Row("plain: degree 0 − degree 3", results, zero, three, rows[-1].num_scenes, place))
     return rows
 
@@ -228,7 +230,7 @@ def short_table(rows: Sequence[Row]) -> str:
 
 def tests_of(found: Comparison) -> list[str]:
     """Return the scenes won and the p-value for a table."""
-    return [f"{found.num_won} of {len(found.by_scene)}", tables.number(found.p_value, 3)]
+    return [f"{found.num_won}/{len(found.by_scene)}", tables.number(found.p_value, 3)]
 
 
 def scenes_table(rows: Sequence[Row]) -> str:
@@ -285,9 +287,9 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     dense = [row for row in own if row.name.endswith(("0.3 MB", EQUAL_TIME))]
     by_scene = [scenes_table(rows) for rows in (at_length, dense) if any(row.differences("psnr") for row in rows)]
     lab.write("details", "\n".join(["# Details of the findings\n", table_of([*shown, *own]), *by_scene]))
-    # Differences from 3DGS of degree 3 are several times as large as the others.
+    # Differences from 3DGS of degree 3, and intervals of two scenes, are several times as large as the others.
     charted = {A2TG: shown, VERSIONS[BYTEWISE]: [row for row in own if row.other != "3DGS-MCMC, degree 3"]}
-    found = {title: [row for row in rows if row.differences("psnr")] for title, rows in charted.items()}
+    found = {title: [row for row in rows if len(row.differences("psnr")) > 2] for title, rows in charted.items()}
     if all(found.values()):
         save_figure(lab.pages / f"{EXPERIMENT.name}.png", forest(found))
 
@@ -296,13 +298,14 @@ def rows_of_a2tg(lab: Lab) -> list[Row]:
     """Return the comparisons of A²TG at the paper's length and size, then those of E1."""
     rows = []
     for scale, place in ({"smoke": PLACES["paper160"]} if lab.is_smoke else PLACES).items():
+        names = {3: "fixed_memory"} if scale == "long" else {3: "paper_degree_3", 0: "paper_degree_0"}
         records = read_kept(lab.out.parent / scale / "records.json")
-        for degree in (3, 0):
-            rows += rows_at_length(read_grid(f"paper_degree_{degree}", scale), records, place)
+        for degree, name in names.items():
+            rows += rows_at_length(read_grid(name, scale), degree, records, place)
     scale = "smoke" if lab.is_smoke else "protocol160"
     records = read_kept(lab.out.parent / scale / "records.json")
     for degree in (3, 1, 0):
-        rows += rows_of_quick(read_grid(f"degree_{degree}", scale), records)
+        rows += rows_of_quick(read_grid(f"degree_{degree}", scale), degree, records)
     return rows
 
 

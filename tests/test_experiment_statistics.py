@@ -27,6 +27,13 @@ def test_views_seeds_and_scenes_are_averaged_in_this_order():
         differences([at("x", "own", 22.0, views="ac"), at("x", "other", 20.0)], "own", "other", "psnr")
 
 
+def test_a_mean_without_views_counts_as_one_view():
+    results = [at("x", "own", 22.0), at("x", "other", 20.0), at("y", "own", 25.0), at("y", "other", 26.0)]
+    old = [tables.Result(one.run, {**one.record, "per_view": None, "psnr": one.record["psnr"]}) for one in results]
+    wanted, found = (compare(differences(each, "own", "other", "psnr")) for each in (results, old))
+    assert found == wanted and found.by_scene == {"x": 2.0, "y": -1.0}
+
+
 def test_the_sign_flip_test_is_scipys_exact_permutation_test():
     values = np.random.default_rng(0).normal(0.4, 1.0, 9)
     options = {"permutation_type": "samples", "n_resamples": np.inf}

@@ -202,7 +202,7 @@ def test_the_papers_rows_have_the_runs_that_there_are():
     grid = read_grid("paper_degree_0", "paper160")
     improved = Method(f"{findings.IMPROVED}, degree 0", "a2tg")
     grid = dataclasses.replace(grid, at_equal_bytes=(*grid.at_equal_bytes[:2], improved))
-    assert findings.rows_at_length(grid, {}, "here") == []
+    assert findings.rows_at_length(grid, 0, {}, "here") == []
     scenes = [cell.scene.label for cell in grid.cells]
     records = {}
     for run in grid.runs(records):
@@ -210,14 +210,14 @@ def test_the_papers_rows_have_the_runs_that_there_are():
         gain = 1 + scenes.index(scene) / 10 if run.method == grid.reference else 2 if run.method == improved else 0
         if (scene, run.method.label) != ("chair", "2DGS*-MCMC, degree 0"):
             records[run.job.key] = record(20 + gain, per_view={"a": [20 + gain, 0.8 - gain / 100, 0.2]})
-    rows = findings.rows_at_length(grid, records, findings.PLACES["paper160"])
+    rows = findings.rows_at_length(grid, 0, records, findings.PLACES["paper160"])
     lines = findings.short_table(rows).splitlines()[2:]
     assert lines == [
         "| **at the paper's length, degree 0** |  |  |  |  |  |",
-        "| A²TG − plain (5 of 6 scenes) | **+1.24 ± 0.26** | **-0.012** | +0.000 | 5 of 5 | .062 |",
-        "| A²TG − plain, first stage | **+1.25 ± 0.20** | **-0.013** | +0.000 | 6 of 6 | .031 |",
-        "| A²TG, improved − plain (5 of 6 scenes) | **+2.00 ± 0.00** | **-0.020** | +0.000 | 5 of 5 | .062 |",
-        "| A²TG, improved − plain, first stage | **+2.00 ± 0.00** | **-0.020** | +0.000 | 6 of 6 | .031 |",
+        "| A²TG − plain (5 of 6 scenes) | **+1.24 ± 0.26** | **-0.012** | +0.000 | 5/5 | .062 |",
+        "| A²TG − plain, first stage | **+1.25 ± 0.20** | **-0.013** | +0.000 | 6/6 | .031 |",
+        "| A²TG, improved − plain (5 of 6 scenes) | **+2.00 ± 0.00** | **-0.020** | +0.000 | 5/5 | .062 |",
+        "| A²TG, improved − plain, first stage | **+2.00 ± 0.00** | **-0.020** | +0.000 | 6/6 | .031 |",
     ]
 
 

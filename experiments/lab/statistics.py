@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from lab.jobs import Record
 from lab.tables import CONFIDENCE, QUALITY, Result, SceneMean, grouped, over_scenes
 
 NUM_DRAWS = 10_000
@@ -41,13 +42,15 @@ class Comparison:
 def differences(results: Sequence[Result], label: str, other: str, figure: str) -> dict[str, list[np.ndarray]]:
     """Return a figure of one method − that of another for every view of every pair, by scene.
 
+    Records from before the protocol have no views: their mean counts as one.
+
     Raises:
       ValueError: if the methods of a pair were scored on different views.
     """
     place = QUALITY.index(figure)  # Records have the figures of a view in this order.
     found: dict[str, list[np.ndarray]] = {}
     for cell, block in grouped(results, lambda result: result.run.cell):
-        views = {result.label: result.record["per_view"] for result in block if result.label in (label, other)}
+        views = {result.label: _by_view(result.record) for result in block if result.label in (label, other)}
         if len(views) < 2:
             continue
         own, base = views[label], views[other]
@@ -55,6 +58,12 @@ def differences(results: Sequence[Result], label: str, other: str, figure: str) 
             raise ValueError(f"{label} and {other} were scored on different views of {cell.scene.label}")
         pair = [np.array([figures[name][place] for name in own], float) for figures in (own, base)]  # None is NaN.
         found.setdefault(cell.scene.label, []).append(pair[0] - pair[1])
+    return found
+
+
+def _by_view(record: Record) -> Mapping[str, Sequence[float]]:
+    """Return the figures of a run by view."""
+    found: Mapping[str, Sequence[float]] = record.get("per_view") or {"mean": [record[figure] for figure in QUALITY]}
     return found
 
 
