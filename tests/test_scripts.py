@@ -116,6 +116,17 @@ def test_the_loop_of_the_readme_is_drawn(tmp_path):
 
 
 @pytest.mark.long
+def test_the_picture_of_cells_is_drawn_and_small(tmp_path, capsys):
+    import cells
+
+    cells.main(tmp_path, stage1_iterations=40, stage2_iterations=40)
+    with Image.open(tmp_path / "cells.png") as drawn, Image.open(ROOT / "docs" / "images" / "cells.png") as kept:
+        assert drawn.size == kept.size
+    assert (ROOT / "docs" / "images" / "cells.png").stat().st_size < 150_000
+    assert capsys.readouterr().out.count(" dB") == 2
+
+
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.* there was no room")
 def test_pictures_of_the_viewer_and_of_meshes_are_drawn(tmp_path, monkeypatch):
     import pictures

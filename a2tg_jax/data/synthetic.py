@@ -2,7 +2,8 @@
 both covered with coloured cells.
 
 The patterns of the still life have details of about 4 to 10 pixels, finer than one or two thousand Gaussians can show
-without textures. The cells are 2 to 4 pixels wide.
+without textures. The cells are 2 to 4 pixels wide: a Gaussian for each costs 52 bytes, 232 with view dependence, and a
+texel 16.
 """
 
 import dataclasses
@@ -38,7 +39,8 @@ DISTANCE = 2.4
 FIELD_OF_VIEW = np.deg2rad(58.0)
 """Field of view across the longer side of an image of the still life."""
 BOX_TARGET = np.array([0.0, 0.0, 0.12])
-FLOOR_RADIUS, BOX_SIDE = 1.0, 0.72
+FLOOR_RADIUS = 1.0
+BOX_SIDE = 0.72
 CELLS_A_METRE = 24
 TEXELS_A_CELL = 16
 SAMPLE_OFFSETS = np.array([[-0.375, -0.125, 0.125, 0.375], [0.125, -0.375, 0.375, -0.125]])
@@ -55,7 +57,7 @@ def synthetic_scene(
     downscale: int = 1,
     test_every: int = 8,
 ) -> Scene:
-    """Make the built-in scene: pinhole views on a closed curve over an arc, and points on the surfaces they see.
+    """Make the built-in still life: pinhole views on a closed curve over an arc, and points on the surfaces they see.
 
     Args:
       seed: random seed for patterns, light and points; the arrangement is always the same.
@@ -128,7 +130,7 @@ def _made(
     downscale: int,
     test_every: int,
 ) -> Scene:
-    """Return a built-in scene. Arguments as of `synthetic_scene`."""
+    """Return a built-in scene. Same arguments as `synthetic_scene`."""
     width, height = full_size
     if num_views < 2 or num_points < 2 or downscale < 1 or min(width, height) < downscale:
         raise ValueError(
@@ -183,13 +185,14 @@ def still_life(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.nda
 
 def celled_box(rng: np.random.Generator) -> list[tuple[ParametricSurface, np.ndarray]]:
     """Return a floor and a box on it, and their colours."""
-    floor_cells, box_cells = round(2 * FLOOR_RADIUS * CELLS_A_METRE), round(BOX_SIDE * CELLS_A_METRE)
+    along_floor = round(2 * FLOOR_RADIUS * CELLS_A_METRE)
+    along_box = round(BOX_SIDE * CELLS_A_METRE)
     return [
-        (Disc((0, 0, 0), FLOOR_RADIUS), patterns.cells(rng, floor_cells, floor_cells, texels=TEXELS_A_CELL)),
+        (Disc((0, 0, 0), FLOOR_RADIUS), patterns.cells(rng, along_floor, along_floor, texels=TEXELS_A_CELL)),
         (
             # A few millimetres above the floor, which it would otherwise not shade under itself.
             Block((0, 0, BOX_SIDE / 2 + 0.005), BOX_SIDE / 2, 0.3),
-            patterns.cells(rng, box_cells, 5 * box_cells, texels=TEXELS_A_CELL),
+            patterns.cells(rng, along_box, 5 * along_box, texels=TEXELS_A_CELL),
         ),
     ]
 
@@ -222,7 +225,7 @@ class Arrangement:
     surfaces: Callable[[np.random.Generator], list[tuple[ParametricSurface, np.ndarray]]]
     """Function that returns shapes and their colours; only these depend on the generator."""
     camera_path: Callable[[int], np.ndarray]
-    """Function that returns the centres [V, 3] of so many cameras."""
+    """Function from a number of cameras to their centres [V, 3]."""
     target: np.ndarray
     """Point that all cameras look at."""
     field_of_view: float
