@@ -15,7 +15,7 @@ from lab import queue, versions
 from lab.cli import EXPERIMENTS, Lab, argument_parser
 from lab.grid import read_grid
 from lab.jobs import TIMES, Folders, Job, _load_checkpoint, milliseconds, model_bytes, run_job
-from lab.plan import Machine, duration, finished_pace, plan_of
+from lab.plan import Machine, duration, finished_pace, missing_text, plan_of
 from lab.progress import Progress
 from lab.stages import stages_of
 from run import experiments, interruptible, main, parse_arguments
@@ -230,8 +230,12 @@ def test_the_plan_counts_what_is_left(tmp_path):
     rest = plan_of([grid], {first.key: record(), first.start.key: record()}, folders, here)
     assert "1 of 3 | 2DGS*-MCMC, equal bytes; Textured Gaussians*, equal bytes" in rest
     assert "the steps of finished stages" in rest
+    assert missing_text(grid, {first.key: record(), first.start.key: record()}) == (
+        "\n*Not finished: built-in 1/2, 400, seed 0: 2DGS*-MCMC, equal bytes; Textured Gaussians*, equal bytes.*\n"
+    )
     mb = model_bytes(first.system) / 1e6
     finished = {key: record(mb=mb) for key in stages_of([grid], {})}
+    assert missing_text(grid, finished) == ""
     assert "| 3 of 3 | – |" in plan_of([grid], finished, folders, here)
     assert [duration(seconds) for seconds in (150, 3600, 9000)] == ["2 minutes", "1.0 hours", "2.5 hours"]
     short = record(stage="textures", num=400, ms_per_step=None)

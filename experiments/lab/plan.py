@@ -99,6 +99,17 @@ def _cells(grids: Sequence[Grid], records: Mapping[str, Record]) -> str:
     return table(header, rows[:MOST_ROWS]) + more
 
 
+def missing_text(grid: Grid, records: Mapping[str, Record]) -> str:
+    """Return a line with the unfinished runs of each cell; empty if all are finished."""
+    parts = []
+    for cell, runs in runs_by_cell([grid], records).items():
+        left = [label for label, run in runs.items() if run.job.key not in records]
+        if left:
+            place = f"{scene_text(cell.scene)}, {cell.size}, seed {cell.seed}"
+            parts.append(f"{place}: {_left_text(left, len(runs))}")
+    return f"\n*Not finished: {' · '.join(parts)}.*\n" if parts else ""
+
+
 def _left_text(labels: Sequence[str], num: int) -> str:
     if not labels:
         return "–"

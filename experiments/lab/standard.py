@@ -7,6 +7,7 @@ from lab import tables
 from lab.cli import Experiment, Lab
 from lab.grid import Grid
 from lab.grid_file import SUFFIX
+from lab.plan import missing_text
 from lab.tables import Result
 
 
@@ -75,7 +76,8 @@ def file_experiment(path: str) -> Experiment:
 
 
 def _as_text(lab: Lab, grid: Grid) -> str:
-    return WRITERS[grid.table](grid, tables.results_of(grid, lab.records))
+    text = WRITERS[grid.table](grid, tables.results_of(grid, lab.records))
+    return f"{text}{missing_text(grid, lab.records)}"
 
 
 STANDARD = (
