@@ -221,6 +221,19 @@ def test_the_papers_rows_have_the_runs_that_there_are():
     ]
 
 
+def test_the_page_has_one_size_of_the_papers_size():
+    places = {}
+    for degree in (3, 0):
+        grid = read_grid(f"paper_degree_{degree}", "full_size")
+        records = {grid.reference_job(cell).key: record() for cell in grid.cells}
+        for row in findings.rows_at_length(grid, degree, records, findings.PLACES["full_size"]):
+            places[row.place] = row.is_on_page
+    sizes = {
+        f"at the paper's size, {num},000 Gaussians, degree {degree}": False for num in (100, 300) for degree in (3, 0)
+    }
+    assert places == {**sizes, "at the paper's size, 100,000 Gaussians, degree 3": True}
+
+
 def test_the_chosen_plain_methods_are_those_of_the_committed_validation_records():
     records = read_kept(EXPERIMENTS / "results" / "protocol-validation" / "records.json")
     grid = read_grid("choose_plain", "protocol", validation=True)
