@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from run_folders import create_run
+from scipy import integrate
 from small_values import some_gaussians
 
 from a2tg_jax import (
@@ -28,7 +29,17 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import WHITE, Origin
 from a2tg_jax.data.load import SceneSource
 from a2tg_jax.finish import baking
-from a2tg_jax.finish.baking import as_plain, bake, distill, drawn_scene, kernels, likeness, pictures, split_splats
+from a2tg_jax.finish.baking import (
+    as_plain,
+    bake,
+    distill,
+    drawn_scene,
+    kernels,
+    likeness,
+    pictures,
+    shares_inside,
+    split_splats,
+)
 from a2tg_jax.finish.shrinking import fewest_texels
 from a2tg_jax.results import conversion
 from a2tg_jax.results.record import RunRecord, write_record
@@ -84,6 +95,39 @@ def test_kernels_add_up_to_the_gaussian(num, options):
     assert peaks.min() > 0
     # Gaussians of a bilinear kernel's variance h²/6, h apart, have a ripple of 2·exp(−2π²/6), 7.5 % of their sum.
     np.testing.assert_allclose(each @ peaks, np.exp(-0.5 * u * u), atol=0.075)
+
+
+@pytest.mark.parametrize("extent", [0.01, 0.5, 1.5, 20.0])
+def test_kernels_have_the_mean_and_the_variance_of_their_texels(extent):
+    """By scipy's quadrature, piece by piece; texels far outside are somewhere, with a size."""
+    options, num = TextureOptions(outside="identity", extent=extent), 4
+    means, scales = kernels(num, options)
+    assert np.isfinite(means).all() and (scales > 0).all() and (np.diff(means) > 0).all()
+    centers = extent * np.array([-0.75, -0.25, 0.25, 0.75])
+    ends = sorted({-12.0, 12.0, *(end for end in (*centers, -extent, extent) if abs(end) < 12)})
+
+    def weight(u, j, k):
+        return np.interp(u, centers, np.eye(num)[j]) * np.exp(-0.5 * u * u) * u**k
+
+    for j in range(num):
+        moments = np.zeros((2, 3))
+        for low, high in itertools.pairwise(ends):
+            for k in range(3):
+                moments[int(abs(low + high) < 2 * extent), k] += integrate.quad(weight, low, high, (j, k))[0]
+        mass, first, second = moments.sum(axis=0)
+        if mass > 1e-9:
+            np.testing.assert_allclose(means[j], first / mass, rtol=1e-3, atol=1e-5)
+            np.testing.assert_allclose(scales[j] ** 2, second / mass - (first / mass) ** 2, rtol=2e-3)
+            np.testing.assert_allclose(shares_inside(num, options)[j], moments[1, 0] / mass, atol=2e-3)
+
+
+@pytest.mark.parametrize("outside", ["clamp", "identity"])
+def test_textures_of_another_extent_become_splats_where_they_are_shown(outside):
+    model, options = textured(), TextureOptions(outside=outside, extent=1.5)
+    texture = dataclasses.replace(model.appearance.texture, options=options)
+    model = dataclasses.replace(model, appearance=dataclasses.replace(model.appearance, texture=texture))
+    found = split_splats(model, [CAMERA], 2.0)
+    assert psnr(found, model) > psnr(as_plain(model.gaussians, model), model) + 2
 
 
 @pytest.fixture(scope="module")

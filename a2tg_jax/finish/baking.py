@@ -41,6 +41,7 @@ from a2tg_jax.io.other_programs import plain_gaussians
 from a2tg_jax.model import Model
 from a2tg_jax.renderer import Renderer
 from a2tg_jax.systems.baselines import Gaussians2d
+from a2tg_jax.texture import NEUTRAL_TEXEL
 from a2tg_jax.training import fit_stage
 from a2tg_jax.training.stage import BACKGROUNDS, Background
 
@@ -116,7 +117,11 @@ def split_splats(model: Model, cameras: Sequence[Camera], growth: float) -> Mode
             parents, own = nearest_gaussians(parents, own), None
         axes = [kernels(side, options) for side in size]
         at_centers = [_weights(means, side, options) for (means, _), side in zip(axes, size, strict=True)]
-        pieces.append(_grid(parents, own, np.einsum("ntsc,tv,su->nvuc", texels, *at_centers), *axes))
+        shown = np.einsum("ntsc,tv,su->nvuc", texels, *at_centers)
+        if options.outside == "identity":
+            shares_v, shares_u = (shares_inside(side, options) for side in size)
+            shown = np.asarray(NEUTRAL_TEXEL) + (shares_v[:, None] * shares_u)[..., None] * (shown - NEUTRAL_TEXEL)
+        pieces.append(_grid(parents, own, shown, *axes))
     joined: Gaussians = jax.tree.map(lambda *parts: jnp.concatenate(parts), *pieces)
     # Fainter splats are skipped by every renderer, and would only take bytes.
     is_seen = np.asarray(joined.opacities) >= LEAST_ALPHA
@@ -147,13 +152,25 @@ Kernels = tuple[np.ndarray, np.ndarray]
 @functools.cache
 def kernels(num: int, options: TextureOptions) -> Kernels:
     """Return the Gaussians along an axis for `num` texels."""
-    # A sum over steps of 1/400: exp(−u²/2) is below 2·10⁻⁸ beyond ±6.
-    u = np.linspace(-6, 6, 4801)
-    weights = _weights(u, num, options) * np.exp(-0.5 * u * u)
-    masses = weights.sum(axis=1)
-    means = weights @ u / masses
+    u, masses = _masses(num, options)
+    means = masses @ u
     # Variance: E[u²] − E[u]².
-    return means, np.sqrt(weights @ (u * u) / masses - means**2)
+    return means, np.sqrt(masses @ (u * u) - means**2)
+
+
+def shares_inside(num: int, options: TextureOptions) -> np.ndarray:
+    """Return the shares [num] of the Gaussians along an axis that are within the extent."""
+    u, masses = _masses(num, options)
+    return masses @ (np.abs(u) <= options.extent)
+
+
+def _masses(num: int, options: TextureOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of an axis, and the share of each [num, Q] of w_j(u)·exp(−u²/2) for `num` texels."""
+    # Steps of 1/400, as exp(−u²/2) is below 2·10⁻⁸ beyond ±6, and as many over the texture, however small it is.
+    u = np.unique(np.concatenate([np.linspace(-end, end, 4801) for end in (6.0, options.extent)]))
+    # Texels far outside weigh nothing, and have a place and a size nevertheless.
+    masses = _weights(u, num, options) * (np.exp(-0.5 * u * u) + 1e-20) * np.gradient(u)
+    return u, masses / masses.sum(axis=1, keepdims=True)
 
 
 def _weights(u: np.ndarray, num: int, options: TextureOptions) -> np.ndarray:
