@@ -137,9 +137,10 @@ class Upscale(HostEvent):
         texels = min(4.0 ** len(self.iterations(num_iterations)), self.cap**2)
         if self.select == "budget":
             return max(num_bytes, min(self._budget_bytes, num_bytes + BYTES_PER_TEXEL * num * texels))
-        # Most of those that grow have grown before; how many will pass a threshold is unknown.
+        # Most of those that grow have grown before, from one texel, or from none, which adds one more; how many will
+        # pass a threshold is unknown.
         share = self.fraction if self.select == "fraction" else USUAL_SHARE
-        return num_bytes + BYTES_PER_TEXEL * num * share * texels
+        return num_bytes + BYTES_PER_TEXEL * num * share * (texels - 1)
 
     def with_room(
         self, model: Model, moments: AdamState, num_bytes: float, num_iterations: int

@@ -8,7 +8,7 @@ Textures of one resolution share a bucket [capacity, Tv, Tu, 4], whose rows past
 
 import functools
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,8 +21,6 @@ from a2tg_jax.core.table import Size, Table, check_table
 MAX_SIDE = 16
 BYTES_PER_TEXEL = 16  # 4 channels of float32
 NEUTRAL_TEXEL = (0.0, 0.0, 0.0, 1.0)  # adds no colour, and multiplies alpha by 1
-Convention = Literal["texel-centre", "align-corners"]
-"""Place of the texels in a texture's square: centres half a texel inside, or the outer ones on the edge."""
 
 
 @pytree(repr=False)
@@ -62,7 +60,7 @@ class Textures(Table):
 # Gauss-Legendre's two places per piece integrate them exactly. M solves the least squares of √weight · values there.
 
 
-def fitted_texels(blocks: np.ndarray, size: Size, uv: Convention, ranges: np.ndarray) -> np.ndarray:
+def fitted_texels(blocks: np.ndarray, size: Size, uv: str, ranges: np.ndarray) -> np.ndarray:
     """Return textures [M, Tv, Tu, 4] at another resolution, whose bilinear lookup has the least mean square difference
     from the old one over the square, cut to the least and largest number [2, 4] of each channel (host).
 
@@ -79,7 +77,7 @@ def fitted_texels(blocks: np.ndarray, size: Size, uv: Convention, ranges: np.nda
 
 
 @functools.cache
-def _fit(old: int, new: int, uv: Convention) -> np.ndarray:
+def _fit(old: int, new: int, uv: str) -> np.ndarray:
     """Return the matrix [T', T] from `old` texels of an axis to the `new` ones of the least-squares fit."""
     nodes = [(np.arange(num) + 0.5) / num if uv == "texel-centre" else np.linspace(0, 1, num) for num in (old, new)]
     ends = np.unique(np.concatenate([[0, 1], *nodes]))

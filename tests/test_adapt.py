@@ -101,6 +101,16 @@ def greedy(statistic, sizes, proposed, budget):
     return mask
 
 
+def test_empty_textures_are_chosen_by_every_rule():
+    """Three grow from nothing to 2×2, which takes 64 bytes, and one from 1×1, which takes 48."""
+    sizes, statistic = np.array([[0, 0], [0, 0], [0, 0], [1, 1]]), np.array([3.0, 1.0, 0.0, 2.0])
+    proposed = next_sizes(sizes, np.full((4, 2), 0.1), **PAPER)
+    assert select(statistic, sizes, proposed, threshold=0.5).tolist() == [True, True, False, True]
+    assert select(statistic, sizes, proposed, fraction=0.5).tolist() == [True, False, False, True]
+    assert select(statistic, sizes, proposed, budget_bytes=64 + 48 + 63).tolist() == [True, False, False, True]
+    assert select(statistic, sizes, proposed, budget_bytes=3 * 64 + 48).all()
+
+
 @pytest.mark.parametrize("budget", [0, 15, 16, 1000, 7777, 20_000, 10**9])
 def test_budget_is_the_greedy_choice_and_leaves_less_than_the_cheapest(budget):
     for seed in range(6):

@@ -320,6 +320,35 @@ def test_a_budget_of_textures_is_checked_before_the_first_stage(scene, cap):
     check_start(scene, changed_config(system, {"texture": {"budget_mb": 0.0298}}, "test"))
 
 
+def test_textures_that_begin_empty_take_nothing_of_a_budget(scene):
+    """120 Gaussians of 232 bytes, or 236 with a shape of the kernel."""
+    texture = {"select": "budget", "budget_mb": 120 * 232 / 1e6}
+    changes = {"stage1_iterations": 10, "texture": texture, "empty_textures": True}
+    check_start(scene, smoke("a2tg", **changes))
+    with pytest.raises(ValueError, match=r"but 120 Gaussians without textures take 0\.028 MB: raise it, or lower"):
+        check_start(scene, smoke("a2tg", **changes, kernel_rate=0.01))
+    given = smoke("a2tg", memory_budget=120 * 232 / 1e6, empty_textures=True)
+    given.check_given_number(120)
+    with pytest.raises(ValueError, match=r"has room for 120 Gaussians of 232 bytes .* and 121 are given"):
+        given.check_given_number(121)
+
+
+@pytest.mark.parametrize(
+    "changes, num",
+    [
+        ({}, 1_000_000 // (232 + 80)),  # Five texels of 16 bytes.
+        ({"texture_share": 0.25}, 750_000 // 232),
+        ({"texture_share": 0.25, "sh_degree": 0}, 750_000 // 52),
+        ({"texture_share": 0.25, "sh_degree": 0, "kernel_rate": 0.01}, 750_000 // 56),
+        ({"texture_share": 0.0}, 1_000_000 // (232 + 16)),  # All begin with a texel.
+        ({"texture_share": 0.0, "empty_textures": True}, 1_000_000 // 232),
+        ({"texture": {"at": ()}, "empty_textures": True}, 1_000_000 // 232),
+    ],
+)
+def test_the_share_of_textures_decides_how_many_gaussians_there_are(changes, num):
+    assert filling(smoke("a2tg", memory_budget="1MB", **changes)).cap == num
+
+
 @pytest.mark.parametrize(
     ("name", "size", "stage"),
     [("a2tg", 248, "textures"), ("textured-gaussians", 488, "textures"), ("bbsplat", 1252, "billboards")],

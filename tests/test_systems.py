@@ -153,6 +153,24 @@ def test_textures_that_have_grown_learn_though_those_of_one_texel_do_not(scene):
         assert is_neutral == (height * width == 1)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("more", [(), (5,)])
+def test_textures_may_begin_empty_and_kernels_have_shapes(scene, tmp_path, more):
+    """Within a budget of which textures get a share; resumed, saved and read as every system."""
+    textures = {"empty_textures": True, "texture_share": 0.25, "texture": {"new_texels": "fitted", "moments": "copied"}}
+    changes = textures | {"memory_budget": "20.8kB", "kernel_rate": 0.1, "noise_in_stage2": True, "more": more}
+    system = tiny("a2tg", sh_degree=2, **changes)
+    result = check_run(scene, system, tmp_path)
+    first = result.stages[0].model
+    assert first.num_bytes / system.budget_bytes == pytest.approx(0.75, abs=0.01)
+    assert first.num_bytes == 4 * (37 + 1) * first.num
+    assert result.history.megabytes.max() <= system.memory_budget
+    assert 0.995 * system.budget_bytes <= result.model.num_bytes
+    sizes, counts = np.unique(result.model.textures.sizes, axis=0, return_counts=True)
+    assert (sizes[0] == 0).all() and counts[0] > 5 and not (sizes == 1).all(axis=1).any()
+    assert np.unique(result.model.appearance.shapes).size > 10, "kernels learn"
+
+
 def test_textured_gaussians_are_a2tg_with_one_size_and_no_events():
     fixed, other = tiny("textured-gaussians", texture_side=2), tiny("a2tg")
     first, second = other.stages()
@@ -273,6 +291,21 @@ def test_a_file_imports_nothing():
         ({"seed": -1}, "seed must be an int, 0 to 2147483647; got -1"),
         ({"tile_size": 0}, "tile_size must be at least 1 and at most 64; got 0"),
         ({"single_texel_rate": -1.0}, "single_texel_rate must be at least 0; got -1"),
+        ({"kernel_rate": -1.0}, "kernel_rate must be at least 0; got -1"),
+        ({"texture_share": 1.0}, "texture_share must be at least 0 and below 1; got 1"),
+        (
+            {"texture_share": 0.53, "memory_budget": "1MB"},
+            r"texture_share must be at most 0.525, the share of textures of 4 × 4 texels; got 0.53: lower it, or raise",
+        ),
+        ({"empty_textures": True, "texture": {"cap": 1}}, "texture.cap must be at least 2; got 1"),
+        (
+            {"empty_textures": True, "single_texel_rate": 0.1},
+            "single_texel_rate has no effect with empty_textures, .*: leave it out; got 0.1",
+        ),
+        (
+            {"empty_textures": True, "lookup": {"initial_rgb": 0.1}},
+            "lookup.initial_rgb has no effect with empty_textures, .*: leave it out; got 0.1",
+        ),
         ({"rates": {"means": float("nan")}}, "rates.means must be a finite number; got nan"),
         ({"rates": {"quats": -1.0}}, "rates.quats must be at least 0; got -1.0"),
         ({"rates": {"means_final_factor": 0.0}}, "rates.means_final_factor must be above 0"),
