@@ -11,6 +11,7 @@ from small_models import some_checkpoint, some_model
 
 import a2tg_jax as a2tg
 from a2tg_jax.appearance import template_of
+from a2tg_jax.cli.main import main
 from a2tg_jax.io.archive import FORMAT, read_archive, write_archive
 from a2tg_jax.io.compact import decode_model, framed, unframed
 from a2tg_jax.io.model_file import FORMAT as MODEL_FORMAT
@@ -114,6 +115,12 @@ def test_models_of_two_extents_are_not_joined():
         ValueError, match=r"one extent; got 1\.5 and 3: train them with the same lookup\.extent, or bake"
     ):
         a2tg.concatenate([narrow, wide])
+
+
+def test_info_says_it(tmp_path, capsys):
+    a2tg.save_model(tmp_path / "m.npz", some_model(SYSTEM))
+    assert main(["info", str(tmp_path / "m.npz")]) == 0
+    assert "textures over ±1.5σ 1×1: 12" in capsys.readouterr().out
 
 
 def test_rows_a_transform_and_an_edit_keep_it():

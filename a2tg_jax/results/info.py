@@ -156,11 +156,13 @@ def _stage_facts(run: RunFolder, name: str) -> dict[str, Any]:
 
 
 def model_facts(model: Model) -> dict[str, Any]:
-    """Return the numbers of Gaussians and bytes of a model, of its degrees, and of its textures by size."""
+    """Return the numbers of Gaussians and bytes of a model, of its degrees, and of its textures by size, with their
+    extent."""
     facts: dict[str, Any] = {"num_gaussians": model.num, "num_bytes": model.num_bytes}
     if model.appearance.bands is not None:
         facts["degrees"] = np.bincount(model.degrees).tolist()
-    if model.textures is not None:
+    if model.appearance.texture is not None and model.textures is not None:
+        facts["extent"] = model.appearance.texture.options.extent
         sizes, counts = np.unique(model.textures.sizes, axis=0, return_counts=True)
         facts["textures"] = {f"{tv}×{tu}": int(num) for (tv, tu), num in zip(sizes, counts, strict=True)}
     return facts
@@ -181,7 +183,8 @@ def _stage_text(stage: Mapping[str, Any]) -> str:
 def _counts_text(facts: Mapping[str, Any]) -> str:
     """Return the numbers of `model_facts` as text."""
     parts = [f"{facts['num_gaussians']:,} Gaussians", in_bytes(facts["num_bytes"])]
-    counts = {"degrees": dict(enumerate(facts.get("degrees", ()))), "textures": facts.get("textures", {})}
+    textures = f"textures over ±{facts['extent']:g}σ" if "extent" in facts else "textures"
+    counts = {"degrees": dict(enumerate(facts.get("degrees", ()))), textures: facts.get("textures", {})}
     for noun, found in counts.items():
         if found:
             parts.append(f"{noun} " + ", ".join(f"{kind}: {num:,}" for kind, num in found.items()))
