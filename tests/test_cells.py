@@ -18,5 +18,5 @@ def test_textures_beat_plain_gaussians_of_equal_bytes_and_training_on_fine_cells
         found[kind] = a2tg.evaluate(scene.test, model)
     plain, textured = found.values()
     assert plain.psnr > 19, "plain Gaussians show something as well"
-    assert textured.psnr > plain.psnr + 0.3
-    assert textured.ssim > plain.ssim
+    assert textured.psnr > plain.psnr + 0.5  # 0.97 when written
+    assert textured.ssim > plain.ssim + 0.03  # 0.053
