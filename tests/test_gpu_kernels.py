@@ -21,7 +21,7 @@ from scenes_random import (
 )
 
 from a2tg_jax import RenderSettings, render_image
-from a2tg_jax.appearance import Appearance, StaticShading, Texture
+from a2tg_jax.appearance import Appearance, StaticShading, Texture, TextureOptions
 from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.rasterize.kernels.cuda import composite, nvrtc
 from a2tg_jax.rasterize.kernels.cuda.source import PRIMITIVES, Argument, c_function, source
@@ -35,9 +35,9 @@ NOT_PRINTED = {"bitcast_convert_type", "shift_right_arithmetic"}
 """Primitives of the formulas of native loops, which GPU kernels have no use for."""
 
 
-def source_of(has_textures=True, dtype="float32", tile_size=16):
+def source_of(has_textures=True, dtype="float32", tile_size=16, options=TextureOptions()):  # noqa: B008 - frozen
     textures = as_textures(draw_scene(4, num=8), "float32")
-    static = StaticShading.of(Appearance(texture=Texture(textures)) if has_textures else Appearance())
+    static = StaticShading.of(Appearance(texture=Texture(textures, options=options)) if has_textures else Appearance())
     columns = 4 if has_textures else 0
     settings = PassSettings(static, 0, columns, 3, dtype, TileGrid(0, 0, tile_size), 0.2, True, "position")
     return source(settings, "cuda")
@@ -59,6 +59,13 @@ def test_nvrtc_compiles_them(has_textures, dtype, tile_size):
         program = nvrtc.ptx(text, capability)
         assert ".entry forward(" in program and ".entry backward(" in program
         assert re.search(r"\b(atom|red)\.[a-z.]*global\.", program)
+
+
+def test_the_extent_of_textures_is_all_that_differs_in_their_kernels():
+    """1/3 becomes 1/1.5 in the lookup, and 3 becomes 1.5 in the comparison."""
+    wide, narrow = (source_of(options=TextureOptions(outside="identity", extent=extent)) for extent in (3.0, 1.5))
+    moved = wide.replace("0x1.5555560000000p-2f", "0x1.5555560000000p-1f")
+    assert moved.replace("<= (0x1.8000000000000p+1f)", "<= (0x1.8000000000000p+0f)") == narrow != wide
 
 
 @pytest.mark.usefixtures("has_nvrtc")
