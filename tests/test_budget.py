@@ -342,7 +342,9 @@ def test_textures_that_begin_empty_take_nothing_of_a_budget(scene):
         ({"texture_share": 0.25, "sh_degree": 0, "kernel_rate": 0.01}, 750_000 // 56),
         ({"texture_share": 0.0}, 1_000_000 // (232 + 16)),  # All begin with a texel.
         ({"texture_share": 0.0, "empty_textures": True}, 1_000_000 // 232),
+        ({"texture_share": 0.9}, 1_000_000 // (232 + 256)),  # All are of 4×4 texels in the end.
         ({"texture": {"at": ()}, "empty_textures": True}, 1_000_000 // 232),
+        ({"texture": {"at": ()}, "texture_share": 0.9}, 1_000_000 // (232 + 16)),
     ],
 )
 def test_the_share_of_textures_decides_how_many_gaussians_there_are(changes, num):

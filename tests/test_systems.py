@@ -294,10 +294,6 @@ def test_a_file_imports_nothing():
         ({"single_texel_rate": -1.0}, "single_texel_rate must be at least 0; got -1"),
         ({"kernel_rate": -1.0}, "kernel_rate must be at least 0; got -1"),
         ({"texture_share": 1.0}, "texture_share must be at least 0 and below 1; got 1"),
-        (
-            {"texture_share": 0.53, "memory_budget": "1MB"},
-            r"texture_share must be at most 0.525, the share of textures of 4 × 4 texels; got 0.53: lower it, or raise",
-        ),
         ({"empty_textures": True, "texture": {"cap": 1}}, "texture.cap must be at least 2; got 1"),
         (
             {"empty_textures": True, "single_texel_rate": 0.1},

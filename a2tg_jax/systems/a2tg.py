@@ -56,8 +56,8 @@ class A2tg(TwoStages):
     """Whether Gaussians have no texture, which takes no bytes, until they are chosen to get more texels; off: all begin
     with one texel."""
     texture_share: float | None = None
-    """Share of a memory_budget for textures, which decides the number of Gaussians; None: as many bytes as 5 texels per
-    Gaussian take, or half of the largest texture if that is less."""
+    """Share of a memory_budget for textures, at most what the largest ones take, which decides the number of Gaussians;
+    None: room for 5 texels per Gaussian, or for half of the largest texture if that is less."""
     kernel_rate: float | None = None
     """Adam's learning rate of the kernels' shapes; None or 0: all kernels are Gaussians, as in the paper."""
     exponents: LimitExponents = LimitExponents()
@@ -96,20 +96,14 @@ class A2tg(TwoStages):
 
     def _floats_in_budget(self) -> float:
         """Return the floats of kernel and texels that a Gaussian has on average in a full memory budget."""
-        least, most = math.prod(self._start), self.texture.cap**2
-        if not self.texture.iterations(self.stage2_iterations):
-            return self._floats(least)
+        least = math.prod(self._start)
+        most = self.texture.cap**2 if self.texture.iterations(self.stage2_iterations) else least
         if self.texture_share is None:
             # Up to half of the largest texture.
             return self._floats(min(BUDGET_TEXELS, (least + most) / 2))
         own = floats_per_gaussian(self.sh_degree) + self._floats(0)
-        if self.texture_share > (limit := 1 - own / (own + FLOATS_PER_TEXEL * most)):
-            raise ValueError(
-                f"texture_share must be at most {limit:.3g}, the share of textures of {self.texture.cap} × "
-                f"{self.texture.cap} texels; got {self.texture_share}: lower it, or raise texture.cap"
-            )
-        # Such that the Gaussians' own floats are the rest of all; the texels that all begin with count.
-        return max(self._floats(least), self._floats(0) + own * self.texture_share / (1 - self.texture_share))
+        texels = own * self.texture_share / (1 - self.texture_share) / FLOATS_PER_TEXEL
+        return self._floats(min(max(texels, least), most))
 
     @classmethod
     def presets(cls) -> dict[str, Self]:
