@@ -22,8 +22,15 @@ from a2tg_jax.systems.two_stages import (
 )
 from a2tg_jax.training.stage import Stage
 
-QUICK_TEXTURES: dict[str, Any] = {"texel_rate": QUICK_TEXELS, "single_texel_rate": 0.0}
-"""Options of short runs (docs/results.md)."""
+QUICK_OPTIONS: dict[str, Any] = {
+    "stage1_iterations": 1_500, "stage2_iterations": 1_500, "texel_rate": QUICK_TEXELS, "empty_textures": True,
+    "texture_share": 0.25, "kernel_rate": 0.01, "lookup": TextureOptions(extent=1.5), "densify": Mcmc(cap=QUICK_CAP),
+}  # fmt: skip
+"""Options of the preset "quick", chosen in experiments/NOTEBOOK.md, "A²TG without handicaps"."""
+SMOKE_OPTIONS: dict[str, Any] = {
+    "stage2_iterations": 120, "texel_rate": QUICK_TEXELS, "single_texel_rate": 0.0, "densify": Mcmc(cap=SMOKE_CAP),
+    "texture": Upscale(fraction=0.5, at=(0.1, 0.2)),
+}  # fmt: skip
 BUDGET_TEXELS = 5
 """Average number of texels per Gaussian under a memory budget: about the result of two or three upscalings of a quarter
 of the Gaussians. Gaussians then take four fifths of the bytes."""
@@ -108,10 +115,7 @@ class A2tg(TwoStages):
     @classmethod
     def presets(cls) -> dict[str, Self]:
         official = cls(noise_in_stage2=True, texture=Upscale.official(), lookup=TextureOptions.official())
-        quick = QUICK_TEXTURES | {"densify": Mcmc(cap=QUICK_CAP)}
-        growth = {"densify": Mcmc(cap=SMOKE_CAP), "texture": Upscale(fraction=0.5, at=(0.1, 0.2))}
-        smoke = QUICK_TEXTURES | growth | {"stage2_iterations": 120}
-        paper, *short = cls.short_presets(quick, smoke).items()
+        paper, *short = cls.short_presets(QUICK_OPTIONS, SMOKE_OPTIONS).items()
         return dict([paper, ("official", official), *short])
 
     def check_options(self) -> None:
