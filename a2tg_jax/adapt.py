@@ -4,7 +4,6 @@ The event `Upscale` averages the statistic, proposes `next_sizes`, lets `select`
 `reallocate`. Except for the statistic, all of it runs on the host, one array at a time.
 """
 
-import functools
 import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -12,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jax.typing import ArrayLike
 
-from a2tg_jax.appearance import TextureOptions, in_words
+from a2tg_jax.appearance import in_words
 from a2tg_jax.core.budget import MOST_ROOM, bytes_of, event_budget, within_budget
 from a2tg_jax.core.checks import check_int, check_literal, check_number, check_shape
 from a2tg_jax.core.optim import AdamState
@@ -21,7 +20,7 @@ from a2tg_jax.core.table import Shape, bucket_capacity, resize
 from a2tg_jax.events import Change, Due, GradientStatistics, HostEvent, Statistic, iterations_at
 from a2tg_jax.model import Model
 from a2tg_jax.parallel.sharded_rows import on_host
-from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures, checked_sizes, fitted_texels
+from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures, checked_sizes
 
 Axes = Literal["paper", "authors"]
 """Rule for the axis that a thin Gaussian doubles."""
@@ -82,9 +81,6 @@ class Upscale(HostEvent):
     moments: Literal["zero", "copied"] = static(default="zero")
     """Adam's moments of a texture that has grown: zero, so that its texels part quickly, or copied from its old
     texels."""
-    new_texels: Literal["nearest", "fitted"] = static(default="nearest")
-    """Texels of a texture that has grown: copies of the nearest old ones, or fitted to the old texture by least
-    squares, which changes less of what is shown."""
 
     @staticmethod
     def official() -> "Upscale":
@@ -193,8 +189,7 @@ class Upscale(HostEvent):
                     left -= _bytes_between(last, grown)
         new_sizes[:num] = grown
         kept = None if self.moments == "copied" else (new_sizes == old_sizes).all(axis=1)
-        fit = model.appearance.texture_options if self.new_texels == "fitted" else None
-        rebuilt = reallocate(textures, new_sizes, moments, tuple(due.shapes), kept, textures.shape, fit)
+        rebuilt = reallocate(textures, new_sizes, moments, tuple(due.shapes), kept, textures.shape)
         due.shapes.add(rebuilt.textures.shape)
         model = model.with_textures(rebuilt.textures)
         return Change(model, rebuilt.moments, self.init(model), unused=unused)
@@ -358,15 +353,11 @@ def reallocate(
     known: Sequence[Shape] = (),
     kept: ArrayLike | None = None,
     room: Shape | None = None,
-    fit: TextureOptions | None = None,
 ) -> ReallocateResult:
     """Rebuild the buckets at new sizes (host). New texels, and their moments, copy the nearest old one.
 
     Texel j of a side that grows from T to T' comes from ⌊(j + 0.5)·T/T'⌋, so doubling repeats each texel. Padding, and
     what grows from an empty texture, is (0, 0, 0, 1) in textures and 0 in moments.
-
-    With `fit`, texels are instead those whose bilinear lookup has the least mean square difference from the old one,
-    cut to the range of texels, such as alpha factors in [0, 1]. Moments still copy the nearest.
 
     Args:
       textures: the present textures, of N Gaussians.
@@ -376,7 +367,6 @@ def reallocate(
       known: shapes of buckets to prefer, since programs are compiled for them.
       kept: [N] bool, whose moments are kept, the others' being 0; None: all.
       room: shape of the buckets, if the textures fit; None: as small as possible, or one of `known`.
-      fit: conventions of the lookup that new texels fit; None: they copy the nearest.
 
     Returns:
       The named tuple (textures, moments), both at the new sizes.
@@ -393,9 +383,7 @@ def reallocate(
     check_textures(textures)
     new_sizes = checked_sizes(new_sizes, "new_sizes")
     check_shape("new_sizes", new_sizes, (textures.num, 2))
-    kept = None if kept is None else np.asarray(kept)
-    resized = None if fit is None else functools.partial(fitted_texels, uv=fit.uv, ranges=fit.texel_ranges)
-    rebuilt, moments = resize(textures, new_sizes, moments, known, kept, room, resized)
+    rebuilt, moments = resize(textures, new_sizes, moments, known, None if kept is None else np.asarray(kept), room)
     return ReallocateResult(rebuilt, moments)
 
 

@@ -6,7 +6,6 @@ N Gaussians; texture i is [Tv, Tu, 4] = signed RGB residual and alpha factor; u 
 Textures of one resolution share a bucket [capacity, Tv, Tu, 4], whose rows past the used ones are padding.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -49,48 +48,6 @@ class Textures(Table):
     def num_texels(self) -> int:
         """Number of texels in use, without padding (host)."""
         return self.count_elements(self.num)
-
-
-# Another resolution that shows nearly the same. Along an axis, scaled to 0 ≤ t ≤ 1, the lookup of T texels c is
-# f(t) = Σ_j c_j h_j(t) with hats h_j(t) = max(0, 1 − |x(t) − j|) about the place x(t) among the texels, clamped to
-# 0..T − 1. Of all T' texels c', those with the least ∫ (Σ_k c'_k h'_k − f)² dt are c' = M c. In two dimensions basis
-# functions are products of hats, and so are the integrals over the square: M of one axis, then M of the other.
-#
-# All functions are linear between neighbouring nodes of both resolutions, hence products of two are quadratic, and
-# Gauss-Legendre's two places per piece integrate them exactly. M solves the least squares of √weight · values there.
-
-
-def fitted_texels(blocks: np.ndarray, size: Size, uv: str, ranges: np.ndarray) -> np.ndarray:
-    """Return textures [M, Tv, Tu, 4] at another resolution, whose bilinear lookup has the least mean square difference
-    from the old one over the square, cut to the least and largest number [2, 4] of each channel (host).
-
-    Nothing that is shown changes where that is possible: from one texel to any number, and between grids that nest.
-    """
-    if blocks.shape[1:3] == size:
-        return blocks
-    of_v, of_u = (_fit(old, new, uv) for old, new in zip(blocks.shape[1:3], size, strict=True))
-    fit = np.kron(of_v, of_u).astype(blocks.dtype)  # of the texels row by row
-    num, channels = blocks.shape[0], blocks.shape[3]
-    fitted = np.tensordot(blocks.reshape(num, -1, channels), fit, (1, 1)).swapaxes(1, 2)
-    least, most = ranges.astype(blocks.dtype)
-    return np.clip(fitted, least, most).reshape(num, *size, channels)
-
-
-@functools.cache
-def _fit(old: int, new: int, uv: str) -> np.ndarray:
-    """Return the matrix [T', T] from `old` texels of an axis to the `new` ones of the least-squares fit."""
-    nodes = [(np.arange(num) + 0.5) / num if uv == "texel-centre" else np.linspace(0, 1, num) for num in (old, new)]
-    ends = np.unique(np.concatenate([[0, 1], *nodes]))
-    middles, halves = (ends[1:] + ends[:-1]) / 2, (ends[1:] - ends[:-1]) / 2
-    places = np.concatenate([middles - halves / np.sqrt(3), middles + halves / np.sqrt(3)])
-
-    def hats(num: int) -> np.ndarray:
-        x = places * num - 0.5 if uv == "texel-centre" else places * (num - 1)
-        values = np.maximum(0, 1 - np.abs(np.clip(x, 0, num - 1)[:, None] - np.arange(num)))
-        return np.sqrt(np.tile(halves, 2))[:, None] * values
-
-    matrix: np.ndarray = np.linalg.lstsq(hats(new), hats(old), rcond=None)[0]
-    return matrix.round(12)  # so that what is exact is not off by the last bits
 
 
 def check_textures(textures: Textures, num: int | None = None) -> None:

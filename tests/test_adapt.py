@@ -1,12 +1,15 @@
 """Adaptation: the table of the rule, the laws of the selection, the rebuild against a naive loop."""
 
 import dataclasses
+import re
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from a2tg_jax.adapt import Upscale, most_textures, next_sizes, reallocate, select
 from a2tg_jax.appearance import Appearance, Texture, allocate_appearance
@@ -251,6 +254,36 @@ def test_doubling_repeats_texels_and_moments_that_are_not_kept_are_zero(every):
     back, nothing = reallocate(larger, sizes)
     assert nothing is None
     jax.tree.map(np.testing.assert_array_equal, texture_arrays(back), arrays)
+
+
+def test_the_page_says_how_much_copies_change_what_is_shown():
+    """Interpolated by scipy at places over ±3σ, weighted by the kernel: the root of the mean squared change over the
+    standard deviation."""
+    places = (np.arange(240) + 0.5) / 240
+    kernel = np.exp(-0.5 * np.square(6 * places - 3))
+    weights = np.outer(kernel, kernel) / kernel.sum() ** 2
+
+    def shown(texels):
+        along = places * len(texels) - 0.5
+        at = np.meshgrid(along, along, indexing="ij")
+        return map_coordinates(texels.astype(np.float64), at, order=1, mode="nearest")
+
+    page = (Path(__file__).parents[1] / "docs" / "how-it-works.md").read_text(encoding="utf-8")
+    for side in (1, 2, 4):
+        # For independent random texels, mean squares are sums over textures with one texel of 1.
+        units = np.eye(side**2, dtype=np.float32).reshape(-1, side, side)
+        textures = textures_from_arrays([np.repeat(unit[..., None], 4, axis=2) for unit in units])
+        larger = texture_arrays(reallocate(textures, 2 * textures.sizes).textures)
+        variance = change = 0.0
+        for unit, copied in zip(units, larger, strict=True):
+            before = shown(unit)
+            variance += np.sum(weights * np.square(before - np.sum(weights * before)))
+            change += np.sum(weights * np.square(shown(copied[..., 0]) - before))
+        if side == 1:
+            assert change < 1e-24, "one texel shows the same at any size"
+            continue
+        share = round(100 * np.sqrt(change / variance))
+        assert re.search(rf"\b{share} %[^%]* \({side}×{side} to {2 * side}×{2 * side}\)", page), share
 
 
 @pytest.mark.parametrize("moments", ["copied", "zero"])

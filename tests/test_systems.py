@@ -157,7 +157,7 @@ def test_textures_that_have_grown_learn_though_those_of_one_texel_do_not(scene):
 @pytest.mark.parametrize("more", [(), (5,)])
 def test_textures_may_begin_empty_and_kernels_have_shapes(scene, tmp_path, more):
     """Within a budget of which textures get a share; resumed, saved and read as every system."""
-    textures = {"empty_textures": True, "texture_share": 0.25, "texture": {"new_texels": "fitted", "moments": "copied"}}
+    textures = {"empty_textures": True, "texture_share": 0.25, "texture": {"moments": "copied"}}
     changes = textures | {"memory_budget": "20.8kB", "kernel_rate": 0.1, "noise_in_stage2": True, "more": more}
     system = tiny("a2tg", sh_degree=2, **changes)
     result = check_run(scene, system, tmp_path)

@@ -96,14 +96,6 @@ class TextureOptions(NamedFields):
         check_number("initial_rgb", self.initial_rgb, least=-1, most=1)
         check_number("max_alpha", self.max_alpha, least=1e-3, most=0.9999)
 
-    @property
-    def texel_ranges(self) -> np.ndarray:
-        """[2, 4] least and largest number of each channel of a texel."""
-        # What `Texture.shown` would clip; alpha that is divided by its maximum has no upper limit.
-        most_alpha = np.inf if self.alpha == "global-maximum" else 1.0
-        least, most = (0.0, 1.0) if self.rgb == "unit" else (-np.inf, np.inf)
-        return np.asarray([[least] * 3 + [0.0], [most] * 3 + [most_alpha]])
-
     @staticmethod
     def official() -> "TextureOptions":
         """Return the conventions of the authors' program."""
@@ -152,9 +144,12 @@ class Texture(Part):
     def project(self) -> "Texture":
         """Return textures with alpha factors clamped to [0, 1], and RGB as well if it is unsigned."""
         # What `shown` would clip is clipped here as well, which changes no image: beyond the bounds, where gradients
-        # are 0, texels would stay forever.
+        # are 0, texels would stay forever. Alpha that is divided by its maximum has no upper bound.
+        options = self.options
+        most_alpha = jnp.inf if options.alpha == "global-maximum" else 1.0
+        least, most = (0.0, 1.0) if options.rgb == "unit" else (-jnp.inf, jnp.inf)
         assert self.texels is not None
-        bounds = jnp.asarray(self.options.texel_ranges, self.texels.buckets[0].dtype)
+        bounds = jnp.asarray([[least] * 3 + [0.0], [most] * 3 + [most_alpha]], self.texels.buckets[0].dtype)
         buckets = tuple(jnp.clip(texels, *bounds[:, None, None, None]) for texels in self.texels.buckets)
         return dataclasses.replace(self, texels=dataclasses.replace(self.texels, buckets=buckets))
 

@@ -27,8 +27,6 @@ T = TypeVar("T")
 Size = tuple[int, ...]
 Group = tuple[np.ndarray, np.ndarray]
 """Indices [n] of Gaussians, and their blocks [n, T₁, …, C], all of one size."""
-Resized = Callable[[np.ndarray, Size], np.ndarray]
-"""Function from blocks [M, T₁, …, C] of one size and another size to blocks of that size."""
 KNOWN_SLACK = 1.25
 """Largest number of elements of a known shape, as a multiple of a new one's, for which it is taken."""
 
@@ -334,12 +332,10 @@ def resize(
     known: Sequence[Shape] = (),
     kept: np.ndarray | None = None,
     room: Shape | None = None,
-    resized: Resized | None = None,
 ) -> tuple[Any, Any]:
     """Return the table with its buckets rebuilt at new sizes [N, D] (host), and the moments likewise.
 
-    Padding, and what grows from an empty block, is `Table.padding` in the table and 0 in moments. `resized` replaces
-    the method of that name in the table, but not in moments.
+    Padding, and what grows from an empty block, is `Table.padding` in the table and 0 in moments.
 
     Moments are any pytree, such as the state of Adam: all tables in it of the same class are rebuilt, other leaves
     stay. They become 0 for blocks that are not `kept` [N]. `known` and `room` are as for `plan_places`.
@@ -351,8 +347,8 @@ def resize(
     own, chosen = type(table), slice(None) if kept is None else kept
     kept_ends = [(bucket[chosen], row[chosen]) for bucket, row in ends]
 
-    def rebuilt(old: Table, ends: list[_Ends], padding: Sequence[float], resized: Resized | None = None) -> Table:
-        targets = _moved(own, old.buckets, ends, places.bucket_sizes, capacities, padding, resized)
+    def rebuilt(old: Table, ends: list[_Ends], padding: Sequence[float]) -> Table:
+        targets = _moved(own, old.buckets, ends, places.bucket_sizes, capacities, padding)
         whole = own.placed([placed_like(target, table.bucket) for target in targets], places)
         return partition(whole)[0] if old.bucket is None else whole  # Moments are floats only.
 
@@ -366,18 +362,17 @@ def resize(
         return rebuilt(leaf, kept_ends, (0.0,) * len(own.padding))
 
     moments = jax.tree.map(rebuilt_moments, moments, is_leaf=lambda leaf: isinstance(leaf, own))
-    return rebuilt(table, ends, own.padding, resized), moments
+    return rebuilt(table, ends, own.padding), moments
 
 
 def _moved(
     kind: type[Table], buckets: Sequence[Any], ends: Sequence[_Ends], sizes: Sequence[Size],
-    capacities: Sequence[int], padding: Sequence[float], resized: Resized | None = None,
+    capacities: Sequence[int], padding: Sequence[float],
 ) -> list[np.ndarray]:  # fmt: skip
     """Return new buckets of given sizes and capacities, with blocks moved from old to new (bucket, row)."""
     dtype = buckets[0].dtype if buckets else np.float32
     targets = [kind._padded(capacity, size, dtype, padding) for capacity, size in zip(capacities, sizes, strict=True)]
     (old_bucket, old_row), (new_bucket, new_row) = ends
-    resized = resized or kind.resized
     for index, bucket in enumerate(buckets):
         from_here = np.flatnonzero(old_bucket == index)
         # Blocks with a side of 0 have nothing to move.
@@ -386,7 +381,7 @@ def _moved(
         source = on_host(bucket)  # Each old bucket is read once, one after the other.
         for target in np.unique(new_bucket[from_here]).tolist():
             own = from_here[new_bucket[from_here] == target]
-            targets[target][new_row[own]] = resized(source[old_row[own]], sizes[target])
+            targets[target][new_row[own]] = kind.resized(source[old_row[own]], sizes[target])
     return targets
 
 

@@ -11,7 +11,7 @@ import a2tg_jax as a2tg
 from a2tg_jax.results.record import common_options, is_equal
 
 PACKAGE = "a2tg_jax"
-LATER_FIELDS = {"continues", "extent", "new_texels"}
+LATER_FIELDS = {"continues", "extent"}
 """Fields that came after the first records, which keep their keys: at their default they are no part of a fingerprint.
 """
 
