@@ -210,7 +210,7 @@ def test_the_help_of_training(capsys, monkeypatch):
     assert text.count("\n") <= 45 and len(flags) > 12
     assert "Defaults of bytewise with the preset paper: --stage1-iterations 30000" in text
     assert cli.main(["train", "--help", "--preset", "quick", "--system", "a2tg"]) == 0
-    assert "Defaults of a2tg with the preset quick: --stage1-iterations 2000" in capsys.readouterr().out
+    assert "Defaults of a2tg with the preset quick: --stage1-iterations 1500" in capsys.readouterr().out
     assert flags <= set(re.findall(r"--[\w.-]*\w", whole))
     assert "it needs more. Photographs beyond" in whole
     assert "Adam's learning rates of the Gaussians." in whole, "groups keep their description"

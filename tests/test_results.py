@@ -389,7 +389,7 @@ def test_a_configuration_file_may_be_partial_and_its_paths_start_from_its_folder
     file.write_text('scene = "../fox"\n' + text)
     record = read_run_file(file)
     assert record.scene == SceneSource(str(tmp_path / "fox")) and record.init == str(tmp_path / "files/a.ply")
-    assert (record.options.stage1_iterations, record.options.densify.cap) == (2_000, 10_000)
+    assert (record.options.stage1_iterations, record.options.densify.cap) == (1_500, 10_000)
     assert (record.options.texture.k_a, record.options.texture.at) == (9.0, (0.25, 0.5))
     assert all(isinstance(number, float) for number in (record.options.texture.k_a, *record.options.texture.at))
     file.write_text(f'scene = "synthetic"\ninit = "{tmp_path / "b.ply"}"\n')
@@ -432,6 +432,32 @@ def test_command_repeats_the_run(tmp_path, name, system, compare, preset):
     assert again.record.systems == record.systems
 
 
+LATER = ("empty_textures", "texture_share", "kernel_rate", "extent", "least")
+"""Options of A²TG that version 0.3 lacks."""
+
+
+@pytest.mark.parametrize("compare", [(), ("a2tg",)])
+def test_a_run_of_an_earlier_version_lacks_what_its_preset_has_since(tmp_path, compare):
+    """Version 0.3 trained "quick" with textures of one texel over ±3σ; resumed, evaluated and repeated it stays so."""
+    off = {"empty_textures": False, "texture_share": None, "kernel_rate": None, "lookup": {"extent": 3.0}}
+    main = Bytewise.preset("quick") if compare else A2tg.preset("quick", single_texel_rate=0.0, **off)
+    compare_options = {"a2tg": {"single_texel_rate": 0.0, **off}} if compare else {}
+    record = RunRecord(
+        RECORD.scene, "bytewise" if compare else "a2tg", main, compare, "quick", compare_options=compare_options
+    )
+    run = with_record(tmp_path / "run", record)
+    lines = run.record.read_text().splitlines()
+    run.record.write_text("\n".join(line for line in lines if line.partition(" =")[0] not in LATER))
+    earlier = read_record(run).systems["a2tg"]
+    assert earlier == record.systems["a2tg"]
+    assert earlier.stages()[1].appearance.texture_options.extent == 3.0 and earlier.kernel_rate is None
+    assert parsed("--config", run.record).systems["a2tg"] == earlier
+    # A file that somebody writes means the preset of today.
+    written = tmp_path / "mine.toml"
+    written.write_text('scene = "cells"\nsystem = "a2tg"\npreset = "quick"\n')
+    assert read_run_file(written).options == A2tg.preset("quick") != earlier
+
+
 def test_contradictions_are_named():
     larger = dataclasses.replace(RECORD.options.texture, cap=8)
     changed = dataclasses.replace(RECORD.options, seed=3, texture=larger)
@@ -445,7 +471,7 @@ def test_contradictions_are_named():
 
 
 def test_shared_stages_are_trained_once():
-    main = A2tg.preset("quick")
+    main = A2tg.preset("quick", kernel_rate=None)
     kinds = {"baseline": Gaussians2dMcmc, "fixed": TexturedGaussians, "density": Gaussians2d}
     plan = plan_run({"main": main, **{label: like(kind, main) for label, kind in kinds.items()}})
     assert plan.names == (
@@ -454,7 +480,10 @@ def test_shared_stages_are_trained_once():
     )  # fmt: skip
     assert plan.chains["fixed"] == ("main-gaussians", "fixed-textures")
     assert [planned.start for planned in plan.stages][1:4] == ["main-gaussians"] * 3
-    assert plan.first_iteration("density-continued") == 2_000
+    assert plan.first_iteration("density-continued") == 1_500
+    shaped = A2tg.preset("quick")
+    plan = plan_run({"main": shaped, "baseline": like(Gaussians2dMcmc, shaped)})
+    assert plan.chains["baseline"] == ("baseline-gaussians", "baseline-continued"), "plain Gaussians have no shapes"
 
 
 def test_stages_that_differ_are_not_shared():
@@ -486,7 +515,7 @@ def test_compared_systems_take_the_options(tmp_path, monkeypatch):
     assert list(record.systems) == ["a2tg", "S", "textured-gaussians"]
     square_textures = dataclasses.replace(RECORD.options.texture, anisotropic=False)
     assert square == dataclasses.replace(RECORD.options, texture=square_textures)
-    assert (fixed.stage1_iterations, fixed.densify.cap) == (2_000, 10_000)
+    assert (fixed.stage1_iterations, fixed.densify.cap) == (1_500, 10_000)
     assert dataclasses.replace(RECORD, compare=("bbsplat",)).systems["bbsplat"].billboard == BBSplat().billboard
     of_preset = dataclasses.replace(RECORD, compare=("bbsplat",), preset="quick").systems["bbsplat"]
     assert of_preset.billboard == BBSplat.preset("quick").billboard != BBSplat().billboard
@@ -500,10 +529,10 @@ def test_options_that_the_main_system_lacks_stay_when_defaults_change(tmp_path, 
     run = with_record(tmp_path, COMPARED)
     table = tomllib.loads(run.record.read_text())["compare_options"]
     assert set(table) == set(COMPARED.compare)
-    assert "least" in table["bytewise"]["exponents"] and "texel_rate" not in table["bytewise"]
-    presets = {"quick": dataclasses.replace(before, exponents=dataclasses.replace(before.exponents, least=0.123))}
+    assert "share" in table["bytewise"]["prune"] and "texel_rate" not in table["bytewise"]
+    presets = {"quick": dataclasses.replace(before, prune=dataclasses.replace(before.prune, share=0.123))}
     monkeypatch.setattr(type(before), "presets", classmethod(lambda _: presets))
-    assert COMPARED.systems["bytewise"].exponents.least == 0.123
+    assert COMPARED.systems["bytewise"].prune.share == 0.123
     assert read_record(run).systems["bytewise"] == before
     again = parsed("--config", run.record, "--seed", "3")
     assert again.systems["bytewise"] == dataclasses.replace(before, seed=3)

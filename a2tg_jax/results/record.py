@@ -214,7 +214,8 @@ def read_run_file(path: Path) -> RunRecord:
             raise ValueError(f"{where} {shortened(key)} is an unknown key{did_you_mean(key, KEYS)}")
     if not isinstance(table.get("scene", ""), str):
         raise ValueError(f"{where} scene must be str; got {shortened(table['scene'])}")
-    table.pop("version", None)  # For people only: errors name the version that reads the file.
+    # Errors name the version that reads the file, not this one.
+    is_of_run = table.pop("version", None) is not None
     source = {name: table.pop(key) for key, name in SCENE_KEYS.items() if key in table}
     scene = config_from_dict(SceneSource, source, where)
     # The options' class depends on system and preset, so they are read last.
@@ -224,15 +225,25 @@ def read_run_file(path: Path) -> RunRecord:
     for key, value in tables.items():
         if not isinstance(value, Mapping):
             raise ValueError(f"{where} {shortened(key)} must be a table of options; got {shortened(value)}")
-    system = changed_config(chosen_system(record.system, record.preset), options, f"{path}: options")
-    return dataclasses.replace(record, options=system).placed(path.parent)
+    start = chosen_system(record.system, record.preset)
+    if not is_of_run:
+        system = changed_config(start, options, f"{path}: options")
+        return dataclasses.replace(record, options=system).placed(path.parent)
+    # A run's file has every option but None. Presets may have other values since, so that what is missing is as in the
+    # preset "paper", where options of later versions change nothing.
+    system = changed_config(chosen_system(record.system), options, f"{path}: options")
+    compared = dict(record.compare_options)
+    for name in record.compare:
+        own = own_options(compared_system(name, system), system)
+        compared[name] = merged(own, compared.get(name, {}))
+    return dataclasses.replace(record, options=system, compare_options=compared).placed(path.parent)
 
 
 def write_record(run: RunFolder, record: RunRecord) -> None:
     """Write run.toml with every option, so that later versions with other defaults repeat the same run."""
-    preset, scene, compared = chosen_system(record.system, record.preset), config_to_dict(record.scene), {}
+    usual, scene, compared = chosen_system(record.system), config_to_dict(record.scene), {}
     for name in record.compare:  # Options not taken from the main system, and given ones.
-        start = compared_system(name, record.options, record.preset)
+        start = compared_system(name, record.options)
         own = own_options(record.systems[label_of(name)], record.options)
         compared[name] = _without_none(merged(own, record.compare_options.get(name, {})), config_to_dict(start))
     table = {
@@ -244,7 +255,7 @@ def write_record(run: RunFolder, record: RunRecord) -> None:
         **({} if record.init is None else {"init": record.init}),
         **({} if record.file_budget is None else {"file_budget": record.file_budget}),
         "version": version("a2tg-jax"),
-        "options": _without_none(config_to_dict(record.unbudgeted().options), config_to_dict(preset)),
+        "options": _without_none(config_to_dict(record.unbudgeted().options), config_to_dict(usual)),
         **({"compare_options": compared} if compared else {}),
     }
     text = f"# Repeats the run: {repeating_command(run)}\n"
