@@ -194,6 +194,8 @@ def test_compared_with_a2tg_both_keep_their_kernels_and_shares():
     compared = compared_system("bytewise", textured, "quick")
     assert (compared.kernel_rate, compared.texture_share) == (own.kernel_rate, own.texture_share)
     compared = compared_system("a2tg", own, "quick")
+    assert (compared.kernel_rate, compared.texture_share) == (0.01, 0.25), "its own of quick"
+    compared = compared_system("a2tg", own)
     assert (compared.kernel_rate, compared.texture_share) == (None, None)
 
 
