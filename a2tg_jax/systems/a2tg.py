@@ -26,7 +26,7 @@ QUICK_OPTIONS: dict[str, Any] = {
     "stage1_iterations": 1_500, "stage2_iterations": 1_500, "texel_rate": QUICK_TEXELS, "empty_textures": True,
     "texture_share": 0.25, "kernel_rate": 0.01, "lookup": TextureOptions(extent=1.5), "densify": Mcmc(cap=QUICK_CAP),
 }  # fmt: skip
-"""Options of the preset "quick", chosen in experiments/NOTEBOOK.md, "A²TG without handicaps"."""
+"""Options of the preset "quick", chosen in experiments/NOTEBOOK.md, "Four handicaps of textures in short runs"."""
 SMOKE_OPTIONS: dict[str, Any] = {
     "stage2_iterations": 120, "texel_rate": QUICK_TEXELS, "single_texel_rate": 0.0, "densify": Mcmc(cap=SMOKE_CAP),
     "texture": Upscale(fraction=0.5, at=(0.1, 0.2)),

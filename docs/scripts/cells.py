@@ -31,7 +31,7 @@ def main(folder: pathlib.Path, **lengths: int) -> None:
     maps = {file: levels for file, _, levels, _ in level_maps(models[1])}
     sizes = level_picture(models[1], maps["resolutions.png"], view.camera, a2tg.RenderSettings())
     pictures = [to_uint8(a2tg.view_image(view)), *renders, sizes]
-    captions = ["photograph", "plain Gaussians", "A²TG", "texels: 1 (dark) to 16 (bright)"]
+    captions = ["photograph", "plain Gaussians", "A²TG", "texels: none (dark) to 16 (bright)"]
     save_picture(folder / "cells.png", side_by_side([picture[PART] for picture in pictures], captions))
 
 
