@@ -26,9 +26,9 @@ from lab.jobs import Folders, Job, Record
 from lab.kept import read_figures, read_kept
 from lab.plan import Machine, plan_of
 from lab.progress import Progress
-from lab.queue import LocalPool, Pool, SubmititPool, TimeLimit, run_all
+from lab.queue import LocalPool, Pool, SubmititPool, TimeLimit, is_finished, run_all
 from lab.scenes import SceneAt, own_scene
-from lab.stages import check_systems, stages_of
+from lab.stages import Stage, check_systems, stages_of
 from lab.tables import Result
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
@@ -115,20 +115,25 @@ class Lab:
 
     def _drop_models(self, grids: Sequence[Grid]) -> None:
         """Delete the models of finished stages that no unfinished one starts from."""
-        stages = stages_of(grids, self.records)
-        starts = [stage.job.start for key, stage in stages.items() if key not in self.records]
-        needed = {start.key for start in starts if start is not None}
-        for key in self.records.keys() & stages.keys() - needed:
-            self.folders.model(stages[key].job).unlink(missing_ok=True)
+        left = [stage.job for stage in self._left(grids)]
+        needed = {job.key for job in left} | {job.start.key for job in left if job.start is not None}
+        for key, stage in stages_of(grids, self.records).items():
+            if key not in needed:
+                self.folders.model(stage.job).unlink(missing_ok=True)
+
+    def _left(self, grids: Sequence[Grid]) -> list[Stage]:
+        """Return the stages that are not finished."""
+        stages = stages_of(grids, self.records).values()
+        return [stage for stage in stages if not is_finished(stage.job, self.folders, self.records)]
 
     def rest_text(self, grids: Sequence[Grid]) -> str:
         """Return what is left after the time limit; empty if nothing is, or without a limit."""
-        stages = stages_of(grids, self.records)
-        left = [stage for key, stage in stages.items() if key not in self.records]
+        left = self._left(grids)
+        num = len(stages_of(grids, self.records))
         if not left or not self.limit.is_too_late or self.args.tables_only:
             return ""
         return (
-            f"the time limit of {self.args.minutes:g} minutes is over: {len(left)} of {len(stages)} stages are left, "
+            f"the time limit of {self.args.minutes:g} minutes is over: {len(left)} of {num} stages are left, "
             f"first {left[0]}; the same command continues, --plan lists them"
         )
 
