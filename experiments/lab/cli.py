@@ -7,7 +7,7 @@ import functools
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -115,25 +115,25 @@ class Lab:
 
     def _drop_models(self, grids: Sequence[Grid]) -> None:
         """Delete the models of finished stages that no unfinished one starts from."""
-        left = [stage.job for stage in self._left(grids)]
+        stages = stages_of(grids, self.records)
+        left = [stage.job for stage in self._left(stages)]
         needed = {job.key for job in left} | {job.start.key for job in left if job.start is not None}
-        for key, stage in stages_of(grids, self.records).items():
+        for key, stage in stages.items():
             if key not in needed:
                 self.folders.model(stage.job).unlink(missing_ok=True)
 
-    def _left(self, grids: Sequence[Grid]) -> list[Stage]:
+    def _left(self, stages: Mapping[str, Stage]) -> list[Stage]:
         """Return the stages that are not finished."""
-        stages = stages_of(grids, self.records).values()
-        return [stage for stage in stages if not is_finished(stage.job, self.folders, self.records)]
+        return [stage for stage in stages.values() if not is_finished(stage.job, self.folders, self.records)]
 
     def rest_text(self, grids: Sequence[Grid]) -> str:
         """Return what is left after the time limit; empty if nothing is, or without a limit."""
-        left = self._left(grids)
-        num = len(stages_of(grids, self.records))
+        stages = stages_of(grids, self.records)
+        left = self._left(stages)
         if not left or not self.limit.is_too_late or self.args.tables_only:
             return ""
         return (
-            f"the time limit of {self.args.minutes:g} minutes is over: {len(left)} of {num} stages are left, "
+            f"the time limit of {self.args.minutes:g} minutes is over: {len(left)} of {len(stages)} stages are left, "
             f"first {left[0]}; the same command continues, --plan lists them"
         )
 
