@@ -86,6 +86,10 @@ def test_models_that_nothing_left_starts_from_can_be_dropped(tmp_path):
     lab.records[first.key] = record()
     lab._drop_models([grid])
     assert [*path.parent.iterdir()] == [other], "models of other sweeps stay"
+    path.touch()
+    lab.folders = dataclasses.replace(lab.folders, lpips_network="alex")
+    lab._drop_models([grid])
+    assert path.is_file(), "LPIPS is to be measured on it"
 
 
 def call(name, *arguments, **options):

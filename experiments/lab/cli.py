@@ -7,7 +7,7 @@ import functools
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -26,9 +26,9 @@ from lab.jobs import Folders, Job, Record
 from lab.kept import read_figures, read_kept
 from lab.plan import Machine, plan_of
 from lab.progress import Progress
-from lab.queue import LocalPool, Pool, SubmititPool, TimeLimit, run_all
+from lab.queue import LocalPool, Pool, SubmititPool, TimeLimit, is_finished, run_all
 from lab.scenes import SceneAt, own_scene
-from lab.stages import check_systems, stages_of
+from lab.stages import Stage, check_systems, stages_of
 from lab.tables import Result
 
 EXPERIMENTS = Path(__file__).resolve().parents[1]
@@ -116,15 +116,20 @@ class Lab:
     def _drop_models(self, grids: Sequence[Grid]) -> None:
         """Delete the models of finished stages that no unfinished one starts from."""
         stages = stages_of(grids, self.records)
-        starts = [stage.job.start for key, stage in stages.items() if key not in self.records]
-        needed = {start.key for start in starts if start is not None}
-        for key in self.records.keys() & stages.keys() - needed:
-            self.folders.model(stages[key].job).unlink(missing_ok=True)
+        left = [stage.job for stage in self._left(stages)]
+        needed = {job.key for job in left} | {job.start.key for job in left if job.start is not None}
+        for key, stage in stages.items():
+            if key not in needed:
+                self.folders.model(stage.job).unlink(missing_ok=True)
+
+    def _left(self, stages: Mapping[str, Stage]) -> list[Stage]:
+        """Return the stages that are not finished."""
+        return [stage for stage in stages.values() if not is_finished(stage.job, self.folders, self.records)]
 
     def rest_text(self, grids: Sequence[Grid]) -> str:
         """Return what is left after the time limit; empty if nothing is, or without a limit."""
         stages = stages_of(grids, self.records)
-        left = [stage for key, stage in stages.items() if key not in self.records]
+        left = self._left(stages)
         if not left or not self.limit.is_too_late or self.args.tables_only:
             return ""
         return (

@@ -360,11 +360,15 @@ def _ready(jobs: Iterable[Job], folders: Folders, records: Records) -> list[Job]
     return list({job.key: job for job in found if job is not None}.values())
 
 
+def is_finished(job: Job, folders: Folders, records: Records) -> bool:
+    """Return whether a job has its record, with the LPIPS that is wanted."""
+    record = records.get(job.key)
+    return record is not None and folders.lpips_network in (None, record.get("lpips_network"))
+
+
 def _first_open(job: Job, folders: Folders, records: Records, *, is_start: bool = False) -> Job | None:
     """Return the job, or the one before it that it needs; None if it is finished."""
-    record = records.get(job.key)
-    is_measured = record is not None and folders.lpips_network in (None, record.get("lpips_network"))
-    if is_measured and (not is_start or folders.model(job).is_file()):
+    if is_finished(job, folders, records) and (not is_start or folders.model(job).is_file()):
         return None
     before = None if job.start is None else _first_open(job.start, folders, records, is_start=True)
     return before or job
