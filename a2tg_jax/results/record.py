@@ -14,7 +14,7 @@ The record is kept as run.toml. A configuration file has the same keys; missing 
     [compare_options.gaussians-2d-mcmc]  # options of a compared system, instead of the main one's
     sh_degree = 0
 
-In a file with `version`, as a run's has, missing options are those of the preset "paper": it has all of its version's.
+In a file with `version`, as a run's has, missing options are as in the preset "paper": it has all of its version's.
 """
 
 import dataclasses
