@@ -296,7 +296,7 @@ def endpoints(rows: Sequence[Row]) -> str:
 
 
 def present(lab: Lab, grids: Sequence[Grid]) -> None:
-    """Write the tables and the chart, from the records of this scale and of those beside it."""
+    """Write the tables and the chart, from the records of this scale and of the other scales."""
     bytewise, equal_time, parts = (tables.results_of(grid, lab.records) for grid in grids)
     of_bytewise = rows_of_bytewise(bytewise, equal_time)
     of_a2tg = rows_of_a2tg(lab)
@@ -323,7 +323,7 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
 
 
 def rows_of_a2tg(lab: Lab) -> list[Row]:
-    """Return the comparisons of A²TG at the paper's length and size, then those of E1."""
+    """Return the comparisons of A²TG at the paper's length and size, then in `quick`."""
     rows = []
     for scale, place in ({"smoke": PLACES["paper160"]} if lab.is_smoke else PLACES).items():
         names = {3: "fixed_memory"} if scale == "long" else {3: "paper_degree_3", 0: "paper_degree_0"}

@@ -120,7 +120,7 @@ class LimitExponents(StepEvent):
 
 
 class Kernels(NamedTuple):
-    """What kernels with exponents add to every stage; nothing if all kernels are Gaussians."""
+    """What trainable shapes of kernels add to each stage; nothing if all kernels are Gaussians."""
 
     part: Exponents | None
     """Part of the appearance."""

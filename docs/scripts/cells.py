@@ -18,7 +18,7 @@ PART = slice(20, 132), slice(24, 136)
 
 
 def main(folder: pathlib.Path, **lengths: int) -> None:
-    """Train both systems for equally many iterations, those of the preset if none are given, and draw a test view."""
+    """Train both systems for equally many iterations, by default as many as the preset has, and draw a test view."""
     scene = a2tg.cells_scene()
     textured = a2tg.A2tg.preset("quick", memory_budget=BUDGET, sh_degree=DEGREE, **lengths)
     lengths = {name: getattr(textured, name) for name in ("stage1_iterations", "stage2_iterations")}

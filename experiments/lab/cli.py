@@ -319,7 +319,7 @@ def argument_parser(description: str) -> argparse.ArgumentParser:
     add("--scenes", type=Path, default=Path("scenes"), help="folder of the scenes that grids/scales.toml names")
     add("--scale", type=_scale, default="small", metavar=f"{{{','.join(SCALES)}}}",
         help="full is the paper's, for a GPU; long has its options and length on small photographs; protocol, "
-        "protocol160, paper160, full_size (for a GPU) and half_size are those of PROTOCOL.md")  # fmt: skip
+        "protocol160, paper160, full_size (for a GPU) and half_size are in PROTOCOL.md")  # fmt: skip
     add("--only", action="append", metavar="SCENE", help="run this scene of the scale only; may be repeated")
     add("--scene", action="append", type=Path, default=[], metavar="PATH",
         help="run this scene folder instead of the scale's; may be repeated")  # fmt: skip

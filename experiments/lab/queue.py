@@ -56,7 +56,7 @@ class Failure:
 
 @dataclasses.dataclass(frozen=True)
 class TimeLimit:
-    """Time limit of a call. Times are those of `time.monotonic`, which the processes of a machine share."""
+    """Time limit of a call. Times are from `time.monotonic`, which the processes of a machine share."""
 
     end: float = math.inf
     """Time at which jobs that still run are ended."""
