@@ -33,6 +33,8 @@ PLACES = {
 """Scales of the paper's comparison (E5, a series before the protocol, E4) in the words of the table."""
 SIZE_OF_ENDPOINT = 100_000, 3
 """Gaussians and degree of the rows of E4 that the page shows; others are in NOTEBOOK.md."""
+LEAST_SCENES = 3
+"""Smallest number of scenes of a row on the page: an interval of two says nothing."""
 QUICK, QUICK_SIZE = "in `quick`", 60
 """Name of E1's place in the table, and its bytes per pixel; other sizes are in NOTEBOOK.md."""
 DENSE, FEW = "dense", "few views"
@@ -243,10 +245,11 @@ def table_of(rows: Sequence[Row]) -> str:
 
 
 def short_table(rows: Sequence[Row]) -> str:
-    """Return the table of the comparisons that have runs, below their place, with the intervals of PSNR alone."""
+    """Return the table of the comparisons of enough scenes, below their place, with the intervals of PSNR alone."""
     header = ["", "ΔPSNR, dB", "ΔSSIM", "ΔLPIPS", "scenes won", "p"]
     lines = []
-    for place, block in tables.grouped([row for row in rows if row.differences("psnr")], lambda row: row.place):
+    shown = [row for row in rows if len(row.differences("psnr")) >= LEAST_SCENES]
+    for place, block in tables.grouped(shown, lambda row: row.place):
         if place:
             lines.append([f"**{place}**", *[""] * (len(header) - 1)])
         for row in block:
@@ -315,9 +318,11 @@ def present(lab: Lab, grids: Sequence[Grid]) -> None:
     dense = [row for row in own if row.name.endswith(("0.3 MB", EQUAL_TIME))]
     by_scene = [scenes_table(rows) for rows in (at_length, dense) if any(row.differences("psnr") for row in rows)]
     lab.write("details", "\n".join(["# Details of the findings\n", table_of([*shown, *own]), *by_scene]))
-    # Differences from 3DGS of degree 3, and intervals of two scenes, are several times as large as the others.
+    # Differences from 3DGS of degree 3 are several times as large as the others.
     charted = {A2TG: shown, VERSIONS[BYTEWISE]: [row for row in own if row.other != "3DGS-MCMC, degree 3"]}
-    found = {title: [row for row in rows if len(row.differences("psnr")) > 2] for title, rows in charted.items()}
+    found = {
+        title: [row for row in rows if len(row.differences("psnr")) >= LEAST_SCENES] for title, rows in charted.items()
+    }
     if all(found.values()):
         save_figure(lab.pages / f"{EXPERIMENT.name}.png", forest(found))
 
