@@ -161,6 +161,7 @@ def rows_against(
     others = {
         plain: "plain",
         f"{plain}, first stage": "plain, first stage",
+        f"{plain}, shapes of kernels": "plain with its kernels",
         suffixed(TEXTURED, degree): "textures of one size",
     }
     num_scenes = len({cell.scene.label for cell in grid.cells})
@@ -196,17 +197,8 @@ def rows_at_length(grid: Grid, degree: int, records: Mapping[str, Record], place
 
 def rows_of_quick(grid: Grid, degree: int, records: Mapping[str, Record]) -> list[Row]:
     """Return the comparisons of the present A²TG of `quick` with plain Gaussians (E7)."""
-    label, plain = (suffixed(name, degree) for name in (PRESENT, MCMC))
-    others = {plain: "plain", f"{plain}, shapes of kernels": "plain with its kernels"}
-    results = tables.results_of(grid, records)
-    num_scenes = len({cell.scene.label for cell in grid.cells})
-    return [
-        Row(
-            f"{A2TG} − {wording}", results, label + EQUAL_BYTES, other + EQUAL_BYTES, num_scenes,
-            f"{QUICK}, degree {degree}", True,
-        )
-        for other, wording in others.items()
-    ]  # fmt: skip
+    own = {suffixed(PRESENT, degree) + EQUAL_BYTES: A2TG}
+    return rows_against(grid, degree, tables.results_of(grid, records), own, QUICK, is_on_page=True)
 
 
 def rows_of_earlier_quick(grid: Grid, degree: int, records: Mapping[str, Record]) -> list[Row]:

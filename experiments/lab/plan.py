@@ -10,7 +10,7 @@ from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.events import HostEvent
 from a2tg_jax.host.text import in_bytes
 from a2tg_jax.training.cost import forecast_stages
-from lab.grid import Grid
+from lab.grid import Grid, Run
 from lab.jobs import Folders, Job, Record, model_bytes, num_gaussians
 from lab.markdown import table
 from lab.queue import estimated_bytes
@@ -90,7 +90,7 @@ def _cells(grids: Sequence[Grid], records: Mapping[str, Record]) -> str:
     """Return a row for each cell with the methods that are left."""
     rows = []
     for cell, runs in runs_by_cell(grids, records).items():
-        left = [label for label, run in runs.items() if run.job.key not in records]
+        left = _left(runs, records)
         length = "+".join(f"{count:,}" for count in cell.iterations)
         done = f"{len(runs) - len(left)} of {len(runs)}"
         rows.append([scene_text(cell.scene), cell.size, str(cell.seed), length, done, _left_text(left, len(runs))])
@@ -103,11 +103,16 @@ def missing_text(grid: Grid, records: Mapping[str, Record]) -> str:
     """Return a line with the unfinished runs of each cell; empty if all are finished."""
     parts = []
     for cell, runs in runs_by_cell([grid], records).items():
-        left = [label for label, run in runs.items() if run.job.key not in records]
+        left = _left(runs, records)
         if left:
             place = f"{scene_text(cell.scene)}, {cell.size}, seed {cell.seed}"
             parts.append(f"{place}: {_left_text(left, len(runs))}")
     return f"\n*Not finished: {' · '.join(parts)}.*\n" if parts else ""
+
+
+def _left(runs: Mapping[str, Run], records: Mapping[str, Record]) -> list[str]:
+    """Return the labels of the unfinished runs of a cell."""
+    return [label for label, run in runs.items() if run.job.key not in records]
 
 
 def _left_text(labels: Sequence[str], num: int) -> str:
