@@ -19,7 +19,6 @@ from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
 from a2tg_jax.events import Change, Due, GradientStatistics, HostEvent, Statistic, iterations_at
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.sharded_rows import on_host
 from a2tg_jax.texture import BYTES_PER_TEXEL, MAX_SIDE, Textures, check_textures, checked_sizes
 
 Axes = Literal["paper", "authors"]
@@ -159,7 +158,7 @@ class Upscale(HostEvent):
                 f"{in_words(model.appearance)} cannot grow textures: the stage needs Appearance(texture=Texture())"
             )
         textures, num = model.textures, model.num
-        old_sizes, scales, averages = textures.sizes, on_host(model.gaussians.scales), on_host(state.average())
+        old_sizes, scales, averages = textures.sizes, np.asarray(model.gaussians.scales), np.asarray(state.average())
         # Rows that do not exist yet count for nothing, and get nothing.
         sizes, new_sizes = old_sizes[:num], old_sizes.copy()
 

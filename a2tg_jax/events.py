@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -23,11 +24,10 @@ from a2tg_jax.core.numerics import safe_divide, safe_norm
 from a2tg_jax.core.optim import AdamState
 from a2tg_jax.core.origin import BLACK, Color
 from a2tg_jax.core.pytree import combine, partition, pytree
-from a2tg_jax.core.table import Shape, map_rows
+from a2tg_jax.core.table import Shape, map_rows, rows_moved
 from a2tg_jax.data.scene import View
 from a2tg_jax.host.text import shortened
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.sharded_rows import on_host, placed_like, rows_moved, zeros_beside
 from a2tg_jax.rasterize.pixel import Statistic as Statistic
 
 LEAST_LEFT = 2
@@ -147,9 +147,7 @@ class Change(NamedTuple):
 class Event(NamedFields):
     """Base class of both kinds of event.
 
-    Where several devices train together, the rows of arrays are spread over the devices; what `init`, `gather` and
-    an event on the host return is spread again. On the host, read arrays by `on_host`, and place new ones by
-    `placed_like`, which never puts all rows on one device (`parallel.sharded_rows`).
+    Where several devices train together, an event on the host, `init` and `gather` get whole arrays on one device.
     """
 
     limited_by: ClassVar[str] = ""
@@ -178,12 +176,11 @@ class Event(NamedFields):
         has a statistic, otherwise ().
 
         It does not follow rows that another event moves inside the step: gather per row only in a stage in which none
-        does. `gather` follows rows that move on the host. If several devices train together, they share the rows of
-        these arrays.
+        does. `gather` follows rows that move on the host.
         """
         if self.statistic is None:
             return ()
-        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
+        return GradientStatistics.init(model.gaussians.num, model.gaussians.means.dtype)
 
     def gather(self, state: Any, rows: np.ndarray) -> Any:
         """Return the state whose row i is the former row rows[i] (host). ValueError: by default, if an array that is no
@@ -306,7 +303,7 @@ def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | 
         sizes.
     """
     num, rows = model.num, np.arange(model.gaussians.num, dtype=np.int32)
-    is_kept = on_host(is_kept)
+    is_kept = np.asarray(is_kept)
     check_mask("is_kept", is_kept, (len(rows) if is_kept.shape == rows.shape else num,))
     is_kept = is_kept[:num]
     if (num_kept := int(is_kept.sum())) < LEAST_LEFT:
@@ -314,7 +311,7 @@ def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | 
     # What is removed stays behind the others, where `num_live` leaves it out, so that no shape changes.
     rows[:num] = np.concatenate([np.flatnonzero(is_kept), np.flatnonzero(~is_kept)])
     moments = gather_moments(moments, rows)
-    left = placed_like(np.asarray(num_kept, np.int32), model.gaussians.means)
+    left = jax.device_put(np.asarray(num_kept, np.int32))
     model = dataclasses.replace(gather_rows(model, rows), num_live=left)
     return Change(model, moments, state, rows=rows)
 
@@ -376,9 +373,9 @@ class GradientStatistics(NamedFields):
     """[N] int32 number of views in which the Gaussian was composited at one or more pixels."""
 
     @staticmethod
-    def init(num: int, dtype: DTypeLike = jnp.float32, like: Array | None = None) -> "GradientStatistics":
-        """Return empty sums for `num` Gaussians, spread like the rows of an array; None: on one device."""
-        return GradientStatistics(zeros_beside(like, (num,), dtype), zeros_beside(like, (num,), jnp.int32))
+    def init(num: int, dtype: DTypeLike = jnp.float32) -> "GradientStatistics":
+        """Return empty sums for `num` Gaussians."""
+        return GradientStatistics(jnp.zeros((num,), dtype), jnp.zeros((num,), jnp.int32))
 
     def observe(self, norms: Array, is_visible: Array) -> "GradientStatistics":
         """Add one view: `norms` [N] where `is_visible` [N]."""

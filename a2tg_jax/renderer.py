@@ -14,10 +14,8 @@ from a2tg_jax.core.gaussians import Gaussians, check_gaussians
 from a2tg_jax.core.numerics import evenly_chosen
 from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.exchange import exchange_of
-from a2tg_jax.parallel.exchange_room import room_of_view
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
-from a2tg_jax.rasterize.views import HEAD_ROOM, capacity_for, has_rows, pairs_of_view, pairs_to_draw, warn_of_empty
+from a2tg_jax.rasterize.views import HEAD_ROOM, capacity_for, has_rows, pairs_of_view, warn_of_empty
 from a2tg_jax.render import appearance_of, background_array, jitted_render
 from a2tg_jax.texture import Textures
 
@@ -81,28 +79,17 @@ def plan_render(
     elif textures is not None:
         raise ValueError("give an appearance or textures, not both")
     check_is_appearance(appearance, gaussians)
-    most = max(pairs_to_draw(gaussians, camera, appearance, settings, num_live) for camera in cameras)
+    most = max(pairs_of_view(gaussians, camera, appearance, settings, num_live) for camera in cameras)
     if most == 0 and has_rows(gaussians, num_live):
         warn_of_empty("any of the cameras", stacklevel=3)
     return dataclasses.replace(settings, capacity=capacity_for(most, head_room))
 
 
 def room_for(model: Model, cameras: Sequence[Camera]) -> RenderSettings:
-    """Return settings with room for a model's tile lists in each view. The devices over which its rows are spread draw
-    each view together (host)."""
-
-    def rounded_up(number: int) -> int:
-        return 1 << number.bit_length()  # Programs are compiled for a room: for few of them.
-
-    settings, appearance = RenderSettings(exchange=exchange_of(model.gaussians.means)), model.appearance
-    if settings.exchange is None:
-        capacity = plan_render(model, cameras, settings=settings).capacity
-        return dataclasses.replace(settings, capacity=rounded_up(capacity or 1))
-    rooms = [room_of_view(model.gaussians, one, appearance, settings, model.num_live) for one in cameras]
-    capacity = rounded_up(max(room.pairs for room in rooms))
-    rows_per_pair = rounded_up(max(room.rows for room in rooms)) / capacity
-    exchange = dataclasses.replace(settings.exchange, rows_per_pair=rows_per_pair)
-    return dataclasses.replace(settings, capacity=capacity, exchange=exchange)
+    """Return settings with room for a model's tile lists in each view (host)."""
+    settings = plan_render(model, cameras)
+    # Programs are compiled for a room: for few of them.
+    return dataclasses.replace(settings, capacity=1 << (settings.capacity or 1).bit_length())
 
 
 class Renderer:

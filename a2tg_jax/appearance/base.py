@@ -42,10 +42,9 @@ from a2tg_jax.core.gaussians import Gaussians, logit, share
 from a2tg_jax.core.geometry import homographies
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.numerics import Integer, at_least
-from a2tg_jax.core.pytree import partition, pytree, static
+from a2tg_jax.core.pytree import is_shared, partition, pytree, static
 from a2tg_jax.core.sh import sh_sum
-from a2tg_jax.core.table import Table, check_places, check_table, is_whole, map_rows
-from a2tg_jax.parallel.sharded_rows import is_shared, on_host, rows_joined, rows_moved
+from a2tg_jax.core.table import Table, check_places, check_table, is_held, is_whole, map_rows, rows_moved
 from a2tg_jax.texture import Textures, check_textures
 
 T = TypeVar("T")
@@ -505,9 +504,13 @@ def join_rows(trees: Sequence[T]) -> T:
         arrays = jax.tree.leaves(first) if is_shared(first) else []
         for other in others if arrays else ():
             found = jax.tree.leaves(other)
-            if len(found) != len(arrays) or not all(map(np.array_equal, map(on_host, arrays), map(on_host, found))):
+            if len(found) != len(arrays) or not all(map(np.array_equal, arrays, found)):
                 name = jax.tree_util.keystr(path).rpartition("].")[-1]
                 raise ValueError(f"{name} must be equal in all models, because all Gaussians share it")
 
+    def joined(*arrays: Array) -> Array:
+        # On the host, where nothing is compiled for their numbers.
+        return jax.device_put(np.concatenate(arrays)) if all(map(is_held, arrays)) else jnp.concatenate(arrays)
+
     jax.tree_util.tree_map_with_path(check_shared, *trees, is_leaf=is_whole)
-    return map_rows(lambda *arrays: rows_joined(arrays), lambda *tables: type(tables[0]).joined(tables), *trees)
+    return map_rows(joined, lambda *tables: type(tables[0]).joined(tables), *trees)

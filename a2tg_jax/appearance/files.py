@@ -24,9 +24,9 @@ from a2tg_jax.appearance.parts import (
     dense_bands,
 )
 from a2tg_jax.core.gaussians import no_rows
+from a2tg_jax.core.pytree import is_shared
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.core.table import Table, is_table, is_whole
-from a2tg_jax.parallel.sharded_rows import is_shared
 from a2tg_jax.texture import MAX_SIDE, Textures
 
 OLD_INNER = "inner."

@@ -23,7 +23,6 @@ from a2tg_jax.core.numerics import Integer, within
 from a2tg_jax.core.pytree import pytree, static
 from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis
 from a2tg_jax.core.table import Places, Size, Table, check_places, check_table
-from a2tg_jax.parallel.sharded_rows import on_host, placed_like
 from a2tg_jax.texture import NEUTRAL_TEXEL, Textures, allocate_textures, check_textures
 
 
@@ -327,13 +326,13 @@ class Coefficients(Table):
 
     @classmethod
     def placed(cls, buckets: Sequence[Any], places: Places) -> Self:
-        bucket, row, num = on_host(places.bucket), on_host(places.row), places.bucket.shape[0]
+        bucket, row, num = np.asarray(places.bucket), np.asarray(places.row), places.bucket.shape[0]
         owners = []
         for index, blocks in enumerate(buckets):
             # N is out of range, so that scatters drop padding.
             own = np.full(len(blocks), num, np.int32)
             own[row[bucket == index]] = np.flatnonzero(bucket == index)
-            owners.append(placed_like(own, places.bucket))
+            owners.append(jax.device_put(own))
         return dataclasses.replace(super().placed(buckets, places), owners=tuple(owners))
 
     @staticmethod

@@ -25,7 +25,7 @@ from a2tg_jax.host.operating_system import has_display
 from a2tg_jax.host.text import counted, defaulting_to
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.mcmc import Mcmc
-from a2tg_jax.parallel.processes import AUTO, ProcessPlace, joined
+from a2tg_jax.parallel import AUTO, ProcessPlace, joined
 from a2tg_jax.results.compression import command_for_file
 from a2tg_jax.results.folder import RunFolder, open_run, opened, resuming_command
 from a2tg_jax.results.forecast import room_for_photographs
@@ -150,7 +150,8 @@ class Train:
     """Memory limit of the process and of the GPU, such as 8GB or 800MB. Training does not start if it needs more.
     Photographs beyond a quarter of it stay on disk. For a limit on the model, use --memory-budget."""
     devices: Annotated[str, arg(metavar="N")] = "1"
-    """Number of GPUs per process that train the scene together, each with a share of its Gaussians; or all."""
+    """Number of GPUs per process that train the scene together, or all. Each draws whole views: without --batch-size,
+    a step takes one view for each of them."""
     coordinator: Annotated[str | None, defaulting_to("one process", "HOST:PORT")] = None
     """Address of the first of several processes that train the scene together, or auto under Slurm, Open MPI or
     Kubernetes. Start the same command for each process."""
@@ -163,14 +164,13 @@ class Train:
 
     def run(self) -> None:
         # Processes must join before anything starts the devices of JAX.
-        with joined(self.place) as team:
+        with joined(self.place, lambda: f"continue with: {resuming_command(RunFolder(self.out))}"):
             session = Session(after_compiling=tidy_memory, devices=devices_named(self.devices))
             most = budget_in_bytes(self.max_memory, "max_memory")
-            if team is not None and not team.is_first:  # It trains with the first process and prints nothing.
-                run = RunFolder(self.out)
-                team.advice = lambda: f"continue with: {resuming_command(run, session.devices)}"
-                record = self.resumed(open_run(self.out), is_first=False) if self.resume else self.whole_record
-                follow_first_process(record, record.scene.load(room_for_photographs(most), is_divided=True), session)
+            record = with_view_for_each(self.whole_record, session.num_devices)
+            if jax.process_index() > 0:  # It trains with the first process and prints nothing.
+                record = self.resumed(open_run(self.out), is_first=False) if self.resume else record
+                follow_first_process(record, record.scene.load(room_for_photographs(most)), session)
                 return
             if self.tensorboard:
                 tensorboard_library()  # Raises before training if it is not installed.
@@ -187,7 +187,9 @@ class Train:
             if self.resume:
                 resume(self.out, options, self.resumed)
             else:
-                print_result(begin_run(self.whole_record, self.out, options), self.out)
+                if record.options.batch_size != self.record.options.batch_size:
+                    print(f"{session.num_devices} devices: {record.options.batch_size} views a step (--batch-size)")
+                print_result(begin_run(record, self.out, options), self.out)
 
     @property
     def place(self) -> ProcessPlace | None:
@@ -334,6 +336,13 @@ def ask(doubts: Sequence[str]) -> None:
     print("Train all the same? [y/N] ", end="", file=sys.stderr, flush=True)
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise ValueError("nothing was trained, as you answered")
+
+
+def with_view_for_each(record: RunRecord, num_devices: int) -> RunRecord:
+    """Return the record with as many views a step as there are devices, unless it has another number than one."""
+    if num_devices == 1 or record.options.batch_size > 1:
+        return record
+    return dataclasses.replace(record, options=dataclasses.replace(record.options, batch_size=num_devices))
 
 
 def devices_named(text: str) -> list[jax.Device] | None:

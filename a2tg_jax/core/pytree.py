@@ -7,7 +7,7 @@ their own functions are distinct.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, dataclass_transform, overload
 
 import jax
@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from a2tg_jax.host.text import name_replace
-from a2tg_jax.parallel.sharded_rows import Shared
 
 T = TypeVar("T")
 MARK = "_registered_pytree"
@@ -46,6 +45,34 @@ def shared(*, default: object = None) -> Any:
       A field, for an array or any pytree of arrays, for a class that `pytree` decorates.
     """
     return dataclasses.field(default=default, metadata={"shared": True})
+
+
+@jax.tree_util.register_pytree_with_keys_class
+class Shared:
+    """Node of a pytree around the arrays of a `shared` field, which have no row for each Gaussian.
+
+    `core.table.map_rows` leaves it unchanged.
+    """
+
+    def __init__(self, tree: Any):
+        """Args:
+        tree: arrays, or any pytree of them.
+        """
+        self.tree = tree
+
+    def tree_flatten_with_keys(self) -> tuple[tuple[tuple[str, Any]], None]:
+        """Return the content under an empty key: paths in errors and files name the field only."""
+        return (("", self.tree),), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, children: Sequence[Any]) -> "Shared":
+        """Return the node around its only child."""
+        return cls(*children)
+
+
+def is_shared(node: object) -> bool:
+    """Return whether a node of a pytree is shared by all rows, for `is_leaf` of `jax.tree`."""
+    return isinstance(node, Shared)
 
 
 def beside(*, default: object) -> Any:

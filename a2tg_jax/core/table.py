@@ -20,8 +20,7 @@ from jax.typing import ArrayLike, DTypeLike
 
 from a2tg_jax.core.checks import check_array, check_floats, check_kind, check_mask, check_shape, plain_array, short_repr
 from a2tg_jax.core.named_fields import NamedFields
-from a2tg_jax.core.pytree import partition, pytree, static
-from a2tg_jax.parallel.sharded_rows import is_shared, on_host, placed_like, rows_moved
+from a2tg_jax.core.pytree import is_shared, partition, pytree, static
 
 T = TypeVar("T")
 Size = tuple[int, ...]
@@ -91,9 +90,8 @@ class Table(NamedFields):
     @classmethod
     def placed(cls, buckets: Sequence[Any], places: "Places") -> Self:
         """Return the table of buckets and of the places that were planned for them (host)."""
-        # `device_put` compiles nothing, but would move arrays that several processes share.
-        held = (bucket if isinstance(bucket, jax.Array) else jax.device_put(bucket) for bucket in buckets)
-        return cls(tuple(held), *places)
+        # It compiles nothing, unlike `jnp.asarray`.
+        return cls(tuple(map(jax.device_put, buckets)), *places)
 
     @classmethod
     def _padded(cls, capacity: int, size: Size, dtype: DTypeLike, padding: Sequence[float] | None = None) -> np.ndarray:
@@ -118,9 +116,9 @@ class Table(NamedFields):
 
     def groups(self) -> list[Group]:
         """Return a group for each bucket, its Gaussians ascending (host)."""
-        bucket, row = on_host(self.bucket), on_host(self.row)
+        bucket, row = np.asarray(self.bucket), np.asarray(self.row)
         ids = [np.flatnonzero(bucket == index) for index in range(len(self.buckets))]
-        return [(own, on_host(blocks)[row[own]]) for own, blocks in zip(ids, self.buckets, strict=True)]
+        return [(own, np.asarray(blocks)[row[own]]) for own, blocks in zip(ids, self.buckets, strict=True)]
 
     def blocks(self) -> list[np.ndarray]:
         """Return the N blocks as NumPy arrays [T₁, …, C], in the order of the Gaussians (host)."""
@@ -166,7 +164,7 @@ class Table(NamedFields):
     def sizes(self) -> np.ndarray:
         """[N, D] integers, the sides of each block (host)."""
         sides = np.asarray(self.bucket_sizes, np.int64).reshape(-1, self.num_sides)
-        return sides[on_host(self.bucket)]
+        return sides[np.asarray(self.bucket)]
 
     @property
     def shape(self) -> Shape:
@@ -179,7 +177,7 @@ class Table(NamedFields):
         The log calls it every few steps, so it makes no [N, D].
         """
         areas = np.asarray([np.prod(size, dtype=np.int64) for size in self.bucket_sizes], np.int64)
-        return int(areas[on_host(self.bucket)[:num]].sum())
+        return int(areas[np.asarray(self.bucket)[:num]].sum())
 
     def count_floats(self, num: int) -> int:
         """Return the number of floats of the first `num` Gaussians, without padding (host)."""
@@ -213,7 +211,7 @@ class Table(NamedFields):
         """Return the blocks of the Gaussians `rows` [M], which may repeat, in buckets as small as they need (host).
         Padding is `padding` of the class, or C given numbers, such as zeros for moments."""
         places, capacities = plan_places(self.sizes[rows])
-        old, new = ((on_host(own.bucket), on_host(own.row)) for own in (self, places))
+        old, new = ((np.asarray(own.bucket), np.asarray(own.row)) for own in (self, places))
         ends, padding = ((old[0][rows], old[1][rows]), new), padding or self.padding
         return self.placed(_moved(type(self), self.buckets, ends, places.bucket_sizes, capacities, padding), places)
 
@@ -261,6 +259,22 @@ def map_rows(of_array: Callable[..., Any], of_table: Callable[..., Any], *trees:
     return jax.tree.map(mapped, *trees, is_leaf=is_whole)
 
 
+def rows_moved(x: Array, rows: Array | np.ndarray) -> Array:
+    """Return the array whose row i is the former row rows[i].
+
+    It is traceable. Outside jit, rows of JAX's arrays move on the host, where nothing is compiled for their number.
+    """
+    if not is_held(x) or isinstance(rows, jax.core.Tracer):
+        return x[rows]
+    device = x.sharding if x.committed else None
+    return jax.device_put(np.asarray(x)[np.asarray(rows)], device)
+
+
+def is_held(x: object) -> bool:
+    """Return whether a value is an array of JAX with numbers, not traced."""
+    return isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer)
+
+
 # Places
 
 _Ends = tuple[np.ndarray, np.ndarray]
@@ -285,13 +299,12 @@ def bucket_capacity(count: int) -> int:
 
 
 def plan_places(
-    sizes: np.ndarray, known: Sequence[Shape] = (), like: Array | None = None, room: Shape | None = None
+    sizes: np.ndarray, known: Sequence[Shape] = (), room: Shape | None = None
 ) -> tuple[Places, tuple[int, ...]]:
     """Return the places of blocks of the given sizes [N, D], from 0 to 63, and the capacity of each bucket (host).
 
     A shape with room for the blocks is taken: `room`, however large it is, or a known one, with a compiled program, of
-    at most `KNOWN_SLACK` times the elements. The places are spread over the devices of an array `like`; None: they are
-    on one.
+    at most `KNOWN_SLACK` times the elements.
     """
     for name, shape in [*(("known", own) for own in known), ("room", room)]:
         if shape is not None:
@@ -322,7 +335,7 @@ def plan_places(
         shape = min(fitting, key=lambda own: own.num_elements, default=new)
     place = np.asarray([shape.sizes.index(size) for size in needed], np.int32)
     buckets = (place[bucket] if len(place) else bucket).astype(np.int32)
-    return Places(placed_like(buckets, like), placed_like(row, like), shape.sizes), shape.capacities
+    return Places(jax.device_put(buckets), jax.device_put(row), shape.sizes), shape.capacities
 
 
 def resize(
@@ -340,8 +353,8 @@ def resize(
     Moments are any pytree, such as the state of Adam: all tables in it of the same class are rebuilt, other leaves
     stay. They become 0 for blocks that are not `kept` [N]. `known` and `room` are as for `plan_places`.
     """
-    places, capacities = plan_places(sizes, known, like=table.bucket, room=room)
-    ends = [(on_host(own.bucket), on_host(own.row)) for own in (table, places)]
+    places, capacities = plan_places(sizes, known, room)
+    ends = [(np.asarray(own.bucket), np.asarray(own.row)) for own in (table, places)]
     if kept is not None:
         check_mask("kept", kept, (table.num,))
     own, chosen = type(table), slice(None) if kept is None else kept
@@ -349,7 +362,7 @@ def resize(
 
     def rebuilt(old: Table, ends: list[_Ends], padding: Sequence[float]) -> Table:
         targets = _moved(own, old.buckets, ends, places.bucket_sizes, capacities, padding)
-        whole = own.placed([placed_like(target, table.bucket) for target in targets], places)
+        whole = own.placed(targets, places)
         return partition(whole)[0] if old.bucket is None else whole  # Moments are floats only.
 
     def rebuilt_moments(leaf: object) -> Any:
@@ -378,7 +391,7 @@ def _moved(
         # Blocks with a side of 0 have nothing to move.
         if not bucket.size or not len(from_here):
             continue
-        source = on_host(bucket)  # Each old bucket is read once, one after the other.
+        source = np.asarray(bucket)  # Each old bucket is read once, one after the other.
         for target in np.unique(new_bucket[from_here]).tolist():
             own = from_here[new_bucket[from_here] == target]
             targets[target][new_row[own]] = kind.resized(source[old_row[own]], sizes[target])
@@ -412,10 +425,10 @@ def check_table(table: Table, num: int | None = None, name: str = "textures") ->
         raise ValueError(f"{name} must have a row for each of {table.num} Gaussians; all buckets are empty")
     if not table.num or any(isinstance(leaf, jax.core.Tracer) for leaf in (table.bucket, table.row)):
         return
-    places, last = on_host(table.bucket), len(table.buckets) - 1
+    places, last = np.asarray(table.bucket), len(table.buckets) - 1
     if places.min() < 0 or places.max() > last:
         raise ValueError(f"{name}.bucket must be 0 to {last}; got {places.min()} to {places.max()}")
-    rows, capacities = on_host(table.row), np.asarray([len(blocks) for blocks in table.buckets])[places]
+    rows, capacities = np.asarray(table.row), np.asarray([len(blocks) for blocks in table.buckets])[places]
     outside = np.flatnonzero((rows < 0) | (rows >= capacities))
     if outside.size:
         first = outside[0]
@@ -427,7 +440,7 @@ def check_table(table: Table, num: int | None = None, name: str = "textures") ->
 
 def check_places(table: Table, name: str = "textures") -> None:
     """Raise ValueError unless each block has its own row; the table must have passed `check_table` (host)."""
-    bucket, row = on_host(table.bucket), on_host(table.row)
+    bucket, row = np.asarray(table.bucket), np.asarray(table.row)
     capacities = np.asarray([len(blocks) for blocks in table.buckets], np.int64)
     # With the rows of all buckets numbered through, equal numbers are shared rows.
     starts = np.cumsum(capacities) - capacities

@@ -12,7 +12,6 @@ from tyro.conf import Positional, arg
 from a2tg_jax.core.checks import check_literal
 from a2tg_jax.data.assembly import check_test_every, with_validation_views
 from a2tg_jax.data.colmap import find_models, load_colmap
-from a2tg_jax.data.division import among_processes, sharing_errors
 from a2tg_jax.data.lenses import LensUse, forget_rays
 from a2tg_jax.data.phone_captures import polycam, record3d
 from a2tg_jax.data.photo_folder import capture_hint, holds_photos, is_video
@@ -80,9 +79,9 @@ class SceneSource:
         folder = os.path.dirname(self.path) if Path(self.path).suffix in (".json", ".xml") else self.path
         return scene_name(folder if is_url(folder) else Path(folder))
 
-    def load(self, room: int | None = None, *, is_divided: bool = False) -> Scene:
+    def load(self, room: int | None = None) -> Scene:
         """Return the scene, which may be a built-in one. Same arguments and errors as `load_scene`."""
-        return _load(self, room, is_divided, is_built_in=self.is_built_in)
+        return _load(self, room, is_built_in=self.is_built_in)
 
 
 def load_scene(
@@ -94,7 +93,6 @@ def load_scene(
     alpha: AlphaMeaning = "transparency",
     mask_as: MaskMeaning = "ignored",
     lens: LensUse = "undistort",
-    is_divided: bool = False,
 ) -> Scene:
     """Read photographs, cameras and points, and normalise the world.
 
@@ -120,9 +118,6 @@ def load_scene(
         as by an alpha channel, which cuts the subject out.
       lens: "undistort" photographs to pinholes, which crops wide angles; or "keep" them and draw through the lens,
         with a ray for each pixel (`Camera.rays`). Pixels more than 80° off the direction of view do not count.
-      is_divided: whether the processes of `jax.distributed` call this together. Each then reads an equal share of the
-        photographs, plus as many of the others as its memory has room for, and up to 32 to find points. An error
-        of one is raised in all.
 
     Returns:
       The scene in its normalised world; `Scene.transform` leads there from the input's.
@@ -130,8 +125,7 @@ def load_scene(
     Raises:
       FileNotFoundError: if the path, or an image or mask named by the scene, does not exist, or the path is no scene.
       OSError: if a store does not answer.
-      ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left,
-        or processes that load it together have other options or photographs than the first.
+      ValueError: if an argument, the model, a pose, an image or a mask is unusable, or fewer than two views are left.
 
     Examples:
       >>> scene = a2tg.load_scene("scene", downscale=2)  # such as a folder with transforms.json
@@ -139,7 +133,7 @@ def load_scene(
       (7, 1)
     """
     source: SceneSource = SceneSource(path, downscale, test_every, alpha, mask_as, lens)  # type: ignore[arg-type]
-    return _load(source, room, is_divided)
+    return _load(source, room)
 
 
 def is_scene(folder: Path) -> bool:
@@ -147,45 +141,37 @@ def is_scene(folder: Path) -> bool:
     return _loader(folder) is not None or _frames(folder) is not None
 
 
-def _load(source: SceneSource, room: int | None, is_divided: bool, is_built_in: bool = False) -> Scene:
-    division = among_processes() if is_divided else None
-    with sharing_errors(division):
-        if division is not None:
-            given = [f"scene={source.path if is_built_in else 'from files'}"]
-            # Machines may have the scene at different paths.
-            given += [f"{name}={value}" for name, value in vars(source).items() if name != "path"]
-            division.check_same(given, "options of the scene")
-        check_literal("alpha", source.alpha, AlphaMeaning)
-        check_literal("mask_as", source.mask_as, MaskMeaning)
-        check_literal("lens", source.lens, LensUse)
-        if (source.alpha, source.mask_as) == ("mask", "background"):
-            raise ValueError(
-                "`alpha` must be transparency where `mask_as` is background, which makes pixels transparent; got mask"
+def _load(source: SceneSource, room: int | None, is_built_in: bool = False) -> Scene:
+    check_literal("alpha", source.alpha, AlphaMeaning)
+    check_literal("mask_as", source.mask_as, MaskMeaning)
+    check_literal("lens", source.lens, LensUse)
+    if (source.alpha, source.mask_as) == ("mask", "background"):
+        raise ValueError(
+            "`alpha` must be transparency where `mask_as` is background, which makes pixels transparent; got mask"
+        )
+    if source.downscale < 1 or source.downscale != int(source.downscale):
+        raise ValueError(f"downscale must be a whole number of at least 1; got {source.downscale}")
+    check_test_every(source.test_every)
+    if room is not None and room < 0:
+        raise ValueError(f"room must be at least 0 bytes; got {room}")
+    if is_built_in:
+        scene = BUILT_IN[source.path](downscale=source.downscale, test_every=source.test_every)
+    else:
+        shelf = Shelf(room)
+        try:
+            options = Options(
+                int(source.downscale),
+                source.test_every,
+                source.alpha,
+                source.mask_as,
+                source.lens,
+                shelf,
             )
-        if source.downscale < 1 or source.downscale != int(source.downscale):
-            raise ValueError(f"downscale must be a whole number of at least 1; got {source.downscale}")
-        check_test_every(source.test_every)
-        if room is not None and room < 0:
-            raise ValueError(f"room must be at least 0 bytes; got {room}")
-        if is_built_in:
-            scene = BUILT_IN[source.path](downscale=source.downscale, test_every=source.test_every)
-        else:
-            shelf = Shelf(room)
-            try:
-                options = Options(
-                    int(source.downscale),
-                    source.test_every,
-                    source.alpha,
-                    source.mask_as,
-                    source.lens,
-                    shelf,
-                    division,
-                )
-                scene = _read(located(source.path), options)
-            finally:
-                forget_rays()
-            warn_of_lenses(scene)
-        return with_validation_views(scene) if source.validation else scene
+            scene = _read(located(source.path), options)
+        finally:
+            forget_rays()
+        warn_of_lenses(scene)
+    return with_validation_views(scene) if source.validation else scene
 
 
 def _read(path: Path, options: Options) -> Scene:

@@ -1,7 +1,6 @@
-"""Reading of a scene's photographs with their masks and depth maps, by one process or by several that divide them.
+"""Reading of a scene's photographs with their masks and depth maps.
 
-One process reads all photographs, so that a broken one is found before training. Of several processes each reads its
-share, plus as many others as its memory has room for. The rest is read when it is first drawn.
+All photographs are read, so that a broken one is found before training.
 
 Next to the folder `images` may be
  - `masks` with NAME.EXT.png (as in COLMAP), NAME.png or NAME.EXT for NAME.EXT. Black, or transparent, excludes a
@@ -12,12 +11,11 @@ Next to the folder `images` may be
 """
 
 import contextlib
-import math
 import os
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -25,7 +23,6 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from a2tg_jax.data.assembly import Shot
 from a2tg_jax.data.decoding import MAX_PIXELS, picture_size, read_grey, read_pixels
-from a2tg_jax.data.division import Division, divided
 from a2tg_jax.data.image_files import find_image, map_in_threads, on_disk
 from a2tg_jax.data.lenses import Lens, LensUse, resize_pixels
 from a2tg_jax.data.photo_store import DepthMap, Mask, Shelf
@@ -68,8 +65,6 @@ class Options(NamedTuple):
     lens: LensUse
     shelf: Shelf
     """Store of the pixels."""
-    division: Division | None
-    """Processes that load the scene together, within `sharing_errors`; None: one."""
 
 
 class Photo(NamedTuple):
@@ -106,27 +101,13 @@ class _Found(NamedTuple):
     depths: Path | None
 
 
-class _Facts(NamedTuple):
-    """Facts about a decoded photograph, which a process sends to the others."""
-
-    stored: tuple[int, int]
-    """(width, height) of the file's pixels."""
-    shape: tuple[int, ...]
-    """Shape of the view's pixels."""
-    is_stored: bool
-    """Whether the view has the pixels of the file, neither undistorted nor downscaled."""
-    mask: Mask | None
-    has_grey_mask: bool = False
-    """Whether its mask file has areas that are neither black nor white."""
-
-
 def read_photos(
     photos: Sequence[Photo], options: Options, place: Path, root: Path, how_to_remove: Callable[[str], str]
 ) -> list[Shot]:
     """Read the photographs of a scene.
 
     Args:
-      photos: in an order that is the same in all processes.
+      photos: the photographs.
       options: of `load_scene`.
       place: path of the scene in messages.
       root: the scene's folder, which has no smaller copies: its siblings are other scenes.
@@ -140,34 +121,8 @@ def read_photos(
                 f"{own.file}: is the only file for {names[own.file]} and {own.photo.name}; put both there, or remove "
                 "one from the scene"
             )
-    read = dict[int, Shot]()
-
-    def own_share(number: int) -> _Facts:
-        facts, read[number] = _read(found[number], options)
-        return facts
-
-    descriptions = [f"{own.photo.name} downscaled by {own.downscale}" for own in found]
-    facts = divided(options.division, descriptions, own_share, place)
-    # All of them are read here if there is one process.
-    others = [number for number in range(len(found)) if number not in read]
-    # Decided before the threads start: their order is not fixed.
-    fitting = options.shelf.fitting([math.prod(facts[number].shape) for number in others])
-
-    def of_another(number: int, fits: bool) -> Shot:
-        own, stored = found[number], facts[number].stored
-        again, shot = _read(own, options, None if fits else facts[number])
-        # In object storage, the size alone would be another request.
-        if fits or not is_remote(own.file):
-            size = again.stored if fits else picture_size(own.file)
-            if size != stored:
-                raise ValueError(
-                    f"{own.file}: is {size[0]}x{size[1]}, but {stored[0]}x{stored[1]} where another process reads it; "
-                    "give all processes the same photographs"
-                )
-        return shot
-
-    read.update(zip(others, map_in_threads(of_another, others, fitting, place=place), strict=True))
-    shots = [read[number] for number in range(len(found))]
+    read = map_in_threads(lambda own: _read(own, options), found, place=place)
+    shots = [shot for shot, _ in read]
     lacking = [own.photo.name for own in found if own.mask is None]
     if len(lacking) == len(found):
         folders = {photo.below_images[0].with_name(MASKS) for photo in photos if photo.below_images}
@@ -182,7 +137,7 @@ def read_photos(
         message = f"{place}: {len(lacking)} of {len(shots)} photographs have no mask, such as {lacking[0]}"
         warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
     masks = [own.mask[0] for own in found if own.mask is not None]
-    grey = [own.mask[0] for own, each in zip(found, facts, strict=True) if own.mask and each.has_grey_mask]
+    grey = [own.mask[0] for own, (_, has_grey_mask) in zip(found, read, strict=True) if own.mask and has_grey_mask]
     warn_of_grey(grey, masks)
     return shots
 
@@ -198,14 +153,12 @@ def warn_of_grey(grey: Sequence[Path], masks: Sequence[Path]) -> None:
         )
 
 
-def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple[_Facts, Shot]:
-    """Read a photograph, and undistort and downscale it.
-
-    One whose facts are known from another process is read when it is first needed.
-    """
+def _read(found: _Found, options: Options) -> tuple[Shot, bool]:
+    """Read a photograph, and undistort and downscale it. Also return whether its mask file has areas that are neither
+    black nor white."""
     photo, file, downscale, _, depths = found
-    photograph: Any = read_pixels(file) if facts is None else None
-    stored = (photograph.shape[1], photograph.shape[0]) if facts is None else facts.stored
+    photograph = read_pixels(file)
+    stored = photograph.shape[1], photograph.shape[0]
     lens = photo.lens
     if not isinstance(lens, Lens):
         full = stored
@@ -240,26 +193,23 @@ def _read(found: _Found, options: Options, facts: _Facts | None = None) -> tuple
         rays = lens.rays(*size)
     except ValueError as error:
         raise ValueError(f"{photo.what}: its camera model {error}") from None
-    if facts is None:
-        pixels = whole_view(photograph)
-        is_stored, counts = pixels is photograph, None
-        mask = None if mask_file is None else read_mask(mask_file[0], stored, lens.size)
-        if mask is not None and mask_file is not None and not cuts_out:
-            counts = _view_mask(mask.counts, mask_file[1], lens, size)
-        elif mask is None and photo.counted is not None:
-            counts = photo.counted(pixels)
-        if options.alpha == "mask" and pixels.shape[2] == 4:
-            is_opaque = pixels[..., 3] == 255
-            counts = is_opaque if counts is None else is_opaque & counts
-            # A view would keep the alpha channel in memory.
-            pixels, is_stored = np.ascontiguousarray(pixels[..., :3]), False
-        has_grey_mask = mask is not None and mask.has_grey_areas
-        facts = _Facts(stored, pixels.shape, is_stored, None if counts is None else Mask.of(counts), has_grey_mask)
-        picture = options.shelf.keep(pixels, file, None if is_stored else view)
-    else:
-        picture = options.shelf.read_later(facts.shape, file, None if facts.is_stored else view)
+    pixels = whole_view(photograph)
+    is_stored, counts = pixels is photograph, None
+    mask = None if mask_file is None else read_mask(mask_file[0], stored, lens.size)
+    if mask is not None and mask_file is not None and not cuts_out:
+        counts = _view_mask(mask.counts, mask_file[1], lens, size)
+    elif mask is None and photo.counted is not None:
+        counts = photo.counted(pixels)
+    if options.alpha == "mask" and pixels.shape[2] == 4:
+        is_opaque = pixels[..., 3] == 255
+        counts = is_opaque if counts is None else is_opaque & counts
+        # A view would keep the alpha channel in memory.
+        pixels, is_stored = np.ascontiguousarray(pixels[..., :3]), False
+    picture = options.shelf.keep(pixels, file, None if is_stored else view)
+    own_mask = None if counts is None else Mask.of(counts)
     depth = None if depths is None else _depth_map(depths, lens, stored, size)
-    return facts, Shot(photo.name, photo.viewmat, K, picture, facts.mask, rays, depth, photo.panorama)
+    shot = Shot(photo.name, photo.viewmat, K, picture, own_mask, rays, depth, photo.panorama)
+    return shot, mask is not None and mask.has_grey_areas
 
 
 def _find_files(

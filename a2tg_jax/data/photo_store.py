@@ -11,7 +11,7 @@ import tempfile
 import threading
 import weakref
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -230,34 +230,6 @@ class Shelf:
                 return Picture.of(pixels)
             self._room += pixels.nbytes
         return self._left(pixels, source, view)
-
-    def fitting(self, sizes: Sequence[int]) -> list[bool]:
-        """Return which pictures of the given bytes have room in memory, if they are kept in this order."""
-        room, fitting = self._room, []
-        for size in sizes:
-            fitting.append(size <= room)
-            room -= size if fitting[-1] else 0
-        return fitting
-
-    def read_later(self, shape: tuple[int, ...], source: Path, view: Processing | None) -> Picture:
-        """Return the picture in an image file that is not read before it is needed, and not kept in memory then."""
-        # The first reading leaves a checksum or a copy on disk, which all later ones must match.
-        lock, kept = threading.Lock(), list[Picture]()
-
-        def read() -> np.ndarray:
-            with lock:
-                if not kept:
-                    pixels = _read_file(source, view)
-                    if pixels.shape != shape:
-                        raise ValueError(
-                            f"{source}: has pixels {list(pixels.shape)}, but {list(shape)} where another process has "
-                            "read it; give all processes the same photographs"
-                        )
-                    kept.append(self._left(pixels, source, view))
-                    return pixels
-            return kept[0].read()
-
-        return Picture(shape, read, is_remote=is_remote(source))
 
     def _left(self, pixels: np.ndarray, source: Path, view: Processing | None) -> Picture:
         """Return a picture of pixels without room in memory. Arguments as for `keep`."""

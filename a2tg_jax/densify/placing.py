@@ -28,7 +28,6 @@ from a2tg_jax.core.table import is_table, map_rows
 from a2tg_jax.data.scene import View, counted_pixels, view_image
 from a2tg_jax.events import Change, Due, HostEvent, clear_moments, iterations_at
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.sharded_rows import everywhere, mesh_of, of_first, on_host, placed_like, rows_replaced
 from a2tg_jax.rasterize.render_types import RenderOutput
 from a2tg_jax.render import jitted_render
 from a2tg_jax.renderer import room_for
@@ -91,13 +90,15 @@ class PlaceByError(HostEvent):
         rows = np.arange(num, num + added.num)
 
         def replaced(old: Array, new: ArrayLike) -> Array:
-            return rows_replaced(old, rows, new)
+            changed = np.array(old)
+            changed[rows] = new
+            return jax.device_put(changed)
 
         own = model.gaussians, model.appearance
         gaussians, shown = map_rows(replaced, replaced, own, (added, appearance))
         is_new = np.isin(np.arange(model.gaussians.num), rows)
-        moments = jax.jit(clear_moments)(model, moments, placed_like(is_new, model.gaussians.means))
-        num_live = placed_like(np.asarray(num + added.num, np.int32), model.gaussians.means)
+        moments = jax.jit(clear_moments)(model, moments, is_new)
+        num_live = jax.device_put(np.asarray(num + added.num, np.int32))
         model = dataclasses.replace(model, gaussians=gaussians, appearance=shown, num_live=num_live)
         return Change(model, moments, state)
 
@@ -113,16 +114,17 @@ def gaussians_at_errors(
     """
     if not views:
         raise ValueError("views must hold at least one view; got none")
-    views, mesh, dtype = evenly_chosen(views, MOST_VIEWS), mesh_of(model.gaussians.means), model.gaussians.means.dtype
+    views = evenly_chosen(views, MOST_VIEWS)
+    dtype = model.gaussians.means.dtype
     settings = room_for(model, [view.camera for view in views])
-    behind = everywhere(mesh, jnp.asarray(background, dtype))
+    behind = jnp.asarray(background, dtype)
     totals, drawn = [], []
     for view in views:
-        camera = everywhere(mesh, jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), view.camera))
+        camera = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), view.camera)
         output, _ = jitted_render()(
             model.gaussians, camera, model.appearance, behind, settings, num_live=model.num_live
         )
-        total, found = _drawn_pixels(view, background, jax.tree.map(on_host, output), num, rng)
+        total, found = _drawn_pixels(view, background, jax.tree.map(np.asarray, output), num, rng)
         totals.append(total)
         drawn.append(found)
     if not sum(totals):
@@ -137,7 +139,7 @@ def gaussians_at_errors(
         np.full(num, np.log(OPACITY / (1 - OPACITY))),
         sh_of_colors(colors, model.gaussians.sh_degree),
     )
-    return Gaussians(*jax.device_put([array.astype(dtype) for array in of_first(mesh, arrays)]))
+    return Gaussians(*jax.device_put([array.astype(dtype) for array in arrays]))
 
 
 def _drawn_pixels(

@@ -24,7 +24,6 @@ from a2tg_jax.data.scene import View, counted_pixels, views_by_kind
 from a2tg_jax.events import LEAST_LEFT, Change, Due, HostEvent, Times, iterations_at, keep_rows
 from a2tg_jax.host.text import counted
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.sharded_rows import everywhere, mesh_of, of_first, on_host, spread
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import render_traced
 from a2tg_jax.renderer import room_for
@@ -99,16 +98,14 @@ class Contributions(NamedTuple):
 def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contributions:
     """Return how much each of N Gaussians contributes, and in how many views by at least `least` pixels (host).
 
-    Spare rows show nothing. Of the views, at least one, only cameras and masks are used. The devices over which the
-    model's rows are spread draw each view together. If they belong to several processes, all of these call it, and get
-    the first one's numbers, since GPUs may round sums differently each time.
+    Spare rows show nothing. Of the views, at least one, only cameras and masks are used.
     """
     if not views:
         raise ValueError("views must hold at least one view; got none")
     total, num_views = np.zeros(model.gaussians.num), np.zeros(model.gaussians.num, np.int64)
     if not len(total):
         return Contributions(total, num_views)
-    mesh, dtype = mesh_of(model.gaussians.means), model.gaussians.means.dtype
+    dtype = model.gaussians.means.dtype
     settings = room_for(model, [view.camera for view in views])
     for own in views_by_kind(views):
         rays = own[0].camera.rays
@@ -116,11 +113,11 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contrib
         cameras = [dataclasses.replace(view.camera, rays=None) for view in own]
         stacked: Any = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves), dtype), *cameras)
         counted = jnp.asarray(counted_pixels(own), dtype)
-        arrays: Any = everywhere(mesh, (stacked, rays, counted, jnp.asarray(least, dtype)))
+        arrays = stacked, rays, counted, jnp.asarray(least, dtype)
         weights, num = jax.jit(_weights, static_argnums=(5,))(model, *arrays, settings)
-        total += on_host(weights).astype(np.float64)
-        num_views += on_host(num)
-    return Contributions(*of_first(mesh, (total, num_views)))
+        total += np.asarray(weights).astype(np.float64)
+        num_views += np.asarray(num)
+    return Contributions(total, num_views)
 
 
 def _weights(
@@ -151,7 +148,7 @@ def _weights(
 
     none = jnp.zeros(len(nothing), jnp.int32)
     found, _ = jax.lax.scan(of_view, (nothing[:, 0], none), (cameras, counted))
-    return spread(None if settings.exchange is None else settings.exchange.mesh, found)
+    return found
 
 
 # Floaters
@@ -192,7 +189,7 @@ class PruneFloaters(HostEvent):
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
-        num, means = model.num, on_host(model.gaussians.means)[: model.num]
+        num, means = model.num, np.asarray(model.gaussians.means)[: model.num]
         is_kept = np.ones(num, bool)
         if self.min_views:
             num_views = shown_in(model, due.views, self.least).num_views[:num]

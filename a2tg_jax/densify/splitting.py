@@ -27,7 +27,6 @@ from a2tg_jax.densify.clone_split import SPLIT_SHRINK, split_in_half
 from a2tg_jax.events import Change, EventInfo, GradientStatistics, Now, Seen, Statistic, clear_moments, gather_rows
 from a2tg_jax.mcmc import FillingMcmc, Moves, plan_growth, plan_relocation
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.sharded_rows import zeros_beside
 
 LEAST_WEIGHT = 1e-12
 """Weight of a host that no view has seen."""
@@ -52,9 +51,9 @@ class SplitByGradient(FillingMcmc):
         return "position"
 
     def init(self, model: Model) -> SplitStatistics:
-        num, like = model.gaussians.num, model.gaussians.means
-        gradients = GradientStatistics.init(num, like.dtype, like)
-        return SplitStatistics(gradients, zeros_beside(like, (num,), like.dtype))
+        num = model.gaussians.num
+        dtype = model.gaussians.means.dtype
+        return SplitStatistics(GradientStatistics.init(num, dtype), jnp.zeros((num,), dtype))
 
     def observe(self, state: SplitStatistics, model: Model, seen: Seen) -> SplitStatistics:
         gaussians = model.gaussians

@@ -23,7 +23,6 @@ from a2tg_jax.core.sh import NUM_BASES, directions_from, sh_basis
 from a2tg_jax.core.table import Shape, bucket_capacity, resize
 from a2tg_jax.events import Change, Due, HostEvent, Seen, iterations_at
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.sharded_rows import on_host, zeros_beside
 
 
 @pytree
@@ -36,9 +35,9 @@ class ViewDependence:
     """[] int32, views so far."""
 
     @staticmethod
-    def init(num: int, dtype: DTypeLike = jnp.float32, like: Array | None = None) -> "ViewDependence":
-        """Return empty sums for `num` Gaussians, spread like the rows of an array; None: on one device."""
-        return ViewDependence(zeros_beside(like, (num, 16, 3), dtype), zeros_beside(like, (), jnp.int32))
+    def init(num: int, dtype: DTypeLike = jnp.float32) -> "ViewDependence":
+        """Return empty sums for `num` Gaussians."""
+        return ViewDependence(jnp.zeros((num, 16, 3), dtype), jnp.zeros((), jnp.int32))
 
     def observe(self, means: Array, centers: Array, colors: Array) -> "ViewDependence":
         """Add V views: cameras at centers [V, 3], and gradients [V, N, 3] by the colour of each Gaussian."""
@@ -51,7 +50,7 @@ class ViewDependence:
 
     def strengths(self) -> np.ndarray:
         """Return [N, 3] norm of the average gradient at the coefficients of degree 1, 2 and 3 (host)."""
-        total, views = on_host(self.total), max(1, int(self.views))
+        total, views = np.asarray(self.total), max(1, int(self.views))
         bands = [total[:, first:end] / views for first, end in itertools.pairwise(NUM_BASES)]
         return np.stack([np.linalg.norm(band, axis=(1, 2)) for band in bands], axis=1)
 
@@ -107,7 +106,7 @@ class AdaptDegrees(HostEvent):
         return dataclasses.replace(model, appearance=model.appearance.with_coefficients(table)), moments
 
     def init(self, model: Model) -> ViewDependence:
-        return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype, model.gaussians.means)
+        return ViewDependence.init(model.gaussians.num, model.gaussians.means.dtype)
 
     def observe(self, state: ViewDependence, model: Model, seen: Seen) -> ViewDependence:
         centers = jax.vmap(lambda camera: camera.center)(seen.cameras)
@@ -153,7 +152,7 @@ def without_idle(table: Coefficients, base_degree: int, idle: float) -> np.ndarr
     degrees = degrees_of_sizes(table.sizes, base_degree)
     for blocks, owners in zip(table.buckets, table.owners, strict=True):
         if blocks.size:
-            rows, values = on_host(owners), on_host(blocks)
+            rows, values = np.asarray(owners), np.asarray(blocks)
             is_used = rows < table.num
             rows, values = rows[is_used], values[is_used]
             # All blocks of a bucket are of one degree.

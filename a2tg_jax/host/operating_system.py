@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 LOCKED_BYTE = 1 << 30
 """Position of the byte that Windows locks: past the file's end, because others cannot read a locked byte."""
@@ -112,33 +112,6 @@ def stack_bytes() -> int:
 
     soft = resource.getrlimit(resource.RLIMIT_STACK)[0]
     return STACK_BYTES if soft == resource.RLIM_INFINITY else soft
-
-
-def wait_in_abort() -> None:
-    """Make abort() wait some seconds before it ends the process, so that another thread can print the reason first.
-
-    XLA aborts a process when another one of the same training ends. Windows is not affected.
-    """
-    library = _c_library()
-    if library is not None:
-        library.signal.argtypes, library.signal.restype = [ctypes.c_int, ctypes.c_void_p], ctypes.c_void_p
-        # The handler is C's sleep, which takes the signal's number, 6, as seconds.
-        library.signal(signal.SIGABRT, ctypes.cast(library.sleep, ctypes.c_void_p))
-
-
-def own_output_only() -> None:
-    """Drop the output of C++ libraries, but not of `sys.stdout` and `sys.stderr`."""
-
-    def moved(stream: TextIO, number: int) -> TextIO:
-        stream.flush()
-        kept = os.fdopen(os.dup(number), "w", buffering=1, encoding=stream.encoding, errors=stream.errors)
-        # C++ writes to the descriptors 1 and 2, not to Python's streams.
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, number)
-        os.close(nowhere)
-        return kept
-
-    sys.stdout, sys.stderr = moved(sys.stdout, 1), moved(sys.stderr, 2)
 
 
 @functools.cache

@@ -9,7 +9,7 @@ The backward pass walks front to back too (`rasterize.pixel.absorb_vjp`), so tha
 
 import functools
 import importlib
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from a2tg_jax.core.bilinear import TextureRegion, within_texels
-from a2tg_jax.parallel.sharded_rows import cotangent_of
 from a2tg_jax.rasterize import tiles
 from a2tg_jax.rasterize.kernels import xla
-from a2tg_jax.rasterize.kernels.platforms import by_platform, choose, instead_of
+from a2tg_jax.rasterize.kernels.platforms import by_platform, choose, cotangent_of, instead_of
 from a2tg_jax.rasterize.splats import PassInputs, PassSettings, Splats, Wanted
 from a2tg_jax.rasterize.tile_pixels import TilePixels
 from a2tg_jax.rasterize.tiles import TileGrid, TileLists
@@ -35,20 +34,12 @@ ADVICE = (
 )
 
 
-class Composited(NamedTuple):
-    """Image of a view without its background."""
-
-    channels: Array  # [D, H, W]; D is red, green, blue(, depth, depth², normal x, y, z)
-    transmittance: Array  # [H, W] of what is behind all splats
-    num_pairs: Array  # number of pairs, the least capacity
-    overflow: Array  # whether the capacity was too small
-
-
 def composite(
     settings: PassSettings, splats: Splats, texels: Array, regions: TextureRegion | None, cutoff: Array,
     lists: TileLists, jacobian: Array, probe: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return channels [D, H, W] and final transmittance [H, W], as `Composited` has them.
+    """Return channels [D, H, W] (red, green, blue(, depth, depth², normal x, y, z)), without the background, and the
+    transmittance [H, W] of what is behind all splats.
 
     Args:
       settings: static settings of the pass.
@@ -89,27 +80,25 @@ def _assemble(tiles: Array, grid: TileGrid) -> Array:
 
 def list_tiles(
     compositor: Wanted, M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int,
-    pixels: TilePixels | None = None, height: Array | None = None,
+    pixels: TilePixels | None = None,
 ) -> TileLists:  # fmt: skip
     """List the splats that touch each tile, as `tiles.tile_lists` does, by native loops where they run.
 
-    If the tiles have pixels with rays, XLA lists the splats, and the height is not used.
+    If the tiles have pixels with rays, XLA lists the splats.
     """
     if pixels is not None:
         return tiles.tile_lists(M, cutoff, near_plane, grid, capacity, pixels)
     integers = [jax.ShapeDtypeStruct((num,), jnp.int32) for num in (capacity, grid.num + 1)]
     results = (*integers, jax.ShapeDtypeStruct((), jnp.float32), jax.ShapeDtypeStruct((), jnp.bool_))
-    ids, starts, num_pairs, overflow = by_platform(
-        _lists_on, (compositor, near_plane, grid, capacity), results, M, cutoff, height
-    )
-    return TileLists(ids, starts, num_pairs, overflow, height=height)
+    found = by_platform(_lists_on, (compositor, near_plane, grid, capacity), results, M, cutoff)
+    return TileLists(*found)
 
 
 def _lists_on(platform: str, compositor: Wanted, near_plane: float, grid: TileGrid, capacity: int) -> Any:
-    def lists(M: Array, cutoff: Array, height: Array | None) -> tuple[Array, ...]:
+    def lists(M: Array, cutoff: Array) -> tuple[Array, ...]:
         # `cuda` has no function of this name.
         tile_lists = getattr(_kernels(compositor, platform), "tile_lists", tiles.tile_lists)
-        return tuple(tile_lists(M, cutoff, near_plane, grid, capacity, height=height)[:4])
+        return tuple(tile_lists(M, cutoff, near_plane, grid, capacity)[:4])
 
     return lists
 

@@ -13,7 +13,6 @@ from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.core.notebook_display import as_bytes, enlarged, png
 from a2tg_jax.core.pytree import pytree
 from a2tg_jax.core.similarity import Similarity
-from a2tg_jax.parallel.exchange import Exchange
 from a2tg_jax.rasterize.kernels.platforms import MAX_TILE_SIZE
 from a2tg_jax.rasterize.splats import Wanted
 
@@ -51,16 +50,12 @@ class RenderSettings(NamedFields):
     supersample: int = 1
     """Factor k by which views are drawn larger; each pixel is the mean over k × k. It lets a model be seen much smaller
     than it was trained without aliasing, at k² times the cost."""
-    exchange: Exchange | None = None
-    """Devices that render together, an image or several at once; None: one."""
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range; convert numpy's integers to Python's, which are static for jit."""
         check_number("near_plane", self.near_plane, above=0)
         check_kind("texture", self.texture, TextureOptions)
         check_literal("compositor", self.compositor, Wanted)
-        if self.exchange is not None:
-            check_kind("exchange", self.exchange, Exchange)
         for name, least, most in (("tile_size", 1, MAX_TILE_SIZE), ("sh_degree", 0, 3), ("supersample", 1, None)):
             check_int(name, getattr(self, name), least, most)
         for name, least in (("capacity", 1), ("tile_batch", 0)):

@@ -205,7 +205,7 @@ def pack_inputs(settings: PassSettings, inputs: PassInputs) -> tuple[Array, ...]
     splats, texels, regions, cutoff, lists = inputs
     dtype, num, capacity = splats.M.dtype, splats.M.shape[0], lists.ids.shape[0]
     packed = pack_splats(splats, settings.has_geometry, cutoff).astype(dtype)
-    size = jnp.asarray([settings.grid.columns, settings.grid.width, lists.height_in(settings.grid)], jnp.int32)
+    size = jnp.asarray([settings.grid.columns, settings.grid.width, settings.grid.height], jnp.int32)
     # Threads divide the tiles by their starts, which must ascend. Without splats no id is valid: all lists are empty.
     starts = jax.lax.cummax(jnp.clip(lists.starts, 0, capacity if num else 0))
     ids = jnp.clip(lists.ids, 0, max(num - 1, 0))

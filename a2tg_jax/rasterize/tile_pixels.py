@@ -30,11 +30,12 @@ class TilePixels(NamedTuple):
     magnifications: Array  # [T] bound of the length in the image plane of one pixel of the image
 
 
-def tile_pixels(rays: Array, tile_size: int, num_rows: int | None = None) -> TilePixels:
+def tile_pixels(rays: Array, tile_size: int) -> TilePixels:
     """Return the pixels of all tiles, given the places [H, W, 2] of their rays in the image plane, which are not finite
-    where a pixel has none; with `num_rows` also tiles below the image, whose pixels have no ray."""
+    where a pixel has none."""
     height, width = rays.shape[:2]
-    num_rows, num_columns = -(-height // tile_size) if num_rows is None else num_rows, -(-width // tile_size)
+    num_rows = -(-height // tile_size)
+    num_columns = -(-width // tile_size)
     margins = (0, num_rows * tile_size - height), (0, num_columns * tile_size - width), (0, 0)
     padded = jnp.pad(jax.lax.stop_gradient(rays), margins, constant_values=jnp.nan)
     blocks = padded.reshape(num_rows, tile_size, num_columns, tile_size, 2).transpose(0, 2, 4, 1, 3)
@@ -54,14 +55,6 @@ def tile_pixels(rays: Array, tile_size: int, num_rows: int | None = None) -> Til
         # The Frobenius norm bounds the length of the image of a unit vector.
         magnifications=jnp.sqrt(jnp.sum(jacobians**2, axis=(1, 2))),
     )
-
-
-def band_pixels(pixels: TilePixels, first: Array, num: int, num_shown: Array) -> TilePixels:
-    """Return the pixels of `num` consecutive tiles from tile `first` on, of which `num_shown` are shown."""
-    band: TilePixels = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, num), pixels)
-    is_shown = (jnp.arange(num, dtype=jnp.int32) < num_shown)[:, None]
-    nowhere = jnp.asarray([[jnp.inf, jnp.inf, -jnp.inf, -jnp.inf]], band.boxes.dtype)
-    return band._replace(is_seen=band.is_seen & is_shown, boxes=jnp.where(is_shown, band.boxes, nowhere))
 
 
 def _fitted(places: Array, is_seen: Array, tile_size: int) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ of P = tile_size² pixels are numbered row by row.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,11 +44,6 @@ class TileLists(NamedTuple):
     num_pairs: Array  # number of pairs before the outline test, as a float; the capacity must hold it
     overflow: Array  # whether the pairs did not fit; the lists are then empty
     pixels: TilePixels | None = None  # pixels of the tiles, if the camera has a ray for each pixel
-    height: Array | None = None  # int32 rows of pixels that are shown; None: all of the grid
-
-    def height_in(self, grid: TileGrid) -> Any:
-        """Return the rows of pixels that are shown of a grid."""
-        return grid.height if self.height is None else self.height
 
 
 class Rectangles(NamedTuple):
@@ -124,9 +119,8 @@ def _touches(outline: Outline, box_from: Callable[[Array, Array], tuple[Array, A
 
 
 def tile_lists(
-    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, pixels: TilePixels | None = None,
-    height: Array | None = None,
-) -> TileLists:  # fmt: skip
+    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, pixels: TilePixels | None = None
+) -> TileLists:
     """List the splats that touch each tile, ordered by depth, ties by index.
 
     Args:
@@ -134,12 +128,10 @@ def tile_lists(
       grid: tiles of the image.
       capacity: number of pairs that fit, before the outline test.
       pixels: pixels of the tiles, if the camera has a ray for each pixel.
-      height: int32 rows of pixels that are shown, at most the grid's; None: all.
     """
     bounds, depths = screen_bounds(M, cutoff, near_plane), M[:, 2, 2]
     order = jnp.argsort(depths, stable=True)
-    shown = grid if height is None else grid._replace(height=height)  # type: ignore[arg-type]
-    unordered = tile_rectangles(bounds, shown, pixels)
+    unordered = tile_rectangles(bounds, grid, pixels)
     # Of counts that are not in order: a GPU would sum and gather in one slow kernel.
     total, rectangles = total_pairs(unordered.counts), jax.tree.map(lambda x: x[order], unordered)
     # The total is known to a relative error of about 2⁻²⁰.
@@ -173,7 +165,7 @@ def tile_lists(
     is_kept = (position < ends[-1]) & is_touched
     tile = jnp.where(is_kept, y * grid.columns + x, grid.num)
     ids, starts = _sort_by_tile(tile, rank, order, grid.num)
-    return TileLists(ids, starts, total, overflow, pixels, height)
+    return TileLists(ids, starts, total, overflow, pixels)
 
 
 def _sort_by_tile(tile: Array, rank: Array, order: Array, num_tiles: int) -> tuple[Array, Array]:

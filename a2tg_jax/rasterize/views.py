@@ -16,9 +16,7 @@ from a2tg_jax.core.cameras import Camera
 from a2tg_jax.core.checks import check_kind
 from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.numerics import Integer
-from a2tg_jax.parallel.exchange import composite_on_devices
-from a2tg_jax.parallel.exchange_room import room_of_view
-from a2tg_jax.rasterize.compositor import Composited, composite, list_tiles
+from a2tg_jax.rasterize.compositor import composite, list_tiles
 from a2tg_jax.rasterize.kernels.platforms import check_compositor
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import Geometry, RenderOutput, RenderSettings
@@ -90,22 +88,15 @@ def render_traced(
     # Cameras get no gradient through the statistic.
     jacobian = jax.lax.stop_gradient(camera.K @ camera.viewmat[:3, :3])
     probe = jnp.zeros((num, 4), splats.M.dtype) if probe is None else probe
-    capacity = settings.capacity or 0
-    if settings.exchange is None:
-        # Which tiles a splat touches is piecewise constant.
-        pixels = None if camera.rays is None else tile_pixels(camera.rays, settings.tile_size)
-        M = jax.lax.stop_gradient(splats.M)
-        lists = list_tiles(settings.compositor, M, cutoff, settings.near_plane, grid, capacity, pixels)
-        image = composite(compositing, splats, texels, regions, cutoff, lists, jacobian, probe)
-        shown = Composited(*image, lists.num_pairs, lists.overflow)
-    else:
-        shown = composite_on_devices(
-            compositing, settings.exchange, capacity, splats, texels, regions, cutoff, jacobian, probe, camera.rays
-        )
+    # Which tiles a splat touches is piecewise constant.
+    pixels = None if camera.rays is None else tile_pixels(camera.rays, settings.tile_size)
+    M = jax.lax.stop_gradient(splats.M)
+    lists = list_tiles(settings.compositor, M, cutoff, settings.near_plane, grid, settings.capacity or 0, pixels)
+    channels, transmittance = composite(compositing, splats, texels, regions, cutoff, lists, jacobian, probe)
     # A splat with a number that is not finite spoils the whole image: a sum would hide it behind the splats in front.
-    taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(shown.channels.dtype)
-    channels, transmittance = shown.channels + taint, shown.transmittance + taint
-    return _output(channels, transmittance, num_colors, has_geometry, background, shown.overflow), shown.num_pairs
+    taint = jnp.where(jnp.any(jnp.isnan(cutoff)), jnp.nan, 0.0).astype(channels.dtype)
+    channels, transmittance = channels + taint, transmittance + taint
+    return _output(channels, transmittance, num_colors, has_geometry, background, lists.overflow), lists.num_pairs
 
 
 def _output(
@@ -146,7 +137,7 @@ def with_capacity(
             "settings.capacity is needed under jit and vmap, where shapes are fixed: "
             "settings = plan_render(model, cameras) outside, then pass settings=settings"
         )
-    pairs = pairs_to_draw(gaussians, camera, appearance, settings, num_live)
+    pairs = pairs_of_view(gaussians, camera, appearance, settings, num_live)
     if pairs == 0 and has_rows(gaussians, num_live):
         warn_of_empty("the camera")
     return dataclasses.replace(settings, capacity=capacity_for(pairs))
@@ -196,16 +187,6 @@ def pairs_of_view(
         return int(_jitted_count()(gaussians, camera, appearance, settings.tile_size, settings.near_plane, num_live))
     except jax.errors.ConcretizationTypeError as error:
         raise ValueError("capacities are planned on the host: call plan_render outside jit and vmap") from error
-
-
-def pairs_to_draw(
-    gaussians: Gaussians, camera: Camera, appearance: Appearance, settings: RenderSettings, num_live: Any = None
-) -> int:
-    """Return the least capacity for a view (host): its pairs or, on several devices, what the fullest band needs."""
-    pairs = pairs_of_view(gaussians, camera, appearance, settings, num_live)
-    if settings.exchange is None or not pairs:
-        return pairs
-    return max(pairs, room_of_view(gaussians, camera, appearance, settings, num_live).pairs)
 
 
 @functools.cache

@@ -17,6 +17,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from a2tg_jax.data.scene import Scene, views_by_kind
@@ -29,7 +30,7 @@ from a2tg_jax.io.archive import read_archive_header
 from a2tg_jax.io.config_json import flatten_config
 from a2tg_jax.io.formats import load_splats
 from a2tg_jax.io.model_file import FORMAT, load_model, number_in_file, save_model
-from a2tg_jax.parallel.processes import broadcast, team
+from a2tg_jax.parallel import any_process, broadcast, check_batch_size, leave
 from a2tg_jax.results.compression import SUFFIX, CompressOptions, command_for_file, compress
 from a2tg_jax.results.folder import (
     DAMAGED,
@@ -116,6 +117,8 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
       Stopped: if a signal ends the training; its `advice` says how to continue.
     """
     record.check()
+    for system in record.systems.values():
+        check_batch_size(system.batch_size, options.session.num_devices)
     check_weights(options.lpips_weights)
     # Neither is a folder here.
     if not record.scene.is_built_in and not is_url(record.scene.path):
@@ -124,7 +127,7 @@ def begin_run(record: RunRecord, out: Path, options: RunOptions) -> RunResult:
     check_free(out, overwrite=options.overwrite)
     given = None if record.init is None else check_init(Path(record.init), out, record.options)
     check_output(out)
-    scene = record.scene.load(room_for_photographs(options.max_memory), is_divided=True)
+    scene = record.scene.load(room_for_photographs(options.max_memory))
     num_given = None if given is None else given.num
     for system in record.systems.values():
         check_loss_data(scene.train, system.all_stages())
@@ -150,9 +153,11 @@ def resume_run(run: RunFolder, options: RunOptions) -> RunResult:
     """Train the stages of a claimed run that are not finished yet, and measure. Raises as `begin_run`."""
     check_weights(options.lpips_weights)
     record, num_given = read_record(run), None
+    for system in record.systems.values():
+        check_batch_size(system.batch_size, options.session.num_devices)
     if is_finished(run, record):
         print(f"{run.path} is finished; to train it on: {resuming_command(run)} --more 2000", flush=True)
-    scene = record.scene.load(room_for_photographs(options.max_memory), is_divided=True)
+    scene = record.scene.load(room_for_photographs(options.max_memory))
     if record.init is not None:
         first = run.model(record.plan.main[0])
         if not first.is_file():
@@ -171,15 +176,11 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
             return f"the run that was in {run.path} is untouched"
         return how_to_go_on(run, options.session.devices)
 
-    others = team()
-    if others is not None:
-        others.advice = advice
     try:
         check_alike(record, scene, options.session)
         with signals.noted() as is_stopped, options.watched(scene) as watch:
             train_run(run, scene, options, is_stopped=is_stopped, watch=watch)
-        if others is not None:
-            others.leave()
+        leave()
         result = evaluate_run(run, scene, lpips_weights=options.lpips_weights)
         if record.file_bytes is not None:
             _write_file(run, record, record.file_bytes, scene, progress=options.progress)
@@ -191,8 +192,6 @@ def _train_and_measure(run: RunFolder, record: RunRecord, scene: Scene, options:
         text = error_text(error, LESS_MEMORY)
         if text is None:
             raise
-        if others is not None:
-            others.report(error)
         raise ValueError(f"{text}; {advice()}") from error
 
 
@@ -408,15 +407,14 @@ def _check_options(path: Path, made: System, wanted: System) -> None:
 def check_alike(record: RunRecord, scene: Scene, session: Session) -> None:
     """Compare options, devices and the scene with the first process; all processes call it together. Raises ValueError
     if they differ."""
-    others = team()
-    if others is None:
+    if jax.process_count() == 1:
         return
-    own = digests_of(record, scene, session)
-    first = broadcast(b"".join(own))
-    differing = [name for place, name in enumerate(DIFFERING) if first[32 * place : 32 * (place + 1)] != own[place]]
+    differing = []
+    for name, digest in zip(DIFFERING, digests_of(record, scene, session), strict=True):
+        if any_process(session.mesh, broadcast(digest) != digest):
+            differing.append(name)
     if differing:
-        raise ValueError(f"this process has other {' and '.join(differing)} than the first: start all with the same")
-    others.has_met = True
+        raise ValueError(f"the processes have different {' and '.join(differing)}: start all with the same")
 
 
 def digests_of(record: RunRecord, scene: Scene, session: Session) -> list[bytes]:
@@ -443,7 +441,7 @@ def digests_of(record: RunRecord, scene: Scene, session: Session) -> list[bytes]
 def _send_stage(name: str | None, files: Sequence[Path | None] = (), num_restored: int | None = None) -> None:
     """Send the other processes the name of the next stage, with the checkpoint and the model that it starts from; None
     at the end."""
-    if team() is not None:
+    if jax.process_count() > 1:
         broadcast(json.dumps({"name": name, "num_restored": num_restored}).encode())
         for file in files:
             broadcast(b"" if file is None else file.read_bytes())

@@ -1,19 +1,19 @@
 """Batches of views: the order of a training, and photographs on their way to the device."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 from numpy.typing import DTypeLike
 
 from a2tg_jax.data.scene import View, kinds_of, ray_bytes
 from a2tg_jax.host.machine import default_device, num_threads
-from a2tg_jax.parallel.exchange import Exchange, are_drawn_here, on_devices
-from a2tg_jax.parallel.sharded_rows import asked_by_any, everywhere
+from a2tg_jax.parallel import any_process, everywhere, of_views, views_here
 
 HOST_SHARE = 2**30
 DEVICE_SHARE = 0.25
@@ -144,7 +144,7 @@ class PhotoStore:
         views: tuple[View, ...],
         order: BatchOrder,
         last: int,
-        exchange: Exchange | None = None,
+        mesh: Mesh | None = None,
         has_depths: bool = False,
         room: float | None = None,
     ):
@@ -152,15 +152,13 @@ class PhotoStore:
         views: all training views.
         order: views of each iteration.
         last: the stage's last iteration.
-        exchange: devices that draw the views of an iteration, and over which photographs that stay there are spread
-          by rows of pixels; None: one.
+        mesh: devices that draw the views of an iteration; None: one. Photographs that stay there are on each of them.
         has_depths: whether depth maps are loaded with the photographs.
         room: largest number of bytes on the device; None: `DEVICE_SHARE` of its memory.
         """
-        self._views, self._order, self._last, self._exchange = views, order, last, exchange
+        self._views, self._order, self._last, self._mesh = views, order, last, mesh
         self._has_depths = has_depths
         plan = plan_batches(views, len(order.indices(1)), room, has_depths=has_depths)
-        self._mesh = None if exchange is None else exchange.mesh
         self._keeps_rays, self.num_ahead = plan.keeps_rays, plan.num_ahead
         self._rays: dict[Kind, Array] = {}
         self._stacks: dict[Kind, Photographs] = {}
@@ -172,9 +170,9 @@ class PhotoStore:
         is_waiting = any(view.picture.is_remote for view in views)
         self._ahead = Ahead(self._read, self.num_ahead, is_waiting=is_waiting)
         # All processes must launch the same program, so one without room makes all stream.
-        self.is_resident = not asked_by_any(self._mesh, not plan.is_resident)
+        self.is_resident = not any_process(mesh, not plan.is_resident)
 
-    def batch(self, iteration: int) -> tuple[Photographs, np.ndarray | None]:
+    def batch(self, iteration: int) -> tuple[Photographs, Array | np.ndarray | None]:
         """Return photographs of one kind that include the iteration's, and the int32 indices of these; None if all
         are.
 
@@ -189,26 +187,28 @@ class PhotoStore:
         if kind not in self._stacks:
             views = [self._views[index] for index in self._of_kind[kind]]
             self._stacks[kind] = self._placed(kind, stack_views(views, self._views, has_depths=self._has_depths))
-        return self._stacks[kind], np.asarray([self._places[index] for index in indices], np.int32)
+        places = np.asarray([self._places[indices[place]] for place in views_here(self._mesh, len(indices))], np.int32)
+        return self._stacks[kind], of_views(self._mesh, places)
 
     def _placed(self, kind: Kind, batch: Photographs) -> Photographs:
         """Return photographs of a kind on the devices, with the rays of their lens, which stay there if the rays of
         all lenses fit."""
         rays = self._rays.get(kind, batch.rays)
         if rays is not None and kind not in self._rays:
-            rays = jax.device_put(rays) if self._mesh is None else everywhere(self._mesh, rays)
+            rays = self._everywhere(rays)
             if self._keeps_rays:
                 self._rays[kind] = rays
-        batch = batch._replace(rays=rays)
-        if self._exchange is not None:
-            return on_devices(self._exchange, batch, is_batch=not self.is_resident)
-        return jax.device_put(batch) if self.is_resident else batch
+        batch = batch._replace(rays=None)
+        placed = self._everywhere(batch) if self.is_resident else of_views(self._mesh, batch)
+        return placed._replace(rays=rays)
+
+    def _everywhere(self, tree: Any) -> Any:
+        return jax.device_put(tree) if self._mesh is None else everywhere(self._mesh, tree)
 
     def _read(self, indices: Sequence[int]) -> Photographs:
-        """Return the photographs of an iteration, without those that other processes' devices draw."""
-        height = self._views[indices[0]].picture.size[0]
-        views, are_read = [self._views[i] for i in indices], are_drawn_here(self._exchange, len(indices), height)
-        return stack_views(views, self._views, has_depths=self._has_depths, are_read=are_read)
+        """Return the photographs of an iteration that this process draws."""
+        views = [self._views[indices[place]] for place in views_here(self._mesh, len(indices))]
+        return stack_views(views, self._views, has_depths=self._has_depths)
 
     def close(self) -> None:
         """End the threads."""
@@ -246,10 +246,7 @@ def device_room() -> float:
     return DEVICE_SHARE * stats["bytes_limit"] if stats and "bytes_limit" in stats else HOST_SHARE
 
 
-def stack_views(
-    views: list[View], among: tuple[View, ...] | None = None, *, has_depths: bool = False,
-    are_read: Sequence[bool] | None = None,
-) -> Photographs:  # fmt: skip
+def stack_views(views: list[View], among: tuple[View, ...] | None = None, *, has_depths: bool = False) -> Photographs:
     """Return views of one image size and lens, stacked in numpy arrays.
 
     Args:
@@ -257,37 +254,33 @@ def stack_views(
       among: views that decide the structure: if one of that size has opacities or a mask, every stack of that size has
         them. None: `views`.
       has_depths: whether depth maps are loaded with the photographs; NaN where a view has none.
-      are_read: whether the pictures of each view are read; other pictures are zeros. None: all.
     """
     size = views[0].picture.size
     alike = [view for view in among or views if view.picture.size == size]
-    read = {place: view for place, view in enumerate(views) if are_read is None or are_read[place]}
-    pixels = {place: view.picture.read() for place, view in read.items()}
+    pixels = [view.picture.read() for view in views]
 
-    def stacked(arrays: Mapping[int, Any], dtype: DTypeLike = np.uint8, channels: tuple[int, ...] = ()) -> Any:
-        # Arrays at their places among zeros [V, H, W, ...], aligned so that `jax.device_put` adopts them on CPUs.
+    def stacked(arrays: Sequence[Any], dtype: DTypeLike = np.uint8, channels: tuple[int, ...] = ()) -> Any:
+        # Aligned so that `jax.device_put` adopts them on CPUs.
         shape = (len(views), *size, *channels)
         num_bytes = math.prod(shape) * np.dtype(dtype).itemsize
         room = np.zeros(num_bytes + ALIGNMENT, np.uint8)
         start = -room.ctypes.data % ALIGNMENT
         stack = room[start : start + num_bytes].view(dtype).reshape(shape)
-        for place, own in arrays.items():
-            stack[place] = own
+        for place, array in enumerate(arrays):
+            stack[place] = array
         return stack
 
     alphas = masks = depths = None
     if any(view.has_alpha for view in alike):
         opaque = np.full(size, 255, np.uint8)
-        alphas = stacked({place: own[..., 3] if own.shape[2] == 4 else opaque for place, own in pixels.items()})
+        alphas = stacked([picture[..., 3] if picture.shape[2] == 4 else opaque for picture in pixels])
     if any(view.mask is not None for view in alike):
         whole = np.ones(size, bool)
-        of_views = {place: whole if view.mask is None else view.mask.read() for place, view in read.items()}
-        masks = stacked(of_views, bool)
+        masks = stacked([whole if view.mask is None else view.mask.read() for view in views], bool)
     if has_depths:
         unknown = np.full(size, np.nan, np.float32)
-        found = {place: unknown if view.depth is None else view.depth.read() for place, view in read.items()}
-        depths = stacked(found, np.float32)
+        depths = stacked([unknown if view.depth is None else view.depth.read() for view in views], np.float32)
     viewmats, Ks = (np.stack([np.asarray(getattr(view.camera, name)) for view in views]) for name in ("viewmat", "K"))
-    images = stacked({place: own[..., :3] for place, own in pixels.items()}, channels=(3,))
+    images = stacked([picture[..., :3] for picture in pixels], channels=(3,))
     rays: Any = views[0].camera.rays
     return Photographs(viewmats, Ks, images, alphas, masks, depths, rays)  # type: ignore[arg-type]

@@ -1,14 +1,12 @@
 """Place where training diverged, found after the fact: views, and rows of parameters (host)."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import jax
 import numpy as np
 
-from a2tg_jax.parallel.sharded_rows import readable, spread
 from a2tg_jax.training.checkpoint import Checkpoint, History
-from a2tg_jax.training.step import Attempt, StepSettings, attempt
+from a2tg_jax.training.step import Attempt
 
 EXPLOSION = 100.0
 """A loss that exceeds the stage's first logged loss by this factor is an explosion, …"""
@@ -31,25 +29,9 @@ def largest_loss(history: History) -> float:
     return max(SMALL_LOSS, EXPLOSION * float(history.loss[0])) if len(history.loss) else float("inf")
 
 
-def spread_attempt(settings: StepSettings, *arguments: Any) -> Attempt:
-    """Return the result of `attempt`, spread over the devices of the settings."""
-    tried, exchange = attempt(settings, *arguments), settings.render.exchange
-    if exchange is None:
-        return tried
-    # Else XLA may choose shardings that JAX cannot name, as where it has divided the devices among views.
-    of_views = tried.views.grads, tried.views.statistic
-    nothing: Any = None
-    views = tried.views._replace(grads=nothing, statistic=nothing)
-    rest: Attempt = spread(exchange.mesh, tried._replace(views=views))
-    # [V, N, ...]: rows are the second axis.
-    grads, statistic = spread(exchange.mesh, of_views, axis=1)
-    return rest._replace(views=rest.views._replace(grads=grads, statistic=statistic))
-
-
-def what_diverged(arguments: tuple[object, ...], names: Sequence[str]) -> str:
+def what_diverged(tried: Attempt, names: Sequence[str]) -> str:
     """Return the views and parameters whose numbers are not finite, or the loss if all of them are finite, given the
-    arguments of `train_step` before the step that could not be taken, and the names of its views."""
-    tried: Attempt = readable(jax.jit(spread_attempt, static_argnums=(0,))(*arguments))
+    step that could not be taken, in NumPy arrays, and the names of its views."""
     losses = np.asarray(tried.views.loss)
     found = [f"the loss of {name} is {loss}" for name, loss in zip(names, losses, strict=True) if not np.isfinite(loss)]
     found += [f"the gradient by {place}" for place in _not_finite(tried.grads)]

@@ -6,6 +6,7 @@ import warnings
 from typing import Any
 
 import jax
+import numpy as np
 
 from a2tg_jax.core.budget import LARGEST_SHORTFALL
 from a2tg_jax.core.checks import check_kind, check_untraced, kind_of
@@ -16,7 +17,6 @@ from a2tg_jax.data.synthetic import BUILT_IN
 from a2tg_jax.host import signals
 from a2tg_jax.host.text import counted, in_bytes, shortened
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.sharded_rows import on_host
 from a2tg_jax.training.checkpoint import Checkpoint, History, check_resume
 from a2tg_jax.training.corrections import corrected_origin
 from a2tg_jax.training.cost import check_rows_fit
@@ -205,7 +205,7 @@ def fit(
             resume = run.checkpoint if is_last or stages[index + 1].continues else None
     assert resume is not None
     # In the memory of the host, so that further trainings have the memory of the GPU.
-    return FitResult(system, tuple(results), dataclasses.replace(resume, state=jax.tree.map(on_host, resume.state)))
+    return FitResult(system, tuple(results), dataclasses.replace(resume, state=jax.tree.map(np.asarray, resume.state)))
 
 
 def _check_arguments(
@@ -319,7 +319,7 @@ def fit_stage(
 
 def _result_of(run: StageRun, scene: Scene, *, is_last: bool) -> StageResult:
     """Return the result of a trained stage."""
-    origin = corrected_origin(origin_of_scene(scene), run.stage.corrections, run.state.corrections)
+    origin = corrected_origin(origin_of_scene(scene), run.stage.corrections, run.whole_state.corrections)
     model = dataclasses.replace(run.model, background=BACKGROUNDS[run.system.background], origin=origin)
     if is_last:
         warn_of_budget(run.system, model)

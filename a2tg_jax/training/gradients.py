@@ -16,7 +16,6 @@ from a2tg_jax.core.numerics import safe_norm
 from a2tg_jax.core.pytree import combine, partition
 from a2tg_jax.events import read_probe
 from a2tg_jax.model import Model, check_is_model
-from a2tg_jax.parallel.exchange import value_and_grad_of_views
 from a2tg_jax.rasterize.pixel import Statistic
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.rasterize.views import render_traced, with_capacity
@@ -166,7 +165,7 @@ class TracedView(NamedTuple):
 
 
 class Differentiated(NamedTuple):
-    """Result of `differentiate`; of G views that are drawn at once [G, ...]."""
+    """Result of `differentiate`."""
 
     value: Array
     """The loss, a scalar."""
@@ -177,7 +176,7 @@ class Differentiated(NamedTuple):
     gaussians: Gaussians
     """Gradient in the Gaussians."""
     appearance: Appearance
-    """Gradient in the floats of the appearance; of several views their mean."""
+    """Gradient in the floats of the appearance."""
     rows: tuple[Array, ...]
     """Gradient in the view's row of each correction."""
     probe: Any
@@ -195,12 +194,11 @@ def differentiate(
     statistic: Statistic | None,
     has_probe: bool,
 ) -> Differentiated:
-    """Render a view, or G views that several devices draw at once, and differentiate its loss: the core of
-    `view_gradients`, which describes the arguments, and of the training step.
+    """Render a view and differentiate its loss: the core of `view_gradients`, which describes the arguments, and of the
+    training step.
 
     The loss is a function of the model, the corrected view and its render, and returns a scalar and any auxiliary
-    value. It is differentiated in all floats of the model and the view's rows. G views have a leading axis, except
-    for the corrections and the camera's rays.
+    value. It is differentiated in all floats of the model and the view's rows.
     """
     floats, rest = partition(model.appearance)
 
@@ -219,10 +217,5 @@ def differentiate(
     # Adds nothing to the render; the gradient at it is the statistic.
     probe = jnp.zeros((model.gaussians.num, 4), jnp.result_type(model.gaussians.means)) if has_probe else None
     with_gradients = jax.value_and_grad(of_floats, argnums=(0, 1, 2, 3), has_aux=True)
-    if settings.exchange is not None and settings.exchange.views_at_once > 1:
-        # Axes of the views, for `jax.vmap`: they share the corrections, and the rays of the lens.
-        cameras: Any = dataclasses.replace(view.camera, viewmat=0, K=0, rays=None)  # type: ignore[arg-type]
-        axes: Any = TracedView(cameras, background=0, corrections=None, rows=0, target=0)  # type: ignore[arg-type]
-        with_gradients = value_and_grad_of_views(of_floats, settings.exchange.views_at_once, axes)
     (value, (auxiliary, num_pairs)), gradients = with_gradients(model.gaussians, floats, view.rows, probe, view)
     return Differentiated(value, auxiliary, num_pairs, *gradients)

@@ -23,17 +23,7 @@ from a2tg_jax.data.scene import Scene
 from a2tg_jax.events import Change, Due, HostEvent, StepEvent
 from a2tg_jax.host.machine import Devices
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.exchange import Exchange, exchange_among
-from a2tg_jax.parallel.exchange_room import exchange_with_room, room_of_view, with_wider_borders
-from a2tg_jax.parallel.sharded_rows import (
-    asked_by_any,
-    everywhere,
-    num_processes,
-    on_host,
-    readable,
-    spread,
-    warn_of_uneven_rows,
-)
+from a2tg_jax.parallel import any_process, check_batch_size, divided, everywhere, mesh_of, num_processes, whole
 from a2tg_jax.rasterize.render_types import RenderSettings
 from a2tg_jax.rasterize.views import capacity_for, pairs_of_view
 from a2tg_jax.training.batches import BatchOrder, PhotoStore
@@ -55,6 +45,7 @@ from a2tg_jax.training.step import (
     StepInfo,
     StepSettings,
     TrainState,
+    attempt,
     continued_state,
     initial_state,
     jitted_step,
@@ -69,8 +60,6 @@ PLANNED_VIEWS = 64
 """Largest number of views that room is planned for."""
 GROWTH_ROOM = 1.5
 """Room as a multiple of what the present model needs."""
-SURELY_FITTING = 0.999
-"""Share of the capacity that surely holds pairs whose number is rounded."""
 
 Size = tuple[int, int]
 """Height and width of a view, in pixels."""
@@ -115,21 +104,17 @@ class Session:
     ):
         """Args:
         after_compiling: called after a step was compiled, such as `gc.collect`.
-        devices: two or more devices that train one scene together, each with a share of the Gaussians and of the
-          pixels, such as `jax.devices()`; None: JAX's default device. If they are of several processes, each of these
-          makes the same calls.
+        devices: two or more devices that train one scene together, each with a share of the training state and of the
+          views of a batch, such as `jax.devices()`; None: JAX's default device. If they are of several processes, each
+          of these makes the same calls.
 
         Raises:
           ValueError: if there is one device or none.
         """
-        if devices is not None and len(devices) < 2:
-            raise ValueError(f"devices must be two or more; got {len(devices)}: for one use jax.default_device(device)")
         self.after_compiling = after_compiling
-        self.exchange = None if devices is None else exchange_among(devices)
-        """Devices that render together; None: one."""
-        self.num_devices = 1 if self.exchange is None else self.exchange.num
-        self.mesh = None if self.exchange is None else self.exchange.mesh
-        """Mesh over which rows are spread; None: one device."""
+        self.mesh = mesh_of(devices)
+        """Mesh of the devices; None: one device."""
+        self.num_devices = 1 if self.mesh is None else self.mesh.size
         processes = num_processes(self.mesh)
         self.devices = Devices(self.num_devices // processes, processes)
         """Numbers of devices of a process and of processes."""
@@ -176,8 +161,8 @@ class StageRun:
         session: what trainings of this process share; None: a new one.
         """
         self.session = session or Session()
-        self.mesh, exchange = self.session.mesh, self.session.exchange
-        self._exchange = None if exchange is None else exchange.for_batches(system.batch_size)
+        self.mesh = self.session.mesh
+        check_batch_size(system.batch_size, self.session.num_devices)
         self.views, self.system, self.index = scene.train, system, index
         self._recorded_views = RecordedViews.of(scene.train)
         stages = system.all_stages()
@@ -191,31 +176,34 @@ class StageRun:
         """Rows of the history since then."""
 
         def copied(tree: Any) -> Any:
-            # Steps take over the buffers that they are given: copies on the device, or in numpy to be spread.
-            return jax.device_put(tree, may_alias=False) if self.mesh is None else jax.tree.map(np.array, tree)
+            return jax.device_put(tree, may_alias=False)  # Steps take over the buffers that they are given.
 
         if resume is None:
             start = initial_model(scene, system) if start is None else start
             model = padded(copied(start.live), self.stage, system, self.session.num_devices)
             names = [view.name for view in self.views]
-            state = initial_state(self.stage, spread(self.mesh, model), names, start.origin)
+            state = initial_state(self.stage, model, names, start.origin)
         else:
             check_corrections(resume.state.corrections, len(self.views))
             if resume.views is not None:
                 resume.views.check(self.views)
-            warn_of_uneven_rows(resume.state.model.gaussians.num, self.session.num_devices)
+            num, num_devices = resume.state.model.gaussians.num, self.session.num_devices
+            if num % num_devices:
+                warnings.warn(
+                    f"the checkpoint has {num:,} rows, which {num_devices} devices cannot share evenly: each holds all "
+                    "of them until the stage ends",
+                    stacklevel=2,
+                )
             state = copied(resume.state)
             if own is None:
                 state = continued_state(stages[index - 1], self.stage, state)
-        self.state = self._with_room(spread(self.mesh, state))
+        self.state = divided(self.mesh, self._with_room(state))
 
         self.clock = self.stage.clock()._replace(largest_loss=largest_loss(self.history))
         self.scene_scale = jnp.asarray(scene.scale, self.state.model.gaussians.means.dtype)
         self.key = jax.random.fold_in(jax.random.key(system.seed), index + 1)
         self.order = BatchOrder(self.views, system.batch_size, system.seed * 2 + index + 1, self.num_restored)
-        self.photographs = PhotoStore(
-            self.views, self.order, self.stage.iterations, self._exchange, self.stage.has_depths
-        )
+        self.photographs = PhotoStore(self.views, self.order, self.stage.iterations, self.mesh, self.stage.has_depths)
         self.launched = LAUNCHED if self.photographs.is_resident else self.photographs.num_ahead
         self.learning = LearningCheck(
             self.views, self.order, self.stage.iterations, system.background, is_first=index == 0,
@@ -224,8 +212,6 @@ class StageRun:
         self.effects = StageEffects(self.stage, system, len({view.picture.size for view in self.views}))
         self.capacities: dict[Size, int] = {}
         """Capacities of the tile lists that steps are compiled for."""
-        self.exchanges: dict[Size, Exchange] = {}
-        """Room of devices that draw together; empty for one device."""
         self.started = time.perf_counter()
         self.time_left: datetime.timedelta | None = None
         """Remaining time of the run, about; None at the beginning."""
@@ -257,16 +243,18 @@ class StageRun:
     @property
     def model(self) -> Model:
         """The Gaussians that exist, and what they show, on one device."""
-        if self.mesh is None:
-            return self.state.model.live
-        live = jax.tree.map(on_host, self.state.model).live
-        return jax.device_put(live, self.mesh.local_mesh.devices.flat[0])
+        return self.state.model.live if self.mesh is None else jax.device_put(whole(self.state.model).live)
+
+    @property
+    def whole_state(self) -> TrainState:
+        """Present state; of several devices in NumPy arrays."""
+        return self.state if self.mesh is None else whole(self.state)
 
     @property
     def checkpoint(self) -> Checkpoint:
         """Present state; the next step reuses its buffers."""
         return Checkpoint(
-            self.system, self.index, readable(self.state), self.history, self.num_restored,
+            self.system, self.index, self.whole_state, self.history, self.num_restored,
             devices=self.session.devices, num_refused=self.num_refused, views=self._recorded_views,
         )  # fmt: skip
 
@@ -311,7 +299,7 @@ class StageRun:
                 if iteration == stop:
                     self._host_events(iteration)
                 self.started += watch(self, is_stopped)
-                must_stop = asked_by_any(self.mesh, is_stopped())
+                must_stop = any_process(self.mesh, is_stopped())
                 is_due = checkpoint_every is not None and iteration % checkpoint_every == 0 and iteration == stop
                 if on_checkpoint is not None and (is_due or must_stop or iteration == end):
                     on_checkpoint(self.checkpoint)
@@ -374,10 +362,9 @@ class StageRun:
         render, due = self.render_settings(self._size(iteration)), None
         if are_events_decided_by_host(self.state):
             due = tuple(times is None or bool(times.is_due(iteration)) for times in self.clock.times)
-        settings = StepSettings(render, self.system.background, due)
+        settings = StepSettings(render, self.system.background, due, self.mesh)
         rows = np.asarray(self.order.indices(iteration), np.int32) if self.stage.corrections else None
-        # Otherwise XLA may choose a sharding for them that JAX cannot name.
-        views, rows = everywhere(self.mesh, (views, rows))
+        rows = everywhere(self.mesh, rows)
         return settings, self.stage, self.clock, self.state, photographs, views, self.scene_scale, self.key, rows
 
     def _size(self, iteration: int) -> Size:
@@ -397,16 +384,7 @@ class StageRun:
             )
             growth = (model.gaussians.num / max(model.num, 1)) ** 0.5
             self.capacities[size] = self._capacity(size, pairs * GROWTH_ROOM * growth)
-            if self._exchange is not None:
-                together = dataclasses.replace(settings, exchange=self._exchange)
-                rooms = [
-                    room_of_view(model.gaussians, camera, appearance, together, model.num_live) for camera in cameras
-                ]
-                self.exchanges[size] = exchange_with_room(
-                    self._exchange, rooms, GROWTH_ROOM, num=model.gaussians.num, num_live=model.num,
-                    capacity=self.capacities[size], tile_size=self.system.tile_size,
-                )  # fmt: skip
-        return dataclasses.replace(settings, capacity=self.capacities[size], exchange=self.exchanges.get(size))
+        return dataclasses.replace(settings, capacity=self.capacities[size])
 
     def _capacity(self, size: Size, pairs: float) -> int:
         """Return a capacity for a number of pairs in views of a size, if possible one of the session's."""
@@ -419,19 +397,16 @@ class StageRun:
         self.state = dataclasses.replace(self.state, status=jnp.zeros_like(self.state.status))
         if info.status == OVERFLOW:
             self.num_regrown += 1
-            size, num_pairs = self._size(iteration), float(info.num_pairs)
-            exchange = self.exchanges.get(size)
-            if exchange is None or exchange.border_room is None or num_pairs > SURELY_FITTING * self.capacities[size]:
-                self.capacities[size] = self._capacity(size, num_pairs * GROWTH_ROOM)
-            else:  # The lists had room; the borders between the bands of the devices had too little.
-                self.exchanges[size] = with_wider_borders(exchange, size[0], self.system.tile_size)
+            size = self._size(iteration)
+            self.capacities[size] = self._capacity(size, float(info.num_pairs) * GROWTH_ROOM)
             return
         where = f"at iteration {iteration} of stage {self.stage.name}"
         if info.status in (NOT_FINITE, EXPLODED):
             names = [self.views[index].name for index in self.order.indices(iteration)]
             what = "loss or gradient is not finite" if info.status == NOT_FINITE else "the loss has exploded"
+            tried = whole(jax.jit(attempt, static_argnums=(0,))(*self.arguments(iteration)))
             raise DivergedError(
-                f"{what} {where}, view {', '.join(names)}: {what_diverged(self.arguments(iteration), names)}: lower "
+                f"{what} {where}, view {', '.join(names)}: {what_diverged(tried, names)}: lower "
                 "the learning rates, or look for a damaged camera or image; the state before it is unharmed",
                 self.checkpoint,
             )
@@ -464,6 +439,8 @@ class StageRun:
         """Apply the host events that follow an iteration, and drop the statistics of past events."""
         if iteration not in self._due_on_host():
             return
+        if self.mesh is not None:
+            self.state = jax.device_put(self.whole_state)
         for place, (event, times) in enumerate(zip(self.stage.events, self.clock.times, strict=True)):
             if not isinstance(event, HostEvent):
                 if times is not None and event.observes and iteration == times.last:
@@ -483,7 +460,7 @@ class StageRun:
                 self._move_rows(change.rows)
             is_dropped = iteration == due[-1] and event.observes and self._is_worth_dropping(iteration)
             self._keep(place, None if is_dropped else change.state)
-            self.state = spread(self.mesh, self.state)
+        self.state = divided(self.mesh, self.state)
 
     def _move_rows(self, rows: np.ndarray) -> None:
         """Move the events' statistics along with the Gaussians."""

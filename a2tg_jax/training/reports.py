@@ -21,7 +21,6 @@ from a2tg_jax.data.scene import View, view_image
 from a2tg_jax.events import Change, HostEvent, StepEvent
 from a2tg_jax.host.progress_bars import has_terminal, is_line_due, new_bar
 from a2tg_jax.host.text import counted, in_bytes
-from a2tg_jax.parallel.sharded_rows import on_host
 from a2tg_jax.training.batches import BatchOrder
 from a2tg_jax.training.options import System
 from a2tg_jax.training.stage import Background, Stage
@@ -267,7 +266,7 @@ class StageEffects:
         # Values are compared until the event has changed some once, which is nearly always the first time.
         if not own.has_changed:
             pairs = zip(*(jax.tree.leaves(tree[:2]) for tree in (before, after)), strict=True)
-            own.has_changed = is_reshaped or not all(a is b or np.array_equal(on_host(a), on_host(b)) for a, b in pairs)
+            own.has_changed = is_reshaped or not all(a is b or np.array_equal(a, b) for a, b in pairs)
         if own.num_applied == 0 or not change.unused:
             own.unused = change.unused
         own.num_applied += 1

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.sharding import Mesh
 
 from a2tg_jax.appearance import Appearance, project_appearance
 from a2tg_jax.core.cameras import Camera
@@ -21,8 +22,7 @@ from a2tg_jax.core.origin import Origin
 from a2tg_jax.core.pytree import combine, partition, pytree
 from a2tg_jax.events import Change, EventInfo, Now, Seen, StepEvent, read_probe
 from a2tg_jax.model import Model
-from a2tg_jax.parallel.exchange import map_views
-from a2tg_jax.parallel.sharded_rows import spread
+from a2tg_jax.parallel import in_views, with_rows_divided, with_rows_of_views_divided
 from a2tg_jax.rasterize.render_types import RenderOutput, RenderSettings
 from a2tg_jax.training.batches import Photographs, over_background
 from a2tg_jax.training.corrections import (
@@ -69,6 +69,8 @@ class StepSettings:
     due: tuple[bool, ...] | None = None
     """Whether each event of the stage is due; a step is compiled for each pattern. With None the step itself decides,
     which makes a GPU wait for the host."""
+    mesh: Mesh | None = None
+    """Devices that draw the views; None: one."""
 
 
 class StepInfo(NamedTuple):
@@ -124,8 +126,7 @@ class BatchGradients(NamedTuple):
     num_pairs: Array
     is_overflow: Array
     grads: tuple[Gaussians, Appearance, tuple[Array, ...]]
-    """Gradients in the Gaussians, in the floats of their appearance, and in the view's row of each correction. Where G
-    views are drawn at once, those in the appearance are [V/G, ...], each a mean over G views."""
+    """Gradients in the Gaussians, in the floats of their appearance, and in the view's row of each correction."""
     statistic: Array | None
     """[V, N, 4], the gradient at the probe of `render_traced`; None if no event gathers it."""
     terms: dict[str, Array]
@@ -180,8 +181,7 @@ def train_step(
     # Chosen inside the step, because it has taken over the old state's buffers.
     new, old = (dataclasses.replace(known, status=status) for known in (tried.state, state))
     chosen = jax.tree.map(lambda a, b: jnp.where(status == FINE, a, b), new, old)
-    if settings.render.exchange is not None:
-        chosen = spread(settings.render.exchange.mesh, chosen)
+    chosen = with_rows_divided(settings.mesh, chosen)
     return chosen, StepInfo(
         loss=jnp.mean(found.loss), psnr=jnp.mean(found.psnr), num_pairs=jnp.max(found.num_pairs), status=status,
         num_live=chosen.model.num_live, num_refused=jnp.asarray(tried.info.num_refused),
@@ -206,7 +206,7 @@ def attempt(
         backgrounds = jnp.full((len(batch.viewmats), 3), 1.0 if settings.background == "white" else 0.0, dtype)
     own = tuple(known.rows[rows] for known in state.corrections)
     is_gathering = any(s is not None and e.statistic for e, s in zip(stage.events, state.events, strict=True))
-    found = batch_gradients(settings.render, stage, clock, model, batch, backgrounds, iteration, own, is_gathering)
+    found = batch_gradients(settings, stage, clock, model, batch, backgrounds, iteration, own, is_gathering)
     # Without the gradients of corrections, each of which belongs to one view.
     grads = jax.tree.map(lambda g: jnp.mean(g, axis=0), found.grads[:2])
 
@@ -253,7 +253,7 @@ def attempt(
 
 
 def batch_gradients(
-    settings: RenderSettings,
+    settings: StepSettings,
     stage: Stage,
     clock: Clock,
     model: Model,
@@ -263,13 +263,13 @@ def batch_gradients(
     own: tuple[Array, ...],
     is_gathering: bool,
 ) -> BatchGradients:
-    """Return loss and gradients of V views: one after the other, or as many at once as the devices share.
+    """Return loss and gradients of V views, which a device draws one after the other.
 
     Backgrounds are [V, 3], and `own` has the rows [V, ...] of each correction. If an event still gathers the stage's
     statistic, `is_gathering` is True.
     """
     height, width = batch.images.shape[1:3]
-    highest = settings.sh_degree
+    highest = settings.render.sh_degree
     degree = jnp.minimum((iteration - 1) // clock.sh_interval, highest) if stage.raises_sh_degree else highest
     options: dict[str, Any] = {
         "has_geometry": stage.has_geometry, "sh_degree": degree,
@@ -306,24 +306,21 @@ def batch_gradients(
             error = error / jnp.mean(mask.astype(error.dtype))
         return value, (error, output.overflow, parts_by_name)
 
-    def gradients_of(arrays: tuple[Any, ...]) -> tuple[BatchGradients, Any]:
-        # Of a view, apart from those in the appearance; or of several views that share these.
+    def gradients_of(model: Model, arrays: tuple[Any, ...]) -> BatchGradients:
         viewmat, K, background, rows, pictures = arrays
         view = TracedView(Camera(viewmat, K, width, height, batch.rays), background, stage.corrections, rows, pictures)
-        found = differentiate(loss, model, view, settings, **options)
+        found = differentiate(loss, model, view, settings.render, **options)
         error, overflow, terms = found.auxiliary
-        grads: Any = (found.gaussians, None, found.rows)
-        own = BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe, terms)
-        return own, found.appearance
+        grads = found.gaussians, found.appearance, found.rows
+        return BatchGradients(found.value, -10 * jnp.log10(error), found.num_pairs, overflow, grads, found.probe, terms)
+
+    def gradients_of_views(model: Model, arrays: tuple[Any, ...]) -> BatchGradients:
+        return jax.lax.map(functools.partial(gradients_of, model), arrays)
 
     pictures = batch.images, batch.alphas, batch.masks, batch.depths
     arrays = batch.viewmats, batch.Ks, backgrounds, own, pictures
-    exchange = settings.exchange
-    if exchange is None or exchange.views_at_once == 1:
-        views, appearance = jax.lax.map(gradients_of, arrays)
-    else:
-        views, appearance = map_views(gradients_of, arrays, exchange.views_at_once)
-    return views._replace(grads=(views.grads[0], appearance, views.grads[2]))
+    views = in_views(settings.mesh, gradients_of_views)(model, arrays)
+    return with_rows_of_views_divided(settings.mesh, views)
 
 
 def optimized(stage: Stage, state: TrainState, grads: Any, rate_of_means: Array, progress: Array) -> OptStep:

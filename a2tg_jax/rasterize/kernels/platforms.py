@@ -9,7 +9,7 @@ import importlib.util
 import os
 import warnings
 from collections.abc import Callable, Hashable
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import jax
 from jax import Array
@@ -20,10 +20,10 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from a2tg_jax.parallel.sharded_rows import vary_with
 from a2tg_jax.rasterize.kernels.cuda import nvrtc
 from a2tg_jax.rasterize.splats import Compositor, Wanted
 
+T = TypeVar("T")
 DETERMINISM_FLAGS = ("--xla_gpu_deterministic_ops", "--xla_gpu_exclude_nondeterministic_ops")
 MAX_TILE_SIZE = 64
 """Largest side of a tile in pixels; native loops keep a tile on the stack."""
@@ -137,6 +137,37 @@ def by_platform(
         *flat, code_of=code_of, static=static, structure=structure, shapes=tuple(shapes), axes=(), advice=advice
     )
     return vary_with(flat, jax.tree.unflatten(structure_of_results, found))
+
+
+# Inside shard_map: results of foreign functions, which JAX assumes to be the same on all devices
+
+
+def _axes(tree: object) -> frozenset[str]:
+    """Return the axes of a mesh along which an array of a pytree varies."""
+    types = [getattr(jax.typeof(leaf), "manual_axis_type", None) for leaf in jax.tree.leaves(tree)]
+    return frozenset().union(*(type_.varying for type_ in types if type_ is not None))
+
+
+def vary_with(inputs: object, results: T) -> T:
+    """Mark the results as varying along every axis of the mesh along which an input varies."""
+    axes = _axes(inputs)
+
+    def vary(result: Array) -> Array:
+        missing = tuple(sorted(axes - _axes(result)))
+        return jax.lax.pcast(result, missing, to="varying") if missing else result
+
+    return jax.tree.map(vary, results)
+
+
+def cotangent_of(primal: object, cotangent: T) -> T:
+    """Sum a cotangent over the devices that share its primal value, leaf by leaf."""
+
+    def total(value: object, cotangent: object) -> Any:
+        # A value that devices share was broadcast to them; the transpose of that is a sum.
+        shared = tuple(sorted(_axes(cotangent) - _axes(value)))
+        return jax.lax.psum(cotangent, shared) if shared else cotangent
+
+    return jax.tree.map(total, primal, cotangent)
 
 
 def _lower(platform: str, context: Any, *operands: object, **parameters: Any) -> Any:

@@ -172,8 +172,7 @@ class _TracedPass:
         if tiles.pixels is not None:
             return jnp.ones_like(tiles.pixels.is_seen, self.dtype), tiles.pixels.is_seen
         x, y = self.pixel_offsets(tiles)
-        height = self.lists.height_in(self.grid)
-        is_inside = (tiles.x[:, None] + x < self.grid.width) & (tiles.y[:, None] + y < height)
+        is_inside = (tiles.x[:, None] + x < self.grid.width) & (tiles.y[:, None] + y < self.grid.height)
         return jnp.ones_like(is_inside, self.dtype), is_inside
 
     def over_tiles(self, function: Callable[..., object]) -> Callable[..., Any]:

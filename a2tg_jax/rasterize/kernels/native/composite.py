@@ -208,18 +208,16 @@ def _overlap(regions: np.ndarray) -> bool:
     return bool(np.any(first[:-1] + area[:-1] > first[1:]))
 
 
-def tile_lists(
-    M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int, height: Array | None = None
-) -> TileLists:
+def tile_lists(M: Array, cutoff: Array, near_plane: float, grid: TileGrid, capacity: int) -> TileLists:
     """List the splats of each tile, with the arguments and result of `rasterize.tiles.tile_lists`."""
     key = str(M.dtype), grid.tile_size, near_plane
     name = ffi.registered(
         f"compositor=native lists {key}", ("lists", key), lambda: functools.partial(_list_handler, list_functions(*key))
     )
     results = ((capacity,), jnp.int32), ((grid.num + 1,), jnp.int32), ((), jnp.float32), ((), jnp.bool_)
-    size = jnp.asarray([grid.columns, grid.width, grid.height if height is None else height], jnp.int32)
+    size = jnp.asarray([grid.columns, grid.width, grid.height], jnp.int32)
     ids, starts, num_pairs, overflow = ffi.call(name, results, M, cutoff.astype(M.dtype), size)
-    return TileLists(ids, starts, num_pairs, overflow, height=height)
+    return TileLists(ids, starts, num_pairs, overflow)
 
 
 def _list_handler(functions: list[CompiledFunction], arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
