@@ -230,7 +230,11 @@ def test_what_other_programs_trained_is_named(tmp_path, capsys, monkeypatch, pro
     for name in names:
         pathlib.Path("out", name).parent.mkdir(parents=True, exist_ok=True)
         pathlib.Path("out", name).touch()
-    wanted = f"it is an output folder of {program}; give its model out{os.sep}{pathlib.Path(names[newest])}"
+    model = f"out{os.sep}{pathlib.Path(names[newest])}"
+    instead = (
+        f"give its model {model}" if model.endswith(".ply") else f"its checkpoint {model} is not read; write a PLY"
+    )
+    wanted = f"it is an output folder of {program}; {instead}"
     for words in (["view", "out"], ["convert", "out", "x.spz"], ["info", "out"], ["render", "out"], ["mesh", "out"]):
         assert main(words) == 2
         assert wanted in capsys.readouterr().err

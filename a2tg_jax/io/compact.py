@@ -17,6 +17,7 @@ import numpy as np
 
 from a2tg_jax.appearance import Appearance
 from a2tg_jax.appearance.parts import MAX_DEGREE, log_exponents_of, shapes_of
+from a2tg_jax.core.checks import check_int, check_literal
 from a2tg_jax.core.gaussians import check_gaussians
 from a2tg_jax.core.named_fields import NamedFields
 from a2tg_jax.host.atomic import write_whole
@@ -53,7 +54,8 @@ from a2tg_jax.texture import MAX_SIDE
 
 # As in PNG: CR LF shows a transfer as text, 0x1A ends a listing on Windows.
 MAGIC = b"a2tgz\r\n\x1a"
-VERSION, OLD_VERSIONS = 3, (1, 2)
+VERSION = 3
+OLD_VERSIONS = (1, 2)
 """Versions 1 and 2, without and with kernel shapes, had one chunk, a zstd header, and a table for each property of the
 parts."""
 HEAD = struct.Struct("<8sHIII")
@@ -63,8 +65,9 @@ ORIGIN_DTYPES = {
 }  # fmt: skip
 FLOATERS = "floaters"
 """Name of the parts with the scores of floaters, which only files for browsers have."""
-LARGEST_CHUNK, LEAST_CHUNK = 16384, 256
-"""Numbers of rows in a chunk of a file for browsers."""
+LARGEST_CHUNK = 16384
+LEAST_CHUNK = 256
+"""Limits of the number of rows in a chunk of a file for browsers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,8 +115,7 @@ class CompactChoices(NamedFields):
             is_bits = type(precision) is int and 1 <= precision <= MOST_BITS
             if not is_bits and precision not in ("float32", "float16"):
                 raise ValueError(f"choices.{name} must be 1 to {MOST_BITS} bits, float32 or float16; got {precision!r}")
-        # The round trip checks the coder against its Literal.
-        config_from_dict(type(self), config_to_dict(self), "choices")
+        check_literal("choices.coder", self.coder, Choice)
         return self
 
 
@@ -210,13 +212,14 @@ def encode_model(
     bits = choices.means if isinstance(choices.means, int) else MOST_BITS
     # With the grids of a tuned model, whose numbers are on these steps: others would round them again.
     known = np.reshape((grids or {}).get("means", ()), (-1, 4)).tolist()
-    axes = [AxisSteps(*own) for own in known] or [AxisSteps.of(x, bits) for x in rows.means.T]
+    axes = [AxisSteps(*steps) for steps in known] or [AxisSteps.of(x, bits) for x in rows.means.T]
     keys = morton(np.stack([axis.codes(x, bits) for axis, x in zip(axes, rows.means.T, strict=True)]), bits)
     # Within each chunk, rows follow the Z curve: neighbours in space have similar numbers, which code well.
     starts = range(0, max(num, 1), chunk)
     order = np.concatenate([part[np.argsort(keys[part], kind="stable")] for part in np.split(order, starts[1:])])
     # With given grids no splat is turned: its numbers were tuned as they are.
-    rows, keys = ordered(rows, order, turns=grids is None), keys[order]
+    rows = ordered(rows, order, turns=grids is None)
+    keys = keys[order]
     header: dict[str, Any] = {
         "num": num,
         "chunk": chunk,
@@ -225,9 +228,11 @@ def encode_model(
         "appearance": appearance_to_dict(model.appearance),
         "background": list(model.background),
     }
-    header["degrees"], header["degree_counts"] = (x.tolist() for x in np.unique(rows.degrees, return_counts=True))
+    degrees, degree_counts = np.unique(rows.degrees, return_counts=True)
+    header |= {"degrees": degrees.tolist(), "degree_counts": degree_counts.tolist()}
     if rows.sizes is not None:
-        header["sizes"], header["size_counts"] = (x.tolist() for x in np.unique(rows.sizes, axis=0, return_counts=True))
+        sizes, size_counts = np.unique(rows.sizes, axis=0, return_counts=True)
+        header |= {"sizes": sizes.tolist(), "size_counts": size_counts.tolist()}
     if page is not None:
         header["page"] = dict(page)
     ends = dict(grids or {})
@@ -250,12 +255,11 @@ def encode_model(
                 writer.means(axes, keys[places], bits)
             else:
                 writer.numbers("means", part.means.T, choices.means)
-            writer.indices("degrees", np.searchsorted(header["degrees"], part.degrees), len(header["degrees"]))
+            writer.indices("degrees", np.searchsorted(degrees, part.degrees), len(degrees))
             if part.sizes is not None:
                 # A pair of sides as one number, which orders pairs as np.unique does.
-                pairs = np.reshape(header["sizes"], (-1, 2)), part.sizes
-                table, found = (sizes @ [MAX_SIDE + 1, 1] for sizes in pairs)
-                writer.indices("sizes", np.searchsorted(table, found), len(table))
+                table, wanted = (np.reshape(pairs, (-1, 2)) @ [MAX_SIDE + 1, 1] for pairs in (sizes, part.sizes))
+                writer.indices("sizes", np.searchsorted(table, wanted), len(table))
             for name, values, precision, is_color in _columns(part, choices):
                 writer.numbers(name, values, precision, is_color=is_color)
             if floaters is not None:
@@ -307,10 +311,12 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
         appearance = appearance_from_dict(header["appearance"])
         check_encodable(appearance)
         reader = ColumnReader(body, header["parts"], header["ends"], room_of(len(data)))
-        num, chunk = header["num"], header.get("chunk", max(header["num"], 1))
-        if type(num) is not int or num < 0 or type(chunk) is not int or chunk < 1:
-            raise ValueError(f"must have a number of rows, in chunks; got {num!r}, {chunk!r}")
-        parts, has_floaters = [], any(name == FLOATERS for name, *_ in header["parts"])
+        num = header["num"]
+        check_int("num", num, 0)
+        chunk = header.get("chunk", max(num, 1))
+        check_int("chunk", chunk, 1)
+        has_floaters = any(name == FLOATERS for name, *_ in header["parts"])
+        parts = []
         for start in range(0, max(num, 1), chunk):
             length = min(chunk, num - start)
             parts.append(_rows_of(reader, length, header, choices, appearance))
@@ -318,12 +324,12 @@ def decode_model(data: bytes, where: str = "the compact scene") -> Model:
                 reader.planes(FLOATERS, 1, length)  # They follow from the rows.
         origin = None
         if "origin" in header:
-            shapes = origin_shapes(len(header["origin"]["names"]))
-            arrays = {
-                name: reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name]) for name, shape in shapes.items()
-            }
+            arrays = {}
+            for name, shape in origin_shapes(len(header["origin"]["names"])).items():
+                arrays[name] = reader.exact(f"origin_{name}", shape, ORIGIN_DTYPES[name])
             # numpy's bool is a byte in the file, and `origin_of` takes no integers for it.
-            origin = origin_of(header["origin"], arrays | {"is_test": arrays["is_test"].astype(bool)})
+            arrays["is_test"] = arrays["is_test"].astype(bool)
+            origin = origin_of(header["origin"], arrays)
         reader.end()
         return model_of(joined_rows(parts), header["base_degree"], appearance, origin, background_of(header))
 
@@ -363,9 +369,9 @@ def _rows_of(
     reader: ColumnReader, num: int, header: Mapping[str, Any], choices: CompactChoices, appearance: Appearance
 ) -> Rows:
     """Return the tables of a chunk; the reader limits their size by the file's."""
-    base, table = header["base_degree"], header["degrees"]
-    if type(base) is not int or not 0 <= base <= MAX_DEGREE:
-        raise ValueError(f"must have a base degree in 0..{MAX_DEGREE}; got {base!r}")
+    base = header["base_degree"]
+    check_int("base_degree", base, 0, MAX_DEGREE)
+    table = header["degrees"]
     means = reader.means(num, choices.means).T
     log_scales = reader.numbers("log_scales", 2, num, choices.log_scales).T
     quats = with_w(reader.numbers("quats", 3, num, choices.quats))
@@ -382,13 +388,12 @@ def _rows_of(
         name = f"sh_{degree}"
         columns = reader.numbers(name, 3, (2 * degree + 1) * count, choices.of_part(name), is_color=True)
         bands.append(columns.reshape(3, 2 * degree + 1, count).transpose(2, 1, 0))
-    sizes, texels = None, None
+    sizes = texels = None
     if "sizes" in header:
         pairs = header["sizes"]
-        if not all(type(side) is int and 0 <= side <= MAX_SIDE for size in pairs for side in size):
-            raise ValueError(f"texture sides must be in 0..{MAX_SIDE}; got {pairs}")
-        if any(len(size) != 2 for size in pairs):
-            raise ValueError(f"texture sides must be pairs; got {pairs}")
+        for height, width in pairs:
+            check_int("the height of a texture", height, 0, MAX_SIDE)
+            check_int("the width of a texture", width, 0, MAX_SIDE)
         sizes = np.asarray(pairs, np.int64).reshape(-1, 2)[reader.indices("sizes", num, len(pairs))]
         count = int(sizes.prod(axis=1).sum())
         colors = reader.numbers("texel_colors", 3, count, choices.texels, is_color=True)
@@ -396,6 +401,7 @@ def _rows_of(
     shapes = None
     if appearance.exponents is not None:
         shapes = reader.numbers("shapes", 1, num, choices.shapes)[0]
-        shapes = shapes_of(shapes) if isinstance(choices.shapes, int) else shapes
+        if isinstance(choices.shapes, int):
+            shapes = shapes_of(shapes)
     logits = logits_of(opacities) if isinstance(choices.opacities, int) else opacities
     return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)
