@@ -5,7 +5,6 @@ import dataclasses
 import itertools
 import pickle
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -64,7 +63,6 @@ def divided(
     division: Division | None,
     names: Sequence[str],
     work: Callable[[int], Result],
-    place: Path | None = None,
 ) -> list[Result]:
     """Return the results for all items, each made by one process, in threads.
 
@@ -72,10 +70,9 @@ def divided(
       division: processes that call this together; None: only this one.
       names: names of the items, the same in all processes.
       work: function of an item's number. If it fails, all processes raise the error of the first such item.
-      place: path that the work reads from, as in `map_in_threads`.
     """
     if division is None:
-        return map_in_threads(work, range(len(names)), place=place)
+        return map_in_threads(work, range(len(names)))
     # Items are dealt by number, so all processes need the same list.
     division.check_same(names, "photographs")
 
@@ -85,7 +82,7 @@ def divided(
         except ERRORS as error:
             return _plain(error)
 
-    own = map_in_threads(attempt, range(division.index, len(names), division.count), place=place)
+    own = map_in_threads(attempt, range(division.index, len(names), division.count))
     parts = division.exchange("photographs read", own)
     # Process p did items p, p + count, p + 2·count, …
     return _without_errors([parts[n % division.count][n // division.count] for n in range(len(names))])

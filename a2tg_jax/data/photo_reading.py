@@ -145,7 +145,7 @@ def read_photos(
         return facts
 
     descriptions = [f"{own.photo.name} downscaled by {own.downscale}" for own in found]
-    facts = divided(options.division, descriptions, own_share, place)
+    facts = divided(options.division, descriptions, own_share)
     # All of them are read here if there is one process.
     others = [number for number in range(len(found)) if number not in read]
     # Decided before the threads start: their order is not fixed.
