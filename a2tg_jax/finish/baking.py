@@ -266,7 +266,7 @@ def pictures(model: Model, cameras: Sequence[Camera], background: Color | None =
         yield np.clip(np.asarray(renderer(camera).color), 0, 1)
 
 
-def likeness(found: Iterable[np.ndarray], wanted: Iterable[np.ndarray]) -> float:
+def likeness(images: Iterable[np.ndarray], wanted: Iterable[np.ndarray]) -> float:
     """Return the PSNR in dB between pictures, from the mean of their squared errors; at most 100."""
-    error = np.mean([np.mean((x - y) ** 2) for x, y in zip(found, wanted, strict=True)])
+    error = np.mean([np.mean((x - y) ** 2) for x, y in zip(images, wanted, strict=True)])
     return -10 * math.log10(max(float(error), 1e-10))

@@ -1,7 +1,7 @@
-"""Smallest file of a model within a loss, or the best one within some bytes, from what each choice of bits costs.
+"""Precisions for a compact file: the smallest file within a loss, or the file of a given size that loses least.
 
-A loss is a function of a model: how many dB it is below the original model. It is measured on photographs or, without
-them, estimated from differences between renders.
+A loss is a function of a model that returns how many dB it is below the original model. It is measured on photographs
+or, without them, estimated from differences between renders.
 """
 
 import bisect

@@ -1,8 +1,8 @@
 """Columns of numbers as small integers and compressed bytes, and back.
 
-Numbers become even steps between two ends, positions steps along a Z curve, and both become planes of one byte each,
-which established libraries compress without loss. `ColumnReader` reads the named columns of a `ColumnWriter`, and
-never unpacks more than its limit, whatever the bytes claim.
+Numbers are rounded to even steps between two ends, and positions become places along a Z curve. The numbers of these
+steps are split into planes of one byte each, which established libraries compress without loss. `ColumnReader` reads
+the named columns of a `ColumnWriter`, and never unpacks more than its limit, whatever the bytes claim.
 
 All arrays are numpy's, on the host; C columns of n numbers are [C, n]. A precision is a number of bits or a float type.
 """

@@ -63,6 +63,8 @@ HEAD = struct.Struct("<8sHIII")
 ORIGIN_DTYPES = {
     "viewmats": "f8", "Ks": "f8", "sizes": "i4", "is_test": "u1", "scale": "f8", "rotation": "f8", "translation": "f8",
 }  # fmt: skip
+COLORED = {"sh_0", "sh_1", "sh_2", "sh_3", "texel_colors"}
+"""Names of the parts whose columns are red, green and blue."""
 FLOATERS = "floaters"
 """Name of the parts with the scores of floaters, which only files for browsers have."""
 LARGEST_CHUNK = 16384
@@ -237,7 +239,8 @@ def encode_model(
         header["page"] = dict(page)
     ends = dict(grids or {})
     if len(starts) > 1:  # All chunks have the same steps.
-        for name, values, precision, _ in _columns(rows, choices):
+        for name, values in _columns(rows, choices):
+            precision = choices.of_part(name)
             if isinstance(precision, int):
                 ends.setdefault(name, ends_of(values, precision))
 
@@ -260,8 +263,8 @@ def encode_model(
                 # A pair of sides as one number, which orders pairs as np.unique does.
                 table, wanted = (np.reshape(pairs, (-1, 2)) @ [MAX_SIDE + 1, 1] for pairs in (sizes, part.sizes))
                 writer.indices("sizes", np.searchsorted(table, wanted), len(table))
-            for name, values, precision, is_color in _columns(part, choices):
-                writer.numbers(name, values, precision, is_color=is_color)
+            for name, values in _columns(part, choices):
+                writer.numbers(name, values, choices.of_part(name), is_color=name in COLORED)
             if floaters is not None:
                 writer.planes(FLOATERS, floaters[order[places]][None])
         return framed(header | {"parts": writer.parts, "ends": writer.ends}, writer.body), writer.num_unpacked
@@ -271,21 +274,20 @@ def encode_model(
     return data if num_unpacked <= room_of(len(data)) else encoded("none")[0]
 
 
-def _columns(rows: Rows, choices: CompactChoices) -> Iterator[tuple[str, np.ndarray, Precision, bool]]:
-    """Yield name, numbers [C, n], precision, and whether they are colours, of each group besides the means."""
-    yield "log_scales", rows.log_scales.T, choices.log_scales, False
-    yield "quats", rows.quats[:, 1:].T, choices.quats, False
-    opacities = opacities_of(rows.logit_opacities) if isinstance(choices.opacities, int) else rows.logit_opacities
-    yield "opacities", opacities[None], choices.opacities, False
+def _columns(rows: Rows, choices: CompactChoices) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the name and the numbers [C, n] of each part besides the means. Bits are of opacities and log-exponents,
+    floats of logits and shapes."""
+    yield "log_scales", rows.log_scales.T
+    yield "quats", rows.quats[:, 1:].T
+    has_bits = isinstance(choices.opacities, int)
+    yield "opacities", (opacities_of(rows.logit_opacities) if has_bits else rows.logit_opacities)[None]
     for degree, band in enumerate(rows.bands):
-        name = f"sh_{degree}"
-        yield name, band.transpose(2, 1, 0).reshape(3, -1), choices.of_part(name), True
+        yield f"sh_{degree}", band.transpose(2, 1, 0).reshape(3, -1)
     if rows.texels is not None:
-        yield "texel_colors", rows.texels[:, :3].T, choices.texels, True
-        yield "texel_alphas", rows.texels[:, 3:].T, choices.texels, False
+        yield "texel_colors", rows.texels[:, :3].T
+        yield "texel_alphas", rows.texels[:, 3:].T
     if rows.shapes is not None:
-        is_bits = isinstance(choices.shapes, int)
-        yield "shapes", (log_exponents_of(rows.shapes) if is_bits else rows.shapes)[None], choices.shapes, False
+        yield "shapes", (log_exponents_of(rows.shapes) if isinstance(choices.shapes, int) else rows.shapes)[None]
 
 
 def half_turned(model: Model) -> Model:
@@ -369,15 +371,21 @@ def _rows_of(
     reader: ColumnReader, num: int, header: Mapping[str, Any], choices: CompactChoices, appearance: Appearance
 ) -> Rows:
     """Return the tables of a chunk; the reader limits their size by the file's."""
+
+    def numbers(name: str, num_columns: int, length: int) -> np.ndarray:
+        return reader.numbers(name, num_columns, length, choices.of_part(name), is_color=name in COLORED)
+
     base = header["base_degree"]
     check_int("base_degree", base, 0, MAX_DEGREE)
-    table = header["degrees"]
     means = reader.means(num, choices.means).T
-    log_scales = reader.numbers("log_scales", 2, num, choices.log_scales).T
-    quats = with_w(reader.numbers("quats", 3, num, choices.quats))
-    opacities = reader.numbers("opacities", 1, num, choices.opacities)[0]
+    log_scales = numbers("log_scales", 2, num).T
+    quats = with_w(numbers("quats", 3, num))
+    logits = numbers("opacities", 1, num)[0]
+    if isinstance(choices.opacities, int):
+        logits = logits_of(logits)
     # Splats of an appearance with bands may have any degree up to the highest, however low the base is.
     highest = MAX_DEGREE if appearance.bands is not None else base
+    table = header["degrees"]
     if not set(table) <= set(range(base, highest + 1)):
         raise ValueError(f"degrees must be in {base}..{highest}; got {table}")
     degrees = np.asarray(table, np.int64)[reader.indices("degrees", num, len(table))]
@@ -385,10 +393,9 @@ def _rows_of(
     for degree in range(highest + 1):
         # Band l has rows only for splats of degree l or more.
         count = int(np.count_nonzero(degrees >= degree))
-        name = f"sh_{degree}"
-        columns = reader.numbers(name, 3, (2 * degree + 1) * count, choices.of_part(name), is_color=True)
+        columns = numbers(f"sh_{degree}", 3, (2 * degree + 1) * count)
         bands.append(columns.reshape(3, 2 * degree + 1, count).transpose(2, 1, 0))
-    sizes = texels = None
+    sizes = texels = shapes = None
     if "sizes" in header:
         pairs = header["sizes"]
         for height, width in pairs:
@@ -396,12 +403,9 @@ def _rows_of(
             check_int("the width of a texture", width, 0, MAX_SIDE)
         sizes = np.asarray(pairs, np.int64).reshape(-1, 2)[reader.indices("sizes", num, len(pairs))]
         count = int(sizes.prod(axis=1).sum())
-        colors = reader.numbers("texel_colors", 3, count, choices.texels, is_color=True)
-        texels = np.concatenate([colors, reader.numbers("texel_alphas", 1, count, choices.texels)]).T
-    shapes = None
+        texels = np.concatenate([numbers("texel_colors", 3, count), numbers("texel_alphas", 1, count)]).T
     if appearance.exponents is not None:
-        shapes = reader.numbers("shapes", 1, num, choices.shapes)[0]
+        shapes = numbers("shapes", 1, num)[0]
         if isinstance(choices.shapes, int):
             shapes = shapes_of(shapes)
-    logits = logits_of(opacities) if isinstance(choices.opacities, int) else opacities
     return Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)

@@ -72,9 +72,10 @@ def save_edit(path: Path, edit: Edit) -> None:
     """Write an edit as the viewer does, for `load_edit`."""
     changes: dict[str, Any] = {}
     if edit.crop is not None:
-        # JSON has no infinity.
-        low, high = (np.where(np.isfinite(ends), ends, None).tolist() for ends in (edit.crop.low, edit.crop.high))
-        changes["crop"] = {"axes": edit.crop.axes.tolist(), "low": low, "high": high}
+        changes["crop"] = {"axes": edit.crop.axes.tolist()}
+        for name, ends in (("low", edit.crop.low), ("high", edit.crop.high)):
+            # JSON has no infinity.
+            changes["crop"][name] = [end if math.isfinite(end) else None for end in ends.tolist()]
     if edit.floaters:
         changes["floaters"] = edit.floaters
     if edit.up is not None:

@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.origin import BLACK
 from a2tg_jax.data.other_runs import model_hint
 from a2tg_jax.host.regular_files import expanded, is_regular
@@ -38,7 +37,7 @@ class FileFormat:
     """Format of files, and what it keeps of a model besides its Gaussians."""
 
     name: str
-    load: Callable[[Path], Model | Gaussians]
+    load: Callable[[Path], Model]
     save: Writer | None
     keeps_appearance: bool = False
     """Whether textures, and everything else that splats show, are kept."""
@@ -57,12 +56,18 @@ class FileFormat:
     """Import of the optional library that writing needs; raises ValueError, with what to install, without it."""
 
 
-_GLTF = FileFormat("glTF", load_gltf, save_gltf, True, True, is_exact=False, has_extension=True)
+_GLTF = FileFormat(
+    "glTF", load_gltf, save_gltf, keeps_appearance=True, keeps_origin=True, is_exact=False, has_extension=True
+)
 _USD = FileFormat("OpenUSD", load_usd, save_usd, keeps_origin=True, is_exact=False, import_library=import_usd)
 _CHECKPOINT = FileFormat("checkpoint", refuse_checkpoint, save_checkpoint_gaussians)
 FORMATS = {
-    ".npz": FileFormat("model", load_model, save_model, True, True, True),
-    ".a2tgz": FileFormat("compact scene", load_compact, save_compact, True, True, is_exact=False),
+    ".npz": FileFormat(
+        "model", load_model, save_model, keeps_appearance=True, keeps_origin=True, keeps_corrections=True
+    ),
+    ".a2tgz": FileFormat(
+        "compact scene", load_compact, save_compact, keeps_appearance=True, keeps_origin=True, is_exact=False
+    ),
     ".compressed.ply": FileFormat(
         "compressed PLY", load_ply_model, writer_as("compressed.ply", encode_packed_ply), is_exact=False
     ),
@@ -131,8 +136,7 @@ def load_splats(path: str | os.PathLike[str]) -> Model:
       ValueError: if the suffix is unknown, an optional library is missing, or the file is damaged.
     """
     path = splats_at(expanded(path))
-    loaded = format_of(path).load(path)
-    return Model(loaded) if isinstance(loaded, Gaussians) else loaded
+    return format_of(path).load(path)
 
 
 def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "original") -> None:
@@ -154,7 +158,10 @@ def save_splats(path: str | os.PathLike[str], model: Model, *, world: World = "o
       200
     """
     save = writer_of(path)
-    save(expanded(path), model, **({} if format_of(path).keeps_origin else {"world": world}))
+    if format_of(path).keeps_origin:
+        save(expanded(path), model)
+    else:
+        save(expanded(path), model, world=world)
 
 
 def files_written(path: Path) -> list[Path]:

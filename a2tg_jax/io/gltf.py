@@ -314,8 +314,9 @@ def _shown(document: Document, described: Mapping[str, Any], splats: Ellipsoids)
         sh = np.pad(sh, ((0, 0), (0, NUM_BASES[-1] - highest), (0, 0)))
     counts = [count for count in NUM_BASES if count <= sh.shape[1]]
     bands = [sh[degrees >= degree, count - 2 * degree - 1 : count] for degree, count in enumerate(counts)]
-    columns = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
-    rows = Rows(*map(np.asarray, columns), degrees, tuple(bands), sizes, texels, shapes)
+    fields = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
+    means, quats, log_scales, logits = map(np.asarray, fields)
+    rows = Rows(means, quats, log_scales, logits, degrees, tuple(bands), sizes, texels, shapes)
     return appearance, rows, base_degree
 
 

@@ -83,8 +83,9 @@ def rows_of_model(model: Model) -> Rows:
         degrees = np.asarray(shown["degrees"], np.int64)
         bands += [shown[f"band_{degree}"] for degree in range(gaussians.sh_degree + 1, len(NUM_BASES))]
     fields = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
+    means, quats, log_scales, logits = map(np.asarray, fields)
     tables = (shown.get(name) for name in ("sizes", "texels", "shapes"))
-    return Rows(*map(np.asarray, fields), degrees, tuple(bands), *tables)
+    return Rows(means, quats, log_scales, logits, degrees, tuple(bands), *tables)
 
 
 def ordered(rows: Rows, order: np.ndarray, *, turns: bool = True) -> Rows:

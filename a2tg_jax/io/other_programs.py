@@ -272,7 +272,7 @@ def reader_of(decode: Callable[[bytes, Path], Model]) -> Callable[[Path], Model]
 
 def pack_bits(columns: Iterable[np.ndarray], bits: tuple[int, ...]) -> np.ndarray:
     """Return columns of unsigned integers of these bits packed into one of 32 bits, the first highest."""
-    packed = np.uint32(0)
+    packed: Any = np.uint32(0)
     for column, num in zip(columns, bits, strict=True):
         packed = packed << np.uint32(num) | column.astype(np.uint32)
     return np.asarray(packed, "<u4")

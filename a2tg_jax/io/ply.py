@@ -191,7 +191,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     Text and binary files of either byte order are read, and colours red, green, blue where f_dc_* are missing. SH
     keep the file's degree. Degrees above 3 are dropped with a warning, and so are Gaussians with numbers that are not
     finite or too large to draw. filter_3D of Mip-Splatting widens the scales and lowers the opacities, as that program
-    draws them; a warning names other attributes, but for normals and further colours.
+    draws them. A warning names other attributes that are not read, except normals and additional colours.
     The third scale (scale_2) of a file that marks its splats as flat is dropped. Other files have ellipsoids: the
     thinnest axis of each becomes the normal and its scale is dropped, with a warning if that is more than a thousandth
     of the

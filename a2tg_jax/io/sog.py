@@ -164,14 +164,14 @@ def _checked_header(data: bytes) -> dict[str, Any]:
 
 def _named_pictures(header: dict[str, Any]) -> list[str]:
     """Return the names of all pictures. ValueError: one is missing, or is no plain name."""
-    names = []
+    names: list[str] = []
     for group, count in PICTURES.items():
         if group == "shN" and not header.get(group):
             continue
         described = header.get(group)
         if not isinstance(described, dict):
             raise ValueError(f"{HEADER} describes no {group}; got {shortened(described)}")
-        pictures = described.get("files")
+        pictures: Any = described.get("files")
         is_list = isinstance(pictures, list) and len(pictures) == count
         if not is_list or not all(isinstance(name, str) for name in pictures):
             raise ValueError(f"{HEADER} must name {count} pictures of {group}; got {shortened(pictures)}")

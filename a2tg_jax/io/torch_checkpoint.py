@@ -11,6 +11,8 @@ import os
 import pickle
 import zipfile
 from collections.abc import Mapping
+from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -18,9 +20,8 @@ from a2tg_jax.core.gaussians import Gaussians
 from a2tg_jax.core.sh import NUM_BASES
 from a2tg_jax.data.other_runs import HOW_TO_EXPORT
 from a2tg_jax.host.atomic import replacing
-from a2tg_jax.host.regular_files import is_regular
 from a2tg_jax.io.other_programs import World, third_log_scales, warn_of_offset, world_gaussians
-from a2tg_jax.io.validate import check_model
+from a2tg_jax.io.validate import check_exists, check_model
 from a2tg_jax.model import Model
 
 PROTOCOL = 2
@@ -125,8 +126,7 @@ def _opcodes(value: object, storages: list[np.ndarray]) -> bytes:
 # Reading
 
 
-def refuse_checkpoint(path: str | os.PathLike[str]) -> Gaussians:
+def refuse_checkpoint(path: Path) -> NoReturn:
     """Raise ValueError that says how to get a PLY file instead of a checkpoint; FileNotFoundError: there is no file."""
-    if not is_regular(path):
-        raise FileNotFoundError(f"{os.fspath(path)}: no such checkpoint")
-    raise ValueError(f"{os.fspath(path)}: is a checkpoint, which is written but not read; {HOW_TO_EXPORT}")
+    check_exists(path, "checkpoint")
+    raise ValueError(f"{path}: is a checkpoint, which is written but not read; {HOW_TO_EXPORT}")

@@ -160,7 +160,7 @@ def check_finite(name: str, tree: object, *, is_signed: bool = True) -> None:
     """Raise ValueError, naming the leaf, if a float of a pytree is NaN or infinite or, unsigned, NaN or negative."""
     for leaf, values in _float_rows(name, tree):
         # `values >= 0` is False for NaN.
-        is_good = (np.isfinite(values) if is_signed else values >= 0).all(axis=1)
+        is_good: np.ndarray = np.all(np.isfinite(values) if is_signed else values >= 0, axis=1)
         if not is_good.all():
             wanted = "finite" if is_signed else "at least 0"
             unwanted = "NaN or infinite" if is_signed else "negative or NaN"

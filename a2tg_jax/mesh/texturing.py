@@ -98,9 +98,10 @@ def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Texels]:
     atlas.generate(xatlas.ChartOptions(), options)
     source, faces, uv = atlas.get_mesh(0)
     colors = None if mesh.colors is None else mesh.colors[source]
-    mesh = Mesh(mesh.vertices[source], faces.astype(np.int32), colors, np.asarray(uv, np.float32))
+    uv = np.asarray(uv, np.float32)
+    mesh = Mesh(mesh.vertices[source], faces.astype(np.int32), colors, uv)
     # uv begins at the lower left, rows of the atlas at the top.
-    corners = (mesh.uv * (size, -size) + (0, size)).astype(np.float32)[mesh.faces]
+    corners = (uv * (size, -size) + (0, size)).astype(np.float32)[mesh.faces]
     # At one depth: charts do not overlap.
     drawn = _draw(corners, np.ones(mesh.faces.shape, np.float32), size, size)
     place = np.flatnonzero(drawn.face >= 0)
