@@ -32,7 +32,8 @@ from a2tg_jax.host import signals
 from a2tg_jax.host.text import did_you_mean
 
 MODULES = (
-    "choose_plain", "findings", "ablation", "resolution_shares", "decomposition", "comparison_pictures", "efficiency",
+    "choose_plain", "findings", "claims", "ablation", "resolution_shares", "decomposition", "comparison_pictures",
+    "efficiency",
 )  # fmt: skip
 """Modules of this folder that hold an EXPERIMENT; the one that measures time comes last."""
 EVERYTHING, PAGES = "all", "pages"
