@@ -176,7 +176,8 @@ def test_a_page_shows_the_tables_that_it_names(tmp_path, monkeypatch):
 
 
 RESULTS = EXPERIMENTS.parent / "docs" / "results.md"
-MADE_OF_MODELS = {"decomposition", "efficiency", "comparison_pictures"}
+NOTEBOOK = EXPERIMENTS / "NOTEBOOK.md"
+MADE_OF_MODELS = {"efficiency"}
 
 
 @pytest.mark.parametrize("scale", ["small", "long", "protocol"])
@@ -273,3 +274,11 @@ def gains_in_the_paper():
 
 def test_the_results_page_is_short():
     assert len(RESULTS.read_text(encoding="utf-8").split()) <= 1_300
+
+
+def test_the_notebook_is_read_in_one_sitting():
+    """It has at most 4,500 words besides generated tables, and its contents are the titles of its sections."""
+    text = re.sub(r"^<!-- \S+ -->$.*?^<!-- end -->$", "", NOTEBOOK.read_text(encoding="utf-8"), flags=re.DOTALL | re.M)
+    assert len(text.split()) <= 4_500
+    contents = text.split("\n# ")[1]
+    assert re.findall(r"^- \[(.*)\]\(#", contents, re.MULTILINE) == re.findall(r"^## (.*)$", text, re.MULTILINE)
