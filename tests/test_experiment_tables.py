@@ -265,6 +265,21 @@ def test_figures_in_sentences_on_results_are_in_tables():
     assert not missing, f"{missing} are in no table"
 
 
+def test_intervals_in_sentences_of_the_notebook_are_in_tables():
+    """In sections that show or link to tables, except for what was measured before the protocol."""
+    shown = " ".join(path.read_text(encoding="utf-8") for path in (EXPERIMENTS / "results" / "protocol").glob("*.md"))
+    interval = r"\d\.\d{2,} ± \d\.\d{2,}"
+    found = set()
+    for section in NOTEBOOK.read_text(encoding="utf-8").split("\n## "):
+        if "<!-- results/protocol/" in section or "(#all-intervals-and-captures)" in section:
+            sentences = pages.BLOCK.sub("", section)
+            sentences = re.sub(r"^- \*\*Before the protocol\*\*.*?(?=^- |^$)", "", sentences, flags=re.DOTALL | re.M)
+            found |= set(re.findall(interval, " ".join(sentences.split())))
+    assert len(found) > 10
+    missing = found - set(re.findall(interval, shown))
+    assert not missing, f"{missing} are in no table"
+
+
 def gains_in_the_paper():
     """PSNR of A²TG − 2DGS*-MCMC in each memory and data set of the paper's Table 1."""
     psnr = {(row["method"], row["dataset"], row["budget_mb"]): row["psnr"] for row in tables.PAPER["fixed_memory"]}
