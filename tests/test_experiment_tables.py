@@ -177,7 +177,8 @@ def test_a_page_shows_the_tables_that_it_names(tmp_path, monkeypatch):
 
 
 RESULTS = EXPERIMENTS.parent / "docs" / "results.md"
-MADE_OF_MODELS = {"decomposition", "efficiency", "comparison_pictures"}
+NOTEBOOK = EXPERIMENTS / "NOTEBOOK.md"
+MADE_OF_MODELS = {"efficiency"}
 
 
 @pytest.mark.parametrize("scale", ["small", "long", "protocol"])
@@ -265,6 +266,21 @@ def test_figures_in_sentences_on_results_are_in_tables():
     assert not missing, f"{missing} are in no table"
 
 
+def test_intervals_in_sentences_of_the_notebook_are_in_tables():
+    """In sections that show or link to tables, except for what was measured before the protocol."""
+    shown = " ".join(path.read_text(encoding="utf-8") for path in (EXPERIMENTS / "results" / "protocol").glob("*.md"))
+    interval = r"\d\.\d{2,} ± \d\.\d{2,}"
+    found = set()
+    for section in NOTEBOOK.read_text(encoding="utf-8").split("\n## "):
+        if "<!-- results/protocol/" in section or "(#all-intervals-and-captures)" in section:
+            sentences = pages.BLOCK.sub("", section)
+            sentences = re.sub(r"^- \*\*Before the protocol\*\*.*?(?=^- |^$)", "", sentences, flags=re.DOTALL | re.M)
+            found |= set(re.findall(interval, " ".join(sentences.split())))
+    assert len(found) > 10
+    missing = found - set(re.findall(interval, shown))
+    assert not missing, f"{missing} are in no table"
+
+
 def gains_in_the_paper():
     """PSNR of A²TG − 2DGS*-MCMC in each memory and data set of the paper's Table 1."""
     psnr = {(row["method"], row["dataset"], row["budget_mb"]): row["psnr"] for row in tables.PAPER["fixed_memory"]}
@@ -274,6 +290,14 @@ def gains_in_the_paper():
 
 def test_the_results_page_is_short():
     assert len(RESULTS.read_text(encoding="utf-8").split()) <= 1_300
+
+
+def test_the_notebook_is_read_in_one_sitting():
+    """It has at most 4,500 words besides generated tables, and its contents are the titles of its sections."""
+    text = re.sub(r"^<!-- \S+ -->$.*?^<!-- end -->$", "", NOTEBOOK.read_text(encoding="utf-8"), flags=re.DOTALL | re.M)
+    assert len(text.split()) <= 4_500
+    contents = text.split("\n# ")[1]
+    assert re.findall(r"^- \[(.*)\]\(#", contents, re.MULTILINE) == re.findall(r"^## (.*)$", text, re.MULTILINE)
 
 
 def claims_result(capture, label, psnr, budget=0.3, equal="", **others):

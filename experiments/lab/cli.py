@@ -144,7 +144,7 @@ class Lab:
 
     @property
     def pages(self) -> Path:
-        """Return the folder of tables and pictures, and make it; some scenes alone have a folder of their own."""
+        """Return the folder of tables and charts, and make it; some scenes alone have a folder of their own."""
         folder = self.out / "partial" if self.is_partial else self.out
         folder.mkdir(parents=True, exist_ok=True)
         return folder
