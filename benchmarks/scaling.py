@@ -28,13 +28,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from a2tg_jax.parallel.exchange import BorderRoom, ImageBands
 
 import a2tg_jax as a2tg
 from a2tg_jax.core.budget import BYTES_PER_FLOAT
 from a2tg_jax.core.gaussians import floats_per_gaussian
 from a2tg_jax.core.geometry import NEAR_PLANE, screen_bounds
 from a2tg_jax.io.config_json import changed_config
-from a2tg_jax.parallel.exchange import BorderRoom, ImageBands
 from a2tg_jax.rasterize.splats import drawn_splats
 from a2tg_jax.rasterize.tiles import Rectangles, TileGrid, tile_rectangles
 from a2tg_jax.systems.baselines import Gaussians2dMcmc

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from a2tg_jax.parallel.exchange import AXIS, ROOM_OF_A_BAND, BorderRoom, ImageBands, exchange_among
+from a2tg_jax.parallel.sharded_rows import on_host, placed_like, readable, rows_moved, sharding_of_rows, spread
 from jax.sharding import PartitionSpec as P
 from scenes_random import fisheye
 from test_shared import Own
@@ -25,8 +27,6 @@ from a2tg_jax.densify.splitting import SplitByGradient
 from a2tg_jax.events import Change, Due, HostEvent, StepEvent
 from a2tg_jax.io.config_json import changed_config
 from a2tg_jax.parallel import exchange as exchanges, sharded_rows as rows
-from a2tg_jax.parallel.exchange import AXIS, ROOM_OF_A_BAND, BorderRoom, ImageBands, exchange_among
-from a2tg_jax.parallel.sharded_rows import on_host, placed_like, readable, rows_moved, sharding_of_rows, spread
 from a2tg_jax.rasterize.tiles import TileGrid
 from a2tg_jax.rasterize.views import pairs_of_view, render_traced
 from a2tg_jax.systems.baselines import Gaussians2dMcmc

@@ -23,14 +23,14 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from a2tg_jax.parallel.processes import LOST, ProcessPlace, joined
+from a2tg_jax.parallel.sharded_rows import placed_like, spread
 from jax.experimental import multihost_utils
 from on_devices import custom_events_change_rows, rows_are_read_and_moved, scene, system
 from test_pictures import write_scene
 
 import a2tg_jax as a2tg
 from a2tg_jax.data import decoding, photo_reading, photo_store
-from a2tg_jax.parallel.processes import LOST, ProcessPlace, joined
-from a2tg_jax.parallel.sharded_rows import placed_like, spread
 from a2tg_jax.systems.baselines import Gaussians2dMcmc
 from a2tg_jax.training import Session, loop
 from a2tg_jax.training.batches import BatchOrder, PhotoStore

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from a2tg_jax.parallel.processes import LOST, Liveness, accept, connect, is_of_collectives, listen
 from on_processes import SHORT, ended, free_port, pair, started, survivor_of, trainings
 from run_folders import create_run
 
@@ -22,7 +23,6 @@ from a2tg_jax.host.machine import Devices
 from a2tg_jax.io.archive import write_archive
 from a2tg_jax.io.model_file import load_model
 from a2tg_jax.parallel import processes
-from a2tg_jax.parallel.processes import LOST, Liveness, accept, connect, is_of_collectives, listen
 from a2tg_jax.results import run_training
 from a2tg_jax.results.folder import RunFolder, resuming_command
 from a2tg_jax.results.history import read_history
