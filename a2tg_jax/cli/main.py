@@ -167,13 +167,14 @@ def parsed(name: str, arguments: Sequence[str]) -> Any:
     from a2tg_jax.cli.arguments import at_home, parse
 
     arguments = [at_home(word) for word in arguments]
-    kind, default = command_class(name), None
-    if name == "train":
-        from a2tg_jax.cli.train import train_defaults
+    kind = command_class(name)
+    program = f"a2tg {name}"
+    words = ["--help" if word == "--help-all" else word for word in arguments]
+    if name != "train":
+        return parse(kind, program, words)
+    from a2tg_jax.cli.train import scene_rule, train_defaults
 
-        default = train_defaults(arguments)
-    arguments = ["--help" if word == "--help-all" else word for word in arguments]
-    return parse(kind, f"a2tg {name}", arguments, default)
+    return parse(kind, program, words, train_defaults(arguments), scene_rule)
 
 
 def _fail(message: str) -> int:

@@ -9,11 +9,12 @@ import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_type_hints
 
 import jax
 import tyro
-from tyro.conf import arg
+from tyro.conf import Positional, arg
+from tyro.constructors import StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 from a2tg_jax.adapt import Upscale
 from a2tg_jax.cli.arguments import LpipsWeights
@@ -305,6 +306,19 @@ def train_defaults(arguments: Sequence[str]) -> Train:
     # MISSING makes SCENE required in tyro.
     scene = record.scene if record.scene.path else dataclasses.replace(record.scene, path=tyro.MISSING)
     return Train(dataclasses.replace(record, scene=scene), tyro.MISSING)
+
+
+def scene_rule(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Return the options of a scene's source, with its path as the argument SCENE; None for other classes."""
+    if info.type is not SceneSource:
+        return None
+    kinds = get_type_hints(SceneSource)
+    kinds["path"] = Annotated[Positional[str], arg(metavar="SCENE")]
+    fields = []
+    for field in dataclasses.fields(SceneSource):
+        default = getattr(info.default, field.name, field.default)
+        fields.append(StructFieldSpec(field.name, kinds[field.name], default, field.metadata.get("help")))
+    return StructConstructorSpec(SceneSource, tuple(fields))
 
 
 def defaults_line(arguments: Sequence[str]) -> str:

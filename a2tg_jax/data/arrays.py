@@ -15,7 +15,6 @@ from a2tg_jax.core.similarity import camera_centers
 from a2tg_jax.data.assembly import (
     PointCloud,
     Shot,
-    Sight,
     are_somewhere,
     assemble_scene,
     check_test_every,
@@ -222,8 +221,7 @@ def _agree_on_subject(shots: Sequence[Shot], viewmats: np.ndarray) -> bool:
 
 def _share_seen(shots: Sequence[Shot], viewmats: np.ndarray, points: np.ndarray) -> float:
     """Return the share of all points, averaged over the views, in an image."""
-    pairs = zip(shots, viewmats, strict=True)
-    sights = [Sight.of(viewmat, shot.K, shot.picture.size, None) for shot, viewmat in pairs]
+    sights = [shot.sight(viewmat) for shot, viewmat in zip(shots, viewmats, strict=True)]
     return float(np.mean([sight.num_seen(points, 0.0) for sight in sights])) / len(points)
 
 
