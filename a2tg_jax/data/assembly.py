@@ -31,9 +31,11 @@ NUM_CANDIDATES = 100_000
 OBJECT_SHARE = 0.8958
 """Half the side of an object's cube over half the width that cameras see at its centre: the cube of ±1.3 of NeRF's
 synthetic objects, whose cameras are 4.031 away and see 39.6°."""
-NEAREST, DEEPEST_AROUND = 0.4, 2.0
+NEAREST = 0.4
+DEEPEST_AROUND = 2.0
 """Depths of random points in front of cameras around a subject, in units of their distance from it."""
-SHALLOWEST, DEEPEST = 0.5, 10.0
+SHALLOWEST = 0.5
+DEEPEST = 10.0
 """Depths of random points in front of other cameras."""
 FIRST_LOOK = 10_000
 """Number of evenly chosen points that a view is tested with first."""

@@ -28,7 +28,8 @@ BITS_PER_SAMPLE = 258
 """TIFF tag of the bits per sample."""
 TIFF_SIZE = 256, 257
 """TIFF tags of the stored width and height."""
-TURNED, SIDEWAYS = range(2, 9), range(5, 9)
+TURNED = range(2, 9)
+SIDEWAYS = range(5, 9)
 """EXIF orientations other than upright, and the ones that exchange width and height."""
 AS_STORED = {
     2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -138,7 +139,8 @@ def save_upright(path: str | os.PathLike[str], target: Path, quality: int) -> No
     TIFF's layout would be wrong.
     """
     with _opened(path) as image:
-        stored, exif = image.getexif(), Image.Exif()
+        stored = image.getexif()
+        exif = Image.Exif()
         exif.update({tag: stored[tag] for tag in LENS_TAGS[:2] if tag in stored})
         details = stored.get_ifd(ExifTags.IFD.Exif)
         exif.get_ifd(ExifTags.IFD.Exif).update(

@@ -27,9 +27,11 @@ INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
 """Polycam's names of intrinsics."""
 NUM_POINTS = 50_000
 """Number of points taken from all depth maps."""
-FARTHEST_MM, LEAST_CONFIDENCE = 5000, 127
+FARTHEST_MM = 5000
+LEAST_CONFIDENCE = 127
 """Depth up to which the sensor measures, and ARKit's medium confidence."""
-BLACKEST, MARGIN = 8, 2
+BLACKEST = 8
+MARGIN = 2
 """Largest value of a pixel of the black border, and pixels next to it that undistortion and JPEG mix with it."""
 METADATA = ("metadata", "metadata.json")
 """Names of Record3D's file."""

@@ -31,7 +31,8 @@ from a2tg_jax.data.photo_store import DepthMap, Mask, Shelf
 from a2tg_jax.host.npz import read_npy
 from a2tg_jax.host.text import shortened
 
-MASKS, DEPTHS = "masks", "depths"
+MASKS = "masks"
+DEPTHS = "depths"
 HALF = 128
 """Level from which on a pixel of a mask is bright."""
 AlphaMeaning = Literal["transparency", "mask"]
@@ -128,9 +129,8 @@ def read_photos(
     lacking = [each.photo.name for each in files if each.mask is None]
     if not masks:
         _warn_of_unused_masks(photos)
-    elif lacking:
-        message = f"{place}: {len(lacking)} of {len(files)} photographs have no mask, such as {lacking[0]}"
-        warnings.warn(f"{message}: all of their pixels count", stacklevel=3)
+    else:
+        warn_of_lacking_masks(place, lacking, len(files))
     warn_of_grey([grey for _, grey in read if grey is not None], masks)
     return [shot for shot, _ in read]
 
@@ -145,6 +145,13 @@ def _warn_of_unused_masks(photos: Sequence[Photo]) -> None:
         for folder in sorted(root.glob("*[mM]ask*/")):
             if not folder.name.startswith(MASKS):
                 warnings.warn(f"{folder}: not read; if it holds masks, rename it to {MASKS}", stacklevel=4)
+
+
+def warn_of_lacking_masks(place: Path, lacking: Sequence[str], num: int) -> None:
+    """Warn of the photographs, among `num`, that have no mask although others have."""
+    if lacking:
+        message = f"{place}: {len(lacking)} of {num} photographs have no mask, such as {lacking[0]}"
+        warnings.warn(f"{message}: all of their pixels count", stacklevel=4)
 
 
 def warn_of_grey(grey: Sequence[Path], masks: Sequence[Path]) -> None:

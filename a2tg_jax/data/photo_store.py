@@ -229,14 +229,16 @@ class Shelf:
             # docs/reliability.md, "Photographs beyond the memory"
             read_again = _FileRead(source, view, checksum)
             return Picture(pixels.shape, read_again, checksum=checksum)
-        folder, shape = cache_folder(), pixels.shape
+        folder = cache_folder()
+        shape = pixels.shape
         try:
             with self._lock:
                 if self._file is None:
                     folder.mkdir(parents=True, exist_ok=True)
                     self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as there are pictures
                     weakref.finalize(self, self._file.close)
-                file, start = self._file, self._end
+                file = self._file
+                start = self._end
                 file.seek(start)
                 file.write(np.ascontiguousarray(pixels).data)
                 file.flush()
