@@ -157,10 +157,14 @@ class Upscale(HostEvent):
             raise ValueError(
                 f"{in_words(model.appearance)} cannot grow textures: the stage needs Appearance(texture=Texture())"
             )
-        textures, num = model.textures, model.num
-        old_sizes, scales, averages = textures.sizes, np.asarray(model.gaussians.scales), np.asarray(state.average())
+        textures = model.textures
+        num = model.num
+        old_sizes = textures.sizes
+        scales = np.asarray(model.gaussians.scales)
+        averages = np.asarray(state.average())
         # Rows that do not exist yet count for nothing, and get nothing.
-        sizes, new_sizes = old_sizes[:num], old_sizes.copy()
+        sizes = old_sizes[:num]
+        new_sizes = old_sizes.copy()
 
         def propose(sizes: np.ndarray, anisotropic: bool) -> np.ndarray:
             return next_sizes(
@@ -266,7 +270,8 @@ def next_sizes(
 def most_textures(sizes: np.ndarray, num_bytes: float, cap: int) -> Shape:
     """Return a shape with room for all textures that `next_sizes` can make of sizes [N, 2] within a number of bytes
     (host)."""
-    reached, num_before = np.unique(sizes, axis=0), 0
+    reached = np.unique(sizes, axis=0)
+    num_before = 0
     while len(reached) > num_before:
         num_before = len(reached)
         larger = [
@@ -324,7 +329,9 @@ def select(
       >>> a2tg.select(np.array([0.3, 0.1, 0.2]), sizes, proposed, budget_bytes=100)
       array([ True, False,  True])
     """
-    statistic, sizes, proposed = np.asarray(statistic), np.asarray(sizes), np.asarray(proposed)
+    statistic = np.asarray(statistic)
+    sizes = np.asarray(sizes)
+    proposed = np.asarray(proposed)
     check_shape("statistic", statistic, ("N",))
     check_shape("sizes", sizes, (len(statistic), 2))
     check_shape("proposed", proposed, (len(statistic), 2))

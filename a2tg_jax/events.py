@@ -302,7 +302,8 @@ def keep_rows(model: Model, moments: AdamState, state: object, is_kept: Array | 
       ValueError: if it is no such mask or keeps fewer than 2, or if textures or view dependence have blocks of several
         sizes.
     """
-    num, rows = model.num, np.arange(model.gaussians.num, dtype=np.int32)
+    num = model.num
+    rows = np.arange(model.gaussians.num, dtype=np.int32)
     is_kept = np.asarray(is_kept)
     check_mask("is_kept", is_kept, (len(rows) if is_kept.shape == rows.shape else num,))
     is_kept = is_kept[:num]

@@ -209,7 +209,8 @@ def perturb(
     check_shape("lr", lr, ())
     scales = gaussians.scales if scales is None else scales
     check_shape("scales", scales, (gaussians.num, 3 if np.shape(scales)[1:] == (3,) else 2))
-    means, dtype = gaussians.means, gaussians.means.dtype
+    means = gaussians.means
+    dtype = gaussians.means.dtype
     noise = jax.random.normal(key, means.shape, dtype)
     axes = rotation_matrices(gaussians.quats)[:, :, : scales.shape[1]]
     # Sums of products instead of matmuls, which accelerators may round to fewer bits.
@@ -246,7 +247,9 @@ def draw_hosts(key: Array, opacities: Array, is_host: Array) -> Array:
     # Rounding may lead past the last block that has hosts.
     block = jnp.minimum(block, jnp.maximum(num_hosts - 1, 0) // width).astype(jnp.int32)
     # By bisection, the first column above the target in the block's ascending row.
-    target, column, step = u_within * within[block, -1], jnp.zeros_like(block), width // 2
+    target = u_within * within[block, -1]
+    column = jnp.zeros_like(block)
+    step = width // 2
     while step:
         column = jnp.where(within[block, column + (step - 1)] <= target, column + step, column)
         step //= 2
@@ -356,7 +359,8 @@ class Mcmc(StepEvent):
     def apply(self, now: Now, model: Model, moments: AdamState, state: Any) -> Change:
         # Dead Gaussians move first: their new places can be hosts of what is added.
         moved, moments, _ = self._move(model, moments, functools.partial(plan_relocation, now.keys[0]))
-        least, cap = self.least(now, model.live_count), min(self.cap, model.gaussians.num)
+        least = self.least(now, model.live_count)
+        cap = min(self.cap, model.gaussians.num)
         plan = functools.partial(plan_growth, now.keys[1], cap=cap, least=least)
         model, moments, info = self._move(moved, moments, plan)
         return Change(model, moments, state, EventInfo(is_possible=info.has_hosts))

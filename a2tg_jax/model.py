@@ -158,7 +158,8 @@ class Model(NamedFields):
     @property
     def degrees(self) -> np.ndarray:
         """[N] degrees of the spherical harmonics of each allocated Gaussian (host)."""
-        base, coefficients = self.gaussians.sh_degree, self.appearance.coefficients
+        base = self.gaussians.sh_degree
+        coefficients = self.appearance.coefficients
         if coefficients is None:
             return np.full(self.gaussians.num, base)
         return degrees_of_sizes(coefficients.sizes, base)
@@ -167,7 +168,8 @@ class Model(NamedFields):
     def sh(self) -> np.ndarray:
         """[N, K, 3] all spherical harmonics, with zeros above the degree of a Gaussian; K belongs to the highest degree
         (host)."""
-        own, coefficients = np.asarray(self.gaussians.sh), self.appearance.coefficients
+        own = np.asarray(self.gaussians.sh)
+        coefficients = self.appearance.coefficients
         if coefficients is None:
             return own
         highest = int(self.degrees.max(initial=self.gaussians.sh_degree))
@@ -304,9 +306,11 @@ def concatenate(models: Sequence[Model]) -> Model:
         check_kind(f"models[{index}]", model, Model)
         check_appearance(model.appearance, model.gaussians)
     models = [model.live for model in models]
-    first, words = models[0], [in_words(model.appearance) for model in models]
+    first = models[0]
+    words = [in_words(model.appearance) for model in models]
     for model, shown in zip(models, words, strict=True):
-        options, others = first.appearance.texture_options, model.appearance.texture_options
+        options = first.appearance.texture_options
+        others = model.appearance.texture_options
         if options is not None and others is not None and options.extent != others.extent:
             raise ValueError(
                 f"models must have textures of one extent; got {options.extent:g} and {others.extent:g}: train them "

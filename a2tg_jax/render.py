@@ -112,7 +112,8 @@ def render_appearance(
     background = background_array(background, gaussians, num_colors)
     if num_live is not None:
         check_shape("num_live", num_live, ())
-        is_known, num = not isinstance(num_live, jax.core.Tracer), gaussians.num
+        is_known = not isinstance(num_live, jax.core.Tracer)
+        num = gaussians.num
         if not jnp.issubdtype(dtype_of(num_live), jnp.integer) or (is_known and not 0 <= int(num_live) <= num):
             raise ValueError(f"num_live must be an integer, 0 to {num}; got {num_live}")
     planned = with_capacity(settings, gaussians, camera, appearance, num_live)

@@ -71,8 +71,10 @@ def plan_render(
     if isinstance(gaussians, Model):
         if appearance is not None or textures is not None:
             raise ValueError("a model has an appearance already: use plan_render(model, cameras)")
-        model, gaussians = gaussians, gaussians.gaussians
-        appearance, num_live = model.appearance, model.num_live
+        model = gaussians
+        gaussians = gaussians.gaussians
+        appearance = model.appearance
+        num_live = model.num_live
     check_gaussians(gaussians)
     if appearance is None:
         appearance = appearance_of(gaussians, textures, settings)
@@ -143,10 +145,12 @@ class Renderer:
         check_gaussians(model.gaussians)
         check_is_appearance(model.appearance, model.gaussians)
         background = model.default_background if background is None else background
-        self._gaussians, self._num_live = model.gaussians, model.num_live
+        self._gaussians = model.gaussians
+        self._num_live = model.num_live
         self._appearance = model.appearance
         self._background = background_array(background, model.gaussians, num_colors_of(model.appearance))
-        self._settings, self._has_geometry = settings, has_geometry
+        self._settings = settings
+        self._has_geometry = has_geometry
         own = [] if model.origin is None else model.origin.cameras
         self._known = evenly_chosen(own, PLANNED_CAMERAS)
         self.capacities: dict[Size, int] = dict(capacities or {})

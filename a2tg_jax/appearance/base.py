@@ -348,7 +348,8 @@ def numbers_in_view(appearance: Appearance, gaussians: Gaussians, camera: Camera
 
 def cutoff_of(appearance: Appearance, opacities: Array) -> Array:
     """Return the squared distance [N] beyond which alpha is below 1/255, of kernels with their exponents."""
-    bound, shapes = appearance.cutoff(opacities).astype(opacities.dtype), appearance.shapes
+    bound = appearance.cutoff(opacities).astype(opacities.dtype)
+    shapes = appearance.shapes
     # The bound of a Gaussian says at which exponent of the falloff alpha is below 1/255.
     return bound if shapes is None else reach_of(curves_of(shapes), bound)
 
@@ -368,7 +369,8 @@ def without_arrays(node: Any, instead: Callable[[str], Any], name: str = "") -> 
     field that is not None."""
     changes = {}
     for field in array_fields(node):
-        value, path = getattr(node, field), f"{name}.{field}" if name else field
+        value = getattr(node, field)
+        path = f"{name}.{field}" if name else field
         if isinstance(value, Part):
             changes[field] = without_arrays(value, instead, path)
         elif value is not None:
@@ -440,7 +442,8 @@ def count_floats(appearance: Appearance, num: int) -> int:
 
 def check_appearance(appearance: Appearance, gaussians: Gaussians) -> None:
     """Raise ValueError, naming the field, unless the arrays of an appearance exist and fit the Gaussians (host)."""
-    kind, dtypes = type(appearance).__name__, " or ".join(FLOATS)
+    kind = type(appearance).__name__
+    dtypes = " or ".join(FLOATS)
     check_arrays_given(appearance)
     for path, leaf in jax.tree_util.tree_leaves_with_path(partition(appearance)[0]):
         if str(leaf.dtype) not in FLOATS:

@@ -73,7 +73,8 @@ class StaticShading:
     def functions(self) -> Elementwise:
         """The functions, composed with exponents and features."""
         own = self.appearance
-        has_curve, has_features = own.exponents is not None, own.features is not None
+        has_curve = own.exponents is not None
+        has_features = own.features is not None
 
         def shade(numbers: tuple[Array, ...], values: tuple[Array, ...], u: Array, v: Array) -> Any:
             # The curve is last (`numbers_in_view`).
@@ -158,7 +159,9 @@ def check_shading(static: StaticShading, arguments: Arguments) -> None:
       ValueError: if a result has the wrong form.
       Exception: what the appearance's own code raises, with a note that names it and the arguments.
     """
-    name, functions, num_colors = static.name, arguments.of(()), arguments.num_colors
+    name = static.name
+    functions = arguments.of(())
+    num_colors = arguments.num_colors
 
     def traced(function: str) -> Any:
         """Return what a function of an appearance returns for scalars, without values."""

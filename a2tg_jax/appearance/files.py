@@ -38,7 +38,8 @@ def arrays_of(appearance: Appearance, sh_degree: int) -> dict[str, np.ndarray]:
     `sh_degree` is the degree of their own spherical harmonics."""
     arrays: dict[str, np.ndarray] = {}
     if appearance.bands is not None and (coefficients := appearance.bands.coefficients) is not None:
-        degrees, dense = degrees_of_sizes(coefficients.sizes, sh_degree), dense_bands(coefficients, sh_degree)
+        degrees = degrees_of_sizes(coefficients.sizes, sh_degree)
+        dense = dense_bands(coefficients, sh_degree)
         arrays |= {"degrees": degrees.astype(np.uint8), "base_degree": np.asarray(sh_degree, np.uint8)}
         for band in range(sh_degree + 1, MAX_DEGREE + 1):
             first, last = (NUM_BASES[degree] - NUM_BASES[sh_degree] for degree in (band - 1, band))
@@ -108,7 +109,8 @@ def _found(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 
 
 def _textures(arrays: Mapping[str, np.ndarray], sizes_name: str, texels_name: str) -> Textures:
-    sizes, texels = _found(arrays, sizes_name), _found(arrays, texels_name)
+    sizes = _found(arrays, sizes_name)
+    texels = _found(arrays, texels_name)
     is_size = sizes.ndim == 2 and sizes.shape[1] == 2 and np.issubdtype(sizes.dtype, np.integer)
     if not is_size or (sizes.size and not 0 <= sizes.min() <= sizes.max() <= MAX_SIDE):
         raise ValueError(f"{sizes_name} must be integers [N, 2] in 0..{MAX_SIDE}; got {sizes.dtype} {sizes.shape}")
@@ -118,15 +120,18 @@ def _textures(arrays: Mapping[str, np.ndarray], sizes_name: str, texels_name: st
 
 
 def _coefficients(arrays: Mapping[str, np.ndarray], sh_degree: int) -> Coefficients:
-    degrees, base = _found(arrays, "degrees"), int(_found(arrays, "base_degree"))
+    degrees = _found(arrays, "degrees")
+    base = int(_found(arrays, "base_degree"))
     if degrees.ndim != 1 or not np.issubdtype(degrees.dtype, np.integer) or not 0 <= base <= MAX_DEGREE:
         raise ValueError(f"degrees must be integers [N] above a base degree in 0..3; got {degrees.shape}, {base}")
     if base != sh_degree:
         raise ValueError(f"bands are above degree {base}, but the Gaussians have degree {sh_degree}")
-    degrees, dtype = degrees.astype(np.int64), np.dtype(np.float32)
+    degrees = degrees.astype(np.int64)
+    dtype = np.dtype(np.float32)
     bands = {}
     for band in range(base + 1, MAX_DEGREE + 1):
-        found, wanted = arrays.get(f"band_{band}"), (int(np.count_nonzero(degrees >= band)), 2 * band + 1, 3)
+        found = arrays.get(f"band_{band}")
+        wanted = (int(np.count_nonzero(degrees >= band)), 2 * band + 1, 3)
         if found is None or found.shape != wanted:
             raise ValueError(f"band_{band} must be {list(wanted)}; got {None if found is None else found.shape}")
         bands[band], dtype = found, found.dtype

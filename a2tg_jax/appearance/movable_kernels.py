@@ -79,7 +79,8 @@ class MovableKernels(Appearance):
 
     def allocate(self, key: Array, gaussians: Gaussians) -> "MovableKernels":
         """Return colourless kernels around the mean. Together they are as opaque there as the Gaussian, up to 0.82."""
-        num, dtype = gaussians.num, gaussians.means.dtype
+        num = gaussians.num
+        dtype = gaussians.means.dtype
         centers = jnp.asarray(INITIAL_CENTERS, dtype)
         # The mean is at a squared distance of 2 from each initial centre.
         weight_at_mean = float(np.exp(-2 * INITIAL_SHARPNESS)) + LEAST_WEIGHT

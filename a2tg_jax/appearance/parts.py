@@ -155,7 +155,8 @@ class Texture(Part):
     def shown(self) -> Textures:
         """Return RGB residuals and alpha factors as they are shown. Buckets and rows out of range are clamped."""
         assert self.texels is not None
-        textures, options = self.texels.nearest_places(), self.options
+        textures = self.texels.nearest_places()
+        options = self.options
         if options.rgb == "signed" and options.alpha == "projected":
             return textures
         divisor = None
@@ -169,7 +170,8 @@ class Texture(Part):
             divisor = jnp.max(jnp.concatenate(alphas)) + 1e-6
 
         def shown(texels: Array) -> Array:
-            rgb, alpha = texels[..., :3], texels[..., 3:]
+            rgb = texels[..., :3]
+            alpha = texels[..., 3:]
             rgb = within(rgb, 0.0, 1.0) if options.rgb == "unit" else rgb
             alpha = alpha if divisor is None else within(alpha / divisor, 0.0, 1.0)
             return jnp.concatenate([rgb, alpha], axis=-1)
@@ -183,7 +185,8 @@ class Texture(Part):
         areas = [height * width for height, width in textures.bucket_sizes]
         capacities = [bucket.shape[0] for bucket in textures.buckets]
         starts = np.cumsum([0] + [capacity * area for capacity, area in zip(capacities, areas, strict=True)])[:-1]
-        bucket_starts, bucket_areas = jnp.asarray(starts, jnp.int32), jnp.asarray(areas, jnp.int32)
+        bucket_starts = jnp.asarray(starts, jnp.int32)
+        bucket_areas = jnp.asarray(areas, jnp.int32)
         sizes = jnp.asarray(textures.bucket_sizes, jnp.int32)[textures.bucket]
         offsets = bucket_starts[textures.bucket] + textures.row * bucket_areas[textures.bucket]
         texels = [bucket.reshape(-1, 4) for bucket in textures.buckets if bucket.size]
@@ -193,7 +196,8 @@ class Texture(Part):
     def peaks(self) -> Array:
         """Return the largest alpha factor [N] of each splat; only for bounds, without gradient."""
         textures = self.shown()
-        most, columns = max(map(len, textures.buckets)), []
+        most = max(map(len, textures.buckets))
+        columns = []
         for bucket in textures.buckets:  # 1 of an empty texture, 0 past the capacity.
             own = jnp.max(bucket[..., 3], axis=(1, 2)) if bucket.size else jnp.ones(most, bucket.dtype)
             columns.append(jnp.pad(own, (0, most - len(own))))
@@ -208,7 +212,8 @@ class Texture(Part):
         """Return the lookup position (x, y) in texels, clamped to [0, width − 1] and [0, height − 1]."""
         if not self.options.uv_gradient:
             u, v = jax.lax.stop_gradient((u, v))
-        width, height = region.width.astype(u.dtype), region.height.astype(v.dtype)
+        width = region.width.astype(u.dtype)
+        height = region.height.astype(v.dtype)
         return texel_coordinates(u, width, self.options), texel_coordinates(v, height, self.options)
 
     def shade(self, values: tuple[Array, ...], u: Array, v: Array) -> tuple[Residual, Factor]:
@@ -326,7 +331,9 @@ class Coefficients(Table):
 
     @classmethod
     def placed(cls, buckets: Sequence[Any], places: Places) -> Self:
-        bucket, row, num = np.asarray(places.bucket), np.asarray(places.row), places.bucket.shape[0]
+        bucket = np.asarray(places.bucket)
+        row = np.asarray(places.row)
+        num = places.bucket.shape[0]
         owners = []
         for index, blocks in enumerate(buckets):
             # N is out of range, so that scatters drop padding.
@@ -369,7 +376,9 @@ class Bands(Part):
 
         The camera's centre is [3]; the highest degree may be traced.
         """
-        table, base, means = self.coefficients, gaussians.sh_degree, gaussians.means
+        table = self.coefficients
+        base = gaussians.sh_degree
+        means = gaussians.means
         assert table is not None
         total = jnp.zeros(means.shape, jnp.result_type(means, center, *table.buckets))
         for blocks, owners in zip(table.buckets, table.owners, strict=True):
@@ -380,7 +389,8 @@ class Bands(Part):
             bases = sh_basis(directions, blocks.shape[1] + NUM_BASES[base])
             colors = jnp.zeros((len(blocks), 3), total.dtype)
             for band in range(base + 1, MAX_DEGREE + 1):
-                first, last = NUM_BASES[band - 1], NUM_BASES[band]
+                first = NUM_BASES[band - 1]
+                last = NUM_BASES[band]
                 # Blocks have all bands up to a degree.
                 if blocks.shape[1] < last - NUM_BASES[base]:
                     break
@@ -436,7 +446,9 @@ def bands_of_dense(dense: np.ndarray, degrees: np.ndarray, base_degree: int) -> 
 # ⟨g, g⟩ = k, and the best k maximises ⟨f, g⟩²/k. Both are tabulated over the logarithm of the exponent.
 
 LEAST_OPACITY = 1e-6
-NUM_SHAPES, NUM_SCALES, NUM_PLACES = 41, 121, 2001
+NUM_SHAPES = 41
+NUM_SCALES = 121
+NUM_PLACES = 2001
 LARGEST_PLACE = 12.0
 """Distance, in standard deviations, up to which kernels are compared."""
 LEAST_LOG_SCALE, MOST_LOG_SCALE = -0.3, 0.9

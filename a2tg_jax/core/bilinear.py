@@ -59,17 +59,22 @@ class Lookup(NamedTuple):
 
 def corners_of(region: TextureRegion, x: Array, y: Array) -> tuple[Corner, ...]:
     """Return the texels above left, above right, below left and below right of (x, y); weight 0 without a texture."""
-    right_most, bottom_most = jnp.maximum(region.width - 1, 0), jnp.maximum(region.height - 1, 0)
+    right_most = jnp.maximum(region.width - 1, 0)
+    bottom_most = jnp.maximum(region.height - 1, 0)
     # Clipped, so that no x or y reads outside the texture.
     left = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, right_most)
     top = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, bottom_most)
     # Beyond the last texel the weight is 0, because x <= width − 1: any index inside will do.
-    right, bottom = jnp.minimum(left + 1, right_most), jnp.minimum(top + 1, bottom_most)
-    above, below = region.first + top * region.width, region.first + bottom * region.width
+    right = jnp.minimum(left + 1, right_most)
+    bottom = jnp.minimum(top + 1, bottom_most)
+    above = region.first + top * region.width
+    below = region.first + bottom * region.width
     exists = (region.width > 0).astype(x.dtype)
     # Without a texture all four weights are 0, and nothing is read into the sum.
-    fx, fy = exists * (x - left.astype(x.dtype)), exists * (y - top.astype(y.dtype))
-    gx, gy = exists - fx, exists - fy
+    fx = exists * (x - left.astype(x.dtype))
+    fy = exists * (y - top.astype(y.dtype))
+    gx = exists - fx
+    gy = exists - fy
     # The slopes follow from ∂fx/∂x = 1 and ∂gx/∂x = −1.
     return (
         Corner(above + left, gx * gy, -gy, -gx),
@@ -103,6 +108,7 @@ def or_empty(sample: Sample, region: TextureRegion, empty: tuple[float, ...]) ->
 def follow(sample: Sample, x: Array, y: Array) -> tuple[Array, ...]:
     """Return the sample's values, differentiable in (x, y)."""
     # Both are 0, and carry the derivative: texels are read once, and JAX need not differentiate the lookup itself.
-    dx, dy = x - jax.lax.stop_gradient(x), y - jax.lax.stop_gradient(y)
+    dx = x - jax.lax.stop_gradient(x)
+    dy = y - jax.lax.stop_gradient(y)
     columns = zip(*sample, strict=True)
     return tuple(value + slope_x * dx + slope_y * dy for value, slope_x, slope_y in columns)

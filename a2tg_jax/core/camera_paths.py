@@ -161,7 +161,8 @@ def _shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 def central_camera(viewmats: np.ndarray) -> int:
     """Return the index of the camera [V, 4, 4] whose axis passes nearest to the subject and which is nearest to the
     median camera, with equal weight."""
-    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
     subject = nearest_point(centers, axes)
     misses = np.linalg.norm(np.cross(subject - centers, axes), axis=1)
     remote = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
@@ -182,8 +183,10 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: np.ndarray | None 
         raise ValueError(f"an orbit needs a camera and a frame; got {len(cameras)} cameras, {num_frames} frames")
     cameras = without_outlying(cameras)
     viewmats = _viewmats(cameras)
-    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
-    subject, up = nearest_point(centers, axes), vertical_of(viewmats) if up is None else up
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
+    subject = nearest_point(centers, axes)
+    up = vertical_of(viewmats) if up is None else up
     offsets = centers - subject
     distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     if np.median(-np.sum(offsets * axes, axis=1) / distances) < LEAST_FACING:
@@ -197,7 +200,8 @@ def turntable(cameras: Sequence[Camera], num_frames: int, up: np.ndarray | None 
         if np.linalg.norm(across) > 1e-3 * np.linalg.norm(vector):
             break
     side = across / np.linalg.norm(across)
-    first, place = cameras[0], distances.mean()
+    first = cameras[0]
+    place = distances.mean()
     frames = []
     for angle in np.arange(num_frames) * (2 * np.pi / num_frames):
         heading = np.cos(angle) * side + np.sin(angle) * np.cross(up, side)
@@ -248,7 +252,8 @@ def look_at(
         raise ValueError(f"{wanted}, and up is {up}: pass another up")
     if not 0 < fov < 180:
         raise ValueError(f"fov must be between 0 and 180 degrees; got {fov}")
-    viewmat, K = looking(center, forward, -up), intrinsics(width, height, np.radians(fov))
+    viewmat = looking(center, forward, -up)
+    K = intrinsics(width, height, np.radians(fov))
     # `float` is JAX's default dtype, float64 under x64.
     camera = Camera(jnp.asarray(viewmat, float), jnp.asarray(K, float), width, height)
     check_camera(camera)
@@ -283,7 +288,9 @@ def smooth_path(cameras: Sequence[Camera], num_frames: int) -> list[Camera]:
     if len(cameras) < 2:
         raise ValueError(f"a path needs two cameras; got {len(cameras)}")
     viewmats = _viewmats(cameras)
-    centers, forwards, downs = camera_centers(viewmats), viewmats[:, 2, :3], viewmats[:, 1, :3]
+    centers = camera_centers(viewmats)
+    forwards = viewmats[:, 2, :3]
+    downs = viewmats[:, 1, :3]
     # The tour begins at an end of the set, and always goes to the nearest camera that it has not visited.
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() or 1.0
     # In radii of the capture, so that positions compare with directions.
@@ -345,10 +352,12 @@ def path_through(views: Sequence[Camera], num_frames: int) -> list[Camera]:
     # Splines need increasing times, also where two views are equal.
     knots = np.concatenate([[0.0], np.cumsum(np.maximum(steps, 1e-3))])
     times = np.linspace(0.0, knots[-1], num_frames)
-    places, turned = CubicSpline(knots, centers, bc_type="natural")(times), Slerp(knots, rotations)(times).as_matrix()
+    places = CubicSpline(knots, centers, bc_type="natural")(times)
+    turned = Slerp(knots, rotations)(times).as_matrix()
     Ks = np.stack([np.asarray(view.K, np.float64).ravel() for view in views])
     lenses = _interpolated(times, knots, Ks).reshape(-1, 3, 3)
-    dtype, size = first.viewmat.dtype, (first.width, first.height)
+    dtype = first.viewmat.dtype
+    size = (first.width, first.height)
     return [
         Camera(jnp.asarray(viewmat_of_axes(R, c), dtype), jnp.asarray(K, dtype), *size)
         for R, c, K in zip(turned, places, lenses, strict=True)

@@ -153,7 +153,8 @@ def check_intrinsics(K: np.ndarray, width: int, height: int, what: str) -> None:
     if not 1 <= min(width, height) <= side <= LONGEST_SIDE:
         raise ValueError(f"{what}: its image must have sides of 1..{LONGEST_SIDE} pixels; got {width}x{height}")
     K = np.asarray(K, np.float64)
-    focal, offset = K[[0, 1], [0, 1]], K[[0, 1], [2, 2]]
+    focal = K[[0, 1], [0, 1]]
+    offset = K[[0, 1], [2, 2]]
     if not ((focal >= SHORTEST_FOCAL * side) & (focal <= LONGEST_FOCAL * side)).all():  # False for NaN.
         wanted = f"{SHORTEST_FOCAL * side:g}..{LONGEST_FOCAL * side:g} pixels, because its image is {width}x{height}"
         raise ValueError(f"{what}: its focal lengths must be in {wanted}; got {_numbers(focal)}")
@@ -278,7 +279,9 @@ def rotation_exp(rotvec: Array) -> Array:
     angle = jnp.sqrt(safe)
     first = jnp.where(is_small, _series(squared, 1, 6, 120, 5040), jnp.sin(angle) / angle)
     second = jnp.where(is_small, _series(squared, 2, 24, 720, 40320), (1 - jnp.cos(angle)) / safe)
-    x, y, z = rotvec[0], rotvec[1], rotvec[2]
+    x = rotvec[0]
+    y = rotvec[1]
+    z = rotvec[2]
     zero = jnp.zeros_like(x)
     W = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
     # W² = ω·ωᵀ − θ²·I, without a product of matrices, which some devices round coarsely.

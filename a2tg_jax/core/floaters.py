@@ -33,7 +33,8 @@ def floater_scores(
       log_scales: [N, 2].
       viewmats, Ks, sizes: [V, 4, 4], [V, 3, 3] and [V, 2] of the cameras; without cameras only gaps count.
     """
-    means, few = np.asarray(means, np.float64), slice(None, None, -(-len(viewmats) // MOST_CAMERAS) or 1)
+    means = np.asarray(means, np.float64)
+    few = slice(None, None, -(-len(viewmats) // MOST_CAMERAS) or 1)
     # A tree does not divide copies at one place, and would compare each with all; nor are they company.
     places, first, place_of = np.unique(means, axis=0, return_index=True, return_inverse=True)
     if len(places) < 2:
@@ -44,13 +45,15 @@ def floater_scores(
     gaps = np.maximum(distances - reach[ids], 0.1 * distances)[:, 1:].mean(axis=1)[place_of.ravel()]
     if not len(viewmats):
         return _bytes_of(_octaves_over_median(gaps))
-    num_views, front = np.zeros(len(means)), np.zeros(len(means))
+    num_views = np.zeros(len(means))
+    front = np.zeros(len(means))
     for viewmat, K, (width, height) in zip(viewmats[few], Ks[few], sizes[few], strict=True):
         x, y, depth = viewmat[:3, :3] @ means.T + viewmat[:3, 3:]
         before = np.flatnonzero(depth > LEAST_DEPTH)
         column, row, _ = K @ np.stack([x[before], y[before], depth[before]]) / depth[before]
         is_seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        seen, octaves = before[is_seen], np.log2(depth[before[is_seen]])
+        seen = before[is_seen]
+        octaves = np.log2(depth[before[is_seen]])
         cell = (column[is_seen] / width * CELLS).astype(int) + CELLS * (row[is_seen] / height * CELLS).astype(int)
         # A cell of few is mostly floaters.
         picture = FEWEST * octaves.mean() if len(octaves) else 0.0

@@ -235,13 +235,15 @@ def init_from_points(
     check_int("num", 2 if num is None else num, 2)
     check_int("sh_degree", sh_degree, 0, len(NUM_BASES) - 1)
     check_number("opacity", opacity, above=0, below=1)
-    points, colors = plain_array("points", points), plain_array("colors", colors)
+    points = plain_array("points", points)
+    colors = plain_array("colors", colors)
     found = np.asarray(colors)
     if hasattr(colors, "dtype") and not np.issubdtype(found.dtype, np.floating):
         raise ValueError(f"colors must be floats in [0, 1]; got {found.dtype}: divide bytes by 255")
     if (outside := found[(found < -COLOR_SLACK) | (found > 1 + COLOR_SLACK)]).size:  # NaN is refused below.
         raise ValueError(f"colors must be in [0, 1]; got {outside.flat[0]:g}: divide bytes by 255")
-    points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
+    points = np.asarray(points, np.float64)
+    colors = np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or points.shape != colors.shape:
         raise ValueError(f"points and colors must both be [P, 3]; got {points.shape} and {colors.shape}")
     if not (np.isfinite(points).all() and np.isfinite(colors).all()):
@@ -249,7 +251,8 @@ def init_from_points(
     rng = np.random.default_rng(seed)
     if num is not None and num < len(points):
         keep = np.sort(rng.choice(len(points), num, replace=False))
-        points, colors = points[keep], colors[keep]
+        points = points[keep]
+        colors = colors[keep]
     if len(points) < 2:
         raise ValueError(f"at least two points are needed to choose scales; got {len(points)}")
     neighbours = min(3, len(points) - 1)

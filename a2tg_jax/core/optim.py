@@ -95,7 +95,8 @@ def adam_update(
     check_number("eps", eps, least=0)
     _check_floats(params)
     for name, tree in (("grads", grads), ("state.mu", state.mu), ("state.nu", state.nu)):
-        found, wanted = str(jax.tree.structure(tree)), str(jax.tree.structure(params))
+        found = str(jax.tree.structure(tree))
+        wanted = str(jax.tree.structure(params))
         if found != wanted:
             raise ValueError(f"{name} must have the structure of params, {wanted}; got {found}")
         leaves = jax.tree_util.tree_leaves_with_path(tree)

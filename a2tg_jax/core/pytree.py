@@ -111,7 +111,8 @@ def pytree(cls: Any = None, /, **options: Any) -> Any:
     for field in dataclasses.fields(made):
         kind = next((kind for kind in ("static", "beside") if field.metadata.get(kind)), "dynamic")
         kinds[kind].append(field.name)
-    dynamic, fixed = tuple(kinds["dynamic"]), tuple(kinds["static"])
+    dynamic = tuple(kinds["dynamic"])
+    fixed = tuple(kinds["static"])
     # For errors, which name a leaf by its path, such as params.gaussians.means.
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in dynamic)
     common = {field.name for field in dataclasses.fields(made) if field.metadata.get("shared")}

@@ -109,14 +109,16 @@ class Table(NamedFields):
         places, capacities = plan_places(sizes)
         dtype = np.result_type(*(blocks for _, blocks in groups)) if groups else np.float32
         shapes = zip(capacities, places.bucket_sizes, strict=True)
-        buckets, rows = [cls._padded(capacity, size, dtype) for capacity, size in shapes], np.asarray(places.row)
+        buckets = [cls._padded(capacity, size, dtype) for capacity, size in shapes]
+        rows = np.asarray(places.row)
         for ids, blocks in groups:
             buckets[int(places.bucket[ids[0]])][rows[ids]] = blocks
         return cls.placed(buckets, places)
 
     def groups(self) -> list[Group]:
         """Return a group for each bucket, its Gaussians ascending (host)."""
-        bucket, row = np.asarray(self.bucket), np.asarray(self.row)
+        bucket = np.asarray(self.bucket)
+        row = np.asarray(self.row)
         ids = [np.flatnonzero(bucket == index) for index in range(len(self.buckets))]
         return [(own, np.asarray(blocks)[row[own]]) for own, blocks in zip(ids, self.buckets, strict=True)]
 
@@ -131,7 +133,8 @@ class Table(NamedFields):
     def of_flat(cls, sizes: np.ndarray, elements: np.ndarray) -> Self:
         """Return the table of sizes [N, D] and of what `flat` returned, which fits them (host)."""
         places, _ = plan_places(sizes)
-        ends, groups = np.cumsum(sizes.prod(axis=1)), []
+        ends = np.cumsum(sizes.prod(axis=1))
+        groups = []
         for index, size in enumerate(places.bucket_sizes):
             ids = np.flatnonzero(np.asarray(places.bucket) == index)
             # A block ends where the running sum of areas does.
@@ -141,7 +144,8 @@ class Table(NamedFields):
 
     def flat(self) -> np.ndarray:
         """Return the elements [M, C] of all blocks, block after block, each row by row (host)."""
-        ends, dtype = np.cumsum(self.sizes.prod(axis=1)), self.buckets[0].dtype if self.buckets else np.float32
+        ends = np.cumsum(self.sizes.prod(axis=1))
+        dtype = self.buckets[0].dtype if self.buckets else np.float32
         elements = np.zeros((ends[-1] if self.num else 0, len(self.padding)), dtype)
         for ids, blocks in self.groups():
             area = math.prod(blocks.shape[1:-1])
@@ -189,7 +193,8 @@ class Table(NamedFields):
         """Return blocks, or moments of them, whose Gaussian i is the former rows[i] of N; traceable. ValueError: there
         are blocks of several sizes."""
         if len(self.buckets) != 1:
-            name, num = type(self).__name__.lower(), len(self.buckets)
+            name = type(self).__name__.lower()
+            num = len(self.buckets)
             raise ValueError(f"{name} of {num} sizes cannot change rows: densify and prune before they grow")
         # With one bucket, row i is Gaussian i's (`plan_places`); padding follows and stays.
         (bucket,) = self.buckets
@@ -212,7 +217,8 @@ class Table(NamedFields):
         Padding is `padding` of the class, or C given numbers, such as zeros for moments."""
         places, capacities = plan_places(self.sizes[rows])
         old, new = ((np.asarray(own.bucket), np.asarray(own.row)) for own in (self, places))
-        ends, padding = ((old[0][rows], old[1][rows]), new), padding or self.padding
+        ends = ((old[0][rows], old[1][rows]), new)
+        padding = padding or self.padding
         return self.placed(_moved(type(self), self.buckets, ends, places.bucket_sizes, capacities, padding), places)
 
     def nearest_places(self) -> Self:
@@ -223,7 +229,8 @@ class Table(NamedFields):
 
         def clipped(index: Array, last: Any) -> Array:
             # Clipped to int32 first, which a negative uint or an int64 beyond it would wrap around in.
-            own, wanted = np.iinfo(index.dtype), np.iinfo(np.int32)
+            own = np.iinfo(index.dtype)
+            wanted = np.iinfo(np.int32)
             index = jnp.clip(index, max(wanted.min, own.min), min(wanted.max, own.max)).astype(jnp.int32)
             return jnp.clip(index, 0, last)
 
@@ -357,7 +364,8 @@ def resize(
     ends = [(np.asarray(own.bucket), np.asarray(own.row)) for own in (table, places)]
     if kept is not None:
         check_mask("kept", kept, (table.num,))
-    own, chosen = type(table), slice(None) if kept is None else kept
+    own = type(table)
+    chosen = slice(None) if kept is None else kept
     kept_ends = [(bucket[chosen], row[chosen]) for bucket, row in ends]
 
     def rebuilt(old: Table, ends: list[_Ends], padding: Sequence[float]) -> Table:
@@ -425,10 +433,12 @@ def check_table(table: Table, num: int | None = None, name: str = "textures") ->
         raise ValueError(f"{name} must have a row for each of {table.num} Gaussians; all buckets are empty")
     if not table.num or any(isinstance(leaf, jax.core.Tracer) for leaf in (table.bucket, table.row)):
         return
-    places, last = np.asarray(table.bucket), len(table.buckets) - 1
+    places = np.asarray(table.bucket)
+    last = len(table.buckets) - 1
     if places.min() < 0 or places.max() > last:
         raise ValueError(f"{name}.bucket must be 0 to {last}; got {places.min()} to {places.max()}")
-    rows, capacities = np.asarray(table.row), np.asarray([len(blocks) for blocks in table.buckets])[places]
+    rows = np.asarray(table.row)
+    capacities = np.asarray([len(blocks) for blocks in table.buckets])[places]
     outside = np.flatnonzero((rows < 0) | (rows >= capacities))
     if outside.size:
         first = outside[0]
@@ -440,7 +450,8 @@ def check_table(table: Table, num: int | None = None, name: str = "textures") ->
 
 def check_places(table: Table, name: str = "textures") -> None:
     """Raise ValueError unless each block has its own row; the table must have passed `check_table` (host)."""
-    bucket, row = np.asarray(table.bucket), np.asarray(table.row)
+    bucket = np.asarray(table.bucket)
+    row = np.asarray(table.row)
     capacities = np.asarray([len(blocks) for blocks in table.buckets], np.int64)
     # With the rows of all buckets numbered through, equal numbers are shared rows.
     starts = np.cumsum(capacities) - capacities

@@ -111,7 +111,8 @@ class CloneSplitPrune(StepEvent):
         """Return a mask [N] of rows that are too faint or too large."""
         opacities = model.appearance.opacities(model.gaussians)
         between = reset_interval(now.num_iterations)
-        is_late, since_reset = now.iteration > between, now.iteration % between
+        is_late = now.iteration > between
+        since_reset = now.iteration % between
         is_faint = (opacities < self.least_opacity) & ~(is_late & (since_reset < RECOVERY))
         return is_faint | (is_late & (jnp.max(model.gaussians.scales, axis=1) > self.largest_share * now.scene_scale))
 

@@ -75,7 +75,8 @@ class PlaceByError(HostEvent):
         if any(map(is_table, jax.tree.leaves(model.appearance, is_leaf=is_table))):
             raise ValueError("share must be 0 in a stage whose Gaussians have textures or differ in degree")
         num = model.num
-        wanted, room = round(num * float(self.share)), min(self.cap, model.gaussians.num) - num
+        wanted = round(num * float(self.share))
+        room = min(self.cap, model.gaussians.num) - num
         if not wanted:
             return Change(model, moments, state, unused=f"share of {num:,} Gaussians is less than one: raise it")
         if room <= 0:
@@ -118,7 +119,8 @@ def gaussians_at_errors(
     dtype = model.gaussians.means.dtype
     settings = room_for(model, [view.camera for view in views])
     behind = jnp.asarray(background, dtype)
-    totals, drawn = [], []
+    totals = []
+    drawn = []
     for view in views:
         camera = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), view.camera)
         output, _ = jitted_render()(

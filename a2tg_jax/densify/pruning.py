@@ -102,7 +102,8 @@ def shown_in(model: Model, views: Sequence[View], least: float = 1.0) -> Contrib
     """
     if not views:
         raise ValueError("views must hold at least one view; got none")
-    total, num_views = np.zeros(model.gaussians.num), np.zeros(model.gaussians.num, np.int64)
+    total = np.zeros(model.gaussians.num)
+    num_views = np.zeros(model.gaussians.num, np.int64)
     if not len(total):
         return Contributions(total, num_views)
     dtype = model.gaussians.means.dtype
@@ -189,7 +190,8 @@ class PruneFloaters(HostEvent):
         return 2  # Rows keep their number; tile lists grow with the Gaussians.
 
     def apply(self, due: Due, model: Model, moments: AdamState, state: object) -> Change:
-        num, means = model.num, np.asarray(model.gaussians.means)[: model.num]
+        num = model.num
+        means = np.asarray(model.gaussians.means)[: model.num]
         is_kept = np.ones(num, bool)
         if self.min_views:
             num_views = shown_in(model, due.views, self.least).num_views[:num]
@@ -214,7 +216,8 @@ def are_near(means: np.ndarray, views: Sequence[View], near: float) -> np.ndarra
     """
     found = np.zeros(len(means), bool)
     for camera in (view.camera for view in views):
-        viewmat, K = np.asarray(camera.viewmat, np.float64), np.asarray(camera.K, np.float64)
+        viewmat = np.asarray(camera.viewmat, np.float64)
+        K = np.asarray(camera.K, np.float64)
         x, y, z = viewmat[:3, :3] @ means.T + viewmat[:3, 3:]
         # Behind the camera nothing is inside: comparisons with NaN are False.
         depth = np.where(z > 0, z, np.nan)

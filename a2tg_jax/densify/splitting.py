@@ -68,7 +68,8 @@ class SplitByGradient(FillingMcmc):
         draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
         moves = plan_relocation(to_move, model.appearance.opacities(model.gaussians), num_live, draw)
         model, moments, state = split_rows(to_split, moves, model, moments, state)
-        cap, least = min(self.cap, model.gaussians.num), self.least(now, num_live)
+        cap = min(self.cap, model.gaussians.num)
+        least = self.least(now, num_live)
         # Rows that have moved are smaller now and share their statistic.
         draw = functools.partial(draw_distinct_hosts, draw_weights(model, state))
         moves = plan_growth(to_add, model.appearance.opacities(model.gaussians), num_live, cap, least, draw)
@@ -100,7 +101,8 @@ def split_rows(
 ) -> tuple[Model, AdamState, SplitStatistics]:
     """Copy rows from their hosts. Hosts and copies are halved, lose Adam's moments and share the statistic."""
     is_split = moves.is_reset | (moves.rows != jnp.arange(model.gaussians.num, dtype=jnp.int32))
-    pixels, found = state.pixels[moves.rows], state.gradients
+    pixels = state.pixels[moves.rows]
+    found = state.gradients
     total = found.total / moves.num_shares.astype(found.total.dtype)
     gradients = GradientStatistics(total[moves.rows], found.views[moves.rows])
     # On the screen, halves are 1.6 times smaller as well.

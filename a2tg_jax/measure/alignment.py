@@ -52,7 +52,8 @@ def color_fit(image: ArrayLike, target: ArrayLike, mask: ArrayLike | None = None
     if mask is not None:
         check_mask("mask", mask, np.shape(image)[:2])
     counts = np.ones(np.shape(image)[:2], bool) if mask is None else np.asarray(mask)
-    colors, wanted = np.asarray(image, np.float64)[counts], np.asarray(target, np.float64)[counts]
+    colors = np.asarray(image, np.float64)[counts]
+    wanted = np.asarray(target, np.float64)[counts]
     for name, values in (("image", colors), ("target", wanted)):
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite where its pixels count; it has NaN or infinite colours")
@@ -94,12 +95,14 @@ def align_poses(
     model = model.live
     background = jnp.asarray(model.background if background is None else background, model.gaussians.means.dtype)
     planned = plan_render(model, [view.camera for view in views], head_room=HEAD_ROOM, settings=settings)
-    descend, aligned = jax.jit(_descent, static_argnums=(6, 7)), []
+    descend = jax.jit(_descent, static_argnums=(6, 7))
+    aligned = []
     for view in views:
         target = jnp.asarray(view_image(view, np.asarray(background)), background.dtype)
         mask = None if view.mask is None else jnp.asarray(view.mask.read())[..., None]
         camera = jax.tree.map(lambda x: jnp.asarray(x, background.dtype), view.camera)
-        inputs, settings = (model.gaussians, model.appearance, camera, target, mask, background), planned
+        inputs = (model.gaussians, model.appearance, camera, target, mask, background)
+        settings = planned
         # A full tile list drops splats, which makes the loss wrong: the descent is repeated.
         while (found := descend(*inputs, settings, num_steps))[1]:
             assert settings.capacity is not None
@@ -128,7 +131,8 @@ def _descent(
         twist, moments, least, best, is_full = carry
         (value, overflow), grad = jax.value_and_grad(loss, has_aux=True)(twist)
         # A NaN loss is not less, so it is never kept.
-        best, least = jnp.where(value < least, twist, best), jnp.where(value < least, value, least)
+        best = jnp.where(value < least, twist, best)
+        least = jnp.where(value < least, value, least)
         rate = FIRST_RATE * (LAST_RATE / FIRST_RATE) ** (index / num_steps)
         twist, moments = adam_update(twist, grad, moments, rate)
         return (twist, moments, least, best, is_full | overflow), None

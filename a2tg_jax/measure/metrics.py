@@ -176,9 +176,11 @@ def parameter_bytes(gaussians: Gaussians, textures: Textures | None = None) -> i
 
 def _clip_pair(image: Array, target: Array, mask: Array | None = None) -> tuple[Array, Array]:
     """Return both images in [0, 1], and black where pixels do not count."""
-    image, target = plain_array("image", image), plain_array("target", target)
+    image = plain_array("image", image)
+    target = plain_array("target", target)
     losses.check_same_shape(image, target)
-    image, target = jnp.clip(image, 0, 1), jnp.clip(target, 0, 1)
+    image = jnp.clip(image, 0, 1)
+    target = jnp.clip(target, 0, 1)
     if mask is None:
         return image, target
     mask = plain_array("mask", mask)

@@ -18,7 +18,8 @@ from a2tg_jax.mcmc import Noise, densify_times
 from a2tg_jax.systems.two_stages import PRUNING, LimitExponents, TwoStages, kernels_of, pruned
 from a2tg_jax.training.stage import Stage
 
-QUICK_CAP, SMOKE_CAP = 40_000, 2_000
+QUICK_CAP = 40_000
+SMOKE_CAP = 2_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -91,7 +92,8 @@ class Bytewise(TwoStages):
         rates = kernels.rates | {"bands": self.view_dependence_rate}
         detailed = dataclasses.replace(plain, bands=Bands())
         if self.view_dependence_share:
-            budget, highest = self._megabytes_before_texels(), min(self.sh_degree, self.view_dependence.highest)
+            budget = self._megabytes_before_texels()
+            highest = min(self.sh_degree, self.view_dependence.highest)
             events.append(dataclasses.replace(self.view_dependence, budget_mb=budget, highest=highest))
         if self.texture_share:
             budget = self._num_bytes() / MEGABYTE
@@ -145,7 +147,8 @@ class Bytewise(TwoStages):
             check_number(name, getattr(self, name), least=0, most=1)
         for name in ("fading_weight", "kernel_rate", "view_dependence_rate", "texel_rate"):
             check_number(name, getattr(self, name), least=0)
-        view, details = self.view_dependence, self.details
+        view = self.view_dependence
+        details = self.details
         by_shares = "the shares decide"
         decided: tuple[tuple[str, Any, str, str], ...] = (
             *(("details", details, name, by_shares) for name in ("select", "fraction", "threshold", "budget_mb")),

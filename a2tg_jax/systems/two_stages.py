@@ -64,7 +64,8 @@ class TwoStages(System):
         name: str = "gaussians",
     ) -> Stage:
         """Return a first stage, in which the degree of spherical harmonics rises and floaters are pruned."""
-        floaters, length = self.floaters, self.stage1_iterations
+        floaters = self.floaters
+        length = self.stage1_iterations
         if floaters.min_views or floaters.near:
             growing = (each for each in events if isinstance(each, StepEvent) and each.most_gaussians is not None)
             times = [found for each in growing if (found := each.times(length)).num_times]
@@ -87,7 +88,8 @@ class TwoStages(System):
         self, name: str, appearance: Appearance, events: tuple[Event, ...] = (), appearance_rate: object = None
     ) -> Stage:
         """Return a second stage, from the result of the first, with all degrees and a fixed number of Gaussians."""
-        losses, length = self.loss.terms(is_first=False), self.stage2_iterations
+        losses = self.loss.terms(is_first=False)
+        length = self.stage2_iterations
         return Stage(name, appearance, events, losses, self.rates, length, appearance_rate, self.corrections_of(1))
 
     def continued(self, first: Stage) -> tuple[Stage, ...]:
